@@ -136,7 +136,7 @@ CASES: dict[str, Case] = {
     "export": Case(
         (*RUN, "states.jsonl"),
         lambda pick: (
-            ["export", "run", "--format", pick.choice(("ply", "spz")), "--output", "out.file"]
+            ["export", "run", "--output", pick.choice(("out.ply", "out.spz"))]
             + (["--states", "states.jsonl"] if pick.random() < 0.5 else [])
         ),
         2,

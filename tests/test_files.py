@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 
 from neeco.capture.images import open_image
 from neeco.capture.points import read_ply
@@ -20,6 +21,9 @@ from neeco.files import (
     LOCK,
     MOST_VALUES,
     TEMPORARY,
+    FastYamlLoader,
+    YamlDumper,
+    YamlLoader,
     is_vacant,
     own_folder,
     parse_yaml,
@@ -74,6 +78,16 @@ def test_a_killed_process_holds_no_folder_and_what_it_left_is_swept(tmp_path: Pa
         left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
         assert left == {*whole, LOCK}
     assert not (tmp_path / LOCK).exists()
+
+
+def test_half_a_character_is_no_json_and_a_pair_of_halves_is_one_letter(tmp_path: Path) -> None:
+    file = tmp_path / "file.json"
+    file.write_text(r'{"name": "\ud83d\ude00"}')
+    assert read_json(file) == {"name": "\N{GRINNING FACE}"}
+    for text in (r'{"name": ["\udcff.jpg"]}', r'{"\uD83D": 1}'):
+        file.write_text(text)
+        with pytest.raises(NeecoError, match="half a character; write its names"):
+            read_json(file)
 
 
 @pytest.mark.parametrize(("umask", "file", "folder"), [(0o077, 0o600, 0o700), (0o002, 0o664, 0o775)])
@@ -177,6 +191,16 @@ def test_yaml_without_measure_is_refused_in_one_line(text: str, told: str, tmp_p
         parse_yaml(Path("file.yaml"), text, "repair it")
     assert "\n" not in str(error.value)
     assert time.process_time() - began < 5
+
+
+@pytest.mark.parametrize("loader", [YamlLoader, FastYamlLoader])
+def test_numbers_are_those_of_yaml_1_2(loader: type[yaml.SafeLoader]) -> None:
+    texts = ["-.5", "+.5", ".5", "1e-3", "-2E3", "1.5e3", "5.", "7", "-.inf"]
+    values = parse_yaml(Path("x"), f"[{', '.join(texts)}]", "", loader)
+    assert values == [float(text.replace(".inf", "inf")) for text in texts]
+    words = ["e3", "1e", "1e3x", "-", ".", "1.2.3", "v1.5", "0x02"]
+    assert parse_yaml(Path("x"), f"[{', '.join(words)}]", "", loader) == [*words[:-1], 2]
+    assert parse_yaml(Path("x"), yaml.dump({"1e5": ".5"}, Dumper=YamlDumper), "", loader) == {"1e5": ".5"}
 
 
 def test_aliases_within_measure_are_read() -> None:

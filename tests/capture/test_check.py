@@ -257,6 +257,20 @@ def test_the_same_picture_under_two_names_is_an_error(folder):
     assert_found(folder, "frames[5].file_path", "same pixels as frames[1]")
 
 
+def test_a_picture_coded_again_under_other_states_is_a_frozen_video(folder):
+    pixels = np.array(Image.open(folder.root / "images/000002.png"))
+    for row, name in enumerate(("000003", "000004")):
+        pixels[row, 4] ^= 1
+        Image.fromarray(pixels).save(folder.root / f"images/{name}.png")
+    message = "shows the picture before it while camera or state changed (2 of 8 frames do)"
+    assert_found(folder, "frames[3].file_path", message, "warning")
+    resting = folder.document["frames"][2]
+    for index in (3, 4):
+        folder.edit(_frame(index, "transform_matrix", resting["transform_matrix"]))
+        folder.edit(_frame(index, "instruments", resting["instruments"]))
+    assert not [problem for problem in check_capture(folder.root) if "picture before" in problem.message]
+
+
 def test_a_mask_that_ignores_everything_is_an_error_and_missing_ones_a_warning(folder):
     Image.new("L", (32, 24), 1).save(folder.root / "mask.png")
     folder.edit(_frame(2, "mask_path", "mask.png"))
@@ -515,3 +529,9 @@ def test_a_reading_that_the_others_tell_is_said(folder):
     folder.edit(edit)
     assert_found(folder, "instruments", "joint 'elbow' of", "warning")
     assert_found(folder, "instruments", "follows from the others (99", "warning")
+
+
+def test_one_time_for_all_frames_is_a_warning_where_states_differ(folder):
+    for index in range(8):
+        folder.edit(_frame(index, "time", 0.0))
+    assert_found(folder, "frames", "every frame has the time 0, though states differ", "warning")

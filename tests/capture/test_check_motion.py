@@ -1,4 +1,4 @@
-"""`neeco check` tells by the images that rotations are transposed or that states belong to other frames."""
+"""`neeco check` tells by the images that states are wrong, and names a mistake only if the images confirm it."""
 
 from __future__ import annotations
 
@@ -171,3 +171,64 @@ def test_poses_of_a_link_that_turns_against_the_shaft_confuse_nothing(sample):
     assert told(sample, bent) == []
     (line,) = told(sample, lambda document: (bent(document), transpose(document)))
     assert "are transposed" in line
+
+
+def edited(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Document], None]:
+    """Every pose, changed."""
+
+    def edit(document: Document) -> None:
+        for state in states(document):
+            state["pose"] = change(np.array(state["pose"])).tolist()
+
+    return edit
+
+
+def in_ecm_axes(document: Document) -> None:
+    """Poses as if x were left and y up in the camera's frame."""
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    for frame, state in zip(document["frames"], states(document), strict=True):
+        camera = np.array(frame["transform_matrix"])
+        state["pose"] = (camera @ half_turn @ np.linalg.inv(camera) @ np.array(state["pose"])).tolist()
+
+
+def wxyz_read_as_xyzw(pose: np.ndarray) -> np.ndarray:
+    pose[:3, :3] = Rotation.from_quat(np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)).as_matrix()
+    return pose
+
+
+def shuffle(document: Document) -> None:
+    given = copy.deepcopy(states(document))
+    for frame, row in zip(document["frames"], np.random.default_rng(0).permutation(len(given)), strict=True):
+        frame["instruments"] = [given[row]]
+
+
+def reverse(document: Document) -> None:
+    given = copy.deepcopy(states(document))
+    for frame, state in zip(document["frames"], reversed(given), strict=True):
+        frame["instruments"] = [state]
+
+
+def test_poses_in_the_axes_of_a_robots_endoscope_are_named(sample):
+    (line,) = told(sample, in_ecm_axes)
+    assert line.startswith("frames[*].instruments[*].pose: poses of 'maryland' are turned by 180 degrees about the")
+
+
+def test_states_that_nothing_explains_contradict_the_images_and_no_cause_is_named(sample):
+    (line,) = told(sample, shuffle)
+    assert line.startswith("frames[*].instruments[*].pose: the images contradict the poses of 'maryland'")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (edited(wxyz_read_as_xyzw), "quaternions of 'maryland' were written w x y z and read as x y z w"),
+        (edited(lambda pose: np.diag([1, 1, -1, 1]) @ pose @ np.diag([1, 1, -1, 1])), "z mirrored"),
+        (edited(lambda pose: pose * ([[1, 1, 1, 1.1]] * 3 + [[1] * 4])), "about 1.1 times as large"),
+        (shift(20), "states of 'maryland' fit the images better 20 frames later"),
+        (reverse, "in reverse order"),
+    ],
+)
+def test_other_mistakes_are_named(sample, change, words):
+    (line,) = told(sample, change)
+    assert words in line

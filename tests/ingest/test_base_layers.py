@@ -15,10 +15,10 @@ from neeco.errors import NeecoError
 from neeco.ingest.base_layers import Layers, evenly_lit, fit_layers, line_through_trocar
 from neeco.ingest.base_shape import SHIFTS
 from neeco.ingest.basefile import StatedBase
+from neeco.ingest.clock_search import GIVEN, ClockOffset
 from neeco.ingest.find_bases import place_bases
 from neeco.ingest.logs import PoseLog
 from neeco.ingest.recording import InstrumentLogs
-from neeco.ingest.registration import GIVEN, ClockOffset
 
 WIDTH, HEIGHT, FOCAL = 80, 64, 100.0
 INTRINSICS = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)

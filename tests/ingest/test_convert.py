@@ -90,6 +90,44 @@ def test_tool_masks_become_loss_masks_that_ignore_the_tool(endonerf, tmp_path):
     assert not errors_only(check_capture(tmp_path / "capture"))
 
 
+def test_tool_masks_of_the_other_polarity_are_told_by_what_they_show(endonerf, tmp_path):
+    convert_folder(endonerf, tmp_path / "capture")
+    for path in (endonerf / "masks").iterdir():
+        Image.fromarray(255 - np.asarray(Image.open(path))).save(path)
+    told = " ".join(convert_folder(endonerf, tmp_path / "inverted"))
+    assert "inverted polarity: white is 69% of most images, so black is read as the tool" in told
+    masks = [[frame.load_mask() for frame in read_capture(tmp_path / name).frames] for name in ("capture", "inverted")]
+    assert all(torch.equal(one, other) for one, other in zip(*masks, strict=True))
+
+
+def test_loss_masks_that_hide_most_of_the_images_are_doubted_when_they_are_copied(nerfstudio, tmp_path):
+    Image.fromarray(np.uint8(255) * (np.indices((HEIGHT, WIDTH))[1] < 4)).save(nerfstudio / "mask.png")
+    document = json.loads((nerfstudio / "transforms.json").read_text())
+    frames = [{**frame, "mask_path": "mask.png"} for frame in document["frames"]]
+    (nerfstudio / "transforms.json").write_text(json.dumps({**document, "frames": frames}))
+    said = convert_folder(nerfstudio, tmp_path / "capture")
+    assert any("Warning: loss masks hide 75% of most images: inverted polarity?" in sentence for sentence in said)
+
+
+def test_poses_of_another_link_stay_those_of_that_link(tmp_path):
+    """A capture whose poses are not of the root, converted: poses are then the root's, as read_capture gives them."""
+    shutil.copytree(SAMPLE, tmp_path / "source")
+    file = tmp_path / "source/transforms.json"
+    document = json.loads(file.read_text())
+    shaft = {"name": "shaft"}
+    wrist = {"name": "wrist", "parent": "shaft", "type": "fixed", "origin": np.eye(4).tolist()}
+    wrist["origin"][2][3] = 9.0
+    kinematics = {"links": [shaft, wrist], "pose_of": "wrist"}
+    document["instruments"] = [{"name": "maryland", "joints": {"jaw_angle": {}}, "kinematics": kinematics}]
+    document["frames"] = document["frames"][::8]
+    file.write_text(json.dumps(document))
+    convert_folder(tmp_path / "source", tmp_path / "capture")
+    old, new = read_capture(tmp_path / "source"), read_capture(tmp_path / "capture")
+    for mine, other in zip(new.frames, old.frames, strict=True):
+        pose, expected = (frame.state.instruments["maryland"].pose for frame in (mine, other))
+        assert torch.allclose(pose, expected)
+
+
 def test_the_round_border_of_a_colmap_folder_is_masked(tmp_path):
     generator, (width, height) = np.random.default_rng(0), (80, 60)
     (tmp_path / "colmap/images").mkdir(parents=True)

@@ -182,10 +182,22 @@ def test_times_that_do_not_fit_the_video_are_refused(session, change, message):
     assert str(session) in str(caught.value)
 
 
-def test_a_missing_video_is_named(session):
-    (session / "endoscope_20260117_153206.mp4").unlink()
-    with pytest.raises(NeecoError, match=r"index.json: videos: 'endoscope_20260117_153206.mp4' is not there"):
-        format_of(session).streams(session)
+def test_a_missing_video_and_a_damaged_table_are_named_and_hide_no_other(session):
+    name = "endoscope_20260117_153206"
+    (session / f"{name}.mp4").unlink()
+    (session / "extracted" / "full_session" / "PSM1_jaw_measured_js.csv").write_bytes(
+        b"# Topic: /PSM1/jaw/measured_js\n"
+    )
+    streams = {stream.name: stream for stream in format_of(session).streams(session)}
+    assert f"videos: '{name}.mp4' is not there" in streams[name].problem
+    assert "holds only comments" in streams["/PSM1/jaw/measured_js"].problem
+    assert streams["/PSM1/measured_cp"].problem is None
+    for stream in (None, f"{name}.left"):
+        with pytest.raises(NeecoError, match=r"index.json: videos: 'endoscope_20260117_153206.mp4' is not there"):
+            format_of(session).open_images(session, stream)
+    assert len(read_pose_log(PoseColumns(session, stream="/PSM1/measured_cp")).times) > 10
+    with pytest.raises(NeecoError, match=r"holds no images that can be read: .*mp4' is not there"):
+        write_template(session)
 
 
 def test_an_extract_of_films_without_times_asks_for_the_session(world, session):

@@ -96,6 +96,7 @@ def test_names_without_a_frame_say_nothing():
     assert meaning_in(["camera_pose.x", "tip_in_ecm.x"]) is None
     assert without_frame("psm1_in_ecm") == "psm1"
     assert without_frame("psm1_in_ecm_pose") == "psm1_pose"
+    assert without_frame("camera_frame") == "camera_frame"
 
 
 @pytest.mark.parametrize(
@@ -210,6 +211,17 @@ def test_transforms_of_a_bag_are_turned_once_at_their_end(tmp_path):
     away = read_pose_log(PoseColumns(bag.path, stream="tf:PSM1 in Cart"))
     assert away.frame == BASE
     np.testing.assert_allclose(away.positions[0], np.add(ECM, [100, 200, 300]), atol=1e-6)
+
+
+def test_the_frame_of_another_camera_is_not_that_of_the_video(tmp_path):
+    bag_world = pytest.importorskip("bag_world")
+    with bag_world.BagWriter(tmp_path, "recording.bag") as bag:
+        for time in TIMES:
+            for side in ("left", "right"):
+                bag.pose(f"/needle/{side}", time, np.array(SEEN) / 1000, [1, 0, 0, 0], f"{side}_eye")
+                bag.image(f"/{side}/image_raw", time, np.zeros((8, 8, 3), np.uint8), "rgb8", f"{side}_eye")
+    assert_seen(read_pose_log(PoseColumns(bag.path, stream="/needle/left")))
+    assert read_pose_log(PoseColumns(bag.path, stream="/needle/right")).frame == BASE
 
 
 def test_static_transforms_tell_the_axes_that_a_frames_name_leaves_open(tmp_path):

@@ -15,13 +15,13 @@ from neeco.capture.check import check_capture
 from neeco.capture.images import write_image
 from neeco.capture.model import State
 from neeco.errors import NeecoError
+from neeco.ingest.assessment import assess_ingest
 from neeco.ingest.from_video import find_shaft, with_roll
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.posing.hand_posed import HandPose
 from neeco.ingest.posing.posed_capture import PosedCapture
 from neeco.ingest.recordingfile import read_recording, recording_from_flags
 from neeco.ingest.shaft_axis import axis_between, contour_normals, image_lines, unit
-from neeco.report.ingest_assessment import assess_ingest
 
 
 @pytest.fixture(scope="module")

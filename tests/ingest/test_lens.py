@@ -48,6 +48,96 @@ def test_the_same_lens_from_opencv_ros_and_nerfstudio(world):
     assert read_lens(world.text(json.dumps(nerfstudio), "transforms.json")) == LENS
 
 
+XML = """<opencv_storage>
+<image_width>320</image_width><image_height>240</image_height>
+<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
+<data>300.5 0. 159.5 0. 301.5 119.5 0. 0. 1.</data></camera_matrix>
+<distortion_coefficients type_id="opencv-matrix"><rows>1</rows><cols>5</cols><dt>d</dt>
+<data>-0.3 0.1 1e-3 -2e-3 0.</data></distortion_coefficients>
+</opencv_storage>
+"""
+ORB = "\n".join(
+    f"Camera.{name}: {value}"
+    for name, value in zip(
+        ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "width", "height"),
+        ("300.5", "301.5", "159.5", "119.5", "-.3", ".1", "1e-3", "-2e-3", "0", "320", "240"),
+        strict=True,
+    )
+)
+KALIBR = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [-.3, .1, 1e-3, -2.0e-3, 0]
+  distortion_model: radtan
+  intrinsics: [300.5, 301.5, 159.5, 119.5]
+  resolution: [320, 240]
+  rostopic: /left
+"""
+EUROC = """sensor_type: camera
+resolution: [320, 240]
+camera_model: pinhole
+intrinsics: [300.5, 301.5, 159.5, 119.5] # fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.3, 0.1, 0.001, -0.002, 0.0]
+"""
+CAMODOCAL = """%YAML:1.0
+---
+model_type: PINHOLE
+image_width: 320
+image_height: 240
+distortion_parameters:
+   {k1: -0.3, k2: 0.1, p1: 0.001, p2: -0.002, k3: 0.}
+projection_parameters: {fx: 300.5, fy: 301.5, cx: 159.5, cy: 119.5}
+"""
+DIALECT = OPENCV.replace("data: [", "data:[") + "File.outputdir: %PATH\nViewer.PointSize:2\n"  # which only OpenCV reads
+SIDES = "".join(
+    f"{side}.{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data:[{numbers}]\n"
+    for side, shift in (("LEFT", 0), ("RIGHT", 60))
+    for name, rows, columns, numbers in (
+        ("K", 3, 3, f"300.5, 0., {159.5 + shift}, 0., 301.5, 119.5, 0., 0., 1."),
+        ("D", 1, 5, "-0.3, 0.1, 0.001, -0.002, 0."),
+    )
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("dialect.yaml", DIALECT),
+        ("opencv.xml", XML),
+        ("opencv.xml", f'<?xml version="1.0"?>\n{XML}'),
+        ("orb.yaml", ORB),
+        ("orb.yaml", "%YAML:1.0\nViewer.PointSize:2\n" + ORB),
+        ("orb3.yaml", ORB.replace("ra.", "ra1.").replace("ra1.w", "ra.w").replace("ra1.h", "ra.h")),
+        ("stella.yaml", "Camera:\n" + ORB.replace("Camera.", "  ").replace("width", "cols").replace("height", "rows")),
+        ("camchain.yaml", KALIBR),
+        ("sensor.yaml", EUROC),
+        ("camodocal.yaml", CAMODOCAL),
+        ("both.yaml", "%YAML:1.0\nCamera.fx: 1.0\nLEFT.width: 320\nLEFT.height: 240\n" + SIDES),
+        ("message.yaml", ROS + "---\n"),
+        ("hand.yaml", "mtx: [[300.5, 0, 159.5], [0, 301.5, 119.5], [0, 0, 1]]\ndist: [[-.3, .1, 1e-3, -2e-3, 0]]\n"
+         "image_size: [320, 240]"),
+        ("opencv.json", json.dumps({"camera_matrix": {"type_id": "opencv-matrix", "rows": 3, "cols": 3, "data":
+         [300.5, 0, 159.5, 0, 301.5, 119.5, 0, 0, 1]}, "image_width": 320, "image_height": 240,
+         "distortion_coefficients": {"data": [-0.3, 0.1, 0.001, -0.002, 0]}})),
+    ],
+)  # fmt: skip
+def test_the_same_lens_from_every_calibrator(world, name, text):
+    assert read_lens(world.text(text, name)) == LENS
+
+
+def test_a_fisheye_lens_of_kalibr_and_of_camodocal(world):
+    kalibr = KALIBR.replace("radtan", "equidistant").replace("[-.3, .1, 1e-3, -2.0e-3, 0]", "[-.02, .01, -4e-3, 7e-4]")
+    camodocal = """%YAML:1.0
+model_type: KANNALA_BRANDT
+image_width: 320
+image_height: 240
+projection_parameters: {k2: -0.02, k3: 0.01, k4: -0.004, k5: 0.0007, mu: 300.5, mv: 301.5, u0: 159.5, v0: 119.5}
+"""
+    lens = read_lens(world.text(kalibr, "kalibr.yaml"))
+    assert len(lens.distortion) == 8
+    assert read_lens(world.text(camodocal, "camodocal.yaml")) == lens
+
+
 def test_four_numbers_or_nothing():
     assert read_lens((290, 291, 160, 128)) == Lens(290.0, 291.0, 160.0, 128.0)
     assert read_lens(None) is None
@@ -65,6 +155,12 @@ def test_a_field_of_view_is_a_focal_length(world):
         ("a.yaml", "", "expected camera_matrix"),
         ("a.yaml", "x: [1, 2", "line 1: not valid YAML"),
         ("a.yaml", "<?xml version='1.0'?>", "is XML"),
+        ("a.yaml", "video: a.mp4\nintrinsics: [300, 300, 160, 120]", "camera_matrix: missing"),
+        ("a.xml", "<opencv_storage><camera_matrix></opencv_storage>", "is XML that OpenCV cannot read"),
+        ("a.yaml", "%YAML:1.0\na:" + "[" * 100_000, "no keys; expected camera_matrix"),
+        ("a.xml", "<?xml version='1.0'?><opencv_storage>" + "<a>" * 100_000, "is XML that OpenCV cannot read"),
+        ("a.yaml", KALIBR.replace("pinhole", "omni"), "omni: this model of a lens is not read"),
+        ("a.yaml", "K: [300, 0, 0, 0, 300, 0, 160, 120, 1]", "camera_matrix: stands column by column"),
         ("a.yaml", "distortion_coefficients: [0, 0, 0, 0]", "camera_matrix: missing"),
         ("a.yaml", OPENCV.replace("300.5", "-300.5"), "two positive focal lengths"),
         ("a.yaml", OPENCV.replace("0.1, ", ""), "has 4 coefficients"),

@@ -5,6 +5,8 @@ from __future__ import annotations
 import builtins
 import importlib.util
 import json
+import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -234,6 +236,35 @@ def test_a_template_names_every_arm_with_its_jaw(plain):
     log = read_pose_log(chosen)
     np.testing.assert_allclose(log.positions, 1000 * EPISODES[0][STATE][:, 8:11].astype(np.float64), atol=1e-9)
     assert log.frame == CAMERA_FRAME
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_a_camera_that_was_not_downloaded_hides_no_other(tmp_path, version):
+    wrist = "observation.images.wrist"
+    path = data_set(tmp_path, version=version, states=EPISODES[:2], cameras=(CAMERA, wrist))
+    for film in path.glob("videos/**/*.mp4"):
+        if wrist in str(film):
+            film.unlink()
+    problems: list[str] = []
+    place = path.parent / "recording.yaml"
+    place.write_text(write_template(path, problems.append))
+    assert len(problems) == 1
+    assert re.match(rf".*: episode 0/{wrist}: .*\.mp4: no such file", problems[0])
+    recording = read_recording(place)
+    assert recording.stream == f"episode 0/{CAMERA}"
+    assert len(recording.open().times) == len(EPISODES[0][STATE])
+    with pytest.raises(NeecoError, match=r"wrist.*\.mp4: no such file"):
+        format_of(path).open_images(path, f"episode 0/{wrist}")
+    shutil.rmtree(path / "videos")
+    with pytest.raises(NeecoError, match=r"holds no images that can be read: .*\.mp4: no such file.* \(and 1 more\)"):
+        write_template(path)
+
+
+def test_the_first_episode_that_is_there_is_offered(tmp_path):
+    path = data_set(tmp_path, version="v2.1", states=EPISODES)
+    for file in path.glob("*/**/*episode_000000*"):
+        file.unlink()
+    assert f'stream: "episode 1/{CAMERA}"' in write_template(path)
 
 
 def test_a_template_asks_what_a_nameless_vector_may_be(nameless):

@@ -72,7 +72,7 @@ def test_where_motion_does_not_tell_the_clock_that_of_the_file_is_taken(recorded
     def refuse(*given):
         raise NeecoError("its clock cannot be told from the images; give it")
 
-    monkeypatch.setattr("neeco.ingest.registration.offset_from_turning", refuse)
+    monkeypatch.setattr("neeco.ingest.registration.clock_from_turning", refuse)
     recording = read_recording(recorded.folder / "lerobot" / "v2.1" / "recording.yaml")
     result = ingest(recording, tmp_path / "capture", lambda what, done, total: None)
     assert result.registration is not None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neeco.capture.lens import Lens
-from neeco.ingest.motion import STEP, ResidualFlow, carve_shape, observations_on, project_mask
+from neeco.ingest.motion import STEP, ResidualFlow, best_lag, carve_shape, observations_on, project_mask
 from neeco.ingest.sfm import SfmResult
 
 PINHOLE = Lens(60.0, 60.0, 32.0, 24.0, (), (64, 48))
@@ -35,6 +35,19 @@ def test_the_shape_lies_where_the_moving_pixels_are() -> None:
     assert shape is not None
     assert shape.agreement > 0.9
     assert np.linalg.norm(np.median(shape.points, axis=0)[:2]) < 2 * shape.spacing
+
+
+@pytest.mark.parametrize("late", [0.0, 2.8])
+def test_poses_logged_late_fit_what_moves_at_another_lag(late: float) -> None:
+    def poses_at(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = np.tile(np.eye(4), (len(times), 1, 1))
+        found[:, :3, 3] = np.stack([20 * np.sin(2 * times), 14 * np.cos(1.3 * times**1.2), 100 + times], 1)
+        return found, times < 30
+
+    times = np.arange(2.0, 12.0, 0.5)
+    evidence = moving_at(poses_at(times)[0][:, :3, 3])
+    lag = best_lag(evidence, lambda lag: poses_at(np.maximum(times - late + lag, 0)), PINHOLE, 4.0)
+    assert lag == pytest.approx(late, abs=0.1)
 
 
 def test_motion_that_follows_no_pose_gives_no_shape() -> None:

@@ -238,6 +238,33 @@ def test_statuses_all_invalid_are_said(world, transforms):
         format_of(path).open_images(path)
 
 
+def test_a_tool_that_was_never_in_view_hides_no_other(world, transforms):
+    both = transforms | {"ProbeToTracker": world.poses(TIMES - START)}
+    statuses = {("StylusToTracker", frame): "INVALID" for frame in range(COUNT)}
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, both, statuses), film())
+    problems = []
+    text = write_template(path, problems.append)
+    assert [problem.partition(": no frame")[0] for problem in problems] == ["a.mha: StylusToTracker"]
+    assert "StylusToTracker: no frame can be used" in text.partition("not used:")[2]
+    recording = read_recording(world.text(text, "recording.yaml"))
+    assert [item.poses.stream for item in recording.instruments] == ["ProbeToTracker"]
+    assert len(read_pose_log(recording.instruments[0].poses).times) == COUNT
+
+
+@pytest.mark.parametrize("name", BESIDE)
+@pytest.mark.parametrize("ending", ["", "\r\n", "\n\n"])
+def test_a_header_of_its_own_may_end_with_its_file(world, transforms, name, ending):
+    path = write(world.folder, name, frame_fields(TIMES, transforms), film())
+    header = path.read_bytes().rstrip() + ending.encode()
+    path.write_bytes(header.replace(b"\n", b"\r\n") if ending == "\r\n" else header)
+    log = read_pose_log(PoseColumns(path, stream="StylusToTracker"))
+    np.testing.assert_allclose(log.positions, world.positions(TIMES - START), atol=1e-6)
+    assert len(format_of(path).open_images(path).times) == COUNT
+    path.write_bytes(header[: header.rindex(b"\n", 0, len(header) // 2)])
+    with pytest.raises(NeecoError, match=r"its header does not end"):
+        format_of(path).streams(path)
+
+
 def test_a_folder_lists_what_it_cannot_read(world, transforms):
     mha(world.folder / "ct.mha", [], film())
     mha(world.folder / "surgery.mha", frame_fields(TIMES, transforms), film())

@@ -253,3 +253,28 @@ def test_files_that_are_no_logs(world, content, message):
     path.write_bytes(content)
     with pytest.raises(NeecoError, match=message):
         read_pose_log(PoseColumns(path))
+
+
+def test_a_tracker_that_repeats_its_last_pose_is_not_measuring(world):
+    rows = world.rows()
+    rows[60:100, 1:] = rows[60, 1:]
+    log = read_pose_log(PoseColumns(world.write(HEADER, rows)))
+    assert_same(log, world, np.delete(world.times, np.arange(61, 100)))
+    assert any("39 rows dropped: the pose of the row before, repeated" in note for note in log.notes)
+
+
+def test_what_comes_to_rest_is_still_measured(world):
+    rows = world.rows()
+    start = 20 * np.clip((1.0 - world.times) / 1.0, 0, None) ** 3 + 20 * np.clip(world.times - 3.0, 0, None) ** 3
+    rows[:, 1] = start  # slows down, rests for two seconds to the last digit, and sets off slowly
+    rows[:, 2:] = rows[0, 2:]
+    log = read_pose_log(PoseColumns(world.write(HEADER, rows)))
+    assert len(log.times) == len(world.times)
+    assert log.notes == ("log.csv: its rotation never changes: does it hold positions alone?",)
+
+
+def test_times_too_coarse_for_the_rows_are_refused(world):
+    rows = world.rows()
+    rows[:, 0] = np.floor(rows[:, 0])
+    with pytest.raises(NeecoError, match=r"195 rows of 200 have the time of another; .* name a finer column"):
+        read_pose_log(PoseColumns(world.write(HEADER, rows)))

@@ -10,8 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
+from neeco.ingest.clock_search import GIVEN, STEP, ClockOffset, _best_rate, clock_from_instrument, correlate
 from neeco.ingest.logs import PoseLog
-from neeco.ingest.registration import correlate, offset_from_instrument, register_with_laparoscope
+from neeco.ingest.registration import register_with_laparoscope
 
 HAND_EYE = np.eye(4)
 HAND_EYE[:3, :3] = Rotation.from_euler("xyz", [20, -10, 35], degrees=True).as_matrix()
@@ -78,15 +79,33 @@ def test_a_clock_that_counts_from_1970_is_found_too() -> None:
 
 def test_a_given_offset_is_kept() -> None:
     times, log = recorded(offset=0.05)
-    found = register_with_laparoscope(in_sfm(scope_path(times)), times, log, 0.048)
+    found = register_with_laparoscope(in_sfm(scope_path(times)), times, log, ClockOffset(0.048, 0.0, GIVEN))
     assert found.clock.seconds == 0.048
     assert found.clock.source == "given"
+
+
+@pytest.mark.parametrize("fps", [24.0, 24.75])
+def test_a_video_at_another_frame_rate_is_a_clock_with_a_rate(fps: float) -> None:
+    right, log = recorded(offset=0.037, noise=0.5)
+    right = right[::3]
+    found = register_with_laparoscope(in_sfm(scope_path(right)), right * 25 / fps, log, None)
+    assert abs(found.clock.rate - fps / 25) < 3 * found.clock.rate_sd < 0.003
+    error = found.clock.at(right * 25 / fps) - right - 0.037
+    assert np.abs(error).max() < 0.006, "s"
+    assert np.sqrt((error**2).mean()) < 3 * found.clock.sd
+
+
+def test_a_clock_that_runs_right_gets_no_rate() -> None:
+    times, log = recorded(offset=0.037)
+    found = register_with_laparoscope(in_sfm(scope_path(times[::4])), times[::4], log, None)
+    assert (found.clock.rate, found.clock.rate_sd) == (1.0, 0.0)
+    assert abs(found.clock.seconds - 0.037) < 3 * found.clock.sd
 
 
 def test_a_scope_that_does_not_turn_cannot_be_calibrated() -> None:
     times, log = recorded(offset=0.0, turn=0.02)
     with pytest.raises(NeecoError, match=r"scope\.csv: .*turned"):
-        register_with_laparoscope(in_sfm(scope_path(times, turn=0.02)), times, log, 0.0)
+        register_with_laparoscope(in_sfm(scope_path(times, turn=0.02)), times, log, ClockOffset(0.0, 0.0, GIVEN))
 
 
 def test_a_log_of_another_recording_is_refused() -> None:
@@ -127,14 +146,32 @@ def motion_seen(times: np.ndarray) -> np.ndarray:
 
 def test_the_instruments_clock_is_told_by_how_fast_it_moves_in_the_images() -> None:
     times = np.arange(0.4, 12, 0.04)
-    found = offset_from_instrument(motion_seen(times), times, instrument_log(0.237))
+    found = clock_from_instrument(motion_seen(times), times, instrument_log(0.237))
     assert found.seconds == pytest.approx(0.237, abs=0.015)
     assert 0 < found.sd < 0.1
     assert found.source == "instrument motion"
+
+
+@pytest.mark.parametrize("rate", [0.8, 2.0])
+def test_the_instruments_motion_tells_another_frame_rate(rate: float) -> None:
+    times = np.arange(0.4, 12, 0.04)
+    found = clock_from_instrument(motion_seen(times), times / rate, instrument_log(0.237))
+    assert found.rate == pytest.approx(rate, abs=3 * found.rate_sd)
+    assert np.abs(found.at(times / rate) - times - 0.237).max() < 0.06, "s"
+
+
+def test_rates_are_found_in_long_recordings_too() -> None:
+    length = 150.0
+    known = np.random.default_rng(2).normal(size=int(length / 0.5))
+    speed = np.abs(np.interp(np.arange(0, length, STEP), np.arange(len(known)) * 0.5, known))
+    video = np.interp(np.arange(0, 120, STEP) * 1.01 + 20, np.arange(0, length, STEP), speed)
+    rate, lags, scores = _best_rate(video, speed)
+    assert rate == pytest.approx(1.01, abs=0.001)
+    assert lags[scores.argmax()] * STEP == pytest.approx(20, abs=0.1)
 
 
 def test_motion_of_something_else_tells_no_clock() -> None:
     times = np.arange(0, 11, 0.04)
     other = np.random.default_rng(5).gamma(2.0, 1.0, len(times) - 1)
     with pytest.raises(NeecoError, match=r"tool\.csv: its clock cannot be told"):
-        offset_from_instrument(other, times, instrument_log(0.0))
+        clock_from_instrument(other, times, instrument_log(0.0))

@@ -26,9 +26,9 @@ def as_rows(matrix):
     return np.asarray(matrix, dtype=float).tolist()
 
 
-def opencv_yaml(folder, scale=1.0):
+def opencv_yaml(folder, scale=1.0, name="stereo.yaml"):
     """As OpenCV's own writer puts it."""
-    path = folder / "stereo.yaml"
+    path = folder / name
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("image_width", SIZE[0])
     storage.write("image_height", SIZE[1])
@@ -119,8 +119,64 @@ def ros_left_file(folder):
     return ros_pair(folder) / "left.yaml"
 
 
+def opencv_xml(folder):
+    return opencv_yaml(folder, name="stereo.xml")
+
+
+def kalibr(folder):
+    """A camchain, in metres; two decimals of its rotation would not do."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = TURN.as_matrix(), SHIFT / 1000
+    chain = {}
+    for name, matrix, bends in (("cam0", LEFT, LEFT_BENDS), ("cam1", RIGHT, RIGHT_BENDS)):
+        intrinsics = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+        chain[name] = {"camera_model": "pinhole", "distortion_model": "radtan", "resolution": list(SIZE)}
+        chain[name] |= {"intrinsics": list(map(float, intrinsics)), "distortion_coeffs": bends.tolist()}
+    chain["cam1"]["T_cn_cnm1"] = pose.tolist()
+    path = folder / "camchain.yaml"
+    path.write_text(yaml.safe_dump(chain), encoding="utf-8")
+    return path
+
+
+def orb_slam(folder):
+    """Its settings of a pair that it rectifies: what ROS's two files say, under LEFT and RIGHT."""
+    document = {"Camera.fx": 700.0, "Camera.bf": 3.0}
+    names = {
+        "camera_matrix": "K",
+        "distortion_coefficients": "D",
+        "rectification_matrix": "R",
+        "projection_matrix": "P",
+    }
+    for side in ("left", "right"):
+        held = yaml.safe_load((ros_pair(folder) / f"{side}.yaml").read_text(encoding="utf-8"))
+        document |= {f"{side.upper()}.{short}": held[name] for name, short in names.items()}
+        document |= {f"{side.upper()}.width": SIZE[0], f"{side.upper()}.height": SIZE[1]}
+    path = folder / "settings.yaml"
+    path.write_text("%YAML:1.0\n" + yaml.safe_dump(document), encoding="utf-8")
+    return path
+
+
+def orb_slam_3(folder):
+    """Stereo.T_c1_c2 maps points of the second camera to the first."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = TURN.as_matrix(), SHIFT / 1000
+    document = {"Camera.type": "PinHole", "Camera.width": SIZE[0], "Camera.height": SIZE[1]}
+    for number, matrix, bends in ((1, LEFT, LEFT_BENDS), (2, RIGHT, RIGHT_BENDS)):
+        values = dict(fx=matrix[0, 0], fy=matrix[1, 1], cx=matrix[0, 2], cy=matrix[1, 2])
+        values |= dict(zip(("k1", "k2", "p1", "p2", "k3"), bends, strict=True))
+        document |= {f"Camera{number}.{name}": float(value) for name, value in values.items()}
+    document["Stereo.T_c1_c2"] = {"rows": 4, "cols": 4, "dt": "f", "data": np.linalg.inv(pose).ravel().tolist()}
+    path = folder / "settings.yaml"
+    path.write_text("%YAML:1.0\n" + yaml.safe_dump(document), encoding="utf-8")
+    return path
+
+
 @pytest.mark.parametrize(
-    "write", [opencv_yaml, opencv_two_files, ini, intuitive_json, scared_json, ros_pair, ros_left_file]
+    "write",
+    [
+        *(opencv_yaml, opencv_two_files, opencv_xml, ini, intuitive_json, scared_json),
+        *(ros_pair, ros_left_file, kalibr, orb_slam, orb_slam_3),
+    ],
 )
 def test_the_same_rig_from_every_file(tmp_path, write):
     left, right, right_from_left = read_stereo(write(tmp_path))

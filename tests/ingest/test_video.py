@@ -158,8 +158,8 @@ def test_images_at_the_times_of_a_table(world, images):
         ("t_s", [["x"]] * 12, "line 2: t_s: no time"),
         (
             "file,t_s",
-            [*[[f"frame{i}.png", i] for i in range(11)], ["other.png", 12]],
-            r"line 13: 'other\.png' is not in",
+            [*[[f"frame{i}.png", i] for i in range(9)], *[[f"other{i}.png", i] for i in range(9, 12)]],
+            r"line 11: 'other9\.png' is not in frames \(3 of 12 like it\)",
         ),
     ],
 )
@@ -179,6 +179,27 @@ def test_damaged_images_are_left_out_and_noted(images):
 def test_images_that_do_not_belong_together(images):
     with pytest.raises(NeecoError, match=r"Give fps, or a CSV"):
         open_images(images)
-    Image.new("RGB", (9, 6)).save(images / "frame11.png")
-    with pytest.raises(NeecoError, match=r"frame11\.png: is 9x6, the images before it 8x6"):
+    for number in (9, 11):
+        Image.new("RGB", (9, 6)).save(images / f"frame{number}.png")
+    with pytest.raises(NeecoError, match=r"frame9\.png: the images of this folder are 8x6 and 9x6"):
         open_images(images, fps=25)
+
+
+def test_one_image_that_is_missing_or_of_another_size_is_left_out_and_shifts_no_other(world, images):
+    listed = world.write("file,t_s", [[f"frame{i}.png", i] for i in range(13)], "times.csv")
+    Image.new("RGB", (4, 4)).save(images / "a_preview.png")
+    video = open_images(images, times=listed)
+    assert video.times.tolist() == list(range(12))
+    assert "1 images are listed and not there and are left out (frame12.png)" in video.notes[0]
+    (images / "frame4.png").unlink()
+    video = open_images(images, fps=10)
+    assert "1 images are of another size and are left out (a_preview.png)" in video.notes[0]
+    (images / "a_preview.png").unlink()
+    video = open_images(images, fps=10)
+    np.testing.assert_allclose(video.times, np.delete(np.arange(12), 4) / 10)
+    assert "1 images are missing by their numbers (first after frame3.png)" in video.notes[0]
+    for number in (6, 8, 10, 1):  # numbers of chosen frames: these say nothing of time
+        (images / f"frame{number}.png").unlink()
+    video = open_images(images, fps=10)
+    assert video.notes == ()
+    np.testing.assert_allclose(video.times, np.arange(7) / 10)

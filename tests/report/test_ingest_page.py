@@ -17,17 +17,20 @@ from html_page import HOSTILE, Page, check_hostile_names
 from PIL import Image
 
 from neeco.capture import read_capture
+from neeco.capture.documents import Problem
 from neeco.capture.images import write_image
 from neeco.capture.model import Frame, State
 from neeco.errors import NeecoError
+from neeco.ingest.assessment import SHOWN, assess_ingest
+from neeco.ingest.base import BaseRegistration
+from neeco.ingest.clock_search import ClockOffset
 from neeco.ingest.motion import RoughShape
-from neeco.ingest.registration import ClockOffset, Registration
-from neeco.ingest.result import IngestResult
+from neeco.ingest.registration import Registration
+from neeco.ingest.result import Doubt, IngestResult
 from neeco.raster.types import Camera
+from neeco.report import ingest_page
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
-from neeco.report.ingest_assessment import assess_ingest
 from neeco.report.ingest_figures import in_view, main_axes, posed_picture, read_tracks, round_length
-from neeco.report.ingest_page import write_ingest_page
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
 VOID = {"meta", "img", "br", "path", "rect"}
@@ -66,6 +69,17 @@ def made(folder: Path, **changes) -> IngestResult:
         ("with the lens given: ends after 2 of 80 keyframes", "taken: all frames at once"),
     )  # fmt: skip
     return replace(result, **changes)
+
+
+def based(overlap: float) -> BaseRegistration:
+    """A base found from outlines that overlap with what moves by so much."""
+    return BaseRegistration(np.eye(4), 0.0, 0.0, np.ones(3), np.ones(3), (), 0.0, 0.0, overlap, 0.5, 1.0, 100)
+
+
+def write_ingest_page(result: IngestResult, path: Path) -> None:
+    """The page with the verdict that goes with it."""
+    capture = read_capture(result.capture)
+    ingest_page.write_ingest_page(result, assess_ingest(result, capture), path, capture)
 
 
 def edited(folder: Path, change) -> Path:
@@ -223,6 +237,10 @@ def test_the_side_view_has_the_tissue_ahead_of_the_camera():
         ({"clocks": {"em": ClockOffset(0.0, 0.08, "scope motion")}}, "bad", "Clock em"),
         ({"clocks": {"jaw_angle": ClockOffset(0.0, float("nan"), "assumed")}}, "careful", "jaw_angle"),
         ({"dropped": tuple((i, "blurred") for i in range(60))}, "careful", "60 of 106"),
+        ({"doubts": (Doubt("nothing moves with the tool", True),)}, "bad", "Doubtful: nothing moves"),
+        ({"doubts": (Doubt("the video runs 4 % fast", False),)}, "careful", "with care: the video runs"),
+        ({"bases": {"psm1": based(0.68)}}, "careful", "overlap by 0.68"),
+        ({"bases": {"psm1": based(0.92)}}, "good", "Ready"),
         ({"dropped": tuple((i, "not among the 40 that cover") for i in range(60))}, "good", "Ready"),
     ],
 )  # fmt: skip
@@ -230,6 +248,22 @@ def test_the_verdict_names_what_is_doubtful(changes, level, piece):
     verdict = assess_ingest(made(SAMPLE, **changes), read_capture(SAMPLE))
     assert verdict.level == level
     assert piece in " ".join([verdict.headline, *verdict.doubts])
+
+
+def test_what_check_finds_is_in_the_verdict():
+    capture = read_capture(SAMPLE)
+    for severity, level in (("warning", "careful"), ("error", "bad")):
+        problem = Problem(severity, "transforms.json", "frames", "images contradict the poses", "correct them")
+        verdict = assess_ingest(made(SAMPLE), capture, [problem])
+        assert verdict.level == level
+        assert "images contradict the poses; correct them" in verdict.headline
+
+
+def test_the_terminal_gets_a_doubtful_verdict_in_capitals_and_the_first_doubts():
+    doubts = tuple(Doubt(f"reason {number}", True) for number in range(SHOWN + 3))
+    first, *others = assess_ingest(made(SAMPLE, doubts=doubts), read_capture(SAMPLE)).lines()
+    assert first == "DOUBTFUL: reason 0."
+    assert others == [*(f"  - Reason {number}." for number in range(1, SHOWN + 1)), "  - and 2 more doubts"]
 
 
 def test_frames_that_left_the_capture_after_registering_are_no_residuals_of_it(tmp_path):

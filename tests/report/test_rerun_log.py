@@ -13,7 +13,7 @@ from test_ingest_page import SAMPLE, made
 
 from neeco.capture import read_capture
 from neeco.cli import main
-from neeco.ingest.registration import ClockOffset
+from neeco.ingest.clock_search import ClockOffset
 from neeco.ingest.result import IngestResult
 from neeco.report.rerun_log import MISSING, write_rrd
 

@@ -154,6 +154,8 @@ def test_states_written_are_states_read(tmp_path, scene, state):
         (lambda line: line["instruments"][0]["pose"][0].pop(), r"instruments\[0\].pose"),
         (lambda line: line["instruments"][0]["joints"].update(jaw_angle=2.0), "joints.jaw_angle.*limits"),
         (lambda line: line["instruments"][0]["joints"].clear(), r"instruments\[0\].joints"),
+        (lambda line: line["instruments"][0]["joints"].update(jaw=0.1), "joints.jaw: is no joint of rod; it has jaw"),
+        (lambda line: line["instruments"][0]["joints"].update(jaw_angle=float("nan")), "joints.jaw_angle: is nan"),
         (lambda line: line["instruments"].clear(), "rod missing"),
         (lambda line: line.pop("instruments"), "instruments"),
         (lambda line: line.update(camera=[[1]]), "camera"),

@@ -201,7 +201,9 @@ def test_indices_and_settings_out_of_range_are_refused(run, rod_images):
 
 def test_splits_of_a_folder_are_those_of_its_records(rod_folder, tmp_path):
     assert len(StoredImages(rod_folder, split="train")) == COUNT
-    assert len(StoredImages(rod_folder, split="val")) == 0
+    for split in ("val", "tset"):
+        with pytest.raises(NeecoError, match=rf"split '{split}' has no images; it has 'train' \({COUNT}\)"):
+            StoredImages(rod_folder, split=split)
     for content, message in (("{\n", "states.jsonl: line 1: not valid JSON"), ("{}\n", "line 1: index is missing")):
         (tmp_path / "dataset.json").write_text((rod_folder / "dataset.json").read_text())
         (tmp_path / "states.jsonl").write_text(content)

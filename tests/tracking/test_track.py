@@ -205,6 +205,14 @@ def test_what_is_known_of_the_footage_and_every_joint_that_was_found_are_written
             assert frame.state.instruments["grasper"].joints == rec["instruments"]["grasper"]["joints"]
 
 
+@pytest.mark.parametrize(("written", "begins"), [(10, "good: "), (6, "usable: "), (4, "DOUBTFUL: ")])
+def test_footage_of_which_few_frames_are_trusted_is_doubtful(footage: Capture, written: int, begins: str) -> None:
+    records = [{"how": "lost" if k >= written else "followed", "trust": {"value": 0.9}} for k in range(10)]
+    found = Tracked(Path("out"), footage, records, written, 0.5, None)  # type: ignore[arg-type]
+    assert found.verdict.startswith(begins)
+    assert f"in {10 - written} of 10 frames nothing was found" in found.verdict
+
+
 def test_an_instrument_is_found_where_nothing_is_known(
     tracked_run: RecordedRun, footage: Capture, tmp_path: Path
 ) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from neeco.capture.check_geometry import check_geometry
+from neeco.capture.check_images import check_images
 from neeco.capture.check_masks import Hidden, masks_fault, measure_hidden, sample_points
 from neeco.capture.check_motion import check_motion
 from neeco.capture.documents import (
@@ -31,6 +32,7 @@ from neeco.capture.documents import (
     key_name,
     printable,
 )
+from neeco.capture.images import is_repeated, to_bytes
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import STILL, Capture, Frame, Instrument, InstrumentState
 from neeco.capture.reader import capture_of, parse_capture
@@ -42,6 +44,8 @@ FEWEST_TRAIN_FRAMES = 4  # below, nothing can be learned
 FEW_TRAIN_FRAMES = 20  # below, expect little
 STILL_CAMERAS = 2  # of a scope that stands still
 ROLL_UNKNOWN_DEG = 45.0  # standard deviation from which a roll is as good as not known
+COMPARED_WIDTH = 320  # px of the reduced pictures that are compared
+FROZEN_MM, FROZEN_ROTATION = 1.0, 0.03  # by which a state changes visibly: a place, and rotations' entries or rad
 COUPLED = 0.98  # share of a reading's variance that the others of its kinematics may tell
 MIN_COUPLED_STATES = 12  # fewer tell each other anyway
 
@@ -103,7 +107,8 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
             check_geometry(part)
         if motion and not errors_only(report.problems):
             for part in parsed.by_tissue():
-                check_motion(part)
+                if check_images(part):  # else nothing is told by them
+                    check_motion(part)
     return Checked(condensed(report.problems), _summary(parsed), capture)
 
 
@@ -172,6 +177,9 @@ def _check_frames(parsed: Parsed) -> None:
         latest[place.file, frame.state.tissue] = time
     if not parsed.timed:
         frames.warning("not every frame has a time; the order stands in", "add `time` in seconds")
+    elif len(instants) > 1 and len({frame.state.time for frame in parsed.frames}) == 1:
+        time = parsed.frames[0].state.time
+        frames.warning(f"every frame has the time {time:g}, though states differ", "write seconds, or leave `time` out")
     elif back:
         more = f" (and {len(back) - 1} more times)" if len(back) > 1 else ""
         remedy = "right if the capture joins recordings or cameras; else sort the frames"
@@ -189,6 +197,7 @@ class _Decoded:
     """What decoding one frame's files found."""
 
     digest: bytes | None  # of the pixels; None when not readable
+    grey: np.ndarray | None  # uint8 [h, w], every few pixels
     uniform: bool  # one colour
     image_error: str
     mask_error: str
@@ -215,6 +224,7 @@ def _check_images(parsed: Parsed) -> None:
             place.child("file_path").warning("every pixel of the image has one colour", "was the camera covered?")
         elif found.digest is not None and first.setdefault(found.digest, index) != index:
             _report_duplicate(parsed, first[found.digest], index)
+    _check_frozen(parsed, decoded)
     without = [place for frame, place in zip(parsed.frames, parsed.places, strict=True) if frame.mask_path is None]
     if without and len(without) < len(parsed.frames):
         message = f"has no mask while other frames do ({len(without)} of {len(parsed.frames)} without)"
@@ -226,12 +236,14 @@ def _check_images(parsed: Parsed) -> None:
 def _decode(frame: Frame, camera: Camera | None, points: np.ndarray) -> _Decoded:
     """Decode a frame's image and mask. Errors name the file within the message, without its folder. camera, points
     [P, 3] mm: what the mask hides of these is measured."""
-    digest, uniform, image_error, mask_error = None, False, "", ""
+    digest, grey, uniform, image_error, mask_error = None, None, False, "", ""
     image, hidden = None, None
     try:
         image = frame.load_image()
         digest = hashlib.blake2b(image.numpy().tobytes(), digest_size=16).digest()
         uniform = bool((image == image[0, 0]).all())
+        step = max(1, image.shape[1] // COMPARED_WIDTH)
+        grey = to_bytes(image[::step, ::step].mean(-1)).numpy()
     except NeecoError as error:
         image_error = str(error).replace(str(frame.image_path), frame.image_path.name)
     try:
@@ -242,7 +254,41 @@ def _decode(frame: Frame, camera: Camera | None, points: np.ndarray) -> _Decoded
             hidden = measure_hidden(image, mask, camera, points)
     except NeecoError as error:
         mask_error = str(error).replace(str(frame.mask_path), frame.mask_path.name if frame.mask_path else "")
-    return _Decoded(digest, uniform, image_error, mask_error, hidden)
+    return _Decoded(digest, grey, uniform, image_error, mask_error, hidden)
+
+
+def _check_frozen(parsed: Parsed, decoded: Sequence[_Decoded]) -> None:
+    """Warn of frames that show the picture before them, coded again, though the camera or an instrument moved. Those
+    with the same pixels are reported as duplicates."""
+    when = [(str(place.file), frame.state.time) for frame, place in zip(parsed.frames, parsed.places, strict=True)]
+    order = sorted(range(len(decoded)), key=when.__getitem__)
+    frozen, source = [], order[0]
+    for index in order[1:]:
+        one, two = decoded[source], decoded[index]
+        if one.grey is None or two.grey is None or one.grey.shape != two.grey.shape or one.uniform:
+            source = index
+            continue
+        if not is_repeated(one.grey, two.grey):
+            source = index
+        elif one.digest != two.digest and _moved(parsed.frames[source], parsed.frames[index]):
+            frozen.append(index)
+    if frozen:
+        count = f"{len(frozen)} of {len(decoded)} frames"
+        message = f"shows the picture before it while camera or state changed ({count} do)"
+        parsed.places[frozen[0]].child("file_path").warning(message, "the video was frozen there: drop these frames")
+
+
+def _moved(one: Frame, two: Frame) -> bool:
+    """Whether the camera or an instrument moved by what an image shows."""
+    shared = one.state.instruments.keys() & two.state.instruments.keys()
+    joints = [(one.state.instruments[name].joints, two.state.instruments[name].joints) for name in shared]
+    readings = [(value, second.get(name, value)) for first, second in joints for name, value in first.items()]
+    if any(abs(after - before) > FROZEN_ROTATION for before, after in readings):
+        return True
+    pairs = [(one.camera.world_from_camera, two.camera.world_from_camera)]
+    pairs += [(one.state.instruments[name].pose, two.state.instruments[name].pose) for name in shared]
+    changes = [(second - first).abs() for first, second in pairs]
+    return any(bool(change[:3, 3].norm() > FROZEN_MM or change[:3, :3].max() > FROZEN_ROTATION) for change in changes)
 
 
 def _report_duplicate(parsed: Parsed, first: int, second: int) -> None:

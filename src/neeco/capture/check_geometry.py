@@ -1,7 +1,7 @@
 """Check that cameras, points and instruments fit together: distances, units, axes, and who sees what.
 
 A mistake of units or axes leaves things out of view. Where that happens the usual mistakes are tried, and one that
-brings things back into view is named.
+brings things back into view is named: where images and points can tell, only if they confirm it.
 """
 
 from __future__ import annotations
@@ -10,19 +10,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from neeco.capture.check_images import agreements
+from neeco.capture.check_motion import POSES, motion_fault
 from neeco.capture.documents import Node, Parsed, errors_only, printable
-from neeco.capture.model import swap_camera_axes
+from neeco.capture.model import Instrument, swap_camera_axes
+from neeco.capture.motion_evidence import Rays
 from neeco.raster.pinhole import project
 
 FEW_POINTS = 100
 FAR = 10.0  # in sizes of the scene
 SEEN_RARELY = 0.1  # a share of the points, or of the frames, that makes one look for a mistake
 SEEN_SURELY = 0.7  # a share that settles it
+COLORS_AGREE = 0.2  # correlation of the points' colours with the images' that confirms a mistake
 SEEN_AGAIN = 0.3  # a share that makes a mistake the likely one
 METRES = 1.0  # mm; an endoscope is never this close, nor an instrument's travel this short
 BEHIND = 1e-9  # mm; what is less deep is not in front of a camera
 SENSOR_REACH_MM = 500.0  # how far from the visible part of an instrument its sensor may sit
-POSES = "frames[*].instruments[*].pose"
 ALL_IN_MM = "give all lengths in mm"
 Mistake = tuple[str, str]  # what is wrong, what to do
 
@@ -129,7 +132,7 @@ def _check_cameras(parsed: Parsed, scene: _Scene) -> None:
         parsed.header("frames").error(message, "give cameras, points and poses in mm")
         return
     seen = scene.cameras.sees(scene.points[None]).mean(axis=1)  # [F] share of the points in each image
-    mistake = _camera_mistake(scene, float(seen.mean())) if seen.mean() < SEEN_RARELY else None
+    mistake = _camera_mistake(parsed, scene, float(seen.mean())) if seen.mean() < SEEN_RARELY else None
     if mistake is not None:
         matrices.error(f"points are outside the images: {mistake[0]}", mistake[1])
         return
@@ -151,8 +154,8 @@ def _check_cameras(parsed: Parsed, scene: _Scene) -> None:
             place.child("transform_matrix").warning("the camera has no point in its image", remedy)
 
 
-def _camera_mistake(scene: _Scene, given: float) -> Mistake | None:
-    """The mistake that best explains points out of view, or None."""
+def _camera_mistake(parsed: Parsed, scene: _Scene, given: float) -> Mistake | None:
+    """The mistake that best explains points out of view, or None. Where the points' colours can tell, they must."""
     cameras, points = scene.cameras, scene.points[None]
     opengl = swap_camera_axes(cameras.poses)  # as written in the file
     if np.linalg.norm(opengl[:, :3, 3], axis=1).max() < METRES < 0.1 * scene.spread:
@@ -166,9 +169,14 @@ def _camera_mistake(scene: _Scene, given: float) -> Mistake | None:
         (inverted, "matrices are world-to-camera with OpenCV axes", "invert them, then flip y and z"),
         (farther, "camera positions are in metres", ALL_IN_MM),
     ]
-    seen = {(what, remedy): cameras.sees(points, poses) for poses, what, remedy in guesses}
-    seen["points are in metres", ALL_IN_MM] = cameras.sees(points * 1000.0)
-    return _likeliest(seen, given)
+    nearer = cameras.poses.copy()
+    nearer[:, :3, 3] /= 1000.0
+    guesses.append((nearer, "points are in metres", ALL_IN_MM))
+    colors = None if errors_only(parsed.places[0].report.problems) else agreements(parsed, [one[0] for one in guesses])
+    if colors is not None:
+        best = int(np.argmax(colors))
+        return guesses[best][1:] if colors[best] > COLORS_AGREE else None
+    return _likeliest({(what, remedy): cameras.sees(points, poses) for poses, what, remedy in guesses}, given)
 
 
 def _likeliest(seen: dict[Mistake, np.ndarray], given: float) -> Mistake | None:
@@ -201,16 +209,30 @@ def _check_instruments(parsed: Parsed, scene: _Scene | None) -> None:
         elif parsed.registered:
             has = np.array([instrument.name in frame.state.instruments for frame in parsed.frames])
             cameras = _Cameras(everyone.poses[has], everyone.intrinsics[has], everyone.sizes[has])
-            _check_placement(name, parsed.header(POSES), cameras, scene, poses, [place for place, _ in found])
+            _check_placement(parsed, instrument, cameras, scene, poses, [place for place, _ in found])
 
 
 def _check_placement(
-    name: str, all_poses: Node, cameras: _Cameras, scene: _Scene | None, poses: np.ndarray, places: list[Node]
+    parsed: Parsed,
+    instrument: Instrument,
+    cameras: _Cameras,
+    scene: _Scene | None,
+    poses: np.ndarray,
+    places: list[Node],
 ) -> None:
     """Check one registered instrument: the cameras, poses [I, 4, 4] and places of the frames that have it."""
+    name, all_poses = printable(instrument.name), parsed.header(POSES)
     seen = cameras.sees(poses[:, None, :3, 3])[:, 0]  # [I]
     outside = "every image" if not seen.any() else f"{len(seen) - int(seen.sum())} of {len(seen)} images"
-    if seen.mean() < SEEN_RARELY and (mistake := _instrument_mistake(cameras, poses, float(seen.mean()))) is not None:
+    mistake = None
+    if seen.mean() < SEEN_RARELY:
+        rays = _rays(parsed, instrument)
+        fault = None if rays is None else motion_fault(parsed, instrument, rays)  # the images decide where they can
+        if rays is None:
+            mistake = _instrument_mistake(cameras, poses, float(seen.mean()))
+        elif fault is not None and fault.named and fault.field == POSES:
+            mistake = fault.message, fault.remedy
+    if mistake is not None:
         all_poses.error(f"instrument {name} is outside {outside}: {mistake[0]}", mistake[1])
         return
     if scene is not None:
@@ -244,6 +266,12 @@ def _check_placement(
             message = f"instrument {name} is {distances[index]:.4g} mm from where it usually is, and out of view"
             remedy = "a tracker drop-out or unit slip? repair the pose or drop the frame"
             places[index].child("pose").warning(message, remedy)
+
+
+def _rays(parsed: Parsed, instrument: Instrument) -> Rays | None:
+    """What moves in the images, where they can be read and show where the instrument is."""
+    states = [instrument.name in frame.state.instruments for frame in parsed.frames]
+    return None if errors_only(parsed.places[0].report.problems) or not all(states) else Rays.of(parsed)
 
 
 def _visible_body_point(cameras: _Cameras, poses: np.ndarray) -> tuple[np.ndarray, float]:

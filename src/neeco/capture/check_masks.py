@@ -34,7 +34,8 @@ def measure_hidden(image: Tensor, mask: Tensor, camera: Camera | None, points: n
     pixels = float(ignored[lit].mean()) if lit.mean() > MIN_LIT else None
     if camera is None or not len(points):
         return Hidden(pixels, 0, 0)
-    places, depths = project_world(points, camera)
+    with np.errstate(all="ignore"):  # points on the camera's plane
+        places, depths = project_world(points, camera)
     inside = (depths > camera.near) & (places >= 0).all(-1) & (places < [camera.width, camera.height]).all(-1)
     column, row = places[inside].astype(int).T
     return Hidden(pixels, int(ignored[row, column].sum()), int(inside.sum()))

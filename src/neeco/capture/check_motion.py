@@ -1,315 +1,256 @@
-"""Check by the images that instruments are where their states say: rotations transposed, states of other frames.
+"""Check by the images that instruments are where their states say, and try what may be wrong where they are not.
 
-What moves is told from the tissue: each frame is predicted from others seen by cameras near its own, warped by the
-sparse points' depth. A point fixed to the instrument lies on what moves in all frames, if the poses are right. So each
-pixel that moves is asked: is there a depth at which what it shows, carried along by the poses, lies on moving pixels in
-the other frames? A mistake is named only where the poses without it answer that clearly better than those given.
+`motion_evidence` tells how well poses explain what moves. A mistake is named only where the poses without it explain
+that clearly better than those given. Where poses explain no more than those of other frames would, and no known mistake
+explains it, only that is said.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from neeco.capture.documents import Parsed, printable
-from neeco.capture.model import Frame, Instrument, InstrumentState, evenly_spaced
-from neeco.raster.pinhole import project
+from neeco.capture.model import Instrument, InstrumentState
+from neeco.capture.motion_evidence import Rays, Timeline
+from neeco.capture.pose_mistakes import placement_mistakes, rotation_mistakes
 
-FRAMES = 84  # looked at, evenly spaced over the capture
-FEWEST_FRAMES = 12  # with fewer, chance decides
-WIDTH = 72  # px to which images are reduced: an instrument is some px wide, errors of depth are hidden
-NEIGHBOURS = 10  # frames that predict one
-NEAR_CAMERAS = 3 * NEIGHBOURS  # at least so many are near enough to choose from, or half of all
-DIFFERENT = (15.0, 50.0)  # of 255, from the prediction: a pixel begins to count as moving, and does wholly
-FEWEST_POINTS = 8  # in view of a camera, to tell depths by
-RAYS = 504  # moving pixels that are asked
-DEPTHS = np.linspace(0.35, 1.0, 12)  # of the tissue's, at which they are
-LONGEST_SHIFT = 16  # steps of time that are tried, at most a fifth of a recording's
-TELLING = 0.4  # share of the rays that are compared: those which some poses explain best
-BLOCKS = 12  # of frames that follow each other, whose answers count as independent
-# An alternative is told when it explains more than the poses given do by these factors, in nearly all blocks. A shift
-# changes much at once; transposed rotations only as much as the instrument turns.
-CLEARLY_TURNED, CLEARLY_SHIFTED = 1.1, 1.15
-SURELY_TURNED, SURELY_SHIFTED = 3.0, 5.0  # standard errors over the blocks; of many shifts one may fit by chance
+SHORT_SHIFT = 16  # steps of time, at most a fifth of a recording's: shifts so small explain much even where wrong
+MOST_SHIFTS = 600  # that are tried over a whole recording
+LONGEST_SHIFT = 1 / 2  # of a recording
+RATES = (0.5, *np.geomspace(0.75, 1 / 0.75, 116), 2.0)  # of a clock
+BEST = 3  # of each kind are compared with all rays
+# An alternative is named when it explains more than the poses given do by a factor, with a certainty in standard errors
+# over the blocks, and has this mean evidence. A shift changes much at once; transposed rotations only as much as the
+# instrument turns; where all else is wrong, nearly nothing is explained. Of many one may fit by chance.
+TURNED, SHIFTED, ELSEWHERE = (1.1, 3.0, 0.15), (1.15, 5.0, 0.2), (1.5, 5.0, 0.2)
+CHANGED_TURNED = 1.25  # the factor for rotations, where they change the evidence most
 TURNING = 25.0  # deg, root mean square: who turns less is explained by transposed rotations nearly as well, or better
-EVIDENT = 0.1  # more evidence than elsewhere at its place, without which no poses explain anything
-BEHIND = 1e-3  # mm; what is less deep is not in front of a camera
+CONTRADICTED = 0.15  # mean evidence below which poses explain too little
+BY_CHANCE = 3.0  # factor by which poses without a mistake explain more than the same in another order
+# the same, of the poses given, below which they explain too little; in few frames chance explains much
+CONTRADICTED_BY_CHANCE, FEW_FRAMES_BY_CHANCE = 4.0, 1.5
+SHUFFLES = 6
+MIN_FRAMES_ELSEWHERE = 36  # of many alternatives one explains the motion in fewer frames
+AS_LIKELY = 0.9  # share of the most evidence from which another mistake is as likely
+NEAR_SHIFTS = 5  # steps to either side of the likeliest shift, which are compared on the same frames
+TRAVEL = 0.055  # of the image's width: who moves less is explained by the poses of any frame
+STATES, POSES = "frames[*].instruments[*]", "frames[*].instruments[*].pose"
 
 
 @dataclass(frozen=True)
 class _Alternative:
-    """Other poses, and how they compare with those given."""
+    """Poses [F, 4, 4] without a mistake, and which frames have them, [F]."""
 
     message: str
     remedy: str
-    needed: tuple[float, float]  # factor and certainty that make it clear
-    factor: float  # by which they explain more of what moves
-    certainty: float  # of that, in standard errors
-    explained: float  # evidence beyond the average where they say the instrument is
+    poses: np.ndarray
+    inside: np.ndarray
+    needed: tuple[float, float, float]  # factor, certainty and evidence that make it clear
+    kind: str
     steps: int = 0  # by which states are shifted
-
-    @property
-    def is_clear(self) -> bool:
-        return self.factor > self.needed[0] and self.certainty > self.needed[1] and self.explained > EVIDENT
+    in_time: bool = False  # by so many median steps of time, not by rows
 
 
-class _Timeline:
-    """Frames by steps of time: those of one time are one step (several cameras); where time goes back, another
-    recording begins."""
+@dataclass(frozen=True)
+class MotionFault:
+    """What the images tell against an instrument's states, where it is said, and what to do."""
 
-    def __init__(self, times: np.ndarray) -> None:
-        gaps = np.diff(times)
-        self.recording = np.concatenate([[0], np.cumsum(gaps < 0)])  # [N]
-        self.step = np.concatenate([[0], np.cumsum(gaps != 0)])  # [N], counted on over all recordings
-        self.frame_at = np.unique(self.step, return_index=True)[1]  # [S] first frame of every step
-        self.times = times[self.frame_at]  # [S]
-        gaps = gaps[gaps > 0]
-        self.gap = float(np.median(gaps)) if len(gaps) else 0.0  # s
-        self.is_even = len(gaps) == 0 or bool(np.ptp(gaps) < 0.1 * self.gap)
-        longest = int(np.bincount(self.recording[self.frame_at]).max())
-        self.longest_shift = min(LONGEST_SHIFT, longest // 5)
-
-    def by_steps(self, poses: np.ndarray, rows: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of poses [N, 4, 4] those so many steps after frames `rows` [F], and where the recording has one, [F]."""
-        wanted = self.step[rows] + steps
-        found = self.frame_at[wanted.clip(0, len(self.frame_at) - 1)]
-        inside = (wanted >= 0) & (wanted < len(self.frame_at)) & (self.recording[found] == self.recording[rows])
-        return poses[found], inside
-
-    def by_time(self, poses: np.ndarray, rows: np.ndarray, delay: float) -> tuple[np.ndarray, np.ndarray]:
-        """Poses as `by_steps`, so many seconds after the frames: interpolated."""
-        moved, inside = poses[rows].copy(), np.zeros(len(rows), dtype=bool)
-        for recording in np.unique(self.recording):
-            frames = self.frame_at[self.recording[self.frame_at] == recording]
-            times = self.times[self.step[frames]]
-            wanted = self.times[self.step[rows]] + delay
-            mine = (self.recording[rows] == recording) & (wanted >= times[0]) & (wanted <= times[-1])
-            if len(frames) < 2 or not mine.any():
-                continue
-            turns = Slerp(times, Rotation.from_matrix(poses[frames, :3, :3]))(wanted[mine])
-            moved[mine, :3, :3] = turns.as_matrix()
-            for axis in range(3):
-                moved[mine, axis, 3] = np.interp(wanted[mine], times, poses[frames, axis, 3])
-            inside |= mine
-        return moved, inside
-
-
-class _Views:
-    """Frames `rows` [F] of a capture reduced to [h, w] px, and what moves in them."""
-
-    def __init__(self, frames: list[Frame], rows: np.ndarray, points: np.ndarray) -> None:
-        first = frames[0].camera
-        self.width, self.height = WIDTH, max(8, round(WIDTH * first.height / first.width))
-        cameras = [frames[row].camera for row in rows]
-        scales = [(self.width / camera.width, self.height / camera.height) for camera in cameras]
-        self.intrinsics = np.array(
-            [(c.fx * x, c.fy * y, c.cx * x, c.cy * y) for c, (x, y) in zip(cameras, scales, strict=True)]
-        )
-        self.world_from_camera = np.stack([camera.world_from_camera.double().numpy() for camera in cameras])
-        depths = [self._tissue_depth(points, index) for index in range(len(rows))]
-        known = [index for index, depth in enumerate(depths) if depth is not None]
-        self.rows, self.intrinsics, self.world_from_camera = (
-            values[known] for values in (rows, self.intrinsics, self.world_from_camera)
-        )
-        self.depths = np.array([depth for depth in depths if depth is not None])  # [F, h, w] mm
-        if len(known) >= FEWEST_FRAMES:
-            self._find_motion([frames[row] for row in self.rows])
-
-    def _find_motion(self, frames: list[Frame]) -> None:
-        pictures = np.stack([self._reduced(frame.load_image_bytes().numpy()) for frame in frames])
-        masks = [frame.load_mask() for frame in frames]
-        full = np.ones((self.height, self.width), np.float32)
-        shown = np.stack([full if mask is None else self._reduced(mask.numpy().astype(np.float32)) for mask in masks])
-        low, high = DIFFERENT
-        moving = [(self._difference(pictures, shown, index) - low) / (high - low) for index in range(len(frames))]
-        # [F, h, w] how surely a pixel moves, in [0, 1]
-        self.moving = np.stack([cv2.blur(pixels.clip(0, 1), (3, 3)) for pixels in moving])
-
-    def _reduced(self, image: np.ndarray) -> np.ndarray:
-        size = (self.width, self.height)
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
-
-    def _tissue_depth(self, points: np.ndarray, index: int) -> np.ndarray | None:
-        """[h, w] mm, between the points [P, 3] that a camera has in view; None where these are too few."""
-        pose, (fx, fy, cx, cy) = self.world_from_camera[index], self.intrinsics[index]
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        local = local[local[:, 2] > BEHIND]
-        pixels, depth = np.stack(project(local, fx, fy, cx, cy), -1), local[:, 2]
-        seen = (pixels > 0).all(1) & (pixels < (self.width, self.height)).all(1)
-        pixels, depth = pixels[seen], depth[seen]
-        if len(depth) < FEWEST_POINTS:
-            return None
-        down, across = np.mgrid[2 : self.height : 4, 2 : self.width : 4]
-        distances, near = cKDTree(pixels).query(np.stack([across, down], -1), k=FEWEST_POINTS)
-        weights = 1 / (distances**2 + 2)
-        coarse = weights.sum(-1) / (weights / depth[near]).sum(-1)
-        smooth = cv2.resize(coarse.astype(np.float32), (self.width, self.height), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(smooth)
-
-    def _difference(self, pictures: np.ndarray, shown: np.ndarray, index: int) -> np.ndarray:
-        """[h, w] of 255, by how much a picture of pictures [F, h, w, 3] differs from what others predict of the still
-        scene, a px aside allowed; 0 where too few see the place, or masks [F, h, w] hide it."""
-        picture, pose, depth = pictures[index], self.world_from_camera[index], self.depths[index]
-        fx, fy, cx, cy = self.intrinsics[index]
-        v, u = np.mgrid[: self.height, : self.width] + 0.5
-        world = np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], -1) @ pose[:3, :3].T + pose[:3, 3]
-        predictions, times_seen = [], np.zeros(depth.shape, int)
-        for other in self._neighbours(index):
-            seen_from = self.world_from_camera[other]
-            local = (world - seen_from[:3, 3]) @ seen_from[:3, :3]
-            fx, fy, cx, cy = self.intrinsics[other]
-            x, y = (place.astype(np.float32) - 0.5 for place in project(local, fx, fy, cx, cy, BEHIND))
-            warped = cv2.remap(pictures[other], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            visible = cv2.remap(shown[other], x, y, cv2.INTER_LINEAR, borderValue=0) > 0.9
-            predictions.append(np.where(visible[..., None], warped, picture))
-            times_seen += visible
-        predicted = np.median(predictions, axis=0)
-        known = (times_seen >= 3) & (shown[index] > 0.9)
-        if known.any():  # the camera's exposure and white balance may have changed
-            predicted = predicted * np.median(picture[known] / predicted[known].clip(1), axis=0)
-        below = cv2.erode(predicted, np.ones((3, 3))) - picture
-        above = picture - cv2.dilate(predicted, np.ones((3, 3)))
-        return np.where(known, np.maximum(below, above).clip(0).max(-1), 0.0)
-
-    def _neighbours(self, index: int) -> list[int]:
-        """Frames whose cameras are near that of `index`, spread over the time that they span."""
-        poses, pose = self.world_from_camera, self.world_from_camera[index]
-        aside = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.median(self.depths[index])
-        cosine = (np.einsum("ij,fij->f", pose[:3, :3], poses[:, :3, :3]) - 1) / 2
-        apart = aside + np.arccos(cosine.clip(-1, 1))
-        apart[index] = np.inf
-        near = np.sort(np.argsort(apart, kind="stable")[: min(len(poses) - 1, max(NEAR_CAMERAS, len(poses) // 2))])
-        return near[evenly_spaced(len(near), NEIGHBOURS)].tolist()
-
-
-class _Rays:
-    """Moving pixels of all frames, as points in them at several depths, and how well poses explain them."""
-
-    def __init__(self, views: _Views) -> None:
-        self.views = views
-        generator = np.random.default_rng(0)
-        each = -(-RAYS // len(views.rows))
-        frames, places = [], []
-        for index, pixels in enumerate(views.moving):
-            sure = np.flatnonzero(pixels > 0.5)
-            if len(sure) >= each:
-                frames += [index] * each
-                places += generator.choice(sure, each, replace=False).tolist()
-        self.frames = np.array(frames, int)  # [R] index into `views`
-        row, column = np.divmod(np.array(places, int), views.width)
-        fx, fy, cx, cy = views.intrinsics[self.frames].T
-        slopes = np.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones(len(row))], -1)  # [R, 3]
-        depths = views.depths[self.frames, row, column][:, None] * DEPTHS
-        self.points = slopes[:, None] * depths[..., None]  # [R, D, 3] mm, in the camera's frame
-        # what moves everywhere or always tells nothing
-        self._evidence = (views.moving - views.moving.mean(0)).astype(np.float32).ravel()
-        self._others = self.frames[:, None] != np.arange(len(views.rows))  # [R, F]
-
-    def evidence(self, poses: np.ndarray) -> np.ndarray:
-        """float32 [R, D, F] at the rays' points, carried to every frame by poses [F, 4, 4], world_from_instrument; 0
-        where they are out of view."""
-        views, count = self.views, len(self.views.rows)
-        camera_from_instrument = np.linalg.inv(views.world_from_camera) @ poses
-        back = np.linalg.inv(camera_from_instrument)[self.frames]
-        points = np.einsum("rij,rdj->rdi", back[:, :3, :3], self.points) + back[:, None, :3, 3]
-        fixed = points.reshape(-1, 3).astype(np.float32)
-        turns, moves = (
-            part.astype(np.float32) for part in (camera_from_instrument[:, :3, :3], camera_from_instrument[:, :3, 3])
-        )
-        x, y, z = (fixed @ turns[:, axis].T + moves[:, axis] for axis in range(3))  # each [R D, F] mm
-        fx, fy, cx, cy = views.intrinsics.astype(np.float32).T
-        depth = z.clip(BEHIND)
-        u, v = x / depth * fx + cx, y / depth * fy + cy
-        inside = (z > BEHIND) & (u >= 0) & (u < views.width) & (v >= 0) & (v < views.height)
-        row, column = v.clip(0, views.height - 1).astype(np.int32), u.clip(0, views.width - 1).astype(np.int32)
-        place = (np.arange(count, dtype=np.int32) * views.height + row) * views.width + column
-        return (self._evidence[place] * inside).reshape(*self.points.shape[:2], count)
-
-    def explained(self, evidence: np.ndarray, counts: np.ndarray) -> np.ndarray:
-        """[R] mean evidence at each ray's best depth, over the other frames that count [F]."""
-        weights = (self._others & counts).astype(np.float32)
-        means = np.einsum("rdf,rf->rd", evidence, weights) / weights.sum(-1).clip(1)[:, None]
-        return np.asarray(means.max(1))
-
-    def compare(self, given: np.ndarray, poses: np.ndarray, inside: np.ndarray) -> tuple[float, float, float]:
-        """Factor, certainty and evidence, as `_Alternative` has them, of poses [F, 4, 4] that there are for some frames
-        [F]; `given`: `evidence` of those in the capture."""
-        counts = inside[self.frames]
-        if len(np.unique(self.frames[counts])) < FEWEST_FRAMES:
-            return 0.0, 0.0, 0.0
-        other = self.explained(self.evidence(poses), inside)[counts]
-        own = self.explained(given, inside)[counts]
-        best = np.maximum(other, own)
-        telling = best >= np.quantile(best, 1 - TELLING)
-        other, own, frames = other[telling], own[telling], self.frames[counts][telling]
-        gains = np.array([(other - own)[frames == frame].mean() for frame in np.unique(frames)])
-        blocks = np.array([block.mean() for block in np.array_split(gains, min(BLOCKS, len(gains)))])
-        error = max(float(blocks.std(ddof=1)) / np.sqrt(len(blocks)), 1e-9)
-        return float(other.mean() / max(own.mean(), 1e-9)), float(blocks.mean()) / error, float(other.mean())
+    field: str
+    message: str
+    remedy: str
+    named: bool = False  # by a mistake that explains it
 
 
 def check_motion(parsed: Parsed) -> None:
-    """Report instruments whose rotations are transposed or whose states belong to other frames, as the images tell.
+    """Report instruments whose states the images contradict, with the mistake that explains it if one does.
 
     Says nothing of a capture without registered poses or without measured points, or where too little moves. `parsed`
     must be free of errors.
     """
-    points = parsed.points
-    if not parsed.registered or points is None or not points.measured or not parsed.instruments:
+    rays = Rays.of(parsed) if parsed.instruments else None
+    if rays is None:
         return
-    timeline = _Timeline(np.array([frame.state.time for frame in parsed.frames]))
-    rows = np.array(evenly_spaced(len(parsed.frames), FRAMES))
-    if len(rows) < FEWEST_FRAMES:
-        return
-    views = _Views(parsed.frames, rows, points.positions.astype(np.float64))
-    if len(views.rows) < FEWEST_FRAMES:
-        return
-    rays = _Rays(views)
     for instrument in parsed.instruments:
-        states = [frame.state.instruments[instrument.name] for frame in parsed.frames]
-        found = _likeliest_mistake(instrument, states, timeline, rays)
-        if found is not None:
-            place = parsed.header("frames[*].instruments[*]" + (".pose" if found.steps == 0 else ""))
-            place.warning(found.message, found.remedy)
+        fault = motion_fault(parsed, instrument, rays)
+        if fault is not None:
+            parsed.header(fault.field).warning(fault.message, fault.remedy)
+
+
+def motion_fault(parsed: Parsed, instrument: Instrument, rays: Rays) -> MotionFault | None:
+    """What the images tell against the states of an instrument, which every frame has."""
+    name, rows = printable(instrument.name), rays.views.rows
+    states = [frame.state.instruments[instrument.name] for frame in parsed.frames]
+    poses = _of_root(instrument, np.stack([state.pose.numpy() for state in states]), states)
+    found = _likeliest_mistake(parsed, instrument, states, poses, rays)
+    if found is not None:
+        field = POSES if found.kind in ("poses", "positions", "rotations") else STATES
+        return MotionFault(field, found.message, found.remedy, named=True)
+    given = rays.mean(poses[rows])
+    if given > CONTRADICTED and _turns_better(instrument, states, poses[rows], rays):
+        message = f"rotations of {name} do not turn as the instrument does in the images"
+        return MotionFault(
+            POSES, message, "are they transposed, or are quaternions in another order (w x y z, x y z w)?"
+        )
+    if given > CONTRADICTED or rays.travel(poses[rows]) < TRAVEL:
+        return None
+    by_chance = _by_chance(rays, poses[rows])
+    if given > (FEW_FRAMES_BY_CHANCE if len(rows) < MIN_FRAMES_ELSEWHERE else CONTRADICTED_BY_CHANCE) * by_chance:
+        return None
+    message = (
+        f"the images contradict the poses of {name}: what moves in them does not lie where the poses say (evidence "
+        f"{given:.2f}, {by_chance:.2f} by chance)"
+    )
+    remedy = "shifts, other axes, frames and units were tried; states, cameras and images must be of one recording"
+    return MotionFault(POSES, message, remedy)
 
 
 def _likeliest_mistake(
-    instrument: Instrument, states: list[InstrumentState], timeline: _Timeline, rays: _Rays
+    parsed: Parsed, instrument: Instrument, states: list[InstrumentState], poses: np.ndarray, rays: Rays
 ) -> _Alternative | None:
     """The mistake without which the poses of an instrument explain clearly, and most, more of what moves."""
-    name, rows = printable(instrument.name), rays.views.rows
-    recorded = np.stack([state.pose.numpy() for state in states])  # [N, 4, 4]
-    turned = recorded.copy()
-    turned[:, :3, :3] = recorded[:, :3, :3].transpose(0, 2, 1)
-    poses, turned = (_of_root(instrument, given, states) for given in (recorded, turned))
-    given = rays.evidence(poses[rows])
-    message = f"rotations of {name} are transposed: so turned back they fit what moves in the images better"
-    remedy = "transpose them: their columns are the instrument's axes in the world"
-    everywhere = np.ones(len(rows), dtype=bool)
-    tried = []
-    if _turning(poses[rows]) > TURNING:
-        compared = rays.compare(given, turned[rows], everywhere)
-        tried.append(_Alternative(message, remedy, (CLEARLY_TURNED, SURELY_TURNED), *compared))
-    for shift in range(-timeline.longest_shift, timeline.longest_shift + 1):
-        if shift == 0:
+    rows = rays.views.rows
+    given, few = rays.evidence(poses[rows]), rays.thinned()
+    tried = [*_turned(instrument, states, poses[rows], rows)]
+    tried += _likeliest(_placed(instrument, parsed, poses, rows), few)
+    shifts = _Shifts(instrument, poses, Timeline(np.array([frame.state.time for frame in parsed.frames])), rows)
+    tried += shifts.likeliest(few)
+    clear, other = [], []
+    for one in tried:
+        if one.needed == ELSEWHERE and len(rows) < MIN_FRAMES_ELSEWHERE:
             continue
-        ways = [(f"{abs(shift)} frame{'s' * (abs(shift) > 1)}", timeline.by_steps(poses, rows, shift))]
-        if not timeline.is_even:  # frames were left out: then a wrong clock is another shift than wrong rows
-            delay = shift * timeline.gap
-            ways.append((f"{abs(delay):.2g} s", timeline.by_time(poses, rows, delay)))
-        for amount, (moved, inside) in ways:
-            direction = "earlier" if shift > 0 else "later"  # than the images they are listed with
-            message = f"states of {name} fit the images better {amount} {direction}"
-            remedy = f"move them {amount} {direction} (a clock's offset, frames dropped or counted from another one?)"
-            compared = rays.compare(given, moved, inside)
-            tried.append(_Alternative(message, remedy, (CLEARLY_SHIFTED, SURELY_SHIFTED), *compared, steps=shift))
-    best = max((one for one in tried if one.is_clear), key=lambda one: one.factor, default=None)
+        found = rays.compare(given, one.poses, one.inside)
+        if found[0] > ELSEWHERE[0]:
+            other.append((found[2], one))
+        enough = all(value > least for value, least in zip(found, one.needed, strict=True))
+        if enough and found[2] > BY_CHANCE * _by_chance(few, one.poses, one.inside):
+            clear.append((found[2], one))
+    if not clear:
+        return None
+    most, best = max(clear, key=lambda found: found[0])
+    rivals = [one for evidence, one in other if evidence > AS_LIKELY * most and not _same(one, best)]
+    if rivals and any(one is best for _, one in other):
+        return None  # nothing tells which of them it is
+    best = shifts.refined(best, rays) if best.steps else best
     # at the end of what was tried there is no telling whether another shift is the right one
-    return None if best is None or abs(best.steps) == timeline.longest_shift > 0 else best
+    return None if abs(best.steps) >= shifts.longest > 0 else best
+
+
+def _same(one: _Alternative, other: _Alternative) -> bool:
+    """Whether two alternatives are one mistake, at most of another amount."""
+    near = abs(one.steps - other.steps) <= 2 * NEAR_SHIFTS
+    return one.kind == other.kind and near and (one.kind != "poses" or np.allclose(one.poses, other.poses, atol=0.1))
+
+
+def _by_chance(rays: Rays, poses: np.ndarray, inside: np.ndarray | None = None) -> float:
+    """Mean evidence of poses [F, 4, 4] in another order: of where the instrument usually is, whenever."""
+    rows = np.arange(len(poses)) if inside is None else np.flatnonzero(inside)
+    generator, shuffled = np.random.default_rng(0), poses.copy()
+    found = []
+    for _ in range(SHUFFLES):
+        shuffled[rows] = poses[generator.permutation(rows)]
+        found.append(rays.mean(shuffled, inside))
+    return float(np.mean(found))
+
+
+def _likeliest(tried: Iterable[_Alternative], few: Rays) -> list[_Alternative]:
+    return sorted(tried, key=lambda one: few.mean(one.poses, one.inside), reverse=True)[:BEST]
+
+
+def _turned(
+    instrument: Instrument, states: list[InstrumentState], poses: np.ndarray, rows: np.ndarray
+) -> Iterator[_Alternative]:
+    """Other rotations than those recorded, of an instrument whose poses [F, 4, 4] turn enough to tell."""
+    if _turning(poses) < TURNING:
+        return
+    seen = [states[row] for row in rows]
+    recorded = np.stack([state.pose.numpy() for state in seen])
+    for mistake in rotation_mistakes(recorded):
+        turned = _of_root(instrument, mistake.poses, seen)
+        message = f"{mistake.what.format(of=_of(instrument))}: turned back, they fit what moves in the images better"
+        yield _Alternative(message, mistake.remedy, turned, np.ones(len(rows), dtype=bool), TURNED, "rotations")
+
+
+def _turns_better(instrument: Instrument, states: list[InstrumentState], poses: np.ndarray, rays: Rays) -> bool:
+    """Whether other rotations explain more where they explain most otherwise, without telling which."""
+    given = rays.evidence(poses)
+    for other in _turned(instrument, states, poses, rays.views.rows):
+        factor, certainty, _ = rays.compare(given, other.poses, other.inside, most_changed=True)
+        if factor > CHANGED_TURNED and certainty > TURNED[1]:
+            return True
+    return False
+
+
+def _placed(instrument: Instrument, parsed: Parsed, poses: np.ndarray, rows: np.ndarray) -> Iterator[_Alternative]:
+    """Poses of other frames, axes and units."""
+    cameras = np.stack([parsed.frames[row].camera.world_from_camera.double().numpy() for row in rows])
+    for mistake in placement_mistakes(poses[rows], cameras):
+        message = f"{mistake.what.format(of=_of(instrument))}: corrected, they lie on what moves in the images"
+        yield _Alternative(
+            message, mistake.remedy, mistake.poses, np.ones(len(rows), dtype=bool), ELSEWHERE, mistake.what.split()[0]
+        )
+
+
+class _Shifts:
+    """Poses [N, 4, 4] of other frames than those they are listed with, for frames `rows` [F]."""
+
+    def __init__(self, instrument: Instrument, poses: np.ndarray, timeline: Timeline, rows: np.ndarray) -> None:
+        self.instrument, self.poses, self.timeline, self.rows = instrument, poses, timeline, rows
+        self.longest = int(timeline.longest * LONGEST_SHIFT)
+
+    def likeliest(self, few: Rays) -> list[_Alternative]:
+        """The likeliest few of all shifts, in steps and, where uneven, in time; and of all rates of a clock."""
+        every = max(1, 2 * self.longest // MOST_SHIFTS)
+        steps = [step for step in range(-self.longest, self.longest + 1, every) if step]
+        found = _likeliest((self._by_steps(step) for step in steps), few)
+        if not self.timeline.is_even:  # frames were left out: then a wrong clock is another shift than wrong rows
+            near = _likeliest((self._by_time(step, nearest=True) for step in steps), few)
+            found += [self._by_time(one.steps) for one in near]
+        rates = _likeliest((self._by_rate(rate) for rate in RATES), few)
+        backwards, inside = self.timeline.backwards(self.poses, self.rows)
+        message = f"states {_of(self.instrument)} are in reverse order: turned round, they fit the images"
+        return [
+            *found,
+            *rates,
+            _Alternative(message, "list them in the images' order", backwards, inside, ELSEWHERE, "backwards"),
+        ]
+
+    def refined(self, found: _Alternative, rays: Rays) -> _Alternative:
+        """The best of the shifts near to one, on the frames for which all of them have poses."""
+        build = self._by_time if found.in_time else self._by_steps
+        near = [build(step) for step in range(found.steps - NEAR_SHIFTS, found.steps + NEAR_SHIFTS + 1) if step]
+        common = np.all([one.inside for one in near], axis=0)
+        means = [rays.mean(one.poses, common) for one in near]
+        return near[int(np.argmax(means))] if max(means) > 0 else found
+
+    def _by_steps(self, steps: int) -> _Alternative:
+        amount = f"{abs(steps)} frame{'s' * (abs(steps) > 1)}"
+        return self._alternative(steps, amount, *self.timeline.by_steps(self.poses, self.rows, steps))
+
+    def _by_time(self, steps: int, nearest: bool = False) -> _Alternative:
+        delay = steps * self.timeline.gap
+        moved = self.timeline.by_time(self.poses, self.rows, delay, nearest=nearest)
+        return replace(self._alternative(steps, f"{abs(delay):.2g} s", *moved), in_time=True)
+
+    def _by_rate(self, rate: float) -> _Alternative:
+        poses, inside = self.timeline.by_time(self.poses, self.rows, rate=rate, nearest=True)
+        message = f"states {_of(self.instrument)} fit the images better on a clock that runs {rate:.3g} times as fast"
+        remedy = "correct their times, or the images' (24, 25 or 30 frames a second?)"
+        return _Alternative(message, remedy, poses, inside, SHIFTED, "rate")
+
+    def _alternative(self, steps: int, amount: str, poses: np.ndarray, inside: np.ndarray) -> _Alternative:
+        direction = "earlier" if steps > 0 else "later"  # than the images they are listed with
+        message = f"states {_of(self.instrument)} fit the images better {amount} {direction}"
+        remedy = f"move them {amount} {direction} (a clock's offset, frames dropped or counted from another one?)"
+        short = abs(steps) <= min(SHORT_SHIFT, self.timeline.longest // 5)
+        return _Alternative(message, remedy, poses, inside, SHIFTED if short else ELSEWHERE, "shift", steps)
+
+
+def _of(instrument: Instrument) -> str:
+    return f"of {printable(instrument.name)}"
 
 
 def _of_root(instrument: Instrument, poses: np.ndarray, states: list[InstrumentState]) -> np.ndarray:

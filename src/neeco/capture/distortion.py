@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -55,7 +56,8 @@ def stated_distortion(node_of: Callable[[str], Node]) -> StatedDistortion | None
     found: dict[str, Node] = {}
     for key in LISTS:
         node = node_of(key)
-        if node.value is None or (isinstance(node.value, list) and all(as_float(item) == 0 for item in node.value)):
+        zeros = isinstance(node.value, list) and all(as_float(item) == 0 for item in node.value)
+        if node.value is None or isinstance(node.value, str) or zeros:  # text is a remark
             continue
         names = LISTED.get(len(node.value)) if isinstance(node.value, list) else None
         if names is None:
@@ -90,8 +92,17 @@ def opencv_distortion(
     coefficients: by NAMES, absent ones are 0. intrinsics: fl_x, fl_y, cx, cy px; size: (width, height) px, None: twice
     the principal point. Other models than OpenCV's are fitted. Raises NeecoError ("what is wrong; what to do").
     """
-    given = {name: coefficients.get(name, 0.0) for name in NAMES}
-    k1, k2, k3, k4, k5, k6, p1, p2 = given.values()
+    return _opencv_distortion(model, tuple(coefficients.get(name, 0.0) for name in NAMES), intrinsics, size)
+
+
+@lru_cache(maxsize=8)
+def _opencv_distortion(
+    model: str,
+    coefficients: tuple[float, ...],
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int] | None,
+) -> tuple[float, ...]:
+    k1, k2, k3, k4, k5, k6, p1, p2 = coefficients
     if model in FISHEYE:
         if any((k5, k6, p1, p2)):
             raise NeecoError("a fisheye lens has coefficients k1 to k4 alone; calibrate again")

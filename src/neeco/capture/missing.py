@@ -40,7 +40,11 @@ def similar_file(folder: Path, text: str) -> str | None:
     for part in parts:
         place = None if place is None else _entry(place, part)
     if place is None or not place.is_file():  # the same name in another folder
-        named = (_entry(other, parts[-1]) for other in _folders(folder, os.stat(folder).st_mtime_ns))
+        try:
+            folders = _folders(folder, os.stat(folder).st_mtime_ns)
+        except OSError:
+            return None
+        named = (_entry(other, parts[-1]) for other in folders)
         place = next((entry for entry in named if entry is not None and entry.is_file()), None)
     return None if place is None else place.relative_to(folder).as_posix()
 

@@ -108,7 +108,9 @@ class State:
                 fault = rigid_fault(given.pose.detach().cpu().double().numpy())
                 if fault is not None:
                     raise NeecoError(f"{place}: pose {fault[0]}; {fault[1]}")
-            for joint, value in given.joints.items() if item is not None else ():
+            if item is None:
+                continue
+            for joint, value in given.joints.items():
                 if (fitted and joint not in item.joints) or not _is_readable(value, fitted):
                     continue
                 fault = item.joint_fault(joint, float(value), slack=1.0 if fitted else 0.0)

@@ -40,8 +40,11 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
 
 
 def capture_of(parsed: Parsed) -> Capture:
-    """What was read without an error, as a capture, the poses of articulated instruments as those of their roots."""
+    """What was read without an error, as a capture, the poses of articulated instruments as those of their roots.
+    Raises NeecoError for an image whose name is not in UTF-8."""
     frames, instruments = tuple(parsed.frames), parsed.instruments
+    for frame in frames:
+        require_utf8(frame.image_path)
     tissues = tuple(
         Tissue(tissue.name, _points(tissue.points, [frame for frame in frames if frame.state.tissue == tissue.name]))
         for tissue in parsed.tissues

@@ -27,6 +27,7 @@ from neeco.raster.types import Camera
 SCHEMA = "neeco-capture/1"
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
 BLENDER_HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there
+STATE_LIKE = ("instrument", "instrument_pose", "instrument_states", "tool", "tools", "joints", "states")  # frames' keys
 _MILLIMETRES = ("mm", "millimeter", "millimetre", "millimeters", "millimetres")
 
 
@@ -55,6 +56,7 @@ def parse_transforms(
     _parse_frames(document, folder, parsed, background)
     _parse_points(document, folder, parsed)
     parsed.instruments = all_instruments(parsed.frames, declared_instruments(document))
+    _warn_of_unread_states(document, parsed)
     return parsed
 
 
@@ -87,6 +89,8 @@ def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0, 
             _parse_points(document, file.parent, parsed)
         declared = {item.name: item for item in declared_instruments(document)} | declared
     parsed.instruments = all_instruments(parsed.frames, tuple(declared.values()))
+    for document in files.values():
+        _warn_of_unread_states(document, parsed)
     if parsed.instruments:
         return parsed
     if not any("time" in frame for document in files.values() for frame in _frame_objects(document)):
@@ -101,6 +105,17 @@ def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0, 
 def _frame_objects(document: Node) -> list[dict[str, Any]]:
     frames = document.value.get("frames")
     return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
+
+
+def _warn_of_unread_states(document: Node, parsed: Parsed) -> None:
+    """Warn of states under other names than `instruments`, where no frame has any under that."""
+    for index, frame in enumerate(_frame_objects(document)):
+        found = [key for key in STATE_LIKE if frame.get(key) is not None]
+        if found and not parsed.instruments:
+            message = "is not read: instrument states belong into `instruments`"
+            remedy = 'write [{"name", "pose": 4x4 mm, "joints": {name: rad}}] there'
+            document.child("frames").item(index).child(found[0]).warning(message, remedy)
+            return
 
 
 def _parse_header(document: Node, parsed: Parsed) -> None:

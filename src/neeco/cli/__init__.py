@@ -7,6 +7,7 @@ Each verb is one module of this package: a frozen dataclass (its docstring and f
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import io
 import os
@@ -113,7 +114,7 @@ def _status(words: list[str]) -> int:
         elif isinstance(error, NeecoError):
             _print_error(str(error))
         elif isinstance(error, OSError):
-            where = error.filename or "output"
+            where = error.filename or ("output" if error.errno == errno.ENOSPC else "system")
             _print_error(f"{where}: {error.strerror or error}; check that path and the disk")
         else:
             raise
@@ -167,8 +168,9 @@ def _dispatch(words: list[str]) -> int:
         choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
     )
     assert run is not None, "tyro leaves through SystemExit when no verb was given"
-    for word in (os.getcwd(), *words):
-        require_utf8(word)
+    with contextlib.suppress(FileNotFoundError):  # the current folder was removed: absolute paths may do
+        for word in (os.getcwd(), *words):
+            require_utf8(word)
     from neeco.raster.devices import readable_failures
     from neeco.raster.native import keep_freed_memory
 

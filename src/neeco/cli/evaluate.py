@@ -69,6 +69,9 @@ def run(args: Evaluate) -> int:
     console.print(_table(evaluation))
     for note in evaluation["notes"]:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
+    for name, joint in trained.scene.diagnostics.get("joints", {}).items():
+        if joint.get("found") is False:
+            console.print(f"DOUBTFUL: joint {name}: {joint['verdict']}", markup=False, highlight=False, soft_wrap=True)
     console.print(f"report: {page}", markup=False, highlight=False, soft_wrap=True)
     return 0
 

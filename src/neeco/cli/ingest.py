@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
+    from neeco.ingest.assessment import Assessment
     from neeco.ingest.recording import Recording
     from neeco.ingest.result import IngestResult
 
@@ -60,6 +61,8 @@ class Ingest:
     """Write images, poses, joints, what moves and clocks into this file, too, for the rerun viewer."""
     json: bool = False
     """Print the numbers as JSON."""
+    strict: bool = False
+    """End with exit status 1 where the verdict is DOUBTFUL."""
 
 
 def run(args: Ingest) -> int:
@@ -91,7 +94,8 @@ def run(args: Ingest) -> int:
                 raise NeecoError(f"{source}: is a folder; of several recordings give each recording.yaml")
             _refuse_beside(args, f"{source}: a folder in another format", keep=("output",))
             return _convert(source, output)
-    return _ingest(recordings_of(args), output, args.rrd, args.json)
+    verdicts = _ingest(recordings_of(args), output, args.rrd, args.json)
+    return 1 if args.strict and any(verdict.level == "bad" for verdict in verdicts) else 0
 
 
 def _refuse_beside(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
@@ -125,9 +129,13 @@ def _init(folder: Path) -> int:
     path = (folder.parent if holds_streams(folder) else folder) / RECORDING
     if path.exists():
         raise NeecoError(f"{path}: already exists; edit it, or move it away first")
-    write_text(path, write_template(folder))
-    if holds_streams(folder) and write_choice_picture(folder, path.with_name(CHOICES)):
-        print(f"wrote {path.with_name(CHOICES)}: what its poses would be under each choice that the file leaves open")
+    write_text(path, write_template(folder, lambda problem: print(f"left out: {problem}")))
+    picture = path.with_name(CHOICES)
+    try:
+        if holds_streams(folder) and write_choice_picture(folder, picture):
+            print(f"wrote {picture}: what its poses would be under each choice that the file leaves open")
+    except NeecoError as error:  # recording.yaml, which names the choices, is written all the same
+        print(f"no picture of the choices that the file leaves open: {error}")
     print(f"wrote {path}: look through it, then: neeco ingest {path} --output CAPTURE")
     return 0
 
@@ -147,7 +155,9 @@ def recordings_of(args: Ingest) -> list[Recording]:
     from neeco.ingest.recordingfile import check_frames, read_recording, recording_from_flags
 
     if args.source:
-        _refuse_beside(args, f"{args.source[0]}: says what was recorded", keep=("output", "frames", "rrd", "json"))
+        _refuse_beside(
+            args, f"{args.source[0]}: says what was recorded", keep=("output", "frames", "rrd", "json", "strict")
+        )
         check_frames(args.frames)
         recordings = [read_recording(source) for source in args.source]
         return [item if args.frames is None else replace(item, frames=args.frames) for item in recordings]
@@ -169,12 +179,14 @@ def recordings_of(args: Ingest) -> list[Recording]:
     return [recording]
 
 
-def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json: bool) -> int:
+def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json: bool) -> list[Assessment]:
+    """Make the capture, print what was found and how good it is; the verdict on each tissue."""
     from neeco.capture import read_capture
     from neeco.capture.check import Problem, errors_only, inspect_capture
     from neeco.cli._output import require_ending
     from neeco.errors import NeecoError
     from neeco.files import finite
+    from neeco.ingest.assessment import assess_ingest
     from neeco.ingest.pipeline import ingest
     from neeco.ingest.tissues import ingest_tissues
     from neeco.report.ingest_page import write_ingest_page
@@ -196,6 +208,7 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
             bar.update(tasks[what], completed=done, total=total or None)
 
         problems: list[Problem] = []
+        verdicts: dict[str, Assessment] = {}
 
         def complete(result: IngestResult, folder: Path) -> None:
             complete_tissues({"": result}, folder)
@@ -207,7 +220,8 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
             capture = checked.capture or read_capture(folder)
             for tissue, result in results.items():
                 own = capture.over(tissue) if tissue else capture
-                write_ingest_page(result, folder / page_of(tissue), own)
+                verdicts[tissue] = assess_ingest(result, own, problems)
+                write_ingest_page(result, verdicts[tissue], folder / page_of(tissue), own)
                 if rrd is not None:
                     report("writing for rerun", 0, 0)
                     write_rrd(result, own, rrd)
@@ -222,9 +236,9 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
         except KeyboardInterrupt:
             raise KeyboardInterrupt("nothing was written") from None
     if as_json:
-        numbers = finite({tissue: result.as_json() for tissue, result in results.items()})
+        numbers = finite({tissue: result.as_json() | verdicts[tissue].as_json() for tissue, result in results.items()})
         print(json.dumps(numbers.get("", {"tissues": numbers}), indent=2, allow_nan=False))
-        return 0
+        return list(verdicts.values())
     for tissue, result in results.items():
         if tissue:
             print(f"tissue {tissue}:")
@@ -232,10 +246,13 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
     for problem in errors_only(problems):
         print(f"wrong: {problem}")
     print(f"capture: {output}  ({len(problems)} remarks by `neeco check`)")
-    print(f"how good it is: {', '.join(str(output / page_of(tissue)) for tissue in results)}")
+    print(f"page: {', '.join(str(output / page_of(tissue)) for tissue in results)}")
     if rrd is not None:
         print(f"to scrub through: rerun {rrd}")
-    return 0
+    for tissue, verdict in verdicts.items():
+        first, *others = verdict.lines()
+        print(f"how good it is: {f'{tissue}: ' if tissue else ''}{first}", *others, sep="\n")
+    return list(verdicts.values())
 
 
 def page_of(tissue: str) -> str:
@@ -260,8 +277,7 @@ def print_result(result: IngestResult) -> None:
         fit = numbers["registration"]
         print(f"registered to {fit['position_rms_mm']:.2f} mm, {fit['rotation_rms_deg']:.2f} deg rms")
     for name, clock in result.clocks.items():
-        spread = f" +- {1000 * clock.sd:.1f}" if clock.sd > 0 else ""
-        print(f"clock {name}: {1000 * clock.seconds:.1f}{spread} ms ({clock.source})")
+        print(f"clock {name}: {clock} ({clock.source})")
     for sentence in result.search:
         print(f"cameras: {sentence}")
     for note in result.notes:

@@ -73,4 +73,5 @@ def run(arguments: Arguments) -> int:
         page = write_track_page(tracked)
     tracked.require_trusted()
     print(f"{tracked.written} of {len(tracked.records)} frames in {tracked.output}; what was found in all: {page}")
+    print(f"how good it is: {tracked.verdict}")
     return 0

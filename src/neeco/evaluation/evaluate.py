@@ -95,7 +95,8 @@ def evaluate_run(
     found. How many the rest takes is the caller's to set (`open_run`). Raises NeecoError for unknown splits and
     unreadable frames.
     """
-    scene, capture = run.scene, run.completed(capture)
+    scene = run.scene
+    capture = scene.recorded.completed(capture, scene.instruments)
     splits = held_out_splits(capture, splits)
     if align:
         gaussian_scene(scene, "--align")

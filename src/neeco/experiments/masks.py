@@ -97,9 +97,10 @@ def score_runs(
     for index, (name, seed, path) in enumerate(runs):
         report(index, len(runs))
         with open_run(path, device) as run:
+            completed = run.scene.recorded.completed(capture, run.scene.instruments)
             for split in splits:
                 folder = output / "masks" / f"{name}-seed{seed}" / split
-                if draw_masks(run, folder, run.completed(capture).split(split)):
+                if draw_masks(run, folder, completed.split(split)):
                     rows += score_folder(name, seed, folder, capture, [split])[0]
     report(len(runs), len(runs))
     return rows
@@ -111,7 +112,8 @@ def score_label_ways(run: Run, capture: Capture, splits: Sequence[str]) -> Label
     None where no frame has a true or reference mask, or where a way cannot label the scene (nothing moves in it).
     Threads of torch: the caller's to set. Raises NeecoError for an unreadable mask.
     """
-    scene, capture = gaussian_scene(run.scene, "label ways"), run.completed(capture)
+    scene = gaussian_scene(run.scene, "label ways")
+    capture = scene.recorded.completed(capture, scene.instruments)
     min_component = Settings(count=1).min_component
     scores: LabelScores = {}
     for way, kind in (("composited", CompositedLabels), ("threshold", ThresholdLabels)):

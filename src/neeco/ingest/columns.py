@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 
 from neeco.errors import NeecoError
 
@@ -149,6 +150,8 @@ def scale_of(
 _TIMES = (
     "header_stamp", "timestamp", "time_stamp", "stamp", "time", "t", "elapsed", "secs", "sec", "seconds", "__time",
 )  # fmt: skip
+_Given = Mapping[str, Sequence[str]]  # columns by what they mean
+_NOTHING: _Given = MappingProxyType({})
 _Choices = list[tuple[bool, list[str]]]  # (may all stand behind one prefix, names)
 
 
@@ -187,24 +190,32 @@ def recognise_time(header: Sequence[str]) -> RecognisedColumns:
         frames = [name for name in header if _plain(name) in ("frame", "frame_number", "frame_id", "frame_no")]
         return RecognisedColumns(time=(frames[0],), counts_frames=True) if frames else RecognisedColumns()
     # `rostopic echo -p` writes %time and field.header.stamp in ns
-    ros = found == "%time" or (found.lower().endswith("header.stamp") and found.lower().startswith("field."))
+    ros = found == "%time" or re.fullmatch(r"\.?field\..*header\.stamp", found.lower()) is not None
     spelled_out = _plain(found) in ("secs", "sec", "seconds", "__time")
     return RecognisedColumns(time=(found,), time_unit="ns" if ros else "s" if spelled_out else None)
 
 
-def recognise_pose(header: Sequence[str]) -> RecognisedColumns:
-    """The columns of time, position and rotation in a log of poses."""
-    when = recognise_time(header)
+def recognise_pose(header: Sequence[str], given: _Given = _NOTHING) -> RecognisedColumns:
+    """The columns of time, position and rotation in a log of poses, none of them for two things. given: the columns of
+    those that the recording names, by meaning: these are not looked for."""
+    left = _left(header, given)
+    when = RecognisedColumns() if "time" in given else recognise_time(left)
+    left = [name for name in left if name not in (when.time or ())]
     unclear: dict[str, str] = {}
-    matrix = _matrix(header)
-    position = None if matrix and len(matrix) > 9 else _group(header, _POSITIONS, "length", "position", unclear)
-    rotation, form = _rotation(header, matrix, unclear)
-    if position and rotation and set(position) & set(rotation):
-        rotation = form = None
+    matrix, position, rotation, form = None, None, None, None
+    if "rotation" not in given:
+        matrix = _matrix(left)
+        rotation, form = _rotation(left, matrix, unclear)
+    if "position" not in given and not (matrix and len(matrix) > 9):
+        position = _group(left, _POSITIONS, "length", "position", unclear)
+    if shared := [name for name in position or () if name in (rotation or ())]:
+        why = f"{', '.join(shared)} may be the position's or the quaternion's; name both under columns"
+        unclear |= {"position": why, "rotation": why}
+        position = rotation = form = None
     lower = [_plain(name) for name in header]
     ndi = {"state", "q0", "tx", "ty", "tz"} <= set(lower)
     ros = bool(position and _ROS.search(position[0].lower()))
-    state = header[lower.index("state")] if ndi else None
+    state = next((name for name in left if ndi and _plain(name) == "state"), None)
     unit = "mm" if ndi else "m" if ros else None
     return replace(
         when, position=position, rotation=rotation, form=form, state=state, length_unit=unit, unclear=unclear
@@ -233,13 +244,21 @@ def pose_bodies(header: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return {}
 
 
-def recognise_value(header: Sequence[str]) -> tuple[str | None, RecognisedColumns]:
-    """The one column beside the time that can be a joint's reading (None when there are none or several)."""
-    when = recognise_time(header)
+def recognise_value(header: Sequence[str], given: _Given = _NOTHING) -> tuple[str | None, RecognisedColumns]:
+    """The one column beside the time that can be a joint's reading (None when there are none or several). given: as
+    for `recognise_pose`."""
+    header = _left(header, given)
+    when = RecognisedColumns() if "time" in given else recognise_time(header)
     counters = {"frame", "seq", "index", "header_seq", "field_header_seq", "frame_id", "header_frame_id", "state"}
     others = [name for name in header if name and name not in (when.time or ()) and _plain(name) not in counters]
     others = [name for name in others if not _plain(name).startswith(("field_header", "header_"))]
     return (others[0] if len(others) == 1 else None), when
+
+
+def _left(header: Sequence[str], given: _Given) -> list[str]:
+    """The columns that mean nothing yet."""
+    taken = {name for names in given.values() for name in names}
+    return [name for name in header if name not in taken]
 
 
 def quaternion_form(names: Sequence[str]) -> str | None:
@@ -251,6 +270,8 @@ def quaternion_form(names: Sequence[str]) -> str | None:
 
 
 def _plain(name: str) -> str:
+    """In small letters, its words joined by _; without what tells columns of one name apart, and `#` for a number."""
+    name = re.sub(r"\s*#\d*$", "", name)
     return re.sub(r"[.\s/:\-]+", "_", name.strip().lower()).strip("%_" if name[:2] != "__" else "")
 
 

@@ -17,10 +17,11 @@ import numpy as np
 
 from neeco.errors import NeecoError
 from neeco.ingest.basefile import same_base
+from neeco.ingest.clock_search import GIVEN, ClockOffset
 from neeco.ingest.formats import VideoSource, format_of
 from neeco.ingest.logs import PoseLog, ReadingLog
 from neeco.ingest.recording import MIN_FRAMES, IngestSettings, InstrumentLogs, Recording
-from neeco.ingest.registration import GIVEN, ClockOffset
+from neeco.ingest.result import Doubt
 from neeco.ingest.sfm import StageProgress
 from neeco.ingest.still import same_place
 from neeco.ingest.synchronized import States, SynchronizedRecording
@@ -62,6 +63,7 @@ class Episodes:
         for part in self.parts:
             part.world_from_base = self.world_from_base
         self._notes: list[str] = []
+        self._doubts: dict[tuple[str, int | None], Doubt] = {}
 
     @property
     def single(self) -> bool:
@@ -83,6 +85,24 @@ class Episodes:
             self.parts[episode or 0].note(note)
         elif note not in self._notes:
             self._notes.append(note)
+
+    @property
+    def doubts(self) -> tuple[Doubt, ...]:
+        """What parts of the recordings contradict each other in."""
+        return tuple(self._doubts.values())
+
+    def is_doubted(self, subject: str) -> bool:
+        """Whether there is a doubt on a subject."""
+        return any(held == subject for held, _ in self._doubts)
+
+    def doubt(self, subject: str, sentence: str, *, severe: bool, episode: int | None = None) -> None:
+        """Set the doubt on a subject, of all of it or of one episode, in place of an earlier one; none where the
+        sentence is empty."""
+        if not sentence:
+            self._doubts.pop((subject, episode), None)
+        else:
+            named = sentence if self.single or episode is None else f"{self.names[episode]}: {sentence}"
+            self._doubts[subject, episode] = Doubt(named, severe)
 
     def episode_of(self, frames: np.ndarray) -> np.ndarray:
         """[N] the episodes that frames [N] are of."""
@@ -168,8 +188,8 @@ class Episodes:
         before = self.clocks.get(name)
         moved = found.seconds - (before.seconds if before is not None else 0.0)
         for part in self.parts:
-            held = part.clocks[name].seconds if name in part.clocks else 0.0
-            part.clocks[name] = replace(found, seconds=held + moved)
+            held = part.clocks.get(name, ClockOffset(0.0, 0.0, GIVEN))
+            part.clocks[name] = replace(held, seconds=held.seconds + moved, sd=found.sd, source=found.source)
 
     @property
     def poses(self) -> dict[str, PoseLog]:
@@ -194,15 +214,14 @@ class Episodes:
         """Logs of one body, or joint, as one on the joint timeline; what reaches into another episode is cut off."""
         if self.single:
             return logs[0]
-        shifts, times, rows = [], [], []
+        inner, times, rows = [], [], []
         for part, log, start in zip(self.parts, logs, self.starts, strict=True):
-            known = part.clocks.get(log.clock)
-            shifts.append(float(start) - (known.seconds if known is not None else 0.0))
+            known = part.clocks.get(log.clock, ClockOffset(0.0, 0.0, GIVEN))
             own = part.times + start
-            moved = log.times + shifts[-1]
+            moved = known.video_times(log.times) + start
             rows.append((moved > own[0] - PAUSE_S / 2) & (moved < own[-1] + PAUSE_S / 2))
             times.append(moved[rows[-1]])
-        inner = [(a + shift, b + shift) for log, shift in zip(logs, shifts, strict=True) for a, b in log.gaps]
+            inner += [tuple(known.video_times(np.array(gap)) + start) for gap in log.gaps]
         joint = np.concatenate(times)
         gaps = {(before, after) for before, after in inner if before >= joint[0] and after <= joint[-1]}
         gaps |= {(float(before[-1]), float(after[0])) for before, after in pairwise(times)}
@@ -226,9 +245,9 @@ class Episodes:
 
         return self._posed(of, times)[0]
 
-    def instrument_poses(self, name: str, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def instrument_poses(self, name: str, times: np.ndarray, lag: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """As `SynchronizedRecording.instrument_poses`, at times [N] of the joint timeline."""
-        return self._posed(lambda part, own: part.instrument_poses(name, own), times)
+        return self._posed(lambda part, own: part.instrument_poses(name, own, lag), times)
 
     def place(self, name: str, times: np.ndarray, poses: np.ndarray) -> None:
         """Take an instrument to be where it was found in the video: poses [N, 4, 4] at times [N] of the joint

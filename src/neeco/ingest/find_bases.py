@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,11 +16,11 @@ from neeco.ingest.base_fit import CLOCK_SD
 from neeco.ingest.base_layers import covered_by, evenly_lit, fit_layers, line_through_trocar
 from neeco.ingest.base_shape import SHIFTS
 from neeco.ingest.basefile import StatedBase
+from neeco.ingest.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, ClockOffset
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.episodes import Episodes
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.recording import InstrumentLogs
-from neeco.ingest.registration import GIVEN, SCOPE_MOTION, ClockOffset
 from neeco.ingest.still import reduced
 
 FRAMES = 140  # looked at, evenly spaced
@@ -137,7 +137,7 @@ def place_bases(
             )
             continue
         if clock.source not in KNOWN:
-            clock = ClockOffset(clock.seconds + registration.clock_s, registration.clock_sd_s, FOUND)
+            clock = replace(clock.later(registration.clock_s), sd=registration.clock_sd_s, source=FOUND)
         placed[arm.item.name] = PlacedBase(registration.world_from_base, clock, registration)
         data.note(describe(arm.item.name, registration))
     return placed
@@ -193,9 +193,9 @@ class _Arm:
 def _arm(data: Episodes, item: InstrumentLogs, seen: _Seen) -> _Arm:
     log, times, stated = data.poses[item.name], seen.times, item.base
     assert stated is not None
-    clock = data.clocks.get(log.clock, ClockOffset(0.0, float("nan"), "assumed equal to the video's"))
+    clock = data.clocks.get(log.clock, ClockOffset(0.0, float("nan"), ASSUMED))
     readings = {
-        joint: readings_at(reading, times + data.clocks.get(reading.clock, clock).seconds)[0]
+        joint: readings_at(reading, data.clocks.get(reading.clock, clock).at(times))[0]
         for joint, reading in data.joints[item.name].items()
     }
     readings = {joint: values for joint, values in readings.items() if np.isfinite(values).all()}
@@ -205,7 +205,7 @@ def _arm(data: Episodes, item: InstrumentLogs, seen: _Seen) -> _Arm:
     states = [{joint: float(values[row]) for joint, values in readings.items()} for row in range(len(times))]
 
     def base_from_shaft(shift: float) -> np.ndarray:
-        poses, _ = poses_at(log, times + clock.seconds + shift)
+        poses, _ = poses_at(log, clock.at(times) + shift)
         if not bends:
             return poses
         assert tree is not None

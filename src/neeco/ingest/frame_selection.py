@@ -9,15 +9,13 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.capture.images import is_repeated
 from neeco.ingest.recording import Splits
 
 NEIGHBOURS = 7  # frames on each side, whose sharpness a frame is compared with
 STILL = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
 STILL_PLACE = 0.06  # the same at one place of a thumbnail
 STILL_MM, STILL_RAD = 0.3, 0.005  # and of the state, within the tracker's noise
-# Levels of 255, mean and largest, by which a picture that is coded again differs at half size: 0.07 and 19 by H.264
-# at its coarsest, 0.4 and 40 or more where a camera or an instrument moves.
-REPEATED_MEAN, REPEATED_MAX = 0.2, 24
 FROZEN_MM, FROZEN_RAD = 1.0, 0.03  # by which a state changes visibly while the picture does not
 MAX_RANGES = 3  # of frames, named in a note
 THUMBNAIL = 64  # px, width
@@ -50,12 +48,6 @@ def frame_features(images: Iterable[np.ndarray]) -> FrameFeatures:
         size = (THUMBNAIL, max(1, round(THUMBNAIL * image.shape[0] / image.shape[1])))
         thumbnails.append(cv2.resize(half, size, interpolation=cv2.INTER_AREA))
     return FrameFeatures(np.array(sharpness), np.array(thumbnails), np.array(repeats))
-
-
-def is_repeated(before: np.ndarray, picture: np.ndarray) -> bool:
-    """Whether a grey picture, uint8 [h, w], is the one before, coded again."""
-    change = cv2.absdiff(before, picture)
-    return bool(change.mean() < REPEATED_MEAN and change.max() < REPEATED_MAX)
 
 
 def frozen_frames(features: FrameFeatures, usable: np.ndarray, states: np.ndarray) -> np.ndarray:

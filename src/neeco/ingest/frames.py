@@ -16,9 +16,8 @@ from neeco.ingest.columns import BASE, CAMERA
 
 CAMERA_FRAMES: dict[str, AxisConvention] = {CAMERA: OPENCV, **CONVENTIONS}  # what `frame` in recording.yaml may say
 FRAMES = (*CAMERA_FRAMES, BASE)
-UNSAID = "nothing says what its poses are stated in"
 _ECM = re.compile(r"(^|[/_.\-])ecm([/_.\-]|$)")
-_BASE = re.compile(r"(^|[/_.\-])(base|world|map|odom|cart|tracker|rcm|remote_center)([/_.\-]|\d|$)")
+_BASE = re.compile(r"(^|[/_.\-])(base|setup|rcm|remote_center|tracker)([/_.\-]|\d|$)")
 _OPTICAL = re.compile(r"(^|[/_.\-])optical([/_.\-]|$)")
 _BODY = re.compile(r"[/_.\-](link|body)$")
 _WORDS = "camera|cam|endoscope|laparoscope|scope|ecm"
@@ -48,7 +47,7 @@ class NamedFrame:
         if self.frame is not None:
             return ""
         *others, last = [f"frame: {name} ({_describe(name)})" for name in self.choices]
-        return f"{self.why}; say so in the recording: {', '.join(others)}, or {last}"
+        return f"{self.why}; say so in the recording, under poses: {', '.join(others)}, or {last}"
 
     @property
     def hints(self) -> tuple[str, ...]:
@@ -81,7 +80,7 @@ def meaning_of(name: str, images: Collection[str] = (), *, dvrk: bool = False) -
         return NamedFrame(CAMERA, f"{name}, the frame of the camera: axes as ROS's images have them ({OPENCV.words})")
     if _OPTICAL.search(plain):
         if own:
-            why = f"{name} is an optical frame, but the images are stated in {', '.join(sorted(images)[:4])}"
+            why = f"{name} is an optical frame, but the images are stated in {printable(', '.join(sorted(images)))}"
             return NamedFrame(None, why, (CAMERA, BASE))
         return NamedFrame(CAMERA, f"{name}, the optical frame of the camera: axes {OPENCV.words}")
     if last == "ecm":
@@ -119,14 +118,17 @@ def meaning_in(names: Sequence[str], *, dvrk: bool = False) -> NamedFrame | None
 
 def without_frame(name: str) -> str:
     """A name without the frame in it: `psm1` of `psm1_in_ecm`."""
+    left = name
     for pattern in (_CAMERA_IN, _BASE_IN):
-        name = pattern.sub(lambda match: "_" if match.end() < len(match.string) else "", name)
-    return name
+        left = pattern.sub(lambda match: "_" if match.end() < len(match.string) else "", left)
+    return name if left == name else left.strip("_") or name
 
 
 def unsaid(*, dvrk: bool = False) -> NamedFrame:
     """The question where nothing names a frame."""
-    return NamedFrame(None, UNSAID, (CAMERA, BASE, *((DVRK_ECM.name,) if dvrk else ())))
+    return NamedFrame(
+        None, "nothing says what its poses are stated in", (CAMERA, BASE, *((DVRK_ECM.name,) if dvrk else ()))
+    )
 
 
 def of_dvrk(*names: str) -> bool:

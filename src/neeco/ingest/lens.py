@@ -10,22 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy import ndimage
 
 from neeco.capture.distortion import opencv_distortion, stated_distortion
 from neeco.capture.documents import Node, RaisingReport, as_float, printable
 from neeco.capture.lens import Border, Lens
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_json, read_text, require_file
+from neeco.files import require_file
+from neeco.ingest.calibrationfile import EXPECTED, CameraNumbers, cameras_in, read_calibration
 from neeco.plausible import size_fault
 from neeco.raster.types import COEFFICIENTS
 
-MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k")
-DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "D", "d")
 FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
 FISHEYE_MODEL = "OPENCV_FISHEYE"
-FISHEYE = ("fisheye", "equidistant", "kannala_brandt", "opencv_fisheye")
 LARGEST = 1e9  # of any of a lens's numbers
 
 # The dark border around a round field of view.
@@ -38,7 +35,8 @@ SHARP = 0.6  # share of the brightness inside the edge that must be gone right o
 
 
 def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
-    """A lens from an OpenCV or ROS calibration (YAML), the fields of a nerfstudio JSON, or (fl_x, fl_y, cx, cy) px.
+    """A lens from a calibration in OpenCV's names (YAML, XML, JSON; of two cameras, the left one's), the fields of a
+    nerfstudio JSON, or (fl_x, fl_y, cx, cy) px.
 
     None: to be estimated. OpenCV's principal point counts from the first pixel's centre, ours from its corner: half a
     pixel is added. A fisheye lens becomes one of OpenCV's rational model. Raises NeecoError naming file, field and
@@ -48,10 +46,11 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
         return None
     if not isinstance(source, Path):
         return checked_lens("intrinsics", [*source], (), None)
-    require_file(source, "a calibration as YAML or JSON")
-    if source.suffix.lower() == ".json":
-        return _nerfstudio(source, read_json(source))
-    return opencv_lens(source, read_opencv_yaml(source))
+    require_file(source, "a calibration as YAML, XML or JSON")
+    document = read_calibration(source)
+    if source.suffix.lower() == ".json" and ("fl_x" in document or not cameras_in(source, document)):
+        return _nerfstudio(source, document)
+    return opencv_lens(source, document)
 
 
 def _nerfstudio(path: Path, document: Any) -> Lens:
@@ -76,20 +75,20 @@ def _nerfstudio(path: Path, document: Any) -> Lens:
 
 
 def opencv_lens(where: Path | str, document: Any) -> Lens:
-    """From `camera_matrix`, `distortion_coefficients`, `image_width`, `image_height`, as OpenCV's samples and ROS's
-    camera_calibration write them, or K, D, width and height of a camera_info; `where` begins messages. Raises
+    """From what a calibration says of its camera, or of the left one of two; `where` begins messages. Raises
     NeecoError."""
-    if not isinstance(document, dict):
-        raise NeecoError(f"{where}: expected camera_matrix and distortion_coefficients, as OpenCV writes them")
-    matrix = matrix_numbers(where, first_of(document, MATRIX_NAMES), "camera_matrix")
-    if len(matrix) != 9:
-        raise NeecoError(f"{where}: camera_matrix: needs 9 numbers, has {len(matrix)}; write it as OpenCV does")
-    found = first_of(document, DISTORTION_NAMES)
-    sides = [(f"image_{side}", f"image_{side.title()}", side) for side in ("width", "height")]
-    size = image_size(where, *(first_of(document, names) for names in sides))
-    values = [matrix[0], matrix[4], matrix[2] + 0.5, matrix[5] + 0.5]
-    distortion = matrix_numbers(where, [] if found is None else found, "distortion_coefficients")
-    return checked_lens(where, values, distortion, size, fisheye=_is_fisheye(document, "distortion_model"))
+    cameras = cameras_in(where, document)
+    if not cameras:
+        given = isinstance(document, dict)
+        raise NeecoError(f"{where}: {'camera_matrix: missing' if given else 'no keys'}; expected {EXPECTED}")
+    return lens_of(where, cameras[0])
+
+
+def lens_of(where: Path | str, camera: CameraNumbers) -> Lens:
+    """The lens of one camera of a calibration. Raises NeecoError."""
+    fx, fy, cx, cy = camera.intrinsics
+    size = image_size(where, *camera.size)
+    return checked_lens(where, [fx, fy, cx + 0.5, cy + 0.5], camera.distortion, size, fisheye=camera.fisheye)
 
 
 def checked_lens(
@@ -123,14 +122,10 @@ def image_size(path: Path | str, width: Any, height: Any) -> tuple[int, int] | N
     """(width, height) px; None where one is not given. Raises NeecoError."""
     if width is None or height is None:
         return None
-    sides = [as_float(value) for value in (width, height)]
-    if None in sides or size_fault(*sides) is not None:
+    sides = [number for value in (width, height) if (number := as_float(value)) is not None]
+    if len(sides) < 2 or size_fault(*sides) is not None:
         raise NeecoError(f"{path}: image size: {printable(width)} x {printable(height)} is not one; correct it")
     return int(width), int(height)
-
-
-def _is_fisheye(document: dict[Any, Any], field: str) -> bool:
-    return str(document.get(field, "")).lower() in FISHEYE
 
 
 def _rational(
@@ -147,51 +142,6 @@ def _rational(
         return opencv_distortion(FISHEYE_MODEL, coefficients, (fl_x, fl_y, cx, cy), size)
     except NeecoError as error:
         raise NeecoError(f"{source}: distortion: {error}") from None
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML with OpenCV's matrices."""
-
-
-for _tag in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(
-        f"tag:yaml.org,2002:{_tag}",
-        lambda loader, node: loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None,
-    )
-
-
-def read_opencv_yaml(path: Path) -> Any:
-    """What a calibration holds, by PyYAML, which unlike cv2.FileStorage reads ROS's files and plain lists, and names a
-    bad line."""
-    text = read_text(path, "OpenCV's calibration as YAML")
-    if text.lstrip().startswith("<"):
-        raise NeecoError(f"{path}: is XML; save the calibration as YAML (name it .yaml in OpenCV's FileStorage)")
-    # `%YAML:1.0` is OpenCV's own spelling, which YAML itself does not allow
-    lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
-    return parse_yaml(path, "\n".join(lines), "save the calibration again", _Loader)
-
-
-def first_of(document: dict[Any, Any], names: Sequence[str]) -> Any:
-    """What the first of these names holds; None where there is none."""
-    return next((document[name] for name in names if document.get(name) is not None), None)
-
-
-def matrix_numbers(path: Path | str, value: Any, field: str) -> list[float]:
-    """The numbers of a matrix in row order, from OpenCV's or ROS's {rows, cols, data} or from (nested) lists."""
-    if isinstance(value, dict):
-        value = value.get("data")
-    if value is None:
-        raise NeecoError(f"{path}: {field}: missing; expected it as OpenCV writes it")
-    if not isinstance(value, list):
-        raise NeecoError(f"{path}: {field}: expected numbers, found {printable(value)}; write it as OpenCV does")
-    flat: list[float] = []
-    for item in value:
-        for entry in item if isinstance(item, list) else [item]:
-            number = as_float(entry)
-            if number is None:
-                raise NeecoError(f"{path}: {field}: {printable(entry)} is not a usable number; write it as OpenCV does")
-            flat.append(number)
-    return flat
 
 
 def find_border(images: Iterable[np.ndarray]) -> Border | None:

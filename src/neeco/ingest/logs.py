@@ -29,6 +29,8 @@ WRONG_ROWS = 0.05  # share of rows that may be wrong (not missing) before the fi
 _FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)
 _FRAME_COLUMN = re.compile(r"(?!.*child)(.*[._/])?(reference[._ ]?)?frame([._ ]?id)?")
 LISTED_STATES = 8  # states that drop rows and are named in the notes
+MAX_SAME_TIME = 0.5  # share of rows at the time of another: more, and times are too coarse
+STUCK_S, STUCK_SAMPLES = 0.5, 10  # that a tracker's noise never leaves a pose unchanged for
 GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
 FARTHEST_MM = 20_000.0  # no tracker of instruments sees that far: the unit is wrong
 TWO_TURNS = 4 * np.pi  # rad, more than any joint turns: the unit is wrong
@@ -109,14 +111,18 @@ class Rows:
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
     table = tool_columns(read_table(source.path, source.stream), source)
-    found = named.recognise_pose(table.header)
+    given = _given(table, time=source.time, position=source.position, rotation=source.rotation)
+    found = named.recognise_pose(table.header, given)
     table = with_named_frame(table, (*(source.position or found.position or ()), *(source.rotation or ())))
     frame = _frame_of(table, source)
     rows = Rows(table)
     _keep_measured(rows, source, found.state)
     times = _times(rows, source, found)
     positions, quats = _poses(rows, source, found)
+    _drop_stuck(rows, times, np.column_stack([positions, quats]))
     times, order = _in_order(rows, times)
+    if np.ptp(quats[order], axis=0).max() == 0 and np.ptp(positions[order], axis=0).max() > 0:
+        rows.repairs.append("its rotation never changes: does it hold positions alone?")
     quats, flips = continuous(quats[order])
     if flips:
         rows.repairs.append(f"the quaternion's sign flipped {flips} times; undone")
@@ -191,8 +197,9 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     """Read a joint sensor's log, through its calibration table when there is one. Raises NeecoError naming file,
     row or column, and remedy."""
     table = read_table(source.path, source.stream)
-    value, found = named.recognise_value(table.header)
-    value = source.value or value
+    given = _given(table, time=source.time, value=None if source.value is None else (source.value,))
+    recognised, found = named.recognise_value(table.header, given)
+    value = source.value or recognised
     if value is None:
         raise NeecoError(f"{source.path}: header: which column is the joint's reading? Name it as columns.value")
     rows = Rows(table)
@@ -213,6 +220,21 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     return ReadingLog(table.path, source.clock, times, values[order], gaps, notes, table.image_hz)
 
 
+def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:
+    """The columns that a recording names, by meaning, as the file spells them. Raises NeecoError for one that is not
+    there, or is named for two things."""
+    given = {
+        meaning: tuple(table.header[column_index(table, name)] for name in names)
+        for meaning, names in columns.items()
+        if names is not None
+    }
+    names = [name for group in given.values() for name in group]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise NeecoError(f"{table.where}: columns: {twice} is named for two things; name a column for each")
+    return given
+
+
 def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
     """Positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
     table = rows.table
@@ -224,7 +246,8 @@ def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[n
         raise _unclear(table, found, "position", "x, y, z columns")
     else:
         read = (*position, *rotation)
-    implied = (found if position == found.position else named.recognise_pose((*position, *rotation))).length_unit
+    known = (found, named.recognise_pose(table.header), named.recognise_pose((*position, *rotation)))
+    implied = next((kind.length_unit for kind in known if kind.position == position), None)
     scale = named.scale_of(table.where, position, "length", source.units.length, implied, "")
     angle = 1.0
     if form in (EULER, ROTATION_VECTOR):
@@ -310,15 +333,25 @@ def _keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
 
 def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColumns) -> np.ndarray:
     """Times [R] in s; rows without one are dropped."""
-    table, names = rows.table, source.time or found.time
+    table, names, rate = rows.table, source.time or found.time, source.rate_hz
+    if names is None and rate is not None:
+        return np.arange(len(table.rows)) / rate
     if names is None:
-        raise NeecoError(f"{table.where}: header: no column of times found; name it as columns.time (or add t_s)")
+        raise NeecoError(
+            f"{table.where}: header: no column of times found; name it as columns.time (or add t_s), or say rate_hz "
+            "where its rows come at a fixed rate"
+        )
     cells = _cells(rows, names)
     known = named.recognise_time(names)
+    if rate is not None and (len(names) == 2 or known.time_unit or named.split_unit(names[0], "time")[1]):
+        raise NeecoError(
+            f"{table.where}: rate_hz: {', '.join(names)} holds times and counts no frames; leave rate_hz out, or name "
+            "the column that counts as columns.time"
+        )
     if len(names) == 2:
         return cells[:, 0] + cells[:, 1] * 1e-9
-    if source.rate_hz is not None:
-        return cells[:, 0] / source.rate_hz
+    if rate is not None:
+        return cells[:, 0] / rate
     if known.counts_frames:
         raise NeecoError(
             f"{table.where}: {names[0]}: counts frames, and nothing says how many a second; say rate_hz in the "
@@ -390,12 +423,38 @@ def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.n
     return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
 
 
+def _drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
+    """Drop the rows of a tracker that repeats its last pose [R, 7] after it lost its tool: exactly the same pose for
+    long, and a jump at an end. What comes to rest slows down before."""
+    used = np.flatnonzero(rows.keep)
+    if len(used) < MIN_SAMPLES:
+        return
+    steps = np.linalg.norm(np.diff(poses[used, :3], axis=0), axis=1)
+    same = np.concatenate([[False], (np.diff(poses[used], axis=0) == 0).all(axis=1), [False]])
+    edges = np.diff(same.astype(int))
+    moving = steps[steps > 0]
+    if not len(moving):
+        return
+    for first, last in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+        # the pose of row `first` is repeated until `last`
+        around = [steps[first - 1]] if first > 0 else []
+        around += [steps[last]] if last < len(steps) else []
+        lasted = times[used[last]] - times[used[first]]
+        if last - first >= STUCK_SAMPLES and lasted > STUCK_S and max(around, default=0.0) > np.median(moving):
+            rows.drop(used[first + 1 : last + 1], "the pose of the row before, repeated (a tracker that lost its tool)")
+
+
 def _in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left."""
     table, usable = rows.table, np.flatnonzero(rows.keep)
     order = usable[np.argsort(times[usable], kind="stable")]
     late = usable[1:][times[usable][1:] < np.maximum.accumulate(times[usable])[:-1]]
     doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
+    if doubled.sum() > max(MIN_SAMPLES, MAX_SAME_TIME * len(order)):
+        raise NeecoError(
+            f"{table.where}: {count_rows(int(doubled.sum()))} of {len(order)} have the time of another; its times are "
+            "too coarse, or of several tools: name a finer column as columns.time"
+        )
     rows.drop(np.sort(order[doubled]), "a second row at one time")
     order = order[~doubled]
     if len(order) < MIN_SAMPLES:

@@ -29,10 +29,18 @@ BLEEDING = 2  # places by which flow bleeds over the border of the field of view
 PATCH = 0.04  # of the image: about what an instrument's front takes
 CELLS = 48  # of the carving grid, per side
 REACH = 0.4  # of the distance to the camera: half a side of that grid
+MIN_AGREEMENT = 0.3  # of the frames, in which a point of the instrument lies on moving pixels
+LAG_CELLS, LAG_STEP = 16, 0.1  # of the grid for lags, per side; s between the lags that are tried
+LONGEST_LAG = 60.0  # s
+MIN_KNOWN = 0.5  # of the frames that need a pose at a lag
+LAG_GAIN = 1.1  # by how much more agreement a lag is clear
+LAG_TOP, LAG_LOBE = 0.95, 0.5  # of the best agreement, and s about its lag: what the lag is the mean of
 COVERED = 0.85  # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
 MARGIN = 6  # px about its projection
 NEAREST = 1e-3  # mm; what is less deep is not in front of the camera
 TINY = 1e-9  # depth in SfM's unit that may be divided by
+
+PosesAt = Callable[[float], tuple[np.ndarray, np.ndarray]]  # lag s -> poses [N, 4, 4] mm, bool [N] where known
 
 
 @dataclass(frozen=True)
@@ -147,10 +155,45 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
     evidence [R, h, w] from `ResidualFlow.moving_pixels` (NaN: not seen), camera_from_instrument [R, 4, 4] mm. None when
     no point stands out: the instrument hardly moves, or its poses do not fit the cameras.
     """
+    grid, spacing, share, enough = _agreement(evidence, camera_from_instrument, pinhole, CELLS)
+    best = float(np.quantile(share[enough], 0.999)) if enough.any() else 0.0
+    background = float(np.nanmean(evidence)) if not np.isnan(evidence).all() else 0.0
+    if best < 2 * background or best < MIN_AGREEMENT:
+        return None
+    belongs = share > max(COVERED * best, 2 * background)
+    return RoughShape(grid[belongs], spacing, best) if belongs.any() else None
+
+
+def best_lag(evidence: np.ndarray, poses_at: PosesAt, pinhole: Lens, longest: float) -> float:
+    """Lag s within +-longest (at most LONGEST_LAG) at which poses explain what moves clearly better than at 0, else 0.
+
+    evidence [R, h, w] as for `carve_shape`; poses_at(lag): camera_from_instrument [R, 4, 4] mm that the log has `lag` s
+    later than its clock says, and bool [R] where it has one.
+    """
+    count = int(min(longest, LONGEST_LAG) / LAG_STEP)
+    lags = LAG_STEP * np.arange(-count, count + 1)
+    scores = np.zeros(len(lags))
+    for index, lag in enumerate(lags):
+        poses, known = poses_at(float(lag))
+        if known.sum() >= MIN_KNOWN * len(evidence):
+            _, _, share, enough = _agreement(evidence[known], poses[known], pinhole, LAG_CELLS)
+            scores[index] = np.quantile(share[enough], 0.99) if enough.any() else 0.0
+    best = float(scores.max())
+    if best < MIN_AGREEMENT or best < LAG_GAIN * scores[count]:
+        return 0.0
+    weights = np.clip(scores - LAG_TOP * best, 0, None) * (np.abs(lags - lags[scores.argmax()]) < LAG_LOBE)
+    return float((weights * lags).sum() / weights.sum())
+
+
+def _agreement(
+    evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens, cells: int
+) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+    """A grid [G, 3] mm about the tracked frame, its spacing mm, the share [G] of the frames in which each of its points
+    lies on moving pixels, and where [G] enough frames have it in view."""
     distance = float(np.median(camera_from_instrument[:, 2, 3])) if len(evidence) else 0.0
     if distance <= 0:
-        return None
-    axis = np.linspace(-REACH, REACH, CELLS) * distance
+        return np.zeros((0, 3)), 0.0, np.zeros(0), np.zeros(0, dtype=bool)
+    axis = np.linspace(-REACH, REACH, cells) * distance
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)  # [G, 3]
     total, seen = np.zeros(len(grid)), np.zeros(len(grid))
     for pixels, pose in zip(evidence, camera_from_instrument, strict=True):
@@ -160,12 +203,7 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
         seen += inside
     enough = seen > 0.3 * len(evidence)
     share = np.where(enough, total / np.maximum(seen, 1), 0.0)
-    background = float(np.nanmean(evidence)) if not np.isnan(evidence).all() else 0.0
-    best = float(np.quantile(share[enough], 0.999)) if enough.any() else 0.0
-    if best < 2 * background or best < 0.3:
-        return None
-    belongs = share > max(COVERED * best, 2 * background)
-    return RoughShape(grid[belongs], float(axis[1] - axis[0]), best) if belongs.any() else None
+    return grid, float(axis[1] - axis[0]), share, enough
 
 
 def project_mask(shape: RoughShape, camera_from_instrument: np.ndarray, camera: Camera) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Exports of NDI's trackers: the columns of every tool, each followed by those of its markers, beside each other."""
+"""Exports of trackers that hold the columns of several bodies beside each other: NDI's tools, each followed by its
+markers, and the rigid bodies that a format tells of."""
 
 from __future__ import annotations
 
@@ -37,12 +38,10 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
     Raises NeecoError where there are several tools and none is named, or columns are named that are not all one tool's:
     the second `Tx` is the first tool's first marker.
     """
-    tools = [] if isinstance(table.rows, np.ndarray) else _tools(table)
+    tools = _tools(table)
     if not tools:
         if source.tool is not None:
-            raise NeecoError(
-                f"{table.path}: tool: there are no columns of tools, which begin with a Port; leave it out"
-            )
+            raise NeecoError(f"{table.path}: tool: there are no columns of tools or rigid bodies; leave it out")
         return table
     listed = ", ".join(tool.title for tool in tools)
     if source.tool is None and (source.position or source.rotation):
@@ -57,18 +56,21 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
             f"holds {len(tools)} tools" if wanted is None else f"{len(chosen)} tools go by {printable(source.tool)}"
         )
         raise NeecoError(f"{table.path}: {problem}; say which as `tool` in the recording: {listed}")
+    table = replace(table, stream=chosen[0].name or chosen[0].port or None)  # which messages and notes name
     first = min(tool.columns[0] for tool in tools)
     columns = [*range(first), *chosen[0].columns]
     header = tuple(_NUMBERED.sub("", table.header[index]) for index in columns)
+    if isinstance(table.rows, np.ndarray):
+        return replace(table, header=header, rows=table.rows[:, columns])
     rows = [[cells[index] if index < len(cells) else "" for index in columns] for cells in table.rows]
     return replace(table, header=header, rows=rows)
 
 
 def tool_names(table: Table) -> tuple[str, ...]:
     """What a recording may call each tool of an export of several, by name or serial number, else by port; () for other
-    tables."""
+    tables, and for one tool without a name."""
     tools = _tools(table)
-    if len(tools) < 2:
+    if len(tools) < 2 and not table.bodies:
         return ()
     shared = Counter(name for tool in tools for name in tool.names)
     return tuple(
@@ -78,6 +80,11 @@ def tool_names(table: Table) -> tuple[str, ...]:
 
 
 def _tools(table: Table) -> list[_Tool]:
+    if table.bodies or isinstance(table.rows, np.ndarray):
+        return [
+            _Tool(body.columns, printable(body.name), "", body.name, frozenset([_canonical(body.name)]))
+            for body in table.bodies
+        ]
     plain = [_NUMBERED.sub("", name).strip() for name in table.header]
     starts = [index for index, name in enumerate(plain) if _PORT.match(name)]
     found = []

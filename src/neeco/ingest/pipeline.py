@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +25,14 @@ from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.base import BaseRegistration
 from neeco.ingest.chosen_images import ChosenImages
-from neeco.ingest.clocks import find_instrument_clocks, register, unknown_clocks
+from neeco.ingest.clocks import doubt_frame_rates, find_instrument_clocks, open_clocks, register
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.convert import staged
 from neeco.ingest.episodes import Episodes, separate
 from neeco.ingest.find_bases import refuse_frames, require_no_base, take_bases
 from neeco.ingest.frame_selection import LEFT_OUT
 from neeco.ingest.from_video import FoundShaft
-from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
+from neeco.ingest.motion import ResidualFlow, RoughShape, best_lag, carve_shape, observations_on
 from neeco.ingest.passing import passing_masks
 from neeco.ingest.posing.posed_capture import prepare
 from neeco.ingest.recording import STILL, Recording
@@ -198,12 +199,15 @@ class WorldIngest:
             masks = moving_masks(self.images.load, len(self.selected), cameras.indices, visible)
             self._find_in_video(cameras, cameras.world_from_camera, masks, None)
         names = [*data.world_from_base, *([self.in_video.name] if self.in_video else [])]
-        tracked = {name: data.instrument_poses(name, self._times(cameras)) for name in names}
+        tracked = {name: partial(data.instrument_poses, name, self._times(cameras)) for name in names}
         found = look_behind(
-            self.images.load, len(self.selected), pinhole, visible, tracked, self.settings, right, self.progress
-        )
+            self.images.load, len(self.selected), pinhole, visible, tracked, self._longest_lag(), self.settings, right,
+            self.progress,
+        )  # fmt: skip
         for note in found.notes:
             data.note(note)
+        for name, lag in found.lags.items():
+            self._doubt_motion(name, name in found.shapes, lag)
         placed = replace(cameras, points=found.points, colors=found.colors, errors=np.zeros(len(found.points)))
         placed = replace(placed, lengths=np.full(len(found.points), len(self.selected)))
         states, usable = data.states_at(self._times(placed))
@@ -314,8 +318,8 @@ class WorldIngest:
         return ResidualFlow(load, sfm, self._times(sfm), pinhole, self.images.field_of_view(), episodes)
 
     def _find_instrument_clocks(self, sfm: SfmResult, pinhole: Lens) -> None:
-        """Clocks that neither `sync` nor the scope gave: from how the instruments move in the images."""
-        if unknown_clocks(self.data):
+        """Clocks that the scope did not give, from how the instruments move in the images."""
+        if open_clocks(self.data):
             self.progress("finding the instrument's clock", 0, 0)
             flow, frames = self._residual_flow(sfm, pinhole), self.selected[sfm.indices]
             find_instrument_clocks(self.data, flow, self._times(sfm), frames)
@@ -339,10 +343,14 @@ class WorldIngest:
             camera_from_instrument = np.linalg.inv(cameras) @ np.where(valid[:, None, None], poses, np.eye(4))
             usable = valid[rows]
             shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], flow.pinhole)
+
+            def before_cameras(lag: float, of: str = name) -> tuple[np.ndarray, np.ndarray]:
+                poses, known = self.data.instrument_poses(of, self._times(sfm)[rows], lag)
+                return np.linalg.inv(cameras[rows]) @ np.where(known[:, None, None], poses, np.eye(4)), known
+
+            lag = best_lag(evidence, before_cameras, flow.pinhole, self._longest_lag())
+            self._doubt_motion(name, shape is not None, lag)
             if shape is None:
-                self.data.note(
-                    f"instrument {name!r}: nothing in the images moves with its tracked pose; check its log and clock"
-                )
                 continue
             shapes[name] = shape
             for row in np.flatnonzero(valid):
@@ -351,6 +359,25 @@ class WorldIngest:
                 )
         return on_instruments, shapes
 
+    def _longest_lag(self) -> float:
+        """s by which the poses of a log may be off its clock: what is longer leaves half of the frames none."""
+        return float(max(np.ptp(part.times) for part in self.data.parts)) / 2
+
+    def _doubt_motion(self, name: str, moves: bool, lag: float) -> None:
+        """Doubt an instrument whose poses nothing in the images moves with, or moves with at another time."""
+        clock, sentence = self.data.poses[name].clock if name in self.data.poses else "", ""
+        if lag and not self.data.is_doubted(f"sync {clock}"):
+            after = "later" if lag > 0 else "earlier"
+            sentence = (
+                f"what moves in the images fits the poses of {name} that its log has {abs(lag):.1f} s {after}: is its "
+                f"clock {clock!r} that of the other logs? Give it one of its own (poses: clock), or correct `sync`"
+            )
+        elif lag or not moves:
+            sentence = (
+                f"nothing in the images moves with the tracked pose of {name}: check its log, its frame and its clock"
+            )
+        self.data.doubt(f"motion of {name}", sentence, severe=True)
+
     def finish(
         self, output: Path, placed: Placed, everywhere: dict[str, dict[str, np.ndarray]] | None = None
     ) -> tuple[Capture, IngestResult]:
@@ -358,6 +385,7 @@ class WorldIngest:
         by instrument and joint, where there are several."""
         data, sfm, registration, tissue = self.data, placed.sfm, placed.registration, placed.tissue
         states, usable = placed.states, placed.usable
+        doubt_frame_rates(data)
         for index in set(range(len(self.selected))) - set(sfm.indices.tolist()):
             self.dropped[int(self.selected[index])] = "no camera: too few of its features match other frames"
         frames, times = self.selected[sfm.indices], self._times(sfm)
@@ -424,6 +452,7 @@ class WorldIngest:
             data.ranges,
             () if self.in_video is None else (self.in_video.name,),
             dict(zip(data.ranges, data.starts.tolist(), strict=False)),
+            data.doubts,
         )
         return capture, result
 

@@ -145,6 +145,8 @@ class Recording:
             return read_stereo(self.stereo.calibration)[0], str(self.stereo.calibration)
         if self.intrinsics is None and self.video is not None and (known := format_of(self.video)) is not None:
             return known.lens(self.video, self.stream), str(self.video)
+        if isinstance(self.intrinsics, Path) and self.intrinsics.suffix.lower() == ".ini":  # which two cameras share
+            return read_stereo(self.intrinsics)[0], str(self.intrinsics)
         where = str(self.intrinsics) if isinstance(self.intrinsics, Path) else f"{self.path}: intrinsics"
         try:
             return read_lens(self.intrinsics), where

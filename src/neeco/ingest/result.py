@@ -9,8 +9,17 @@ from typing import Any
 import numpy as np
 
 from neeco.ingest.base import BaseRegistration
+from neeco.ingest.clock_search import ClockOffset
 from neeco.ingest.motion import RoughShape
-from neeco.ingest.registration import ClockOffset, Registration
+from neeco.ingest.registration import Registration
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A reason not to trust an ingest, one sentence. severe: the capture is likely to be wrong."""
+
+    sentence: str
+    severe: bool
 
 
 @dataclass(frozen=True)
@@ -46,6 +55,7 @@ class IngestResult:
     in_video: tuple[str, ...] = ()  # instruments that nothing tracked, found in the images
     # s of the capture's time at which each of several recordings has its own 0
     episode_starts: dict[str, float] = field(default_factory=dict)
+    doubts: tuple[Doubt, ...] = ()  # that parts of the recording contradict each other
 
     @property
     def still(self) -> bool:
@@ -62,9 +72,13 @@ class IngestResult:
         recordings, those of the frame's own."""
         name = self._episode_of(frame)
         if name is None:
-            return {clock: seconds + ahead.seconds for clock, ahead in self.clocks.items()}
+            return {clock: float(ahead.at(np.array(seconds))) for clock, ahead in self.clocks.items()}
         own = seconds - self.episode_starts[name]
-        return {clock: own + ahead.seconds for clock, ahead in self.clocks.items() if clock.endswith(f" of {name}")}
+        return {
+            clock: float(ahead.at(np.array(own)))
+            for clock, ahead in self.clocks.items()
+            if clock.endswith(f" of {name}")
+        }
 
     def _episode_of(self, frame: int) -> str | None:
         """The name of the one of several recordings that a video frame is of."""
@@ -76,6 +90,8 @@ class IngestResult:
             name: {
                 "offset_s": clock.seconds,
                 "sd_s": clock.sd if np.isfinite(clock.sd) else None,  # nobody knows
+                "rate": clock.rate,
+                "rate_sd": clock.rate_sd,
                 "source": clock.source,
             }
             for name, clock in self.clocks.items()

@@ -12,6 +12,7 @@ import yaml
 
 from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.errors import NeecoError
+from neeco.files import YamlLoader
 
 LARGEST = 1e12  # number that any key may hold: more is a slip, and overflows what is computed of it
 
@@ -108,7 +109,7 @@ def close_match(name: str, names: Iterable[str]) -> str | None:
     return next(iter(difflib.get_close_matches(name, list(names), n=1, cutoff=0.6)), None)
 
 
-class RecordingLoader(yaml.SafeLoader):
+class RecordingLoader(YamlLoader):
     """YAML in which a key given twice is an error: the first would be lost without a word."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:

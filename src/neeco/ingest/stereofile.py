@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import configparser
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +14,19 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.documents import printable
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.files import read_json, read_text, require_file, visible_entries
-from neeco.ingest.lens import checked_lens, first_of, image_size, matrix_numbers, opencv_lens, read_opencv_yaml
+from neeco.files import read_text, require_file, visible_entries
+from neeco.ingest.calibrationfile import CameraNumbers, cameras_in, first_of, matrix_numbers, read_calibration, word
+from neeco.ingest.lens import checked_lens, image_size, lens_of
 from neeco.raster.rotations import rotation_error
 from neeco.raster.types import COEFFICIENTS
 
-# names of the left and right camera matrix, and of their distortion
-MATRICES = (
-    ("M1", "M2"), ("KL", "KR"), ("K0", "K1"), ("K1", "K2"), ("K_left", "K_right"), ("K_l", "K_r"),
-    ("cameraMatrix1", "cameraMatrix2"), ("camera_matrix_1", "camera_matrix_2"), ("camera_matrix1", "camera_matrix2"),
-    ("camera_matrix_left", "camera_matrix_right"), ("left_camera_matrix", "right_camera_matrix"),
-)  # fmt: skip
-DISTORTIONS = (
-    ("D1", "D2"), ("DL", "DR"), ("D0", "D1"), ("D_left", "D_right"), ("D_l", "D_r"),
-    ("distCoeffs1", "distCoeffs2"), ("dist_coeffs_1", "dist_coeffs_2"), ("dist_coeffs1", "dist_coeffs2"),
-    ("dist_coeffs_left", "dist_coeffs_right"), ("left_dist_coeffs", "right_dist_coeffs"),
-    ("distortion_coefficients_left", "distortion_coefficients_right"),
-)  # fmt: skip
-EXPECTED = "OpenCV's stereo YAML (M1, D1, M2, D2, R, T), a StereoCalibration.ini, or left.yaml and right.yaml of ROS"
+EXPECTED = (
+    "OpenCV's stereo YAML (M1, D1, M2, D2, R, T), a camchain of Kalibr, settings of ORB-SLAM, a StereoCalibration.ini, "
+    "or left.yaml and right.yaml of ROS"
+)
+_TURNS, _SHIFTS = ("r", "rotation", "rotationmatrix"), ("t", "translation", "translationvector", "tvec")
+_RECTIFICATION, _PROJECTION = ("rectificationmatrix", "r"), ("projectionmatrix", "p")
+_RIGHT_FROM_LEFT, _LEFT_FROM_RIGHT = ("tcncnm1",), ("stereotc1c2", "tc1c2")  # 4x4: of Kalibr, of ORB-SLAM
 METRES = (5e-4, 0.2)  # how far apart the cameras of a stereo scope or rig are
 MILLIMETRES = (1.0, 200.0)
 WIDEST_TURN = math.radians(30)  # of one camera against the other
@@ -42,19 +37,20 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
     """The left lens, the right lens, and right_from_left [4, 4] mm, which maps points of the left camera's frame to the
     right one's (OpenCV axes).
 
-    Read are OpenCV's stereo YAML (`M1 D1 M2 D2 R T`, or `K1 ...`; R and T may stand in `extrinsics.yml` beside
-    `intrinsics.yml`), ROS's camera_info of two cameras (a folder with a left and a right file, or the left file, the
-    right one beside it), the da Vinci's `.ini` ([StereoLeft], [StereoRight]) and JSON (`intrinsics`, `extrinsics`, or
-    `KL DL KR DR R T`). T is in mm or m: which, its length says, and is refused where both could be. Raises NeecoError
-    naming file, field and remedy.
+    Read are OpenCV's stereo YAML or XML (`M1 D1 M2 D2 R T`, or `K1 ...`; R and T may stand in `extrinsics.yml` beside
+    `intrinsics.yml`), Kalibr's camchain, settings of ORB-SLAM (`LEFT.K ...`, `Camera1.fx ...`), ROS's camera_info of
+    two cameras (a folder with a left and a right file, or the left file, the right one beside it), the da Vinci's
+    `.ini` ([StereoLeft], [StereoRight]) and JSON (`intrinsics`, `extrinsics`, or `KL DL KR DR R T`). T is in mm or m:
+    which, its length says, and is refused where both could be. Raises NeecoError naming file, field and remedy.
     """
     path = Path(path)
     if path.is_dir():
-        return _camera_infos(*_pair_of_files(path))
+        left, right = _pair_of_files(path)
+        return _rectified((left, _one_camera(left)), (right, _one_camera(right)))
     require_file(path, EXPECTED)
     if path.suffix.lower() == ".ini":
         return _ini(path)
-    document = read_json(path) if path.suffix.lower() == ".json" else read_opencv_yaml(path)
+    document = read_calibration(path)
     if not isinstance(document, dict):
         raise NeecoError(f"{path}: holds no keys; expected {EXPECTED}")
     for key in ("data", "camera-calibration"):
@@ -62,37 +58,43 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
             document = document[key]
     if "intrinsics" in document and "extrinsics" in document:
         return _two_intrinsics(path, document)
-    if _names_in(document, MATRICES) is not None:
-        return _matrices(path, document)
-    if any(key in document for key in ("projection_matrix", "P", "p")):
-        return _camera_infos(path, _right_beside(path))
+    cameras = cameras_in(path, document)
+    if len(cameras) == 2:
+        return _two_cameras(path, document, *cameras)
+    if cameras and first_of(cameras[0].keys, _PROJECTION) is not None:
+        right = _right_beside(path)
+        return _rectified((path, cameras[0]), (right, _one_camera(right)))
     raise NeecoError(f"{path}: camera matrices: not there for two cameras; expected {EXPECTED}")
 
 
-def _matrices(path: Path, document: dict[Any, Any]) -> tuple[Lens, Lens, np.ndarray]:
-    """From `M1 D1 M2 D2 R T` and the like."""
-    names = _names_in(document, MATRICES)
-    assert names is not None
-    distortions = _names_in(document, DISTORTIONS)
-    if distortions is None:
-        raise NeecoError(f"{path}: distortion: not there for two cameras; give D1 and D2, zeros where there is none")
-    left, right = [
-        _lens(path, _matrix(path, document, matrix), matrix_numbers(path, document[distortion], distortion), document)
-        for matrix, distortion in zip(names, distortions, strict=True)
+def _two_cameras(
+    path: Path, document: dict[Any, Any], left: CameraNumbers, right: CameraNumbers
+) -> tuple[Lens, Lens, np.ndarray]:
+    """From what one file says of both, and of how the right one stands."""
+    lenses = [
+        _lens(path, camera.intrinsics, camera.distortion, camera.size, camera.fisheye) for camera in (left, right)
     ]
-    source = path
-    if "R" not in document and path.stem.lower().startswith("intrinsics"):
+    keys = {word(str(name)): value for name, value in document.items()}
+    of_pair = {**right.keys, **keys}
+    for names, turned_back in ((_RIGHT_FROM_LEFT, False), (_LEFT_FROM_RIGHT, True)):
+        if first_of(of_pair, names) is not None:
+            matrix = _numbers(path, of_pair, names, 16).reshape(4, 4)
+            matrix = np.linalg.inv(matrix) if turned_back and np.linalg.det(matrix) else matrix
+            return (lenses[0], lenses[1], _pose(path, matrix[:3, :3].ravel(), matrix[:3, 3]))
+    source, turn, shift = path, first_of(keys, _TURNS), first_of(keys, _SHIFTS)
+    if turn is None and first_of(right.keys, _PROJECTION) is not None:
+        return _rectified((path, left), (path, right))
+    if turn is None and path.stem.lower().startswith("intrinsics"):
         source = path.with_name("ex" + path.name[2:])
         if not source.is_file():
             raise NeecoError(f"{path}: R: missing; put {source.name}, which OpenCV writes with it, beside it")
-        document = read_opencv_yaml(source)
-    if not isinstance(document, dict) or not {"R", "T"} <= set(document):
+        found = read_calibration(source)
+        keys = {word(str(name)): value for name, value in found.items()} if isinstance(found, dict) else {}
+        turn, shift = first_of(keys, _TURNS), first_of(keys, _SHIFTS)
+    if turn is None or shift is None:
         raise NeecoError(f"{source}: R, T: missing; give the right camera's rotation and translation, as OpenCV does")
-    return (
-        left,
-        right,
-        _pose(source, matrix_numbers(source, document["R"], "R"), matrix_numbers(source, document["T"], "T")),
-    )
+    pose = _pose(source, matrix_numbers(source, turn, "R"), matrix_numbers(source, shift, "T"))
+    return (lenses[0], lenses[1], pose)
 
 
 def _two_intrinsics(path: Path, document: dict[Any, Any]) -> tuple[Lens, Lens, np.ndarray]:
@@ -108,7 +110,7 @@ def _two_intrinsics(path: Path, document: dict[Any, Any]) -> tuple[Lens, Lens, n
         if len(f) != 2 or len(c) != 2:
             raise NeecoError(f"{path}: intrinsics[{number}]: f and c take two numbers each; correct them")
         k = matrix_numbers(path, camera.get("k", []), f"intrinsics[{number}].k")
-        lenses.append(_lens(path, (*f, *c), k, document))
+        lenses.append(_lens(path, (*f, *c), k, (document.get("width"), document.get("height"))))
     turn = matrix_numbers(path, extrinsics.get("om"), "extrinsics.om")
     return (lenses[0], lenses[1], _pose(path, turn, matrix_numbers(path, extrinsics.get("T"), "extrinsics.T")))
 
@@ -136,9 +138,7 @@ def _ini(path: Path) -> tuple[Lens, Lens, np.ndarray]:
                 raise NeecoError(f"{path}: [{side}] {stem}x, {stem}y: missing; save the calibration again")
         size = numbers["res_"] if len(numbers["res_"]) == 2 else [None, None]
         cameras.append(numbers)
-        lenses.append(
-            _lens(path, (*numbers["fc_"], *numbers["cc_"]), numbers["kc_"], dict(width=size[0], height=size[1]))
-        )
+        lenses.append(_lens(path, (*numbers["fc_"], *numbers["cc_"]), numbers["kc_"], (size[0], size[1])))
     left, right = cameras
     turned = left["r_"] and not np.allclose(left["r_"], np.eye(3).ravel()[: len(left["r_"])], atol=1e-6)
     if turned or any(left["t_"]):
@@ -161,15 +161,24 @@ def _number(path: Path, field: str, text: str) -> float:
         raise NeecoError(f"{path}: {field}: {printable(text)} is not a number; save the calibration again") from None
 
 
-def _camera_infos(left: Path, right: Path) -> tuple[Lens, Lens, np.ndarray]:
-    """From two cameras' `camera_matrix`, `distortion_coefficients`, `rectification_matrix` and `projection_matrix`, or
-    K, D, R and P, as ROS writes them: the right projection's fourth column is -focal length x baseline."""
+def _one_camera(path: Path) -> CameraNumbers:
+    cameras = cameras_in(path, read_calibration(path))
+    if not cameras:
+        raise NeecoError(f"{path}: camera_matrix: missing; expected the camera_info of one camera, as ROS saves it")
+    return cameras[0]
+
+
+def _rectified(
+    of_left: tuple[Path, CameraNumbers], of_right: tuple[Path, CameraNumbers]
+) -> tuple[Lens, Lens, np.ndarray]:
+    """From the rectification and projection of two cameras, each with the file that states it, as ROS's camera_info and
+    ORB-SLAM's settings have them: the right projection's fourth column is -focal length x baseline."""
+    left, right = of_left[0], of_right[0]
     lenses, turns, projections = [], [], []
-    for path in (left, right):
-        document = read_opencv_yaml(path)
-        lenses.append(opencv_lens(path, document))
-        turns.append(_numbers(path, document, ("rectification_matrix", "R", "r"), 9).reshape(3, 3))
-        projections.append(_numbers(path, document, ("projection_matrix", "P", "p"), 12).reshape(3, 4))
+    for path, camera in (of_left, of_right):
+        lenses.append(lens_of(path, camera))
+        turns.append(_numbers(path, camera.keys, _RECTIFICATION, 9).reshape(3, 3))
+        projections.append(_numbers(path, camera.keys, _PROJECTION, 12).reshape(3, 4))
         if rotation_error(turns[-1]) > NOT_ROTATED:
             raise NeecoError(
                 f"{path}: rectification_matrix: is no rotation; calibrate the two cameras as one stereo rig"
@@ -204,37 +213,22 @@ def _right_beside(path: Path) -> Path:
     raise NeecoError(f"{path}: is one camera's; put the right camera's beside it, as left.yaml and right.yaml")
 
 
-def _names_in(document: dict[Any, Any], pairs: Sequence[tuple[str, str]]) -> tuple[str, str] | None:
-    return next((pair for pair in pairs if set(pair) <= set(document)), None)
-
-
-def _numbers(path: Path, document: dict[Any, Any], names: tuple[str, ...], count: int) -> np.ndarray:
+def _numbers(path: Path, document: Mapping[str, Any], names: tuple[str, ...], count: int) -> np.ndarray:
     found = matrix_numbers(path, first_of(document, names), names[0])
     if len(found) != count:
         raise NeecoError(f"{path}: {names[0]}: needs {count} numbers, has {len(found)}; write it as ROS does")
     return np.array(found)
 
 
-def _matrix(path: Path, document: dict[Any, Any], name: str) -> tuple[float, float, float, float]:
-    """Focal lengths and principal point of a 3x3 camera matrix, as it stands there."""
-    values = _numbers(path, document, (name,), 9)
-    return float(values[0]), float(values[4]), float(values[2]), float(values[5])
-
-
-def _lens(path: Path, matrix: Sequence[float], distortion: Sequence[float], document: dict[Any, Any]) -> Lens:
-    """A lens as OpenCV means its numbers: the first pixel's centre at 0. document: says the images' size."""
-    sizes = [
-        first_of(document, (side, f"image_{side}", f"image_{side.title()}", f"Camera.{side}"))
-        for side in ("width", "height")
-    ]
-    for name in ("image_size", "imageSize", "size"):
-        found = document.get(name)
-        if isinstance(found, list) and len(found) == 2:
-            sizes = found
+def _lens(
+    path: Path, matrix: Sequence[float], distortion: Sequence[float], size: tuple[Any, Any], fisheye: bool = False
+) -> Lens:
+    """A lens as OpenCV means its numbers: the first pixel's centre at 0. size: width and height of its images, as they
+    stand there."""
     length = next((count for count in COEFFICIENTS if count >= len(distortion)), len(distortion))
     coefficients = [*distortion, *[0.0] * (length - len(distortion))]
     values = [matrix[0], matrix[1], matrix[2] + 0.5, matrix[3] + 0.5]
-    return checked_lens(path, values, coefficients, image_size(path, *sizes))
+    return checked_lens(path, values, coefficients, image_size(path, *size), fisheye=fisheye)
 
 
 def _pose(path: Path, turn: Sequence[float] | np.ndarray, shift: Sequence[float] | np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from neeco.capture.lens import Lens
 from neeco.capture.model import REFERENCE_PIXELS, Frame, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
-from neeco.ingest.motion import STEP, RoughShape, carve_shape, project_mask
+from neeco.ingest.motion import STEP, PosesAt, RoughShape, best_lag, carve_shape, project_mask
 from neeco.ingest.recording import IngestSettings, StereoPartner
 from neeco.ingest.sfm import SfmResult, StageProgress
 from neeco.ingest.stereofile import read_stereo
@@ -26,17 +26,19 @@ from neeco.ingest.still import Background, find_background, moving_masks, reduce
 from neeco.ingest.tissue_surface import TissueSurface, surface_behind, surface_from_stereo
 
 Load = Callable[[int], np.ndarray]  # row of the chosen frames -> image uint8 [H, W, 3], undistorted
-Tracked = Mapping[str, tuple[np.ndarray, np.ndarray]]  # instrument -> camera_from_instrument [K, 4, 4], known [K]
+Tracked = Mapping[str, PosesAt]  # instrument -> camera_from_instrument [K, 4, 4] of the chosen frames
 
 
 @dataclass(frozen=True)
 class StillScene:
-    """points [P, 3] mm and colors uint8 [P, 3] of the tissue; shapes: of the instruments, by name; how: the tissue's
-    depth was found, in words; notes: one sentence each."""
+    """points [P, 3] mm and colors uint8 [P, 3] of the tissue; shapes: of the instruments, by name; lags: by name, s at
+    which an instrument's poses fit what moves better (0: none); how: the tissue's depth was found, in words; notes: one
+    sentence each."""
 
     points: np.ndarray
     colors: np.ndarray
     shapes: dict[str, RoughShape]
+    lags: dict[str, float]
     how: str
     notes: tuple[str, ...]
 
@@ -129,15 +131,18 @@ def look_behind(
     pinhole: Lens,
     visible: np.ndarray | None,
     tracked: Tracked,
+    length: float,
     settings: IngestSettings,
     right: RightCamera | None,
     progress: StageProgress,
 ) -> StillScene:
     """What `count` frames of a still scope show. tracked: instruments whose place before it is known; visible: bool
-    [H, W], the field of view."""
+    [H, W], the field of view; length: of the recording, s."""
     progress("finding the instrument", 0, 0)
     small = Lens.of(pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
-    shapes, notes = _rough_shapes(load, count, small, visible, tracked, settings)
+    shapes, lags = _rough_shapes(load, count, small, visible, tracked, length, settings)
+    placed_at = {name: poses_at(0.0) for name, poses_at in tracked.items()}
+    notes = []
     progress("finding the tissue behind it", 0, 0)
 
     def hidden_from(lens: Lens, world_from_camera: np.ndarray, rows: list[int]) -> Callable[[int], np.ndarray] | None:
@@ -147,7 +152,7 @@ def look_behind(
         def hidden(place: int) -> np.ndarray:
             row, found = rows[place], none
             for name, shape in shapes.items():
-                poses, known = tracked[name]
+                poses, known = placed_at[name]
                 if known[row]:
                     found = found | project_mask(shape, camera_from_world @ poses[row], camera)
             return found
@@ -165,11 +170,11 @@ def look_behind(
         if surface is None:
             notes.append("the stereo partner's images match too little for depth; is its calibration this scope's?")
     if surface is None:
-        deepest = [float(poses[known, 2, 3].max()) for poses, known in tracked.values() if known.any()]
-        placed = [(shape, tracked[name][0][tracked[name][1]]) for name, shape in shapes.items()]
+        deepest = [float(poses[known, 2, 3].max()) for poses, known in placed_at.values() if known.any()]
+        placed = [(shape, placed_at[name][0][placed_at[name][1]]) for name, shape in shapes.items()]
         surface = surface_behind(placed, small, max(deepest, default=None), settings.scene_distance_mm)
     points, colors = surface.points(background.colors, pinhole, visible)
-    return StillScene(points, colors, shapes, surface.how, tuple(notes))
+    return StillScene(points, colors, shapes, lags, surface.how, tuple(notes))
 
 
 def _by_stereo(
@@ -190,11 +195,12 @@ def _rough_shapes(
     small: Lens,
     visible: np.ndarray | None,
     tracked: Tracked,
+    length: float,
     settings: IngestSettings,
-) -> tuple[dict[str, RoughShape], list[str]]:
-    """The rough shape of every tracked instrument that moves in the images, and a note of every other."""
+) -> tuple[dict[str, RoughShape], dict[str, float]]:
+    """The rough shape of every tracked instrument that moves in the images, and the lag of every one's poses."""
     if not tracked:
-        return {}, []
+        return {}, {}
     rows = np.unique(np.linspace(0, count - 1, settings.shape_frames).astype(int))
     masks = moving_masks(load, count, rows, visible).astype(np.float32)  # [R, h, w]
     size = -(-masks.shape[2] // STEP), -(-masks.shape[1] // STEP)
@@ -202,14 +208,16 @@ def _rough_shapes(
     if visible is not None:
         shown = cv2.resize(reduced(visible.astype(np.uint8) * 255), size, interpolation=cv2.INTER_AREA) == 255
         evidence[:, ~shown] = np.nan
-    shapes, notes = {}, []
-    for name, (poses, known) in tracked.items():
-        usable = known[rows]
-        shape = carve_shape(evidence[usable], poses[rows[usable]], small)
-        if shape is None:
-            notes.append(
-                f"instrument {name!r}: nothing in the images moves with its tracked pose; check its log and clock"
-            )
-        else:
+    shapes, lags = {}, {}
+    for name, poses_at in tracked.items():
+        poses, known = (values[rows] for values in poses_at(0.0))
+        shape = carve_shape(evidence[known], poses[known], small)
+        if shape is not None:
             shapes[name] = shape
-    return shapes, notes
+
+        def at_rows(lag: float, of: PosesAt = poses_at) -> tuple[np.ndarray, np.ndarray]:
+            poses, known = of(lag)
+            return poses[rows], known[rows]
+
+        lags[name] = best_lag(evidence, at_rows, small, length)
+    return shapes, lags

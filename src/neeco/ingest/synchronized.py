@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from neeco.errors import NeecoError
+from neeco.ingest.clock_search import ASSUMED, GIVEN, LONGEST, ClockOffset
 from neeco.ingest.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.formats import MAX_UNLIKE, compare_lengths
 from neeco.ingest.from_video import with_roll
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording import Recording
-from neeco.ingest.registration import GIVEN, LONGEST, ClockOffset
 from neeco.ingest.sfm import StageProgress
 
 SLOWEST, FASTEST = 0.01, 10_000.0  # frames a second
@@ -70,14 +70,14 @@ class SynchronizedRecording:
 
     def logged_poses(self, log: PoseLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses [N, 4, 4] in the tracker's frame at video times, and where known."""
-        return poses_at(log, times + self._offset(log))
+        return poses_at(log, self._clock(log).at(times))
 
-    def instrument_poses(self, name: str, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses [N, 4, 4] of an instrument at video times, in the world's frame as far as that is known (else in its
-        tracker's), and where known."""
+    def instrument_poses(self, name: str, times: np.ndarray, lag: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Poses [N, 4, 4] of an instrument at video times, or `lag` s later, in the world's frame as far as that is
+        known (else in its tracker's), and where known."""
         if name in self.found:
             return self._found_poses(name, times)
-        poses, known = self.logged_poses(self.poses[name], times)
+        poses, known = self.logged_poses(self.poses[name], times + lag)
         return (self.world_from_base[name] @ poses if name in self.world_from_base else poses), known
 
     def _found_poses(self, name: str, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -89,7 +89,7 @@ class SynchronizedRecording:
         known = np.abs(times - held[row]) < SAME_INSTANT
         found = np.where(known[:, None, None], poses[row], np.nan)
         if name in self.rolls:
-            roll, logged = readings_at(self.rolls[name], times + self._offset(self.rolls[name]))
+            roll, logged = readings_at(self.rolls[name], self._clock(self.rolls[name]).at(times))
             found, known = with_roll(found, np.nan_to_num(roll)), known & logged
         return found, known
 
@@ -106,7 +106,7 @@ class SynchronizedRecording:
             usable &= valid
             readings = {}
             for joint, reading in self.joints[name].items():
-                values, known = readings_at(reading, times + self._offset(reading))
+                values, known = readings_at(reading, self._clock(reading).at(times))
                 readings[joint] = self._within_limits(reading, limits[name][joint], values)
                 usable &= known
             states[name] = (poses, readings)
@@ -122,14 +122,14 @@ class SynchronizedRecording:
         columns, usable = [], np.ones(len(self.times), dtype=bool)
         for log in self.poses.values():
             if log.clock in self.clocks:
-                poses, valid = poses_at(log, self.times + self.clocks[log.clock].seconds)
+                poses, valid = poses_at(log, self.clocks[log.clock].at(self.times))
                 usable &= valid
                 columns.append(np.where(valid[:, None], poses[:, :3, 3], 0.0))
                 columns.append(np.where(valid[:, None], poses[:, :3, :3].reshape(-1, 9)[:, :3], 0.0))
                 self._check_overlap(log, valid)
         for reading in (reading for name in self.placed for reading in self.joints[name].values()):
             if reading.clock in self.clocks:
-                values, valid = readings_at(reading, self.times + self.clocks[reading.clock].seconds)
+                values, valid = readings_at(reading, self.clocks[reading.clock].at(self.times))
                 usable &= valid
                 columns.append(np.where(valid, values, 0.0)[:, None])
                 self._check_overlap(reading, valid)
@@ -199,18 +199,18 @@ class SynchronizedRecording:
                 f"({self.times[0]:g} to {self.times[-1]:g} s), and nothing ties the clocks; give the offset: "
                 f"sync: {{{log.clock}: seconds}}"
             )
-        self.clocks[log.clock] = ClockOffset(0.0, float("nan"), "assumed equal to the video's")
+        self.clocks[log.clock] = ClockOffset(0.0, float("nan"), ASSUMED)
         self.notes.append(f"{why} and is taken to be the video's{cost}")
 
-    def _offset(self, log: PoseLog | ReadingLog) -> float:
-        """Seconds the log's clock is ahead; the video's own clock when motion did not give it."""
+    def _clock(self, log: PoseLog | ReadingLog) -> ClockOffset:
+        """The log's clock; the video's own clock when motion did not give it."""
         if log.clock not in self.clocks:
             self._assume(log, f"the clock {log.clock!r} was not given and could not be found,")
-        return self.clocks[log.clock].seconds
+        return self.clocks[log.clock]
 
     def _check_overlap(self, log: PoseLog | ReadingLog, valid: np.ndarray) -> None:
         if not valid.any():
-            first, last = (end - self.clocks[log.clock].seconds for end in (log.times[0], log.times[-1]))
+            first, last = self.clocks[log.clock].video_times(log.times[[0, -1]])
             raise NeecoError(
                 f"{log.path}: has no sample for any video frame: by the video's clock it covers {first:g} to {last:g} "
                 f"s, the video {self.times[0]:g} to {self.times[-1]:g} s; correct the offset of its clock, sync: "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -77,7 +77,7 @@ class _Log:
 
 @dataclass
 class _FolderFiles:
-    """What the files of a folder seem to be, as paths relative to it."""
+    """What the files of a folder seem to be, as paths relative to it. others: what there is, too, in words."""
 
     videos: list[_Log] = field(default_factory=list)
     images: list[str] = field(default_factory=list)
@@ -87,13 +87,23 @@ class _FolderFiles:
     joints: list[tuple[_Log, RecognisedColumns, str, str | None]] = field(default_factory=list)
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
-    placeholders: list[str] = field(default_factory=list)  # what stands in a file's place, in words
+    problems: list[str] = field(default_factory=list)  # of others, those that cannot be read
+    image_problems: list[str] = field(default_factory=list)  # of these, those that may be of images
     episodes: str | None = None  # of a data set that holds several, "0-9"
 
+    def leave_out(self, what: str, why: str = "", images: bool = False) -> None:
+        """List something as not used. why: what is wrong with it, where anything is; images: may they be in it?"""
+        line = " ".join((f"{what}: {why}" if why else what).split())
+        line = "".join(sign if sign.isprintable() else "?" for sign in line)
+        self.others.append(line)
+        self.problems += [line] if why else []
+        self.image_problems += [line] if why and images else []
 
-def write_template(source: Path) -> str:
+
+def write_template(source: Path, report: Callable[[str], None] = lambda problem: None) -> str:
     """The text of a recording.yaml for the files in a folder and its subfolders, or for one file or folder that holds
-    several streams, to stand beside it; `read_recording` accepts it.
+    several streams, to stand beside it; `read_recording` accepts it. report: is told of what cannot be read, which is
+    left out.
 
     Raises NeecoError when there are no images.
     """
@@ -108,9 +118,13 @@ def write_template(source: Path) -> str:
         raise NeecoError(f"{source}: not there; give the recording's folder")
     found = _find_files(source)
     if not found.videos and not found.images:
-        if found.placeholders:
-            raise NeecoError(f"{source / found.placeholders[0]}")
+        if found.image_problems:
+            first, *rest = found.image_problems
+            first, more = first.removeprefix(f"{source.name}: "), f" (and {len(rest)} more)" if rest else ""
+            raise NeecoError(f"{source}: holds no images that can be read: {first}{more}")
         raise NeecoError(f"{source}: holds no video and no folder of images; put the recording's video there")
+    for problem in found.problems:
+        report(problem)
     frames = [_frames_line(log) for log in found.videos]
     frames += [f"images: {{folder: {_scalar(folder)}, fps: 25}}" for folder in found.images]
     if not found.videos:
@@ -133,7 +147,7 @@ def write_template(source: Path) -> str:
         scope_hints=scopes[0][0].hints if scopes else (),
         other_scopes=[", ".join(log.lines()) for log, _ in scopes[1:]],
         sync=next(iter(found.syncs), None),
-        others=[*found.placeholders, *found.others][:MAX_OTHERS],
+        others=found.others[:MAX_OTHERS],
         episodes=found.episodes,
         partner=next((line for line in frames[1:] if line.startswith(("video:", "images:"))), "video: right.mp4"),
     )
@@ -163,7 +177,7 @@ def _find_files(source: Path) -> _FolderFiles:
     for file in [file for file in files if file.suffix.lower() not in IMAGES][:MAX_FILES]:
         name, suffix = file.relative_to(folder).as_posix(), file.suffix.lower()
         if problem := placeholder(file):
-            found.placeholders.append(f"{name}: {problem}")
+            found.leave_out(name, problem, images=True)
         elif suffix in VIDEOS:
             found.videos.append(_Log(name))
         elif format_of(file) is not None:
@@ -171,7 +185,7 @@ def _find_files(source: Path) -> _FolderFiles:
                 _classify_table(found, _Log(name), file)
         elif suffix == ".json" and _is_sync(file):
             found.syncs.append(name)
-        elif suffix in (".yaml", ".yml", ".json") and _is_lens(file):
+        elif suffix in (".yaml", ".yml", ".xml", ".json") and _is_lens(file):
             found.lenses.append(name)
     return found
 
@@ -185,18 +199,24 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         known.require_package(path)
         streams = known.streams(path)
     except NeecoError as error:
-        found.others.append(" ".join(str(error).replace(str(path), name).split()))
+        found.leave_out(name, _without_place(str(error), path, name), images=True)
         return path.is_dir()
     for stream in streams:
         log = _Log(name, stream.name, stream.body, stream.hints, stream.asks, stream.clock, stream.columns is None)
-        used = stream.offered and stream.count > 0
+        used = stream.offered and stream.count > 0 and stream.problem is None
         if used and stream.kind == IMAGE_STREAMS:
             found.videos.append(log)
         elif used and stream.kind in (POSES, READINGS):
-            _classify_stream(found, log, stream, path)
+            try:
+                _classify_stream(found, log, stream, path)
+            except NeecoError as error:
+                found.leave_out(f"{name}: {stream.name}", _without_place(str(error), path, stream.name))
+        elif stream.problem is not None:
+            why, images = _without_place(stream.problem, path, stream.name), stream.kind == IMAGE_STREAMS
+            found.leave_out(f"{name}: {stream.name}", why, images)
         else:
             rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
-            found.others.append(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}")
+            found.leave_out(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}")
             if (several := _EPISODES.fullmatch(stream.name)) and known.of_episode(stream.name, 0) is not None:
                 found.episodes = f"{several[1]}-{several[2]}"
     return bool(streams)
@@ -215,6 +235,11 @@ def _classify_stream(found: _FolderFiles, log: _Log, stream: Stream, path: Path)
     found.joints += [(log, when, column, joint) for joint, column in named]
 
 
+def _without_place(message: str, path: Path, name: str) -> str:
+    """A message without the file and the stream that it begins with."""
+    return message.removeprefix(f"{path}: ").removeprefix(f"{name}: ").replace(str(path), path.name)
+
+
 def _frames_line(log: _Log) -> str:
     return f"video: {_scalar(log.file)}" if log.stream is None else f"video: {{{', '.join(log.lines())}}}"
 
@@ -225,11 +250,15 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
         table = read_table(file)
         meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
     except NeecoError as error:
-        found.others.append(" ".join(str(error).replace(str(file), name).split()))
+        found.leave_out(name, _without_place(str(error), file, name))
         return
     if tools := tool_names(table):
         for tool in tools:
-            own = tool_columns(table, PoseColumns(file, tool=tool))
+            try:
+                own = tool_columns(table, PoseColumns(file, tool=tool))
+            except NeecoError as error:
+                found.leave_out(f"{name}: {tool}", _without_place(str(error), file, name))
+                continue
             found.poses.append((_Log(name, tool=tool), recognise_pose(own.header)))
         return
     pose = recognise_pose(table.header)
@@ -245,7 +274,7 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     elif len(columns) == 2 and angles and not when.time and len(table.rows) <= MAX_CALIBRATION_ROWS:
         found.calibrations.append((name, table.header))
     elif not (when.time and len(columns) <= 2):
-        found.others.append(f"{name}: columns {', '.join(columns[:10])[:100]}")
+        found.leave_out(f"{name}: columns {', '.join(columns[:10])[:100]}")
 
 
 def _is_sync(file: Path) -> bool:
@@ -292,7 +321,8 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     clock = "em" if log.stream is None else log.clock
     lines = [*log.lines(), *([f"clock: {clock}"] if clock else [])]
     lines += [f"# {ask}" for ask in log.asks if not ask.startswith(" ")]
-    if log.stream is not None and log.is_whole and columns.time and of_length and columns.rotation:
+    known_again = log.tool is not None or (log.stream is not None and log.is_whole)
+    if known_again and columns.time and of_length and columns.rotation:
         return [*lines, *_unit_lines(columns, {"length": of_length})]  # recognised again when read
     given = [
         ("time", columns.time),
@@ -327,6 +357,8 @@ def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | 
     lines = []
     if columns.counts_frames:
         lines.append("rate_hz: 40   # time counts frames, and this rate is a guess: correct it")
+    elif columns.time is None:
+        lines.append("rate_hz: 40   # nothing says when its rows were taken, and this rate is a guess: correct it")
     elif columns.time and len(columns.time) == 1 and not (columns.time_unit or split_unit(columns.time[0], "time")[1]):
         wanted = {"time": columns.time} | wanted
     implied = {"length": columns.length_unit}

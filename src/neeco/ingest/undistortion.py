@@ -35,9 +35,9 @@ def undistort_frames(frames: Sequence[Frame], folder: Path, border: Border | Non
         return Undistorted(tuple(frames), None, [])
     first, *others = {Lens.of(frame.camera): None for frame in frames}
     lens = None if others else replace(first, border=border)
-    kept = f"of their {1 + len(others)} lenses none is kept" if lens is None else "their lens is kept"
+    note = f"of their {1 + len(others)} lenses none is kept" if lens is None else "their lens is kept"
     straight = [_undistort(frame, folder / str(order)) for order, frame in enumerate(frames)]
-    return Undistorted(tuple(straight), lens, [f"{count} of {len(frames)} images are undistorted; {kept}."])
+    return Undistorted(tuple(straight), lens, [f"{count} of {len(frames)} images are undistorted; {note}."])
 
 
 def _undistort(frame: Frame, folder: Path) -> Frame:

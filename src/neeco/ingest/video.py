@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -21,6 +22,9 @@ from neeco.ingest.formats import VideoSource, numbers, read_table
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 MIN_IMAGES = 2
 SQUARE = 0.005  # by which a square pixel's width and height may differ: 1 px of 200
+MAX_RATE = 1000.0  # frames a second, beyond which a file's own number is no rate
+MAX_LEFT_OUT = 0.1  # of a folder's images (or one): more that are missing or of another size are no slip
+SAME_RATE = 2e-4  # relative difference of frame rates that is none
 
 
 def require_installed(name: str) -> None:
@@ -46,7 +50,8 @@ def open_video(path: Path, fps: float | None = None, part: tuple[float, float] |
 
 def open_images(folder: Path, fps: float | None = None, times: Path | None = None) -> VideoSource:
     """A folder of images, ordered by name (2 before 10), at `fps` or at the times of a CSV file: one column of times,
-    and perhaps one of file names. Images that cannot be read are left out and noted. Raises NeecoError."""
+    and perhaps one of file names. Images that cannot be read, are of another size than nearly all, or are listed and
+    not there are left out and noted; at `fps`, a gap in their names' numbers is one in time. Raises NeecoError."""
     folder = Path(folder)
     if not folder.is_dir():
         raise NeecoError(f"{folder}: {'is a file; give a folder of images' if folder.exists() else 'no such folder'}")
@@ -54,29 +59,62 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     files = sorted((file for file in visible_entries(folder) if file.suffix.lower() in IMAGES), key=_natural_order)
     if len(files) < MIN_IMAGES:
         raise NeecoError(f"{folder}: holds {len(files)} images; expected frames as {', '.join(IMAGES[:3])} files")
+    notes: list[str] = []
     if times is not None:
-        files, stamps = _image_times(folder, files, Path(times))
+        files, stamps = _image_times(folder, files, Path(times), notes)
     elif fps is not None:
-        stamps = np.arange(len(files)) / fps
+        stamps = _numbered(folder, files, notes) / fps
     else:
         raise NeecoError(f"{folder}: when were the images taken? Give fps, or a CSV file of times, in the recording")
-    size, usable, bad = None, [], []
-    for index, file in enumerate(files):
+    sizes: list[tuple[int, int] | None] = []
+    for file in files:
         try:
-            found = open_image(file).size
+            sizes.append(open_image(file).size)
         except NeecoError:
-            bad.append(file.name)
-            continue
-        if size is not None and found != size:
-            raise NeecoError(
-                f"{file}: is {found[0]}x{found[1]}, the images before it {size[0]}x{size[1]}; give images of one size"
-            )
-        size = found
-        usable.append(index)
-    if size is None or len(usable) < MIN_IMAGES:
-        raise NeecoError(f"{folder}: {len(usable)} of {len(files)} images can be read; replace the damaged files")
-    note = f"{folder.name}: {len(bad)} images cannot be read and are left out ({', '.join(bad[:3])})"
-    return _Images(folder, size, (note,) if bad else (), stamps[usable], tuple(files[i] for i in usable))
+            sizes.append(None)
+    known = Counter(size for size in sizes if size is not None)
+    if known.total() < MIN_IMAGES:
+        raise NeecoError(f"{folder}: {known.total()} of {len(files)} images can be read; replace the damaged files")
+    size, count = known.most_common(1)[0]
+    other = [file for file, found in zip(files, sizes, strict=True) if found not in (None, size)]
+    if not _are_few(len(other), count):
+        listed = " and ".join("x".join(map(str, found)) for found, _ in known.most_common(2))
+        raise NeecoError(f"{other[0]}: the images of this folder are {listed}; give images of one size")
+    bad = [file for file, found in zip(files, sizes, strict=True) if found is None]
+    notes += _left_out(folder, "cannot be read", bad) + _left_out(folder, "are of another size", other)
+    usable = [index for index, found in enumerate(sizes) if found == size]
+    return _Images(folder, size, tuple(notes), stamps[usable], tuple(files[i] for i in usable))
+
+
+def _are_few(count: int, total: int) -> bool:
+    return count <= max(1, MAX_LEFT_OUT * total)
+
+
+def _left_out(folder: Path, why: str, files: Sequence[Path]) -> list[str]:
+    names = ", ".join(file.name for file in files[:3])
+    return [f"{folder.name}: {len(files)} images {why} and are left out ({names})"] if files else []
+
+
+def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarray:
+    """Which place in time each image has, [N] from 0: by the last number in its name, where nearly all names are alike
+    but for it and count on evenly, else by its place in the folder."""
+    places = np.arange(len(files))
+    parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", file.stem) for file in files]
+    if any(part is None for part in parts) or len({(part[1], part[3]) for part in parts if part}) != 1:
+        return places
+    numbers = np.array([int(part[2]) for part in parts if part])
+    steps = np.diff(numbers)
+    step = max(Counter(steps.tolist()).items(), key=lambda item: item[1])[0]
+    if step <= 0 or steps.min() < step or (steps % step).any() or not _are_few(int((steps != step).sum()), len(steps)):
+        return places
+    places = (numbers - numbers[0]) // step
+    missing = int(places[-1]) + 1 - len(files)
+    if missing:
+        first = files[int(np.flatnonzero(steps != step)[0])].name
+        notes.append(
+            f"{folder.name}: {missing} images are missing by their numbers (first after {first}); a gap in time"
+        )
+    return places
 
 
 @dataclass(frozen=True)
@@ -98,6 +136,11 @@ class _Video(VideoSource):
     numbered: bool
     threads: str
     part: tuple[float, float] | None = None
+    stated_fps: float | None = None
+
+    @property
+    def own_fps(self) -> float | None:
+        return self.stated_fps
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = {self.stamps[int(index)]: int(index) for index in indices}
@@ -213,13 +256,17 @@ class _Scan:
         order = sorted(set(stamps))
         if len(stamps) == len(self.stamps) and self.time_base and len(order) > 0.9 * len(stamps):
             times = (np.array(order, dtype=np.float64) - order[0]) * self.time_base
+            own = None
             if fps is not None:
+                own = _another_rate(1 / float(np.median(np.diff(times))), fps)
                 times = np.arange(len(order)) / fps
+            if own is not None:
+                notes.append(f"{self.path.name}: says itself {own:.4g} frames a second, the recording {fps:g}")
             if len(order) < len(stamps):
                 notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
-            return self._video(notes, times, tuple(order), False)
+            return self._video(notes, times, tuple(order), False, own)
         rate = fps or self.rate
-        if not rate:
+        if not rate or rate > MAX_RATE:
             raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
         if fps is None:
             notes.append(f"{self.path.name}: its frames have no times; taken as {rate:g} a second")
@@ -227,10 +274,17 @@ class _Scan:
         times = np.arange(count) / rate
         return self._video(notes, times, tuple(range(count)), True)
 
-    def _video(self, notes: list[str], times: np.ndarray, stamps: tuple[int, ...], numbered: bool) -> _Video:
+    def _video(
+        self,
+        notes: list[str],
+        times: np.ndarray,
+        stamps: tuple[int, ...],
+        numbered: bool,
+        stated_fps: float | None = None,
+    ) -> _Video:
         assert self.size is not None
         return _Video(
-            self.path, self.size, tuple(notes), times, stamps, numbered, self.threads, self.part,
+            self.path, self.size, tuple(notes), times, stamps, numbered, self.threads, self.part, stated_fps,
             pixel_aspect=self.pixel_aspect,
         )  # fmt: skip
 
@@ -256,6 +310,11 @@ class _Scan:
         return notes
 
 
+def _another_rate(own: float, fps: float) -> float | None:
+    """A file's own frame rate where it is another than the one stated."""
+    return None if abs(own / fps - 1) < SAME_RATE else own
+
+
 def _rgb(frame: Any) -> np.ndarray:
     """uint8 [H, W, 3]. The converter's quick default is over one level too dark, so it is asked for exact rounding."""
     from av.video.reformatter import Interpolation
@@ -275,7 +334,7 @@ def _natural_order(file: Path) -> list[tuple[int, int, str]]:
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
 
 
-def _image_times(folder: Path, files: list[Path], table_path: Path) -> tuple[list[Path], np.ndarray]:
+def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[str]) -> tuple[list[Path], np.ndarray]:
     """The files a table of times names (all of them, in order, when it names none) and their times [N] s."""
     table = read_table(table_path)
     found = recognise_time(table.header)
@@ -287,23 +346,27 @@ def _image_times(folder: Path, files: list[Path], table_path: Path) -> tuple[lis
     wrong = [*[row for row, _ in bad], *np.flatnonzero(missing)]
     if wrong:
         raise NeecoError(f"{table_path}: line {table.lines[min(wrong)]}: {column}: no time; repair or remove the line")
-    times = values[:, 0] * scale
+    times, rows_used = values[:, 0] * scale, list(range(len(values)))
     by_name = {file.name: file for file in files} | {file.stem: file for file in files}
     for index in range(len(table.header)):
         cells = [Path(row[index]).name if index < len(row) else "" for row in table.rows]
         if sum(cell in by_name for cell in cells) > 0.5 * len(cells):
-            absent = [row for row, cell in enumerate(cells) if cell not in by_name]
-            if absent:
+            there = [row for row, cell in enumerate(cells) if cell in by_name]
+            absent = [folder / cell for cell in cells if cell not in by_name]
+            if not _are_few(len(absent), len(cells)):
+                row = next(row for row, cell in enumerate(cells) if cell not in by_name)
                 raise NeecoError(
-                    f"{table_path}: line {table.lines[absent[0]]}: {cells[absent[0]]!r} is not in {folder.name}"
-                    "; correct the name"
+                    f"{table_path}: line {table.lines[row]}: {cells[row]!r} is not in {folder.name} ({len(absent)} of "
+                    f"{len(cells)} like it); correct the names"
                 )
-            files = [by_name[cell] for cell in cells]
+            notes += _left_out(folder, "are listed and not there", absent)
+            files, times, rows_used = [by_name[cells[row]] for row in there], times[there], there
             break
     else:
         if len(times) != len(files):
             raise NeecoError(f"{table_path}: has {len(times)} times for {len(files)} images; add a column of names")
     falling = np.flatnonzero(np.diff(times) <= 0)
     if len(falling):
-        raise NeecoError(f"{table_path}: line {table.lines[falling[0] + 1]}: {column} does not increase; sort the rows")
+        line = table.lines[rows_used[falling[0] + 1]]
+        raise NeecoError(f"{table_path}: line {line}: {column} does not increase; sort the rows")
     return files, times

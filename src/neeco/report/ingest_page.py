@@ -12,21 +12,21 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.capture.model import Capture, Frame
+from neeco.ingest.assessment import Assessment, clock_cost_mm, rms
 from neeco.ingest.result import IngestResult
 from neeco.report import ingest_figures as figures
 from neeco.report.charts import residual_chart
 from neeco.report.coverage import SPLIT_COLORS, degrees_of_freedom, extrapolations, histogram, unvisited
-from neeco.report.ingest_assessment import assess_ingest, clock_cost_mm, rms
 from neeco.report.page import split_counts, write_page
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
-def write_ingest_page(result: IngestResult, path: Path, capture: Capture | None = None) -> None:
+def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, capture: Capture | None = None) -> None:
     """Write one HTML file about an ingest: style, pictures, curves and the view in 3D are inside it.
 
-    capture: what lies at `result.capture`, read here unless given. Raises NeecoError when it or one of the images shown
-    cannot be read, or the page cannot be written.
+    verdict: of `assess_ingest`; capture: what lies at `result.capture`, read here unless given. Raises NeecoError when
+    it or one of the images shown cannot be read, or the page cannot be written.
     """
     capture = capture or read_capture(result.capture)
     axes = figures.main_axes(capture, result.shapes)
@@ -39,7 +39,7 @@ def write_ingest_page(result: IngestResult, path: Path, capture: Capture | None 
         stamps=[result.capture],
         result=result,
         capture=capture,
-        verdict=assess_ingest(result, capture),
+        verdict=verdict,
         splits=split_counts(capture),
         in_view=[
             (item.name, figures.in_view(capture, item.name)) for item in capture.instruments if capture.registered
@@ -78,7 +78,8 @@ def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
         moved = clock_cost_mm(name, clock.sd, capture)
         cost = f"{moved:.2f}" if moved else "–"
         offset = f"{clock.seconds * 1000:+.1f}".replace("-", "−")
-        rows.append([name, offset, sure, cost, clock.source])
+        rate = "1" if clock.rate == 1 else f"{clock.rate:.5f} ±{clock.rate_sd:.5f}"
+        rows.append([name, offset, sure, rate, cost, clock.source])
     return rows
 
 

@@ -79,10 +79,10 @@ def _log_still(rerun: Any, stream: Any, result: IngestResult, capture: Capture) 
             spheres = rerun.Points3D(shape.points, radii=shape.spacing / 2, colors=[255, 225, 74, 255])
             stream.log([*place, "shape"], spheres, static=True)
     rows = [
-        f"| {name} | {1000 * clock.seconds:+.1f} ms | {1000 * clock.sd:.1f} ms | {clock.source} |"
+        f"| {name} | {1000 * clock.seconds:+.1f} ms | {1000 * clock.sd:.1f} ms | {clock.rate:.5g} | {clock.source} |"
         for name, clock in result.clocks.items()
     ]
-    table = "\n".join(["| clock | ahead of the video | sd | from |", "|---|---|---|---|", *rows])
+    table = "\n".join(["| clock | ahead of the video | sd | rate | from |", "|---|---|---|---|---|", *rows])
     stream.log("clocks", rerun.TextDocument(table, media_type="text/markdown"), static=True)
 
 

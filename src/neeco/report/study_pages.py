@@ -230,8 +230,9 @@ def _frame_images(comparison: ComparisonResult, capture: Capture, output: Path) 
             first_seeds.setdefault(job["name"], job["seed"])
     for name, seed in first_seeds.items():
         with open_run(job_folder(output, name, seed)) as run:
-            completed = run.completed(replace(capture, frames=tuple(chosen))).frames
-            for index, frame in enumerate(completed):
+            shown_frames = replace(capture, frames=tuple(chosen))
+            completed = run.scene.recorded.completed(shown_frames, run.scene.instruments)
+            for index, frame in enumerate(completed.frames):
                 image = draw(run.scene, frame.state, frame.camera).image.numpy()
                 recorded, counted = frame.load_image(), frame.load_mask()
                 score = psnr(torch.from_numpy(image), recorded, counted)

@@ -46,6 +46,7 @@ def write_track_page(tracked: Tracked) -> Path:
         name=tracked.footage.root.name,
         subtitle="instruments followed by their scene",
         stamps=[tracked.output],
+        verdict=tracked.verdict,
         tiles=[
             (f"{tracked.written} of {len(records)}", f"frames trusted by {tracked.min_trust:g}"),
             (f"{median(values):.3f}", "trust, median"),

@@ -88,7 +88,7 @@ class Recorded:
             for item in instruments
             if unstated.get(item.name, set()) & set(item.unrecorded)
         ]
-        if not found or not self.states:
+        if not found:
             return capture
         worlds = {tissue: self.over(tissue) for tissue in self.tissues}
         frames = [
@@ -100,7 +100,7 @@ class Recorded:
     def with_unrecorded(self, state: State, instruments: Sequence[Instrument]) -> State:
         """A state with the unrecorded joints of `instruments` as they were found at the training frames nearest to it
         by pose and time, all of one tissue."""
-        if not any(item.unrecorded for item in instruments):
+        if not any(item.unrecorded for item in instruments) or not self.states:
             return state
         filled = dict(state.instruments)
         for item in instruments:

@@ -81,7 +81,7 @@ def annotate_capture(
     scene = gaussian_scene(run.scene, "annotate")
     labeller = CompositedLabels(scene)
     trained_on = run.capture()
-    capture = trained_on if capture is None else run.completed(capture)
+    capture = trained_on if capture is None else scene.recorded.completed(capture, scene.instruments)
     _check_instruments(scene, capture)
     settings = {"annotates": os.path.abspath(capture.root), "frames": len(capture.frames), "min_trust": min_trust}
     settings["captures_sha256"] = [fingerprint(recorded) for recorded in (capture, trained_on)]

@@ -53,7 +53,10 @@ def split_views(run: Run, split: str, capture_path: Path | None = None) -> list[
 
     Stems that several frames share are made unique by the names of the folders above them. Raises NeecoError.
     """
-    capture = run.capture() if capture_path is None else run.completed(read_capture(capture_path))
+    if capture_path is None:
+        capture = run.capture()
+    else:
+        capture = run.scene.recorded.completed(read_capture(capture_path), run.scene.instruments)
     frames = capture.split(split)
     if not frames:
         known = ", ".join(capture.splits) or "none"

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -49,6 +50,7 @@ SECOND = "second"  # in it: steps by tissue and light that were learned again
 RUN = "run"  # the folder of the scene by which footage over another tissue was tracked: a run
 OTHER_TISSUE = 3.0  # times the misfit over the own tissue that instruments have over tissue learned from footage
 MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
+MOSTLY_TRUSTED = 0.5  # of the frames: with fewer the footage is doubtful
 SURE = 0.8  # trust with which instruments are begun to be followed at once
 BEGINNINGS = 8  # frames in which the instruments are looked for, until one is SURE
 TOGETHER = 0.7  # trust below which a stretch is followed once more, from its far end
@@ -67,6 +69,16 @@ class Tracked:
     written: int
     min_trust: float
     scene: Scene
+
+    @property
+    def verdict(self) -> str:
+        """How far the states can be trusted, in one sentence; a doubtful verdict in capitals."""
+        count, missing = len(self.records), sum(record["how"] == "lost" for record in self.records)
+        typical = median(record["trust"]["value"] for record in self.records)
+        found = f"trust is {typical:.2f} in the median, and in {missing} of {count} frames nothing was found"
+        if self.written < MOSTLY_TRUSTED * count:
+            return f"DOUBTFUL: {found}; is it the run's instrument, over its tissue?"
+        return f"{'good' if self.written == count else 'usable'}: {found}"
 
     def require_trusted(self) -> None:
         """Raises NeecoError where no frame is trusted."""

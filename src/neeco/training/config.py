@@ -3,7 +3,6 @@ values and config.yaml."""
 
 from __future__ import annotations
 
-import contextlib
 import math
 import typing
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,7 @@ from typing import Any, ClassVar
 import yaml
 
 from neeco.errors import NeecoError
+from neeco.files import YamlLoader
 from neeco.scene.method_registry import DEFAULT, method_class, method_settings
 from neeco.scene.training_session import RunLength
 from neeco.settings import name_and_value, new_name, plain, structure, warn_renamed, with_fields
@@ -337,12 +337,9 @@ def _assign(values: dict[str, Any], config: TrainConfig, assignment: str) -> Non
         target[last] = text
         return
     try:
-        value = yaml.safe_load(text)
+        value = yaml.load(text, YamlLoader)
     except yaml.YAMLError:
         raise NeecoError(f"--set {name}: {text!r} is not a value; quote it as in YAML") from None
-    if isinstance(value, str):
-        with contextlib.suppress(ValueError):  # 1e-4 is a word to YAML
-            value = float(value)
     if isinstance(old, dict) and not isinstance(value, dict):
         raise NeecoError(f"--set {name}: is a group of fields; give one of {', '.join(old) or 'them'}, as {name}.FIELD")
     target[last] = value

@@ -19,7 +19,16 @@ from torch import Tensor
 from neeco import __version__
 from neeco.capture import Capture, read_capture
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text, require_file, require_inside, require_like, require_utf8, write_text
+from neeco.files import (
+    YamlDumper,
+    parse_yaml,
+    read_text,
+    require_file,
+    require_inside,
+    require_like,
+    require_utf8,
+    write_text,
+)
 from neeco.scene.drawable import Learned
 from neeco.scene.io import DAMAGED, load_scene, pack_scene, save_tensors, unpack_scene
 from neeco.scene.training_session import Session, StepResult, members
@@ -40,16 +49,13 @@ class Run:
     config: dict[str, Any]
 
     def capture(self) -> Capture:
-        """The capture it was trained on, `completed`. Raises NeecoError when it has moved."""
+        """The capture it was trained on; joints that nobody recorded are as training found them (`Recorded.completed`).
+        Raises NeecoError when it has moved."""
         root = Path(self.config["capture"])
         if not root.exists():
             config = self.path / "config.yaml"
             raise NeecoError(f"{config}: capture: {root} no longer exists; put it back, or write there where it is")
-        return self.completed(read_capture(root, self.config["transforms"]))
-
-    def completed(self, capture: Capture) -> Capture:
-        """`capture` with joints that nobody recorded as training found them: what is drawn of its frames."""
-        return self.scene.recorded.completed(capture, self.scene.instruments)
+        return self.scene.recorded.completed(read_capture(root, self.config["transforms"]), self.scene.instruments)
 
 
 def load_run(path: Path, device: torch.device | None = None) -> Run:
@@ -96,7 +102,7 @@ def write_config(path: Path, capture: Path, config: TrainConfig, fingerprint: st
     values = {"schema": SCHEMA, "version": __version__, "capture": os.path.abspath(capture)}
     values |= {CAPTURE_DIGEST: fingerprint}
     values |= config_to_dict(config)
-    write_text(path / "config.yaml", yaml.safe_dump(values, sort_keys=False))
+    write_text(path / "config.yaml", yaml.dump(values, Dumper=YamlDumper, sort_keys=False))
 
 
 def require_same_capture(path: Path, root: Path, fingerprint: str) -> None:

@@ -19,7 +19,7 @@ from neeco.capture import Capture
 from neeco.capture.check import read_checked
 from neeco.capture.model import Frame
 from neeco.capture.writer import fingerprint
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, memory_failure
 from neeco.files import is_vacant, own_folder, read_text, write_text
 from neeco.scene.io import pack_scene, save_scene
 from neeco.scene.method_registry import method_class, unmet_need
@@ -105,7 +105,7 @@ def train(
     frames = _training_frames(capture, capture_path, config)
     log = _Log(output / "metrics.jsonl", progress, watch, clock)
     go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
-    with own_folder(output), method_class(config.method).torch_threads():
+    with own_folder(output), method_class(config.method).torch_threads(), _saying_what_is_needed(frames, config):
         try:
             session = _begin(capture, frames, output, config, device, resume, log)
         except KeyboardInterrupt:
@@ -159,6 +159,17 @@ def _begin(
     log.truncate(session.iteration)
     session.seconds += log.clock() - started
     return session
+
+
+@contextmanager
+def _saying_what_is_needed(frames: tuple[Frame, ...], config: TrainConfig) -> Iterator[None]:
+    """Raise NeecoError with the memory that training takes where the block finds too little."""
+    try:
+        yield
+    except Exception as error:
+        if (failure := memory_failure(error)) is None:
+            raise
+        raise NeecoError(f"{failure}; this training is of {_size_note(frames, config)}") from error
 
 
 def _size_note(frames: tuple[Frame, ...], config: TrainConfig) -> str:

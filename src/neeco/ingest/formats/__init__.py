@@ -34,13 +34,24 @@ DELIMITED = (".csv", ".tsv", ".txt")
 
 
 @dataclass(frozen=True)
+class Body:
+    """One of the bodies whose poses stand beside each other in a table. columns: by their index, of which the second
+    and later ones of a name end in `#2`, ...; without that, they are named as a table of this body alone would name
+    them."""
+
+    name: str
+    columns: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class Table:
     """What a log file, or one stream of it, holds. header: column names, all different; rows: cells, stripped, of which
     a row may have more or fewer than the header, or numbers [R, C], NaN where missing; lines: int64 [R] the file's line
     (or record) of each row, from 1; stream: which of the file's; record: what a row is called; stated_in: the
     file's own name of the frame that poses are stated in, meaning: what that says (None: nothing, taken as a base);
     notes: what reading it changed or left out, in words; image_hz: images a second of the video, where every row is the
-    state of one of its images; None: rows have times of their own."""
+    state of one of its images; None: rows have times of their own; bodies: where the columns of several stand beside
+    each other, behind those that all share."""
 
     path: Path
     header: tuple[str, ...]
@@ -53,6 +64,7 @@ class Table:
     meaning: NamedFrame | None = None
     notes: tuple[str, ...] = ()
     image_hz: float | None = None
+    bodies: tuple[Body, ...] = ()
 
     @property
     def frame(self) -> str | None:
@@ -83,7 +95,8 @@ class Stream:
     For a template: offered: is it what is recorded most likely, or only there, too? body: what it is of, where the
     format tells; joints: (name, column) of the readings worth having, None: all angles; hints: remarks on the body;
     columns: of the table, those that are the body's (None: all); asks: keys of the log that nothing in the file says,
-    as lines for the user to choose from, those of its columns indented; clock: that of a file without images.
+    as lines for the user to choose from, those of its columns indented; clock: that of a file without images; problem:
+    why it cannot be read, though the rest of the file can.
     """
 
     name: str
@@ -98,6 +111,7 @@ class Stream:
     columns: tuple[str, ...] | None = None
     asks: tuple[str, ...] = ()
     clock: str | None = None
+    problem: str | None = None
 
 
 @dataclass(frozen=True)
@@ -110,6 +124,11 @@ class VideoSource:
     notes: tuple[str, ...]
     times: np.ndarray
     pixel_aspect: float = field(default=1.0, kw_only=True)
+
+    @property
+    def own_fps(self) -> float | None:
+        """Frames a second that the file itself says where others were asked for; None where it says none, or these."""
+        return None
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         """(index, uint8 [H, W, 3] RGB) of the frames asked for, in increasing order. Raises NeecoError."""
@@ -189,11 +208,14 @@ def read_table(path: Path, stream: str | None = None) -> Table:
 
 def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kinds: Sequence[str]) -> Stream:
     """The stream that is wanted, or the only one of these kinds. Raises NeecoError listing what there is."""
-    fitting = [stream for stream in streams if stream.kind in kinds]
+    fitting = [stream for stream in streams if stream.kind in kinds and stream.problem is None]
     listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
     if wanted is None:
         if len(fitting) == 1:
             return fitting[0]
+        broken = next((stream for stream in streams if stream.kind in kinds and stream.problem is not None), None)
+        if broken is not None and not fitting:
+            raise NeecoError(f"{path}: {broken.name}: {broken.problem}")
         raise NeecoError(
             f"{path}: holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream` in the recording: "
             f"{listed}"
@@ -201,6 +223,8 @@ def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kin
     found = next((stream for stream in streams if stream.name == wanted), None)
     if found is None:
         raise NeecoError(f"{path}: stream: holds no {printable(wanted)}; name one of {listed}")
+    if found.problem is not None:
+        raise NeecoError(f"{path}: {found.name}: {found.problem}")
     if found not in fitting:
         kind = f"{found.type}, not {' or '.join(kinds)}"
         raise NeecoError(f"{path}: stream: {printable(wanted)} is {kind}; name one of {listed}")

@@ -25,7 +25,6 @@ from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
-from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from neeco.errors import NeecoError
@@ -102,7 +101,7 @@ class Bag:
                 try:
                     deserialize = self.store.deserialize_ros1 if self._ros1 else self.store.deserialize_cdr
                     message = deserialize(data, connection.msgtype)
-                except SerdeError:
+                except Exception:  # of damaged ones rosbags raises nearly anything; a message hides no other
                     message = None
                 yield connection.topic, received, message
 

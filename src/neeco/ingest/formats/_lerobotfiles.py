@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -19,10 +20,12 @@ INFO = "meta/info.json"
 EPISODES_2 = "meta/episodes.jsonl"
 EPISODES_3 = "meta/episodes"
 VERSIONS = re.compile(r"v?(2)\.[01]|v?(3)\.0")
+FILM_COLUMNS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")  # of each camera, version 3
 FIXED = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns that every data set has
 
 MOST_INFO = 16 * 2**20  # bytes of meta/info.json
 MOST_EPISODES = 2_000_000
+MOST_TRIED = 1000  # episodes, for one that is there
 MOST_FEATURES = 2000
 MOST_NUMBERS = 4096  # of one feature in a row
 MOST_ROWS = 2_000_000  # of an episode
@@ -31,6 +34,10 @@ BUFFER = 2**20  # bytes of a column that are read at a time
 MOST_LINE = 2**20  # characters of a line of meta/episodes.jsonl
 
 _FIELD = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")
+
+
+class _NotThere(NeecoError):
+    """A file, or what is said of one, is missing, as where somebody downloaded a part of a data set."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +62,14 @@ class Film:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode: its number, how many rows it has, and its files."""
+    """One episode: its number, how many rows it has, and its files; absent: cameras whose file is not there, and why in
+    words."""
 
     number: int
     length: int
     data: Path
     films: Mapping[str, Film]
+    absent: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -87,6 +96,16 @@ class DataSet:
             raise NeecoError(f"{self.path}: holds no episode; download the data set again")
         return len(numbers), min(numbers), max(numbers)
 
+    def first_present(self) -> Episode:
+        """The first episode whose states are there: not everybody downloads all. Raises NeecoError."""
+        problem = None
+        for record in islice(self._records(None), MOST_TRIED):
+            try:
+                return self.episode(record["episode_index"])
+            except _NotThere as error:
+                problem = problem or error
+        raise problem or NeecoError(f"{self.path}: holds no episode; download the data set again")
+
     def episode(self, number: int) -> Episode:
         """One episode. Raises NeecoError when it is not there."""
         record = next(self._records(number), None)
@@ -97,25 +116,32 @@ class DataSet:
         length = record["length"]
         if not 0 < length <= MOST_ROWS:
             raise NeecoError(f"{self.path}: episode {number}: length: {length} rows cannot be; correct meta")
-        if self.version == 2:
-            values: dict[str, int | str] = {"episode_chunk": number // self.chunks_size, "episode_index": number}
-            films = {key: Film(self._file("video_path", {**values, "video_key": key})) for key in self.films}
-            return Episode(number, length, self._file("data_path", values), films)
-        films = {}
+        place: dict[str, int | str] = {"episode_chunk": number // self.chunks_size, "episode_index": number}
+        if self.version == 3:
+            place = {name: record[f"data/{name}"] for name in ("chunk_index", "file_index")}
+        films, absent = {}, {}
         for key in self.films:
-            place = {
-                "chunk_index": record[f"videos/{key}/chunk_index"],
-                "file_index": record[f"videos/{key}/file_index"],
-            }
-            start, end = (float(record[f"videos/{key}/{name}_timestamp"]) for name in ("from", "to"))
-            if not 0 <= start < end < 1e9:  # NaN compares false
-                raise NeecoError(
-                    f"{self.path}: episode {number}: {key}: from {start:g} to {end:g} s is no part of a video; "
-                    "correct meta/episodes"
-                )
-            films[key] = Film(self._file("video_path", {**place, "video_key": key}), start, end)
-        place = {name: record[f"data/{name}"] for name in ("chunk_index", "file_index")}
-        return Episode(number, length, self._file("data_path", place), films)
+            try:
+                films[key] = self._film(number, key, record, place)
+            except _NotThere as error:
+                absent[key] = str(error)
+        return Episode(number, length, self._file("data_path", place), films, absent)
+
+    def _film(self, number: int, key: str, record: Mapping[str, Any], place: Mapping[str, int | str]) -> Film:
+        """Where one camera's images of an episode are. Raises _NotThere, and NeecoError for what cannot be."""
+        if self.version == 2:
+            return Film(self._file("video_path", {**place, "video_key": key}))
+        names = {name: f"videos/{key}/{name}" for name in FILM_COLUMNS}
+        if missing := [name for name in names.values() if name not in record]:
+            raise _NotThere(f"{self.path / EPISODES_3}: has no column {missing[0]}; download the data set again")
+        start, end = (float(record[names[f"{side}_timestamp"]]) for side in ("from", "to"))
+        if not 0 <= start < end < 1e9:  # NaN compares false
+            raise NeecoError(
+                f"{self.path}: episode {number}: {key}: from {start:g} to {end:g} s is no part of a video; "
+                "correct meta/episodes"
+            )
+        own = {name: record[names[name]] for name in ("chunk_index", "file_index")}
+        return Film(self._file("video_path", {**own, "video_key": key}), start, end)
 
     def _file(self, field: str, values: Mapping[str, int | str]) -> Path:
         """The file that a template of info.json names. Raises NeecoError when it leads out of the data set."""
@@ -137,7 +163,7 @@ class DataSet:
             raise NeecoError(f"{where}: {printable(name)} is no path inside the data set; correct it")
         file = self.path / parts
         if not file.is_file():
-            raise NeecoError(f"{file}: no such file; download the episode's files, too")
+            raise _NotThere(f"{file}: no such file; download the episode's files, too")
         return require_inside(file, _boundary(self.path))
 
     def _records(self, number: int | None) -> Iterator[dict[str, Any]]:
@@ -179,11 +205,12 @@ class DataSet:
         columns = ["episode_index", "length"]
         if number is not None:
             columns += ["data/chunk_index", "data/file_index"]
-            names = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
-            columns += [f"videos/{key}/{name}" for key in self.films for name in names]
+        of_films = [f"videos/{key}/{name}" for key in self.films for name in FILM_COLUMNS if number is not None]
         for file in files:
-            table = ParquetFile(require_inside(file, _boundary(self.path))).read(columns, number)
-            values = {name: _whole(file, name, table[name]) if "time" not in name else table[name] for name in columns}
+            source = ParquetFile(require_inside(file, _boundary(self.path)))
+            found = [*columns, *(name for name in of_films if name in source.names)]
+            table = source.read(found, number)
+            values = {name: _whole(file, name, table[name]) if "time" not in name else table[name] for name in found}
             for row in range(len(table["episode_index"])):
                 yield {name: column[row].item() for name, column in values.items()}
 

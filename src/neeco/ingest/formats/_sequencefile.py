@@ -89,11 +89,15 @@ def read_sequence(path: Path) -> FrameSequence:
 
 
 def _lines(path: Path, stream: BinaryIO) -> Iterator[str]:
+    """The lines of a header, of which the last may end with the file."""
     while line := stream.readline(LONGEST_LINE):
-        if not line.endswith(b"\n") or stream.tell() > LONGEST_HEADER:
-            break
+        if len(line) == LONGEST_LINE or stream.tell() > LONGEST_HEADER:
+            raise _unended(path)
         yield line.decode("utf-8", "replace").strip()
-    raise NeecoError(f"{path}: its header does not end; copy or export the sequence again")
+
+
+def _unended(path: Path) -> NeecoError:
+    return NeecoError(f"{path}: its header does not end; copy or export the sequence again")
 
 
 def _read_meta(path: Path, stream: BinaryIO) -> _Header:
@@ -101,13 +105,15 @@ def _read_meta(path: Path, stream: BinaryIO) -> _Header:
     header = _Header(path)
     for line in _lines(path, stream):
         name, equals, value = (part.strip() for part in line.partition("="))
+        if not line:
+            continue
         if not equals:
             raise NeecoError(f"{path}: {printable(line, 40)} is no `Name = value`; export the sequence again")
         header.add(name, value)
-        if name == "ElementDataFile":
-            break
-    header.end = stream.tell()
-    return header
+        if name.lower() == "elementdatafile":
+            header.end = stream.tell()
+            return header
+    raise _unended(path)
 
 
 def _meta(header: _Header) -> FrameSequence:
@@ -134,14 +140,17 @@ def _read_nrrd(path: Path, stream: BinaryIO) -> _Header:
     """`field: value` and `key:=value` lines up to an empty one."""
     header = _Header(path)
     lines = _lines(path, stream)
-    if not next(lines).startswith("NRRD000"):
+    if not next(lines, "").startswith("NRRD000"):
         raise NeecoError(f"{path}: does not begin with NRRD000; export the sequence again")
+    ended = False
     for line in lines:
-        if not line:
+        if ended := not line:
             break
         if not line.startswith("#"):
             name, _, value = line.partition(":")
             header.add(name.strip(), value.removeprefix("=").strip())
+    if not ended and not header.plain.keys() & {"data file", "datafile"}:  # a header by itself may end with its file
+        raise _unended(path)
     header.end = stream.tell()
     return header
 

@@ -31,13 +31,7 @@ def chained(survey: Survey, stream: str, images: set[str]) -> Table:
             listed = printable(", ".join(sorted(there)), 300).strip("'")
             remedy = f"name one of {listed}" if there else "the bag has no tf; name a topic"
             raise NeecoError(f"{where}: there is no transform of {printable(name)}; {remedy}")
-    ups, downs = (_to_root(survey, where, name) for name in (child, frame))
-    while ups and downs and ups[-1] == downs[-1]:
-        ups.pop()
-        downs.pop()
-    ends = [_parent(survey, where, edges[-1]) if edges else name for edges, name in ((ups, child), (downs, frame))]
-    if ends[0] != ends[1]:
-        raise NeecoError(f"{where}: nothing joins {child} to {frame}; they hang from {ends[0]} and {ends[1]}")
+    ups, downs = _path(survey, where, child, frame)
     moving = [edge for edge in (*ups, *downs) if not survey.poses[f"tf:{edge}"].static]
     if not moving:
         raise NeecoError(f"{where}: does not move: all transforms between are static; name another frame")
@@ -58,17 +52,25 @@ def chained(survey: Survey, stream: str, images: set[str]) -> Table:
 def fixed_transform(survey: Survey, child: str, frame: str) -> np.ndarray | None:
     """[4, 4] mm frame_from_child where static transforms join the two; None elsewhere."""
     try:
-        ups, downs = (_to_root(survey, str(survey.path), name) for name in (child, frame))
-        while ups and downs and ups[-1] == downs[-1]:
-            ups.pop()
-            downs.pop()
-        ends = [_parent(survey, "", edges[-1]) if edges else name for edges, name in ((ups, child), (downs, frame))]
+        ups, downs = _path(survey, str(survey.path), child, frame)
     except NeecoError:
         return None
-    if ends[0] != ends[1] or not all(survey.poses[f"tf:{edge}"].static for edge in (*ups, *downs)):
+    if not all(survey.poses[f"tf:{edge}"].static for edge in (*ups, *downs)):
         return None
     once = np.zeros(1)
     return np.asarray((np.linalg.inv(_composed(survey, downs, once)) @ _composed(survey, ups, once))[0])
+
+
+def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str], list[str]]:
+    """The transforms from a child and from a frame up to what both hang from, each by its child. Raises NeecoError."""
+    ups, downs = (_to_root(survey, where, name) for name in (child, frame))
+    while ups and downs and ups[-1] == downs[-1]:
+        ups.pop()
+        downs.pop()
+    ends = [_parent(survey, where, edges[-1]) if edges else name for edges, name in ((ups, child), (downs, frame))]
+    if ends[0] != ends[1]:
+        raise NeecoError(f"{where}: nothing joins {child} to {frame}; they hang from {ends[0]} and {ends[1]}")
+    return ups, downs
 
 
 def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from neeco.errors import NeecoError
 from neeco.files import read_json, visible_entries
 from neeco.ingest.formats import (
     IMAGES,
+    OTHER,
     POSES,
     READINGS,
     RecordingFormat,
@@ -76,8 +77,9 @@ class DvrkSession(RecordingFormat):
         return any(_topic_of(file) for file in _tables_in(path)[:1])
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        films, found = _films(path), []
-        if not films and visible_entries(path, "*.mp4"):
+        films, absent = _films(path)
+        found = [Stream(name, IMAGES, "video", 0, problem=why) for name, why in absent.items()]
+        if not films and not absent and visible_entries(path, "*.mp4"):
             raise NeecoError(f"{path}: nothing says the times of its videos' frames; give the session's own folder")
         # the left camera's are the frames; others are listed
         for number, name in enumerate(sorted(films, key=lambda name: ("right" in name, "left" not in name, name))):
@@ -87,9 +89,16 @@ class DvrkSession(RecordingFormat):
         bag = _bag(path)
         if bag is not None:
             RosBag().require_package(bag)
-            return (*found, *RosBag().streams(bag))
+            try:
+                return (*found, *RosBag().streams(bag))
+            except NeecoError as error:
+                return (*found, Stream(bag.name, OTHER, "bag", 0, problem=str(error)))
         for topic, file in _topics(path).items():
-            table = DelimitedText().read(file)
+            try:
+                table = DelimitedText().read(file)
+            except NeecoError as error:
+                found.append(Stream(topic, OTHER, "table", 0, problem=str(error)))
+                continue
             kind, columns = _columns(table)
             if kind is not None:
                 found.append(_stream(topic, kind, columns, table))
@@ -109,7 +118,9 @@ class DvrkSession(RecordingFormat):
         return _converted(path, chosen, table, columns, start)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
-        films = _films(path)
+        films, absent = _films(path)
+        if (why := absent.get(re.sub(r"\.(left|right)$", "", stream or ""))) is not None:
+            raise NeecoError(why)
         name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
         if name not in films:
             raise NeecoError(f"{path}: stream: {printable(name)} is in the bag; name the bag as the video's file")
@@ -160,28 +171,34 @@ class _Files(VideoSource):
             yield index, pixels
 
 
-def _films(path: Path) -> dict[str, _Film]:
-    """Images by stream: of a session's videos, else of files named by their times."""
+def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:
+    """Images by stream, of a session's videos, else of files named by their times; and why other videos cannot be
+    used."""
     if not (path / INDEX).is_file():
-        return _stamped_files(path)
+        return _stamped_files(path), {}
     document = read_json(path / INDEX)
     videos = [video for entry in [document, *_list(document, "streams")] for video in _list(entry, "videos")]
     found: dict[str, _Film] = {}
+    absent: dict[str, str] = {}
     for video in videos:
         name = video.get("file") if isinstance(video, dict) else None
         if not isinstance(name, str) or Path(name).name != name or not name.lower().endswith(".mp4"):
             continue
         file = path / name
         if not file.is_file():
-            raise NeecoError(f"{path / INDEX}: videos: {printable(name)} is not there; put it beside {INDEX}")
-        sidecar = file.with_suffix(".json")
-        times, layout = _frame_times(sidecar)
+            absent[file.stem] = f"{path / INDEX}: videos: {printable(name)} is not there; put it beside {INDEX}"
+            continue
+        try:
+            times, layout = _frame_times(file.with_suffix(".json"))
+        except NeecoError as error:
+            absent[file.stem] = str(error)
+            continue
         if layout in HALVES:
             for half, side in enumerate(HALVES[layout]):
                 found[f"{file.stem}.{side}"] = _Film(times, (file,), half)
         else:
             found[file.stem] = _Film(times, (file,))
-    return found
+    return found, absent
 
 
 def _frame_times(sidecar: Path) -> tuple[np.ndarray, str]:
@@ -220,7 +237,7 @@ def _stamped_files(path: Path) -> dict[str, _Film]:
 
 def _start(path: Path) -> float:
     """Unix time s from which the times of all streams count: the first image's, else 0."""
-    return min((float(film.times[0]) for film in _films(path).values()), default=0.0)
+    return min((float(film.times[0]) for film in _films(path)[0].values()), default=0.0)
 
 
 def _bag(path: Path) -> Path | None:
@@ -243,7 +260,7 @@ def _tables_in(path: Path) -> list[Path]:
 
 def _topics(path: Path) -> dict[str, Path]:
     found = {topic: file for file in _tables_in(path) if (topic := _topic_of(file))}
-    if not found and not _films(path):
+    if not found and not any(_films(path)):
         raise NeecoError(f"{path}: holds no videos and no topics; give the folder of a session")
     return found
 

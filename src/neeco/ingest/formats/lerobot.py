@@ -68,10 +68,10 @@ class LeRobot(RecordingFormat):
             return False
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        """Those of the first episode; all others have the same."""
+        """Those of the first episode that is there; all others have the same."""
         data = self._data_set(path)
         count, first, last = data.episodes()
-        found = self._episode_streams(data, data.episode(first))
+        found = self._episode_streams(data, data.first_present())
         if count > 1:
             found = (*found, Stream(f"episodes {first} to {last}", OTHER, "episodes with the same streams", count))
         return found
@@ -102,6 +102,8 @@ class LeRobot(RecordingFormat):
             return _open_stored(data, episode, key, times, order, notes)
         from neeco.ingest.video import open_video
 
+        if key in episode.absent:
+            raise NeecoError(episode.absent[key])
         film = episode.films[key]
         part = None if film.start is None or film.end is None else (film.start, film.end)
         video = open_video(film.file, part=part)
@@ -158,17 +160,27 @@ class LeRobot(RecordingFormat):
         return data.episode(number), key
 
     def _episode_streams(self, data: DataSet, episode: Episode) -> tuple[Stream, ...]:
+        from neeco.ingest.formats._lerobotfiles import ParquetFile
+
         found = []
+        absent = dict(episode.absent)
+        for key in set(data.features) - set(data.films) - set(ParquetFile(episode.data).names):
+            absent[key] = f"{episode.data}: has no column {printable(key)}; download the data set again"
         for key in sorted(data.features, key=_camera_order):
             feature, name = data.features[key], f"episode {episode.number}/{key}"
-            kind = _kind(feature)
-            if kind == IMAGES:
-                size = "x".join(map(str, feature.shape))
-                found.append(Stream(name, IMAGES, f"{feature.dtype} {size}", episode.length, data.fps))
+            if _kind(feature) == IMAGES:
+                title = f"{feature.dtype} {'x'.join(map(str, feature.shape))}"
+                found.append(Stream(name, IMAGES, title, episode.length, data.fps, problem=absent.get(key)))
         for key, feature in data.features.items():
             name, kind = f"episode {episode.number}/{key}", _kind(feature)
             if kind == READINGS:
-                found += self._table_streams(data, feature, name, episode)
+                try:
+                    if key in absent:
+                        raise NeecoError(absent[key])
+                    found += self._table_streams(data, feature, name, episode)
+                except NeecoError as error:
+                    title = f"{feature.dtype} of {len(feature.names)}"
+                    found.append(Stream(name, READINGS, title, episode.length, data.fps, problem=str(error)))
             elif kind == OTHER and key not in _OWN:
                 found.append(Stream(name, OTHER, f"{feature.dtype} {list(feature.shape)}", episode.length, data.fps))
         return tuple(found)

@@ -52,21 +52,28 @@ class PlusSequence(RecordingFormat):
         times = _times(sequence)
         found = []
         if sequence.has_images:
-            count = len(_image_frames(sequence)[0])
+            frames, notes = _image_frames(sequence)
+            problem = None if len(frames) >= MIN_IMAGES else _too_few(sequence, frames, notes)
             color = "grey" if sequence.channels == 1 else "RGB"
             title = f"{color} images of {sequence.size[0]}x{sequence.size[1]}"
-            found.append(Stream(IMAGE_STREAM, IMAGES, title, count, _rate(times, sequence.count)))
+            rate = _rate(times, sequence.count)
+            found.append(Stream(IMAGE_STREAM, IMAGES, title, len(frames), rate, problem=problem))
         for name in _transforms(sequence):
             texts = sequence.fields[name + TRANSFORM]
             # what is the same in every frame is a calibration (ImageToProbe), no motion
             fixed = len(texts) > 1 and len(set(texts.values())) == 1
             title = "fixed transform" if fixed else "transform"
             body, kind = _ends(name)[0], OTHER if fixed else POSES
+            statuses = sequence.fields.get(name + TRANSFORM + STATUS, {})
+            problem = None
+            if not any(statuses.get(frame, GOOD).lower() == GOOD for frame in texts):
+                status = f"{name}{TRANSFORM}{STATUS} is {printable(next(iter(statuses.values())), 20)}"
+                problem = f"no frame can be used: {status} in all; record again, or name another transform"
             meaning = _meaning(name)
             found.append(
                 Stream(
                     name, kind, title, len(texts), _rate(times, len(texts)), body=body, hints=meaning.hints,
-                    asks=meaning.asks,
+                    asks=meaning.asks, problem=problem,
                 )
             )  # fmt: skip
         return tuple(found)
@@ -113,9 +120,6 @@ class PlusSequence(RecordingFormat):
         sequence = _sequence_of(path)
         choose_stream(path, self.streams(path), stream, (IMAGES,))
         frames, notes = _image_frames(sequence)
-        if len(frames) < MIN_IMAGES:
-            why = f" ({notes[0].partition(': ')[2]})" if notes else ""
-            raise NeecoError(f"{path}: {len(frames)} of {sequence.count} images can be used{why}; record again")
         times = _times(sequence)
         seconds = np.array([times[frame] for frame in frames])
         return SequenceImages(path, sequence.size, tuple(notes), seconds, sequence, tuple(frames))
@@ -184,6 +188,12 @@ def _image_frames(sequence: FrameSequence) -> tuple[list[int], list[str]]:
     if unstamped:
         notes.append(f"{name}: {unstamped} images have no {TIME} later than the one before; left out")
     return frames, notes
+
+
+def _too_few(sequence: FrameSequence, frames: Sequence[int], notes: Sequence[str]) -> str:
+    """Why the images cannot be used, of which only these frames are good."""
+    why = f" ({notes[0].partition(': ')[2]})" if notes else ""
+    return f"{len(frames)} of {sequence.count} images can be used{why}; record again"
 
 
 def _times(sequence: FrameSequence) -> dict[int, float]:

@@ -143,9 +143,9 @@ class RosBag(RecordingFormat):
         received = [log.received[number] for number in log.numbers]
         rate = _rate(survey.seconds(log.stamps, received))
         usable = len(log.numbers) > 0
-        why = "" if usable or not log.bad else f": one {log.bad.most_common(1)[0][0]}"
-        kind = f"{survey.image_types[name]}{f' ({log.description})' if usable else why}"
-        return Stream(name, IMAGES if usable else OTHER, kind, len(log.received), rate)
+        problem = None if usable or not log.bad else f"no image can be used: one {log.bad.most_common(1)[0][0]}"
+        kind = f"{survey.image_types[name]}{f' ({log.description})' if usable else ''}"
+        return Stream(name, IMAGES if usable or problem else OTHER, kind, len(log.received), rate, problem=problem)
 
     def _pose_stream(self, survey: Survey, name: str) -> Stream:
         log, meaning = survey.poses[name], _meaning(survey, name)
@@ -168,8 +168,19 @@ class RosBag(RecordingFormat):
             hints.append("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit")
         rate = _rate(survey.seconds(log.stamps, log.received))
         kind = OTHER if log.static else POSES
+        damaged = _all_damaged(log)
         return Stream(
-            name, kind, title, len(log.stamps), rate, offered, _body(name), None, tuple(hints), asks=meaning.asks
+            name,
+            kind,
+            title,
+            len(log.stamps),
+            rate,
+            offered,
+            _body(name),
+            None,
+            tuple(hints),
+            asks=meaning.asks,
+            problem=damaged,
         )
 
     def _joint_stream(self, survey: Survey, name: str) -> Stream:
@@ -182,7 +193,8 @@ class RosBag(RecordingFormat):
                 found = [("jaw", names[0])]
             wrist = tuple((known, _joint_column(joint)) for known, joint in found)
         rate = _rate(survey.seconds(log.stamps, log.received))
-        return Stream(name, READINGS, log.type, len(log.stamps), rate, offered, _body(name), wrist)
+        problem = _all_damaged(log)
+        return Stream(name, READINGS, log.type, len(log.stamps), rate, offered, _body(name), wrist, problem=problem)
 
 
 def _table(survey: Survey, name: str, log: Samples, header: tuple[str, ...], values: np.ndarray) -> Table:
@@ -193,6 +205,10 @@ def _table(survey: Survey, name: str, log: Samples, header: tuple[str, ...], val
         notes.append(f"{title}: {log.damaged} message{' is' if log.damaged == 1 else 's are'} damaged; left out")
     rows, numbers = np.column_stack([seconds, values]), np.arange(1, len(seconds) + 1)
     return Table(survey.path, header, rows, numbers, stream=name, record="message", notes=tuple(notes))
+
+
+def _all_damaged(log: Samples) -> str | None:
+    return f"all {log.damaged} messages are damaged" if log.damaged and not log.stamps else None
 
 
 def _time_notes(title: str, stamps: Sequence[int], received: np.ndarray) -> list[str]:

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from neeco.capture.documents import as_float, printable
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text, visible_entries
+from neeco.files import FastYamlLoader, parse_yaml, read_text, visible_entries
 from neeco.ingest.formats import (
     HUGE,
     IMAGES,
@@ -32,6 +31,7 @@ from neeco.ingest.formats import (
     choose_stream,
     compare_lengths,
 )
+from neeco.ingest.logs import WRONG_ROWS
 from neeco.ingest.stereofile import read_stereo
 from neeco.ingest.video import open_images, open_video
 
@@ -43,7 +43,6 @@ JOINT_NAMES = ("yaw_rad", "pitch_rad", "insertion_m", "roll_rad", "wrist_pitch_r
 WRIST = (("wrist_pitch", "wrist_pitch_rad"), ("wrist_yaw", "wrist_yaw_rad"), ("jaw", "jaw_rad"))
 POSE_HEADER = ("t_s", *(f"m{row}{column}{'_m' if column == 3 else ''}" for row in range(3) for column in range(4)))
 LIGHTS = ("regular", "", "green")  # folders of the videos; what is green shows the ultraviolet paint
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # 20 times faster where PyYAML was built with it
 
 
 @dataclass(frozen=True, eq=False)  # it holds arrays
@@ -127,6 +126,8 @@ def _read(path: Path) -> _Arms:
     states = []
     for name in (POSE_FILE, JOINT_FILE):
         file = path / name
+        if name == JOINT_FILE and not file.exists():
+            continue  # poses can be used without joints
         try:
             state = file.stat()
         except OSError as error:
@@ -140,31 +141,34 @@ def _read(path: Path) -> _Arms:
 @lru_cache(maxsize=2)
 def _cached(path: Path, state: tuple[int, ...]) -> _Arms:
     poses = _by_arm(path / POSE_FILE, _pose, "R (3x3) and t")
-    joints = _by_arm(path / JOINT_FILE, _joints, "six or seven joints")
+    joints = {}
+    if (path / JOINT_FILE).exists():
+        joints = _by_arm(path / JOINT_FILE, _joints, "six or seven joints")
     return _Arms(poses, joints)
 
 
 def _by_arm(file: Path, parse: Any, expected: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Frames [T] and rows [T, C] of each arm, from {frame: {arm: values}}."""
-    document = parse_yaml(file, read_text(file, "states by frame"), "copy it again", _Loader)
+    document = parse_yaml(file, read_text(file, "states by frame"), "copy it again", FastYamlLoader)
     if not isinstance(document, dict) or not document:
         raise NeecoError(f"{file}: expected states by frame, as in '0': {{PSM1: ...}}; copy it again")
-    found: dict[str, list[tuple[int, Sequence[float]]]] = {}
+    found: dict[str, list[tuple[int, Sequence[float] | None]]] = {}
     for key, arms in document.items():
         frame = _frame(file, key)
         if not isinstance(arms, dict):
             raise NeecoError(f"{file}: frame {frame}: expected the state of each arm; copy it again")
         for arm, value in arms.items():
-            row = parse(value)
-            if row is None:
-                raise NeecoError(f"{file}: frame {frame}: {printable(arm)}: expected {expected}; copy it again")
-            found.setdefault(str(arm), []).append((frame, row))
+            found.setdefault(str(arm), []).append((frame, parse(value)))
     tables = {}
     for arm, rows in found.items():
         rows.sort(key=lambda row: row[0])
-        if len({len(row) for _, row in rows}) > 1:
+        bad = [frame for frame, row in rows if row is None]
+        if len(bad) > WRONG_ROWS * len(rows):
+            raise NeecoError(f"{file}: frame {bad[0]}: {printable(arm)}: expected {expected}; copy it again")
+        lengths = {len(row) for _, row in rows if row is not None}
+        if len(lengths) > 1:
             raise NeecoError(f"{file}: {printable(arm)}: has more joints in some frames than in others; copy it again")
-        values = np.array([row for _, row in rows])
+        values = np.array([row or [np.nan] * min(lengths) for _, row in rows])  # as a table has what is missing
         values[~(np.abs(values) < HUGE)] = np.nan  # which is how a table says that a value is missing
         tables[arm] = (np.array([frame for frame, _ in rows], np.int64), values)
     if not tables:

@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text, write_text
+from neeco.files import YamlDumper, parse_yaml, read_text, write_text
 
 FILE = "hand_posed.yaml"
 HEADER = """\
@@ -87,9 +87,8 @@ def _line(answer: HandPose) -> str:
         "joints_deg": {name: round(angle, 1) for name, angle in answer.joints_deg.items()},
     }
     value |= {key: getattr(answer, key) for key in OPTIONAL if getattr(answer, key) is not None}
-    return str(
-        yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=math.inf, allow_unicode=True)
-    ).strip()
+    style: dict[str, Any] = {"default_flow_style": True, "sort_keys": False, "width": math.inf, "allow_unicode": True}
+    return str(yaml.dump(value, Dumper=YamlDumper, **style)).strip()
 
 
 def _answer(entry: Any, place: str) -> HandPose:

@@ -45,7 +45,10 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
         if boundary is not None:
             articulation.wrist_start.fill_(boundary)
         for reading in articulation.reading_names:
-            verdicts[f"{instrument.name}.{reading}"] = _verdict(session, articulated, index, reading)
+            verdict = _verdict(session, articulated, index, reading)
+            verdicts[f"{instrument.name}.{reading}"] = verdict
+            if not verdict["found"]:
+                session.report(f"warning: {instrument.name}: joint {reading} {verdict['verdict']}")
         scene = session.scene
         count = int(solid_gaussians(scene.canonical, index).sum())
         scene.diagnostics.setdefault("instruments", {}).setdefault(instrument.name, {})["solid_gaussians"] = count

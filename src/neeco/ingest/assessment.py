@@ -2,29 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from neeco.capture.documents import Problem
 from neeco.capture.fromvideofile import UNKNOWN_DEG
 from neeco.capture.model import Capture
 from neeco.ingest.result import IngestResult
 
-# Limits above which the page begins to doubt: conventions, not measurements.
+# Limits above which an ingest is doubted: conventions, not measurements.
 POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.015, 0.5
 SEVERE = 3.0  # times the limit
 FEW_TRAIN, FEW_POINTS = 20, 100
+LITTLE_OVERLAP = 0.8  # of a base's outline with what moves: nine tenths are usual, half is another instrument or time
+NO_OVERLAP = 0.6
+SHOWN = 5  # doubts listed by `lines`
+VERDICTS = {"good": "good", "careful": "usable", "bad": "doubtful"}
 USABLE = ("not among the", "beside an unseen frame")  # how reasons begin that do not speak against a frame
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """headline: one sentence; doubts: why it is not better, one sentence each."""
+    """headline: one sentence; doubts: why it is not better, one sentence each, the worst first."""
 
     level: Literal["good", "careful", "bad"]
     headline: str
     doubts: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """The verdict for a terminal: the headline, a doubtful one's in capitals, and the first SHOWN doubts."""
+        verdict, _, rest = self.headline.partition(":")
+        words = {"good": f"good. {self.headline}", "careful": self.headline, "bad": f"{verdict.upper()}:{rest}"}
+        shown = [words[self.level]]
+        others = [doubt for doubt in self.doubts if not self.headline.endswith(_lower(doubt))]
+        shown += [f"  - {doubt}" for doubt in others[:SHOWN]]
+        return shown + ([f"  - and {len(others) - SHOWN} more doubts"] if len(others) > SHOWN else [])
+
+    def as_json(self) -> dict[str, Any]:
+        """For scripts (`--json`)."""
+        return {"verdict": VERDICTS[self.level], "headline": self.headline, "doubts": list(self.doubts)}
 
 
 def rms(values: np.ndarray) -> float:
@@ -32,13 +51,19 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
 
 
-def assess_ingest(result: IngestResult, capture: Capture) -> Assessment:
-    """Judge a finished ingest by its own numbers; nothing here knows the truth."""
-    severe: list[str] = []
-    doubts: list[str] = []
+def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Problem] = ()) -> Assessment:
+    """Judge a finished ingest by its own numbers, by contradictions in its recording, and by the problems that `check`
+    found in its capture; nothing here knows the truth."""
+    severe = [_sentence(doubt.sentence) for doubt in result.doubts if doubt.severe]
+    severe += [_sentence(str(problem)) for problem in problems if problem.severity == "error"]
+    doubts = [_sentence(doubt.sentence) for doubt in result.doubts if not doubt.severe]
     for value, limit, sentence in _measured(result, capture):
         if value > limit:
             (severe if value > SEVERE * limit else doubts).append(sentence)
+    for name, base in result.bases.items():
+        if base.overlap < LITTLE_OVERLAP:
+            sentence = f"The outline of {name} and what moves overlap by {base.overlap:.2f} only: is its clock right?"
+            (severe if base.overlap < NO_OVERLAP else doubts).append(sentence)
     train = len(capture.split("train"))
     if train < FEW_TRAIN:
         severe.append(f"Only {train} frames are left to train on.")
@@ -54,19 +79,26 @@ def assess_ingest(result: IngestResult, capture: Capture) -> Assessment:
     ]
     if result.in_video and not _rolls_known(capture):
         doubts.append("The instrument's roll is not known: log it, or pose frames by hand, before training.")
+    doubts += [_sentence(str(problem)) for problem in problems if problem.severity == "warning"]
     if not capture.instruments:
-        severe.append("No instrument was tracked: only methods without states, such as 3dgs, can be trained.")
-        return Assessment("bad", "Cameras only: there is no instrument to pose.", (*severe, *doubts))
-    if not capture.registered:
-        severe.append("The instrument's poses are not in the cameras' frame, so it cannot be drawn where it was.")
-        headline = "Cameras and instrument do not meet: instrument poses are in a frame of their own."
-        return Assessment("bad", headline, (*severe, *doubts))
+        doubts.append("No instrument was tracked: only methods without states, such as 3dgs, can be trained.")
+        if not severe:
+            return Assessment("careful", "Cameras only: there is no instrument to pose.", tuple(doubts))
+    elif not capture.registered:
+        severe.append(
+            "Cameras and instrument do not meet: instrument poses are in a frame of their own, so that it cannot be "
+            "drawn where it was."
+        )
     if severe:
         return Assessment("bad", "Doubtful: " + _lower(severe[0]), (*severe, *doubts))
     if doubts:
         return Assessment("careful", "Usable, with care: " + _lower(doubts[0]), tuple(doubts))
     fit = "nothing measured speaks against it" if result.registration is None else "cameras and instrument fit together"
     return Assessment("good", f"Ready to train: {fit}.", ())
+
+
+def _sentence(text: str) -> str:
+    return text[0].upper() + text[1:] + ("" if text.endswith((".", "?")) else ".")
 
 
 def _rolls_known(capture: Capture) -> bool:

@@ -1,0 +1,253 @@
+"""What calibration files say of one camera or of two, in the names of OpenCV, ROS, Kalibr, ORB-SLAM and their like.
+
+All of them name what OpenCV does: a principal point that counts from the first pixel's centre, and its distortion.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import cv2
+import yaml
+
+from neeco.capture.documents import as_float, printable
+from neeco.errors import NeecoError
+from neeco.files import YamlLoader, parse_yaml, read_json, read_text
+
+EXPECTED = "camera_matrix and distortion_coefficients, as OpenCV writes them"
+FISHEYE = {"fisheye", "equidistant", "equi", "kannalabrandt", "kannalabrandt8", "opencvfisheye"}
+OTHER_MODELS = {"fov", "omni", "mei", "ds", "doublesphere", "eucm", "scaramuzza"}  # that OpenCV's cannot stand for
+SIDES = (("left", "right"), ("l", "r"), ("0", "1"), ("1", "2"), ("cam0", "cam1"), ("camera1", "camera2"))
+MAX_DEPTH = 60  # of nested brackets, tags or blanks: OpenCV's parser recurses without a limit
+MAX_INDENT = 4 * MAX_DEPTH  # blanks
+
+# names without capitals and signs: Camera_Matrix, cameraMatrix and camera_matrix are one
+_MATRIX = ("cameramatrix", "intrinsicmatrix", "intrinsicsmatrix", "cammatrix", "cameramat", "mtx", "k", "m")
+_DISTORTION = (
+    "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distcoefs", "distortion", "dist", "d",
+)  # fmt: skip
+_INTRINSICS = ("intrinsics", "projectionparameters")  # four numbers, or by name
+_FOCAL = (("fx", "fy", "cx", "cy"), ("mu", "mv", "u0", "v0"))
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE_COEFFICIENTS = (("k1", "k2", "k3", "k4"), ("k2", "k3", "k4", "k5"))  # of OpenCV, and with mu, mv, u0, v0
+_SIZES = (("imagewidth", "imageheight"), ("width", "height"), ("w", "h"), ("cols", "rows"))
+_SIZE_LISTS = ("resolution", "imagesize", "size")  # width, height
+_MODELS = ("distortionmodel", "cameramodel", "modeltype", "type", "model")
+_SECTIONS = ("camera", "cam", "cam0", "camera1")
+
+
+@dataclass(frozen=True)
+class CameraNumbers:
+    """One camera. intrinsics: fx, fy, cx, cy px, the first pixel's centre at 0; distortion: OpenCV's coefficients, of a
+    fisheye lens where `fisheye`; size: width and height px, as they stand there; keys: all it says, by plain name."""
+
+    intrinsics: tuple[float, float, float, float]
+    distortion: tuple[float, ...]
+    size: tuple[Any, Any]
+    fisheye: bool
+    keys: Mapping[str, Any]
+
+
+class _Loader(YamlLoader):
+    """YAML with OpenCV's matrices."""
+
+
+for _tag in ("opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(
+        f"tag:yaml.org,2002:{_tag}",
+        lambda loader, node: loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None,
+    )
+
+
+def read_calibration(path: Path) -> Any:
+    """What a calibration file holds: JSON, YAML, or OpenCV's own dialects of YAML and XML.
+
+    YAML is read by PyYAML, which unlike cv2.FileStorage reads ROS's files and plain lists, and names a bad line; by
+    cv2.FileStorage what only OpenCV takes for YAML, as `data:[1, 2]` and `%PATH`. Raises NeecoError.
+    """
+    if path.suffix.lower() == ".json":
+        return read_json(path)
+    text = read_text(path, "OpenCV's calibration as YAML or XML")
+    if text.lstrip().startswith("<"):
+        if "<opencv_storage" not in text:
+            raise NeecoError(f"{path}: is XML, but not OpenCV's (<opencv_storage>); save the calibration as YAML")
+        header = "" if text.lstrip().startswith("<?xml") else '<?xml version="1.0"?>\n'
+        found = _by_opencv(header + text.lstrip())
+        if found is None:
+            raise NeecoError(f"{path}: is XML that OpenCV cannot read; save the calibration again")
+        return found
+    # `%YAML:1.0` is OpenCV's own spelling, which YAML itself does not allow
+    lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
+    begun = next((number for number, line in enumerate(lines) if re.match(r"\s*[^\s#-]", line)), 0)
+    if "---" in lines[begun:]:  # as `rostopic echo` ends each message
+        lines = lines[: lines.index("---", begun)]
+    try:
+        document = parse_yaml(path, "\n".join(lines), "save the calibration again", _Loader)
+    except NeecoError:
+        document = _by_opencv(text)
+        if document is None:
+            raise
+    if not isinstance(document, dict) and isinstance(again := _by_opencv(text), dict):
+        return again
+    return document
+
+
+def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
+    """The camera that a document describes, or the left one and the right one; () where it describes none. `where`
+    begins messages. Raises NeecoError for numbers that cannot be."""
+    if not isinstance(document, dict):
+        return ()
+    keys = _plain(document)
+    for pair in SIDES:
+        sides = [_side(keys, side) for side in pair]
+        if all(_has_camera(side) for side in sides):
+            left, right = (_camera(where, side, pair_of=True) for side in sides)
+            return left, right
+    for section in ("", *_SECTIONS):
+        inner = keys if not section else _side(keys, section)
+        if _has_camera(inner):
+            return (_camera(where, inner),)
+    return ()
+
+
+def first_of(document: Mapping[Any, Any], names: Sequence[str]) -> Any:
+    """What the first of these names holds; None where there is none."""
+    return next((document[name] for name in names if document.get(name) is not None), None)
+
+
+def word(name: str) -> str:
+    """A name in small letters and digits alone."""
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def matrix_numbers(where: Path | str, value: Any, field: str) -> list[float]:
+    """The numbers of a matrix in row order, from OpenCV's or ROS's {rows, cols, data} or from (nested) lists."""
+    if isinstance(value, dict):
+        value = value.get("data")
+    if value is None:
+        raise NeecoError(f"{where}: {field}: missing; expected it as OpenCV writes it")
+    if not isinstance(value, list):
+        raise NeecoError(f"{where}: {field}: expected numbers, found {printable(value)}; write it as OpenCV does")
+    flat: list[float] = []
+    for item in value:
+        for entry in item if isinstance(item, list) else [item]:
+            number = as_float(entry)
+            if number is None:
+                raise NeecoError(
+                    f"{where}: {field}: {printable(entry)} is not a usable number; write it as OpenCV does"
+                )
+            flat.append(number)
+    return flat
+
+
+def _by_opencv(text: str) -> Any:
+    """What cv2.FileStorage reads of a text; None where it does not take it for one of its own."""
+    depths = accumulate(1 if token in "[{<" else -1 for token in re.findall(r"[\[{]|[\]}]|<(?![/?!])|</", text))
+    indent = max((len(line) - len(line.lstrip()) for line in text.splitlines()), default=0)
+    if max(depths, default=0) > MAX_DEPTH or indent > MAX_INDENT or not text.startswith(("%YAML", "<?xml")):
+        return None
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    except (cv2.error, SystemError):
+        return None
+    try:
+        return _value(storage.root()) if storage.isOpened() else None
+    finally:
+        storage.release()
+
+
+def _value(node: Any) -> Any:
+    if node.isMap():
+        return {name: _value(node.getNode(name)) for name in node.keys()}  # noqa: SIM118 - no mapping
+    if node.isSeq():
+        return [_value(node.at(index)) for index in range(node.size())]
+    if node.isString():
+        return node.string()
+    return int(node.real()) if node.isInt() else node.real() if node.isReal() else None
+
+
+def _plain(document: Mapping[Any, Any]) -> dict[str, Any]:
+    """By names of small letters and digits."""
+    return {word(str(name)): value for name, value in document.items()}
+
+
+def _side(keys: Mapping[str, Any], side: str) -> dict[str, Any]:
+    """What a document says of one camera: in a section of its own, or by keys that begin or end with its name; of
+    images' size and model, what it says of both."""
+    section = keys.get(side)
+    if isinstance(section, dict) and "data" not in section:
+        return _plain(section)
+    shared = [name for names in (*_SIZES, _SIZE_LISTS, _MODELS) for name in names]
+    found = {name: keys[f"camera{name}"] for name in shared if f"camera{name}" in keys}  # Camera.width, Camera1.fx
+    found |= {name: keys[name] for name in shared if name in keys}
+    found |= {name.removesuffix(side): value for name, value in keys.items() if name.endswith(side) and name != side}
+    return found | {
+        name.removeprefix(side): value for name, value in keys.items() if name.startswith(side) and name != side
+    }
+
+
+def _has_camera(keys: Mapping[str, Any]) -> bool:
+    matrix = first_of(keys, _MATRIX)
+    if isinstance(matrix, dict | list):
+        return True
+    listed = first_of(keys, _INTRINSICS)
+    if isinstance(listed, list):  # with more than that: `intrinsics` of a recording.yaml count from the image's corner
+        return len(listed) == 4 and first_of(keys, (*_MODELS, *_DISTORTION, *_SIZE_LISTS)) is not None
+    named = _plain(listed) if isinstance(listed, dict) else keys
+    return any(set(names) <= set(named) for names in _FOCAL)
+
+
+def _camera(where: Path | str, keys: Mapping[str, Any], pair_of: bool = False) -> CameraNumbers:
+    """What keys that have a camera say of it."""
+    models = {word(str(keys[name])) for name in _MODELS if name in keys}
+    if unread := models & OTHER_MODELS:
+        raise NeecoError(
+            f"{where}: {min(unread)}: this model of a lens is not read; calibrate a pinhole with radial and tangential "
+            "(radtan), or equidistant, distortion"
+        )
+    matrix, listed = first_of(keys, _MATRIX), first_of(keys, _INTRINSICS)
+    if isinstance(matrix, dict | list):
+        values = matrix_numbers(where, matrix, "camera_matrix")
+        if len(values) != 9:
+            raise NeecoError(f"{where}: camera_matrix: needs 9 numbers, has {len(values)}; write it as OpenCV does")
+        if values[2] == values[5] == 0 and all(values[6:8]):
+            raise NeecoError(f"{where}: camera_matrix: stands column by column; write it row by row, as OpenCV does")
+        four = [values[0], values[4], values[2], values[5]]
+    elif isinstance(listed, list):
+        four = matrix_numbers(where, listed, "intrinsics")
+    else:
+        held = _plain(listed) if isinstance(listed, dict) else keys
+        names = next(names for names in _FOCAL if set(names) <= set(held))
+        four = matrix_numbers(where, [held[name] for name in names], ", ".join(names))
+    size = next(((keys[w], keys[h]) for w, h in _SIZES if w in keys and h in keys), (None, None))
+    both = first_of(keys, _SIZE_LISTS)
+    if isinstance(both, list) and len(both) == 2:
+        size = (both[0], both[1])
+    fisheye = bool(models & FISHEYE)
+    bends = _distortion(where, keys, fisheye)
+    if pair_of and matrix is not None and not bends and first_of(keys, _DISTORTION) is None:
+        raise NeecoError(f"{where}: distortion: not there for two cameras; give D1 and D2, zeros where there is none")
+    return CameraNumbers((four[0], four[1], four[2], four[3]), tuple(bends), size, fisheye, keys)
+
+
+def _distortion(where: Path | str, keys: Mapping[str, Any], fisheye: bool) -> list[float]:
+    """Coefficients: of a vector, or by name, among all keys or in a section of their own."""
+    vector = first_of(keys, _DISTORTION)
+    if vector is not None:
+        return matrix_numbers(where, vector, "distortion_coefficients")
+    sections = [keys.get(name) for name in ("projectionparameters", "distortionparameters")]
+    held = dict(keys)
+    for section in sections:
+        held |= _plain(section) if isinstance(section, dict) else {}
+    names = _COEFFICIENTS if not fisheye else _FISHEYE_COEFFICIENTS["mu" in held]
+    given = [index for index, name in enumerate(names) if held.get(name) is not None]
+    if not given:
+        return []
+    count = next(length for length in (4, 5, 8) if length > given[-1])
+    values = [held.get(name) or 0.0 for name in names[:count]]
+    return matrix_numbers(where, values, ", ".join(names[:count]))
