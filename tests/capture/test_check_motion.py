@@ -128,15 +128,18 @@ def test_a_clock_that_is_off_is_told_in_seconds_where_frames_are_unevenly_spaced
     assert line.endswith("states of 'maryland' fit the images better 0.48 s later")
 
 
-def test_a_capture_says_the_mistake_as_a_warning_and_training_does_not_look(sample):
+def test_a_capture_says_the_mistake_as_a_strong_warning_that_training_is_given_and_does_not_refuse(sample):
     document = json.loads((SAMPLE / "transforms.json").read_text())
     shift(7)(document)
     (sample / "transforms.json").write_text(json.dumps(document))
+    given: list[str] = []
+    assert read_checked(sample, report=given.append).instruments
     (problem,) = check_capture(sample)
+    assert given == [str(problem)]
     assert problem.severity == "warning"
+    assert problem.contradicted
     assert problem.message == "states of 'maryland' fit the images better 7 frames later"
     assert problem.remedy.startswith("move them 7 frames later")
-    assert read_checked(sample).instruments  # not refused
 
 
 @pytest.mark.parametrize("field", ["instrument_frame", "ply_file_path"])

@@ -252,8 +252,13 @@ def test_the_verdict_names_what_is_doubtful(changes, level, piece):
 
 def test_what_check_finds_is_in_the_verdict():
     capture = read_capture(SAMPLE)
-    for severity, level in (("warning", "careful"), ("error", "bad")):
-        problem = Problem(severity, "transforms.json", "frames", "images contradict the poses", "correct them")
+    for severity, contradicted, level in (
+        ("warning", False, "careful"),
+        ("warning", True, "bad"),
+        ("error", False, "bad"),
+    ):
+        words = ("transforms.json", "frames", "images contradict the poses", "correct them")
+        problem = Problem(severity, *words, contradicted)
         verdict = assess_ingest(made(SAMPLE), capture, [problem])
         assert verdict.level == level
         assert "images contradict the poses; correct them" in verdict.headline

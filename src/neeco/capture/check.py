@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -83,10 +83,16 @@ def check_capture(path: Path | str, transforms: str = "transforms.json") -> list
     return inspect_capture(path, transforms).problems
 
 
-def read_checked(path: Path | str, transforms: str = "transforms.json") -> Capture:
-    """A capture that can be trained on. Raises NeecoError with the first error that `check_capture` finds."""
-    checked = inspect_capture(path, transforms, motion=False)
+def read_checked(
+    path: Path | str, transforms: str = "transforms.json", report: Callable[[str], None] | None = None
+) -> Capture:
+    """A capture that can be trained on. report: is given what the images contradict, which takes seconds to find.
+    Raises NeecoError with the first error that `check_capture` finds."""
+    checked = inspect_capture(path, transforms, motion=report is not None)
     ProblemReport(checked.problems).raise_first(path)
+    for problem in checked.problems:
+        if report is not None and problem.contradicted:
+            report(str(problem))
     assert checked.capture is not None  # else there would be an error
     return checked.capture
 

@@ -203,13 +203,14 @@ def check_images(parsed: Parsed) -> bool:
     if found is None and not fits:
         found = _order(parsed, colors, given)
     if found is not None:
-        frames.warning(found.message, found.remedy)
+        frames.warning(found.message, found.remedy, contradicted=True)
         return False
     if given.mean() < CONTRADICTED and colors.agreement(coarse=True).mean() < CONTRADICTED_COARSELY:
         frames.warning(
             "the images contradict the cameras: sparse points do not have the colours of the pixels they project to "
-            f"(correlation {given.mean():.2f}, at least {GOOD:g} where they fit)",
+            f"(correlation {given.mean():.2f})",
             "images, cameras, intrinsics and points must be of one recording, in one order, and nothing turned",
+            contradicted=True,
         )
         return False
     as_given, swapped = (colors.color_difference(swapped) for swapped in (False, True))
@@ -218,6 +219,7 @@ def check_images(parsed: Parsed) -> bool:
             f"red and blue of the images are swapped against the sparse points' (they differ by {as_given:.0f} of 255, "
             f"swapped by {swapped:.0f})",
             "write both as RGB (OpenCV reads and writes BGR)",
+            contradicted=True,
         )
     return True
 

@@ -77,7 +77,7 @@ def check_motion(parsed: Parsed) -> None:
     for instrument in parsed.instruments:
         fault = motion_fault(parsed, instrument, rays)
         if fault is not None:
-            parsed.header(fault.field).warning(fault.message, fault.remedy)
+            parsed.header(fault.field).warning(fault.message, fault.remedy, contradicted=True)
 
 
 def motion_fault(parsed: Parsed, instrument: Instrument, rays: Rays) -> MotionFault | None:

@@ -34,6 +34,7 @@ class Problem:
     field: str
     message: str
     remedy: str
+    contradicted: bool = False  # a warning: the images say that what is recorded is wrong
 
     def __str__(self) -> str:
         place = f"{self.file}: {self.field}" if self.field else self.file
@@ -68,8 +69,8 @@ class ProblemReport:
     def error(self, file: str, field: str, message: str, remedy: str = "") -> None:
         self.problems.append(Problem("error", file, field, message, remedy))
 
-    def warning(self, file: str, field: str, message: str, remedy: str = "") -> None:
-        self.problems.append(Problem("warning", file, field, message, remedy))
+    def warning(self, file: str, field: str, message: str, remedy: str = "", contradicted: bool = False) -> None:
+        self.problems.append(Problem("warning", file, field, message, remedy, contradicted))
 
     def raise_first(self, root: object) -> None:
         """Raise NeecoError with the first error, if there is one. `root`: the capture, named in the message."""
@@ -134,8 +135,8 @@ class Node:
         message, _, remedy = str(error).partition("; ")
         self.error(message, remedy)
 
-    def warning(self, message: str, remedy: str = "") -> None:
-        self.report.warning(self.file, self.field, message, remedy)
+    def warning(self, message: str, remedy: str = "", contradicted: bool = False) -> None:
+        self.report.warning(self.file, self.field, message, remedy, contradicted)
 
     @property
     def reported(self) -> bool:

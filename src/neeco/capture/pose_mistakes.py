@@ -9,10 +9,8 @@ from itertools import permutations, product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.model import swap_camera_axes
+from neeco.capture.conventions import DVRK_ECM, OPENGL
 
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera axes from OpenGL's, or back
-ECM = np.diag([-1.0, -1.0, 1.0, 1.0])  # OpenCV's camera axes from those of the dVRK's ECM (x left, y up), or back
 UNITS = {"centimetres": 10.0, "inches": 25.4, "metres": 1000.0}  # mm
 SCALES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 2.0)
 
@@ -49,9 +47,17 @@ def placement_mistakes(poses: np.ndarray, world_from_camera: np.ndarray) -> Iter
     yield Mistake("poses {of} are instrument-from-world", invert, np.linalg.inv(poses))
     in_camera = "poses {of} are in the camera's frame"
     yield Mistake(in_camera, "multiply by world_from_camera", world_from_camera @ poses)
-    yield Mistake(f"{in_camera} with OpenGL axes", "multiply by transform_matrix", world_from_camera @ OPENGL @ poses)
+    yield Mistake(
+        f"{in_camera} with OpenGL axes",
+        "multiply by transform_matrix",
+        world_from_camera @ OPENGL.poses_to_opencv(poses),
+    )
     ecm = "the axes of the dVRK's ECM (x left, y up)"
-    yield Mistake(f"{in_camera} with {ecm}", "turn them by diag(-1, -1, 1) first", world_from_camera @ ECM @ poses)
+    yield Mistake(
+        f"{in_camera} with {ecm}",
+        "turn them by diag(-1, -1, 1) first (`frame: ecm` in recording.yaml)",
+        world_from_camera @ DVRK_ECM.poses_to_opencv(poses),
+    )
     yield Mistake(
         "poses {of} are camera-from-instrument, inverted",
         "invert them and multiply by world_from_camera",
@@ -60,13 +66,13 @@ def placement_mistakes(poses: np.ndarray, world_from_camera: np.ndarray) -> Iter
     camera_from_instrument = np.linalg.inv(world_from_camera) @ poses
     yield Mistake(
         f"poses {{of}} are turned by 180 degrees about the camera's view: they have {ecm}",
-        "turn them by diag(-1, -1, 1) in the camera's frame",
-        world_from_camera @ ECM @ camera_from_instrument,
+        "turn them by diag(-1, -1, 1) in the camera's frame (`frame: ecm` in recording.yaml)",
+        world_from_camera @ DVRK_ECM.poses_to_opencv(camera_from_instrument),
     )
     yield Mistake(
         "poses {of} have y and z flipped in the camera's frame (OpenGL axes)",
         "turn them by diag(1, -1, -1) in the camera's frame",
-        world_from_camera @ OPENGL @ camera_from_instrument,
+        world_from_camera @ OPENGL.poses_to_opencv(camera_from_instrument),
     )
     for axis, name in enumerate("xyz"):
         flip = np.eye(4)
@@ -89,12 +95,12 @@ def placement_mistakes(poses: np.ndarray, world_from_camera: np.ndarray) -> Iter
 
 def camera_mistakes(world_from_camera: np.ndarray) -> Iterator[Mistake]:
     """Mistakes of camera poses [N, 4, 4] (OpenCV axes), as they are stated with OpenGL axes in files."""
-    opengl = swap_camera_axes(world_from_camera)
+    opengl = OPENGL.camera_to_opencv(world_from_camera)
     inverted = np.linalg.inv(opengl)
     flip = "flip y and z: transform_matrix has OpenGL axes"
     yield Mistake("camera axes are OpenCV's", flip, opengl)
     invert = "invert them: camera-to-world is expected"
-    yield Mistake("camera matrices are world-to-camera", invert, swap_camera_axes(inverted))
+    yield Mistake("camera matrices are world-to-camera", invert, OPENGL.camera_to_opencv(inverted))
     yield Mistake("camera matrices are world-to-camera with OpenCV axes", "invert them, then flip y and z", inverted)
     for given, restore in ((world_from_camera, np.asarray), (np.linalg.inv(world_from_camera), np.linalg.inv)):
         for mistake in rotation_mistakes(given):

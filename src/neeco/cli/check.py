@@ -48,8 +48,9 @@ def run(arguments: Arguments) -> int:
 def _print(problems: list[Problem], errors: int, summary: CaptureSummary) -> None:
     console = Console(soft_wrap=True, highlight=False)
     for problem in problems:
-        style = "bold red" if problem.severity == "error" else "yellow"
-        console.print(Text.assemble((f"{problem.severity:<8}", style), str(problem)))
+        style = "bold red" if problem.severity == "error" else "bold yellow" if problem.contradicted else "yellow"
+        label = problem.severity.upper() if problem.contradicted else problem.severity
+        console.print(Text.assemble((f"{label:<8}", style), str(problem)))
     warnings = len(problems) - errors
     if problems:
         console.print(f"{_count(errors, 'error')}, {_count(warnings, 'warning')}")

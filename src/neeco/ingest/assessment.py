@@ -55,7 +55,8 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
     """Judge a finished ingest by its own numbers, by contradictions in its recording, and by the problems that `check`
     found in its capture; nothing here knows the truth."""
     severe = [_sentence(doubt.sentence) for doubt in result.doubts if doubt.severe]
-    severe += [_sentence(str(problem)) for problem in problems if problem.severity == "error"]
+    grave = [problem for problem in problems if problem.severity == "error" or problem.contradicted]
+    severe += [_sentence(str(problem)) for problem in grave]
     doubts = [_sentence(doubt.sentence) for doubt in result.doubts if not doubt.severe]
     for value, limit, sentence in _measured(result, capture):
         if value > limit:
@@ -79,7 +80,7 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
     ]
     if result.in_video and not _rolls_known(capture):
         doubts.append("The instrument's roll is not known: log it, or pose frames by hand, before training.")
-    doubts += [_sentence(str(problem)) for problem in problems if problem.severity == "warning"]
+    doubts += [_sentence(str(problem)) for problem in problems if problem not in grave]
     if not capture.instruments:
         doubts.append("No instrument was tracked: only methods without states, such as 3dgs, can be trained.")
         if not severe:

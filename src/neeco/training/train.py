@@ -95,7 +95,9 @@ def train(
     elif not is_vacant(output):
         raise NeecoError(f"{output}: not empty; give another --output, or --resume to continue the run in it")
     config = replace(config, deformation=method_class(config.method).resolved(config.deformation))
-    capture = read_checked(capture_path, config.transforms) if capture is None else capture
+    contradicted: list[str] = []
+    if capture is None:
+        capture = read_checked(capture_path, config.transforms, None if resume else contradicted.append)
     digest = fingerprint(capture)
     if resume:
         require_same_capture(output, capture.root, digest)
@@ -112,6 +114,8 @@ def train(
             raise KeyboardInterrupt("before the first step; run the same command again") from None
         if not (output / "config.yaml").exists():
             write_config(output, capture_path, config, digest)
+        for problem in contradicted:
+            log.note(f"warning: {problem}")
         log.note(_size_note(frames, config))
         with deferred_interrupts() as stop:
             _run(session, output, config, log, stop, go_on)
