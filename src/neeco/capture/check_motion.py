@@ -34,7 +34,8 @@ BY_CHANCE = 3.0  # factor by which poses without a mistake explain more than the
 # the same, of the poses given, below which they explain too little; in few frames chance explains much
 CONTRADICTED_BY_CHANCE, FEW_FRAMES_BY_CHANCE = 4.0, 1.5
 SHUFFLES = 6
-MIN_FRAMES_ELSEWHERE = 36  # of many alternatives one explains the motion in fewer frames
+MIN_FRAMES_ELSEWHERE = 45  # of many alternatives one explains the motion in fewer frames
+FEW_FRAMES = 36  # in which chance explains much
 AS_LIKELY = 0.9  # share of the most evidence from which another mistake is as likely
 NEAR_SHIFTS = 5  # steps to either side of the likeliest shift, which are compared on the same frames
 TRAVEL = 0.055  # of the image's width: who moves less is explained by the poses of any frame
@@ -98,7 +99,7 @@ def motion_fault(parsed: Parsed, instrument: Instrument, rays: Rays) -> MotionFa
     if given > CONTRADICTED or rays.travel(poses[rows]) < TRAVEL:
         return None
     by_chance = _by_chance(rays, poses[rows])
-    if given > (FEW_FRAMES_BY_CHANCE if len(rows) < MIN_FRAMES_ELSEWHERE else CONTRADICTED_BY_CHANCE) * by_chance:
+    if given > (FEW_FRAMES_BY_CHANCE if len(rows) < FEW_FRAMES else CONTRADICTED_BY_CHANCE) * by_chance:
         return None
     message = (
         f"the images contradict the poses of {name}: what moves in them does not lie where the poses say (evidence "
@@ -120,12 +121,14 @@ def _likeliest_mistake(
     tried += shifts.likeliest(few)
     clear, other = [], []
     for one in tried:
-        if one.needed == ELSEWHERE and len(rows) < MIN_FRAMES_ELSEWHERE:
+        if one.needed == ELSEWHERE and one.inside.sum() < MIN_FRAMES_ELSEWHERE:
             continue
         found = rays.compare(given, one.poses, one.inside)
         if found[0] > ELSEWHERE[0]:
             other.append((found[2], one))
         enough = all(value > least for value, least in zip(found, one.needed, strict=True))
+        if enough and one.kind == "rotations":
+            enough = _clearly_turned(rays, given, one)
         if enough and found[2] > BY_CHANCE * _by_chance(few, one.poses, one.inside):
             clear.append((found[2], one))
     if not clear:
@@ -177,11 +180,14 @@ def _turned(
 def _turns_better(instrument: Instrument, states: list[InstrumentState], poses: np.ndarray, rays: Rays) -> bool:
     """Whether other rotations explain more where they explain most otherwise, without telling which."""
     given = rays.evidence(poses)
-    for other in _turned(instrument, states, poses, rays.views.rows):
-        factor, certainty, _ = rays.compare(given, other.poses, other.inside, most_changed=True)
-        if factor > CHANGED_TURNED and certainty > TURNED[1]:
-            return True
-    return False
+    return any(_clearly_turned(rays, given, other) for other in _turned(instrument, states, poses, rays.views.rows))
+
+
+def _clearly_turned(rays: Rays, given: np.ndarray, other: _Alternative) -> bool:
+    """Whether other rotations explain more where they change the evidence `given` most: elsewhere, on the shaft of a
+    thin instrument, any rotation explains nearly as much."""
+    factor, certainty, _ = rays.compare(given, other.poses, other.inside, most_changed=True)
+    return factor > CHANGED_TURNED and certainty > TURNED[1]
 
 
 def _placed(instrument: Instrument, parsed: Parsed, poses: np.ndarray, rows: np.ndarray) -> Iterator[_Alternative]:

@@ -33,7 +33,7 @@ MIN_AGREEMENT = 0.3  # of the frames, in which a point of the instrument lies on
 LAG_CELLS, LAG_STEP = 16, 0.1  # of the grid for lags, per side; s between the lags that are tried
 LONGEST_LAG = 60.0  # s
 MIN_KNOWN = 0.5  # of the frames that need a pose at a lag
-LAG_GAIN = 1.1  # by how much more agreement a lag is clear
+LAG_GAIN = 1.1  # by how much more agreement than at 0 and at all other lags one is clear
 LAG_TOP, LAG_LOBE = 0.95, 0.5  # of the best agreement, and s about its lag: what the lag is the mean of
 COVERED = 0.85  # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
 MARGIN = 6  # px about its projection
@@ -165,7 +165,8 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
 
 
 def best_lag(evidence: np.ndarray, poses_at: PosesAt, pinhole: Lens, longest: float) -> float:
-    """Lag s within +-longest (at most LONGEST_LAG) at which poses explain what moves clearly better than at 0, else 0.
+    """Lag s within +-longest (at most LONGEST_LAG) at which poses explain what moves clearly better than at 0 and at all
+    others, else 0.
 
     evidence [R, h, w] as for `carve_shape`; poses_at(lag): camera_from_instrument [R, 4, 4] mm that the log has `lag` s
     later than its clock says, and bool [R] where it has one.
@@ -179,9 +180,11 @@ def best_lag(evidence: np.ndarray, poses_at: PosesAt, pinhole: Lens, longest: fl
             _, _, share, enough = _agreement(evidence[known], poses[known], pinhole, LAG_CELLS)
             scores[index] = np.quantile(share[enough], 0.99) if enough.any() else 0.0
     best = float(scores.max())
-    if best < MIN_AGREEMENT or best < LAG_GAIN * scores[count]:
+    lobe = np.abs(lags - lags[scores.argmax()]) < LAG_LOBE
+    rival = float(scores[~lobe].max(initial=0.0))  # motion that repeats fits at several lags
+    if best < MIN_AGREEMENT or best < LAG_GAIN * max(float(scores[count]), rival):
         return 0.0
-    weights = np.clip(scores - LAG_TOP * best, 0, None) * (np.abs(lags - lags[scores.argmax()]) < LAG_LOBE)
+    weights = np.clip(scores - LAG_TOP * best, 0, None) * lobe
     return float((weights * lags).sum() / weights.sum())
 
 
