@@ -14,7 +14,7 @@ from capture_files import PIVOT_MM, write_grasper
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
-from neeco.methods.carving.evidence import gather_evidence
+from neeco.methods.carving.evidence import CarvingSettings, gather_evidence
 from neeco.methods.kinematic import deformation
 from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews
@@ -115,12 +115,12 @@ def test_evidence_of_images_of_two_sizes_lies_in_each_ones_own(capture: Path) ->
     views = TrainingViews.read(frames)
     plain = training_config("3dgs", {"iterations": 1})
     scene = initial_scene(read_capture(capture), frames, plain, print)
-    together = gather_evidence(scene, views, plain.deformation.carving)
+    together = gather_evidence(scene, views, CarvingSettings())
     assert together.hits.shape == (len(frames), 72, 80)
     points = torch.tensor([[0.0, 0.0, 60.0], [38.0, 0.0, 80.0], [0.0, 42.0, 80.0], [10.0, -20.0, 70.0]])
     for index in range(4):
         single = TrainingViews(frames[index : index + 1], views.images[index : index + 1], (None,))
-        alone = gather_evidence(scene, single, plain.deformation.carving)
+        alone = gather_evidence(scene, single, CarvingSettings())
         expected = alone.look_up_camera(points[None])
         found = together.subset(torch.tensor([index])).look_up_camera(points[None])
         assert torch.equal(found[1], expected[1])

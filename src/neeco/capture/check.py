@@ -32,7 +32,7 @@ from neeco.capture.documents import (
     key_name,
     printable,
 )
-from neeco.capture.images import is_repeated, to_bytes
+from neeco.capture.images import is_repeated
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import STILL, Capture, Frame, Instrument, InstrumentState
 from neeco.capture.reader import capture_of, parse_capture
@@ -249,7 +249,7 @@ def _decode(frame: Frame, camera: Camera | None, points: np.ndarray) -> _Decoded
         digest = hashlib.blake2b(image.numpy().tobytes(), digest_size=16).digest()
         uniform = bool((image == image[0, 0]).all())
         step = max(1, image.shape[1] // COMPARED_WIDTH)
-        grey = to_bytes(image[::step, ::step].mean(-1)).numpy()
+        grey = np.rint(255 * image.numpy()[::step, ::step].mean(-1)).astype(np.uint8)
     except NeecoError as error:
         image_error = str(error).replace(str(frame.image_path), frame.image_path.name)
     try:

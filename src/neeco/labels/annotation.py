@@ -195,10 +195,13 @@ def minimum_rectangle(mask: np.ndarray) -> np.ndarray | None:
     first = mask[rows].argmax(1)
     last = mask.shape[1] - mask[rows, ::-1].argmax(1)
     corners = np.concatenate([np.stack([x, rows + dy], 1) for x in (first, last) for dy in (0, 1)]).astype(float)
-    turn = np.radians(cv2.minAreaRect(corners.astype(np.float32))[2])
-    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    (low_u, low_v), (high_u, high_v) = (find(corners @ axes.T, axis=0) for find in (np.min, np.max))
-    return np.array([[low_u, low_v], [high_u, low_v], [high_u, high_v], [low_u, high_v]]) @ axes
+    found = []
+    for turn in (0.0, np.radians(cv2.minAreaRect(corners.astype(np.float32))[2])):
+        axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        (low_u, low_v), (high_u, high_v) = (find(corners @ axes.T, axis=0) for find in (np.min, np.max))
+        ends = np.array([[low_u, low_v], [high_u, low_v], [high_u, high_v], [low_u, high_v]])
+        found.append(((high_u - low_u) * (high_v - low_v), ends @ axes))
+    return min(found, key=lambda rectangle: rectangle[0])[1]
 
 
 def outer_polygons(mask: np.ndarray) -> list[np.ndarray]:
