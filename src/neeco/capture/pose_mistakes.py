@@ -48,10 +48,10 @@ def placement_mistakes(poses: np.ndarray, world_from_camera: np.ndarray) -> Iter
     in_camera = "poses {of} are in the camera's frame"
     in_opengl, in_ecm = OPENGL.poses_to_opencv(poses), DVRK_ECM.poses_to_opencv(poses)
     ecm = "the axes of the dVRK's ECM (x left, y up)"
-    turn = "turn them by diag(-1, -1, 1) first (`frame: ecm` in recording.yaml)"
+    half_turn = "turn them by diag(-1, -1, 1) first (`frame: ecm` in recording.yaml)"
     yield Mistake(in_camera, "multiply by world_from_camera", world_from_camera @ poses)
     yield Mistake(f"{in_camera} with OpenGL axes", "multiply by transform_matrix", world_from_camera @ in_opengl)
-    yield Mistake(f"{in_camera} with {ecm}", turn, world_from_camera @ in_ecm)
+    yield Mistake(f"{in_camera} with {ecm}", half_turn, world_from_camera @ in_ecm)
     yield Mistake(
         "poses {of} are camera-from-instrument, inverted",
         "invert them and multiply by world_from_camera",

@@ -165,8 +165,8 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
 
 
 def best_lag(evidence: np.ndarray, poses_at: PosesAt, pinhole: Lens, longest: float) -> float:
-    """Lag s within +-longest (at most LONGEST_LAG) at which poses explain what moves clearly better than at 0 and at all
-    others, else 0.
+    """Lag s within +-longest (at most LONGEST_LAG) at which poses explain what moves clearly better than at 0 and at
+    all others, else 0.
 
     evidence [R, h, w] as for `carve_shape`; poses_at(lag): camera_from_instrument [R, 4, 4] mm that the log has `lag` s
     later than its clock says, and bool [R] where it has one.
