@@ -266,9 +266,12 @@ def test_what_check_finds_is_in_the_verdict():
 
 def test_the_terminal_gets_a_doubtful_verdict_in_capitals_and_the_first_doubts():
     doubts = tuple(Doubt(f"reason {number}", True) for number in range(SHOWN + 3))
-    first, *others = assess_ingest(made(SAMPLE, doubts=doubts), read_capture(SAMPLE)).lines()
+    verdict = assess_ingest(made(SAMPLE, doubts=doubts), read_capture(SAMPLE))
+    first, *others = verdict.lines()
     assert first == "DOUBTFUL: reason 0."
     assert others == [*(f"  - Reason {number}." for number in range(1, SHOWN + 1)), "  - and 2 more doubts"]
+    assert verdict.as_json()["verdict"] == "doubtful"
+    assert len(verdict.as_json()["doubts"]) == SHOWN + 3
 
 
 def test_frames_that_left_the_capture_after_registering_are_no_residuals_of_it(tmp_path):
