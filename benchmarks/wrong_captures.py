@@ -221,7 +221,7 @@ def margins(name: str, parsed: Parsed) -> None:
             agree = _Colors(chosen)
             colors = " ".join(f"{agree.agreement(coarse=coarse).mean():.2f}" for coarse in (False, True))
             check_images(chosen)
-        check_motion(chosen)
+        check_motion(chosen, {})
         said = "; ".join(problem.message for problem in report.problems) or "silent"
         print(f"| {name}, {part} | {colors} | {', '.join(evidence) or '-'} | {said} |", flush=True)
 

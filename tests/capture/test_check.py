@@ -198,10 +198,13 @@ def test_mistakes_in_instrument_poses_are_named(sample, mistake, words):
     assert words in problem.message
 
 
-def test_a_sensor_mounted_behind_the_tip_is_only_a_warning(sample):
+def test_a_sensor_mounted_behind_the_tip_is_nothing_where_the_images_fit_its_poses_else_only_a_warning(sample):
     behind = np.eye(4)
     behind[:3, 3] = [0, 0, -100.0]
     sample.edit_poses(lambda pose: pose @ behind)
+    assert problems(sample) == []
+    assert problems(sample, "warning") == []
+    sample.edit(lambda document: document.pop("ply_file_path"))  # now the images tell nothing
     assert problems(sample) == []
     assert_found(sample, "frames[*].instruments[*].pose", "outside every image", "warning")
 

@@ -38,7 +38,7 @@ def told(sample: Path, change: Callable[[Document], object]) -> list[str]:
     report = ProblemReport()
     parsed = parse_capture(sample, report)
     assert report.problems == []
-    check_motion(parsed)
+    check_motion(parsed, {})
     assert all(problem.severity == "warning" for problem in report.problems)
     return [f"{problem.field}: {problem.message}" for problem in report.problems]
 

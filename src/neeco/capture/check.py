@@ -109,12 +109,12 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
         _check_frames(parsed)
         _check_images(parsed)
         _check_states(parsed)
-        for part in parsed.by_tissue():
-            check_geometry(part)
+        parts = parsed.by_tissue()
+        told = [check_geometry(part) for part in parts]
         if motion and not errors_only(report.problems):
-            for part in parsed.by_tissue():
+            for part, verdicts in zip(parts, told, strict=True):
                 if check_images(part):  # else nothing is told by them
-                    check_motion(part)
+                    check_motion(part, verdicts)
     return Checked(condensed(report.problems), _summary(parsed), capture)
 
 

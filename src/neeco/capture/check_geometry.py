@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from neeco.capture.check_images import agreements
-from neeco.capture.check_motion import POSES, motion_fault
+from neeco.capture.check_motion import POSES, MotionVerdict, judge_motion
 from neeco.capture.documents import Node, Parsed, errors_only, printable
 from neeco.capture.model import Instrument, swap_camera_axes
 from neeco.capture.motion_evidence import Rays
@@ -85,8 +85,9 @@ class _Scene:
         return max(self.spread, self.distance)
 
 
-def check_geometry(parsed: Parsed) -> None:
-    """Check points, cameras against points, then instruments against both (not against cameras that are wrong)."""
+def check_geometry(parsed: Parsed) -> dict[str, MotionVerdict]:
+    """Check points, cameras against points, then instruments against both (not against cameras that are wrong). Returns
+    what the images told of instruments that are out of view, by name."""
     report = parsed.places[0].report
     before = len(errors_only(report.problems))
     points = _usable_points(parsed)
@@ -95,7 +96,8 @@ def check_geometry(parsed: Parsed) -> None:
     if scene is not None:
         _check_cameras(placed, scene)
     if placed.frames and len(errors_only(report.problems)) == before:
-        _check_instruments(placed, scene)
+        return _check_instruments(placed, scene)
+    return {}
 
 
 def _usable_points(parsed: Parsed) -> np.ndarray | None:
@@ -186,8 +188,10 @@ def _likeliest(seen: dict[Mistake, np.ndarray], given: float) -> Mistake | None:
     return best if shares[best] > max(SEEN_AGAIN, 3 * given) else None
 
 
-def _check_instruments(parsed: Parsed, scene: _Scene | None) -> None:
-    """Report instruments far from the scene or outside every image, and the mistakes behind it."""
+def _check_instruments(parsed: Parsed, scene: _Scene | None) -> dict[str, MotionVerdict]:
+    """Report instruments far from the scene or outside every image, and the mistakes behind it; what the images told of
+    them."""
+    told: dict[str, MotionVerdict] = {}
     if not parsed.registered and parsed.instruments:
         message = "instrument poses are 'unregistered': in a tracker's or robot's own frame, not the cameras' world"
         remedy = (
@@ -209,7 +213,10 @@ def _check_instruments(parsed: Parsed, scene: _Scene | None) -> None:
         elif parsed.registered:
             has = np.array([instrument.name in frame.state.instruments for frame in parsed.frames])
             cameras = _Cameras(everyone.poses[has], everyone.intrinsics[has], everyone.sizes[has])
-            _check_placement(parsed, instrument, cameras, scene, poses, [place for place, _ in found])
+            verdict = _check_placement(parsed, instrument, cameras, scene, poses, [place for place, _ in found])
+            if verdict is not None:
+                told[instrument.name] = verdict
+    return told
 
 
 def _check_placement(
@@ -219,22 +226,25 @@ def _check_placement(
     scene: _Scene | None,
     poses: np.ndarray,
     places: list[Node],
-) -> None:
-    """Check one registered instrument: the cameras, poses [I, 4, 4] and places of the frames that have it."""
+) -> MotionVerdict | None:
+    """Check one registered instrument: the cameras, poses [I, 4, 4] and places of the frames that have it. Returns what
+    the images tell of it, where they were asked."""
     name, all_poses = printable(instrument.name), parsed.header(POSES)
     seen = cameras.sees(poses[:, None, :3, 3])[:, 0]  # [I]
     outside = "every image" if not seen.any() else f"{len(seen) - int(seen.sum())} of {len(seen)} images"
-    mistake = None
+    mistake, verdict = None, None
     if seen.mean() < SEEN_RARELY:
         rays = _rays(parsed, instrument)
-        fault = None if rays is None else motion_fault(parsed, instrument, rays)  # the images decide where they can
         if rays is None:
             mistake = _instrument_mistake(cameras, poses, float(seen.mean()))
-        elif fault is not None and fault.named and fault.field == POSES:
-            mistake = fault.message, fault.remedy
+        else:  # the images decide where they can
+            verdict = judge_motion(parsed, instrument, rays)
+            fault = verdict.fault
+            if fault is not None and fault.named and fault.field == POSES:
+                mistake = fault.message, fault.remedy
     if mistake is not None:
         all_poses.error(f"instrument {name} is outside {outside}: {mistake[0]}", mistake[1])
-        return
+        return None
     if scene is not None:
         distances = np.linalg.norm(poses[:, :3, 3] - scene.center, axis=1)
         far = np.flatnonzero(distances > FAR * scene.size + SENSOR_REACH_MM * (scene.distance > METRES))
@@ -242,10 +252,12 @@ def _check_placement(
             message = f"instrument {name} is far from the points: {distances[index]:.4g} mm"
             places[index].child("pose").error(message, "pose and points must share frame and unit (mm)")
         if len(far):
-            return
+            return verdict
     elif np.median(np.linalg.norm(poses[:, :3, 3] - cameras.centers, axis=1)) < METRES:
         all_poses.error(f"instrument {name} is within {METRES:g} mm of the cameras: metres?", ALL_IN_MM)
-        return
+        return verdict
+    if verdict is not None and (verdict.supported or verdict.fault is not None):
+        return verdict  # more than where an origin is
     if not seen.any():  # a sensor away from the instrument's visible part, or a wrong frame
         (x, y, z), share = _visible_body_point(cameras, poses)
         if share > 0.5:
@@ -266,6 +278,7 @@ def _check_placement(
             message = f"instrument {name} is {distances[index]:.4g} mm from where it usually is, and out of view"
             remedy = "a tracker drop-out or unit slip? repair the pose or drop the frame"
             places[index].child("pose").warning(message, remedy)
+    return verdict
 
 
 def _rays(parsed: Parsed, instrument: Instrument) -> Rays | None:

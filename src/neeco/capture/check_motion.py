@@ -7,7 +7,7 @@ explains it, only that is said.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,26 +66,42 @@ class MotionFault:
     named: bool = False  # by a mistake that explains it
 
 
-def check_motion(parsed: Parsed) -> None:
+@dataclass(frozen=True)
+class MotionVerdict:
+    """What the images tell of an instrument's states. fault: against them; supported: what moves lies where they say;
+    neither where too little moves."""
+
+    fault: MotionFault | None
+    supported: bool
+
+
+def check_motion(parsed: Parsed, known: Mapping[str, MotionVerdict]) -> None:
     """Report instruments whose states the images contradict, with the mistake that explains it if one does.
 
-    Says nothing of a capture without registered poses or without measured points, or where too little moves. `parsed`
-    must be free of errors.
+    known: verdicts by instrument that were reached before. Says nothing of a capture without registered poses or
+    without measured points, or where too little moves. `parsed` must be free of errors.
     """
-    rays = Rays.of(parsed) if parsed.instruments else None
-    if rays is None:
-        return
-    for instrument in parsed.instruments:
-        fault = motion_fault(parsed, instrument, rays)
-        if fault is not None:
+    asked = [instrument for instrument in parsed.instruments if instrument.name not in known]
+    rays = Rays.of(parsed) if asked else None
+    found = {} if rays is None else {instrument.name: judge_motion(parsed, instrument, rays) for instrument in asked}
+    for verdict in {**known, **found}.values():
+        if (fault := verdict.fault) is not None:
             parsed.header(fault.field).warning(fault.message, fault.remedy, contradicted=True)
 
 
-def motion_fault(parsed: Parsed, instrument: Instrument, rays: Rays) -> MotionFault | None:
-    """What the images tell against the states of an instrument, which every frame has."""
-    name, rows = printable(instrument.name), rays.views.rows
+def judge_motion(parsed: Parsed, instrument: Instrument, rays: Rays) -> MotionVerdict:
+    """What the images tell of the states of an instrument, which every frame has."""
     states = [frame.state.instruments[instrument.name] for frame in parsed.frames]
     poses = _of_root(instrument, np.stack([state.pose.numpy() for state in states]), states)
+    fault = _fault(parsed, instrument, states, poses, rays)
+    given = rays.mean(poses[rays.views.rows])
+    return MotionVerdict(fault, fault is None and given > CONTRADICTED)
+
+
+def _fault(
+    parsed: Parsed, instrument: Instrument, states: list[InstrumentState], poses: np.ndarray, rays: Rays
+) -> MotionFault | None:
+    name, rows = printable(instrument.name), rays.views.rows
     found = _likeliest_mistake(parsed, instrument, states, poses, rays)
     if found is not None:
         field = POSES if found.kind in ("poses", "positions", "rotations") else STATES
