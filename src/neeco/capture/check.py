@@ -110,9 +110,9 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
         _check_images(parsed)
         _check_states(parsed)
         parts = parsed.by_tissue()
-        told = [check_geometry(part) for part in parts]
+        judged = [check_geometry(part) for part in parts]
         if motion and not errors_only(report.problems):
-            for part, verdicts in zip(parts, told, strict=True):
+            for part, verdicts in zip(parts, judged, strict=True):
                 if check_images(part):  # else nothing is told by them
                     check_motion(part, verdicts)
     return Checked(condensed(report.problems), _summary(parsed), capture)

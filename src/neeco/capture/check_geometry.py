@@ -87,7 +87,7 @@ class _Scene:
 
 def check_geometry(parsed: Parsed) -> dict[str, MotionVerdict]:
     """Check points, cameras against points, then instruments against both (not against cameras that are wrong). Returns
-    what the images told of instruments that are out of view, by name."""
+    what the images say of instruments that are out of view, by name."""
     report = parsed.places[0].report
     before = len(errors_only(report.problems))
     points = _usable_points(parsed)
@@ -189,9 +189,9 @@ def _likeliest(seen: dict[Mistake, np.ndarray], given: float) -> Mistake | None:
 
 
 def _check_instruments(parsed: Parsed, scene: _Scene | None) -> dict[str, MotionVerdict]:
-    """Report instruments far from the scene or outside every image, and the mistakes behind it; what the images told of
-    them."""
-    told: dict[str, MotionVerdict] = {}
+    """Report instruments far from the scene or outside every image, and the mistakes behind it; returns what the images
+    say of them."""
+    verdicts: dict[str, MotionVerdict] = {}
     if not parsed.registered and parsed.instruments:
         message = "instrument poses are 'unregistered': in a tracker's or robot's own frame, not the cameras' world"
         remedy = (
@@ -215,8 +215,8 @@ def _check_instruments(parsed: Parsed, scene: _Scene | None) -> dict[str, Motion
             cameras = _Cameras(everyone.poses[has], everyone.intrinsics[has], everyone.sizes[has])
             verdict = _check_placement(parsed, instrument, cameras, scene, poses, [place for place, _ in found])
             if verdict is not None:
-                told[instrument.name] = verdict
-    return told
+                verdicts[instrument.name] = verdict
+    return verdicts
 
 
 def _check_placement(
