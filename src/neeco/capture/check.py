@@ -113,7 +113,7 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
         judged = [check_geometry(part) for part in parts]
         if motion and not errors_only(report.problems):
             for part, verdicts in zip(parts, judged, strict=True):
-                if check_images(part):  # else nothing is told by them
+                if check_images(part):  # else motion in them proves nothing
                     check_motion(part, verdicts)
     return Checked(condensed(report.problems), _summary(parsed), capture)
 

@@ -192,7 +192,7 @@ def check_images(parsed: Parsed) -> bool:
     """Report images that contradict the cameras, or whose red and blue are swapped, as the sparse points tell.
 
     Says nothing without measured points that have colours. Returns False where images and cameras contradict each
-    other, so that nothing else can be told from the images. `parsed` must be free of errors.
+    other, so that nothing else can be judged by the images. `parsed` must be free of errors.
     """
     if not _has_colors(parsed):
         return True

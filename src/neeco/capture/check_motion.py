@@ -101,6 +101,7 @@ def judge_motion(parsed: Parsed, instrument: Instrument, rays: Rays) -> MotionVe
 def _fault(
     parsed: Parsed, instrument: Instrument, states: list[InstrumentState], poses: np.ndarray, rays: Rays
 ) -> MotionFault | None:
+    """What speaks against an instrument's states and poses [N, 4, 4] of its root; None where nothing does."""
     name, rows = printable(instrument.name), rays.views.rows
     found = _likeliest_mistake(parsed, instrument, states, poses, rays)
     if found is not None:
