@@ -38,8 +38,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from neeco.capture.model import evenly_spaced, swap_camera_axes
 from neeco.errors import NeecoError
 from neeco.files import write_json
-from neeco.ingest.base import find_base
-from neeco.ingest.still import moving_masks
+from neeco.ingest.cameras.still import moving_masks
+from neeco.ingest.registration.base import find_base
 
 CLOCK_S = 0.04  # by which the log is ahead
 LOOKED_AT = 140  # frames

@@ -35,8 +35,8 @@ def still_the_clocks() -> None:
     from datetime import UTC, datetime
 
     from neeco.evaluation import evaluate
-    from neeco.experiments import machine, training_job
     from neeco.report import page
+    from neeco.studies import machine, training_job
     from neeco.training import train
 
     ticks = iter(range(10**12))

@@ -299,7 +299,7 @@ def clock_set_back(verb: Verb, whole: Undisturbed, work: Path, pick: random.Rand
     clear(verb.shelf)
 
     def begin() -> None:
-        from neeco.experiments import training_job
+        from neeco.studies import training_job
         from neeco.training import train
 
         def falling() -> float:

@@ -141,8 +141,8 @@ def import_modules() -> None:
         importlib.import_module(f"neeco.cli.{verb}")
     for module in (
         "rich.progress",
-        "neeco.experiments.comparison",
-        "neeco.experiments.downstream.experiment",
+        "neeco.studies.comparison",
+        "neeco.studies.downstream.experiment",
         "neeco.ingest.pipeline",
         "neeco.ingest.convert",
         "neeco.report.run_page",
@@ -164,8 +164,8 @@ def import_modules() -> None:
 
 def hasten_ingest() -> None:
     """Let structure from motion be answered from known cameras (as in tests/ingest)."""
-    from neeco.ingest.sfm import StructureFromMotion
-    from neeco.ingest.sfm_strategies import Attempt, strategies
+    from neeco.ingest.cameras.sfm import StructureFromMotion
+    from neeco.ingest.cameras.sfm_strategies import Attempt, strategies
 
     world = module_at(TESTS / "ingest" / "conftest.py", "ingest_world")
     known = world.Recorded(world.World(Path(os.devnull)))

@@ -27,19 +27,19 @@ import cv2
 import numpy as np
 
 from neeco.capture import read_capture
-from neeco.capture.lens import Lens
 from neeco.capture.model import REFERENCE_PIXELS, Capture, FromVideo, InstrumentState, State, swap_camera_axes
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.files import write_json
-from neeco.ingest.from_video import FoundShaft, find_shaft, with_roll
-from neeco.ingest.motion import ResidualFlow
-from neeco.ingest.passing import passing_masks
-from neeco.ingest.recording import IngestSettings
-from neeco.ingest.sfm import SfmResult
-from neeco.ingest.shaft_axis import Scene
-from neeco.ingest.still import moving_masks, reduced
-from neeco.raster.pinhole import project_world
+from neeco.geometry.lens import Lens
+from neeco.geometry.projection import project_world
+from neeco.ingest.cameras.sfm import SfmResult
+from neeco.ingest.cameras.still import moving_masks, reduced
+from neeco.ingest.foreground.motion import ResidualFlow
+from neeco.ingest.foreground.passing import passing_masks
+from neeco.ingest.recording.model import IngestSettings
+from neeco.ingest.shaft.axis import Scene
+from neeco.ingest.shaft.from_video import FoundShaft, find_shaft, with_roll
 
 LOGGED_DEG = 1.0  # standard deviation stated of a roll that is the truth's
 

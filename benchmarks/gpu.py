@@ -38,8 +38,6 @@ from torch import Tensor
 from neeco import __version__
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.experiments.machine import machine
-from neeco.experiments.training_job import Budget, TrainingJob
 from neeco.files import write_json, write_text
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.raster import Camera, Gaussians, rasterize
@@ -50,6 +48,8 @@ from neeco.raster.optimizer import adam_step
 from neeco.raster.triton import ready
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.method_registry import make_deformation, method_settings
+from neeco.studies.machine import machine
+from neeco.studies.training_job import Budget, TrainingJob
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 from neeco.training.config import training_config

@@ -26,14 +26,14 @@ from from_video import masks_of
 from scipy.ndimage import gaussian_filter1d
 
 from neeco.capture import Capture, Instrument, InstrumentState, State, read_capture, write_capture
-from neeco.capture.lens import Lens
 from neeco.capture.model import REFERENCE_PIXELS, FromVideo, Uncertainty, swap_camera_axes
 from neeco.files import read_json
-from neeco.ingest.from_video import find_shaft
+from neeco.geometry.lens import Lens
+from neeco.ingest.cameras.still import reduced
 from neeco.ingest.posing.hand_posed import HandPose, write_answers
 from neeco.ingest.posing.posed_capture import PosedCapture, Posing, prepare
-from neeco.ingest.shaft_axis import Scene
-from neeco.ingest.still import reduced
+from neeco.ingest.shaft.axis import Scene
+from neeco.ingest.shaft.from_video import find_shaft
 
 HAND_DEG = 3.0
 SMOOTH_FRAMES = 3.0  # of the shaft's errors in the control

@@ -24,6 +24,7 @@ from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou, mean_of
 from neeco.files import read_json, require_like, write_json
+from neeco.geometry.camera import Camera
 from neeco.labels.labellers import (
     DELTAS,
     THRESHOLD_STATES,
@@ -32,7 +33,7 @@ from neeco.labels.labellers import (
     delta_magnitudes,
     find_thresholds,
 )
-from neeco.raster.types import Camera, Gaussians
+from neeco.raster.types import Gaussians
 from neeco.scene import Scene
 from neeco.scene.deformation import Deltas, LabelledByMotion
 from neeco.training.run import open_run

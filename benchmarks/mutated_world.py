@@ -25,9 +25,9 @@ def prepare(verbs: Sequence[str]) -> None:
 
     import_modules()
     if "downstream" in verbs:
-        for module in ("monai.networks.nets", "neeco.experiments.downstream.models.unet"):
+        for module in ("monai.networks.nets", "neeco.studies.downstream.models.unet"):
             importlib.import_module(module)
-    from neeco.experiments import machine
+    from neeco.studies import machine
 
     torch.set_num_threads(1)
     hasten_ingest()
@@ -107,7 +107,7 @@ def make_bags(folder: Path, recording: Path) -> None:
     """The recording as bags, each with its recording.yaml."""
     from rendered.bags import LAYOUTS, write_bags
 
-    from neeco.ingest.template import write_template
+    from neeco.ingest.recording.template import write_template
 
     write_bags(recording, {"em": 0.04, "jaw_angle": -0.01})
     shutil.move(recording / "bags", folder)

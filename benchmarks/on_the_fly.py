@@ -26,11 +26,11 @@ from torch.utils.data import DataLoader, Dataset
 import neeco
 from neeco.capture import read_capture
 from neeco.cli import main as run_neeco
-from neeco.experiments.downstream.model import TrainingTask, input_size
-from neeco.experiments.downstream.models.unet import UNet
-from neeco.experiments.downstream.samples import BatchSampler, Example, has_labels, recorded_samples
-from neeco.experiments.downstream.scores import mask_scores, mean_scores
-from neeco.experiments.machine import hardware_words, machine
+from neeco.studies.downstream.model import TrainingTask, input_size
+from neeco.studies.downstream.models.unet import UNet
+from neeco.studies.downstream.samples import BatchSampler, Example, has_labels, recorded_samples
+from neeco.studies.downstream.scores import mask_scores, mean_scores
+from neeco.studies.machine import hardware_words, machine
 
 
 @dataclass(frozen=True)

@@ -39,10 +39,10 @@ from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.experiments.comparison import COMPARISON_FILE, SPLIT_COLUMNS, job_folder, read_comparison
-from neeco.experiments.study import spread
-from neeco.experiments.tables import Column, SummaryRow, markdown_table, summary_table
 from neeco.files import write_json
+from neeco.studies.comparison import COMPARISON_FILE, SPLIT_COLUMNS, job_folder, read_comparison
+from neeco.studies.study import spread
+from neeco.studies.tables import Column, SummaryRow, markdown_table, summary_table
 from neeco.training.run import read_config
 
 OUTPUT_FILE = "paper_frames.json"

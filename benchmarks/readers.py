@@ -63,7 +63,7 @@ def write_bag(kind: str, packed: str | None, jpeg: bool) -> Callable[[Contents, 
     def write(contents: Contents, folder: Path) -> Path:
         from rendered.bagwriter import BagWriter
 
-        from neeco.ingest.template import write_template
+        from neeco.ingest.recording.template import write_template
 
         with BagWriter(folder, kind, packed=packed) as bag:
             for now, place, turn, angle in contents.states():
@@ -92,7 +92,7 @@ def write_sequence(compressed: bool) -> Callable[[Contents, Path], Path]:
         from rendered.pluswriter import frame_fields, write_mha
         from scipy.spatial.transform import Rotation
 
-        from neeco.ingest.template import write_template
+        from neeco.ingest.recording.template import write_template
 
         states = list(contents.states())[:: LOG_HZ // RATE_HZ][: contents.frames]
         poses = np.tile(np.eye(4), (len(states), 1, 1))
@@ -116,7 +116,7 @@ def write_lerobot(version: str, embedded: bool) -> Callable[[Contents, Path], Pa
         from rendered.lerobotsets import POSE
         from rendered.lerobotwriter import Episode, LeRobotWriter
 
-        from neeco.ingest.template import write_template
+        from neeco.ingest.recording.template import write_template
 
         step = LOG_HZ // RATE_HZ
         one = [np.array([*place, *turn[1:], turn[0], angle]) for _, place, turn, angle in contents.states()][::step]
@@ -165,8 +165,8 @@ RECORDINGS: dict[str, Callable[[Contents, Path], Path]] = {
 
 def measure(path: Path) -> None:
     """Read a recording and print the processor's seconds, those of the logs alone, frames and peak memory MiB."""
-    from neeco.ingest.recordingfile import read_recording
-    from neeco.ingest.synchronized import SynchronizedRecording
+    from neeco.ingest.recording.file import read_recording
+    from neeco.ingest.timing.synchronized import SynchronizedRecording
 
     started = time.process_time()
     data = SynchronizedRecording(read_recording(path), lambda what, done, total: None)

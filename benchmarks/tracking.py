@@ -44,10 +44,10 @@ from neeco.capture import read_capture, write_capture
 from neeco.capture.images import write_image
 from neeco.capture.model import Frame, InstrumentState, State, swap_camera_axes
 from neeco.evaluation.mask_folders import load_reference
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import project
+from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 from neeco.labels.drawing import draw
-from neeco.raster.pinhole import project
-from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
-from neeco.raster.types import Camera
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.camera_effects import SMOKE_MM, apply_effects
 from neeco.tracking.fitting import Fitter

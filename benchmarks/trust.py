@@ -24,8 +24,8 @@ from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import held_out_splits
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.trust import estimate_trust
+from neeco.geometry.rotations import rigid_from_vector
 from neeco.labels.labellers import CompositedLabels
-from neeco.raster.rotations import rigid_from_vector
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.annotated import fitted, typical_errors
 from neeco.training.run import open_run

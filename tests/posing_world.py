@@ -14,8 +14,8 @@ from scipy.ndimage import gaussian_filter
 from neeco.capture.model import Capture, Frame, FromVideo, Instrument, InstrumentState, PointCloud, State, Uncertainty
 from neeco.capture.reader import read_capture
 from neeco.capture.writer import write_capture
+from neeco.geometry.camera import Camera
 from neeco.ingest.posing.posed_capture import prepare
-from neeco.raster.types import Camera
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 200.0
 RADIUS, LENGTH, HINGE = 3.0, 24.0, 9.0  # mm

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
-from neeco.raster.types import Camera
+from neeco.geometry.camera import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.deformation import UNPERTURBED, Deformation, Deltas, Perturbation, Posed
 

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.geometry.camera import Camera
+from neeco.geometry.rotations import rigid_from_vector
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.nerfies.field import NerfiesSettings, NerfScene
-from neeco.raster.rotations import rigid_from_vector
-from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.method_registry import make_deformation, method_settings
 

@@ -34,10 +34,10 @@ from neeco.files import (
     visible_entries,
     write_atomically,
 )
-from neeco.ingest.formats import read_table
-from neeco.ingest.formats.plus import PlusSequence
-from neeco.ingest.lens import read_lens
-from neeco.ingest.video import open_video
+from neeco.ingest.calibration.lens import read_lens
+from neeco.ingest.readers import read_table
+from neeco.ingest.readers.plus import PlusSequence
+from neeco.ingest.readers.video import open_video
 from neeco.scene.io import load_scene
 
 HOLD = """\

@@ -13,9 +13,9 @@ from scene_worlds import pose_of
 from neeco.capture.images import write_image, write_labels
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.capture.writer import write_capture
+from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.methods.kinematic.articulation import LINK_LOGITS
-from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.drawable import Learned
 from neeco.scene.io import save_scene

@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from neeco.ingest.logs import read_pose_log, read_reading_log
-from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.recording.file import read_recording
 from rendered.bagwriter import BagWriter
 
 BASE = "tracker"  # the frame of all poses

@@ -15,7 +15,7 @@ from neeco.capture import Capture, Frame, Instrument, InstrumentState, PointClou
 from neeco.capture.images import write_labels
 from neeco.errors import NeecoError
 from neeco.files import write_json, write_text
-from neeco.raster.types import Camera
+from neeco.geometry.camera import Camera
 from rendered import breathing, errors
 from rendered.exposure import meter
 from rendered.frames import Renderer, Settings, Shot, image_name, moved, render_all, take_shots

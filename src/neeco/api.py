@@ -18,10 +18,10 @@ from neeco.capture.model import Instrument
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.evaluation.image_metrics import find_lpips
+from neeco.geometry.rotations import rigid_fault
 from neeco.labels.annotation import LabelledImage, RGBDImage, draw_labelled
 from neeco.plausible import Fault, focal_fault
 from neeco.raster.devices import device_of
-from neeco.raster.rotations import rigid_fault
 from neeco.scene.drawable import Learned
 from neeco.scene.io import load_scene
 from neeco.training import run as runs

@@ -1,6 +1,6 @@
 """What no camera, joint, time or mask can be: one list of limits for all readers of files and the Python API.
 
-Each function returns what is wrong and what to do, or None. What no pose can be, `neeco.raster.rotations.rigid_fault`
+Each function returns what is wrong and what to do, or None. What no pose can be, `neeco.geometry.rotations.rigid_fault`
 says.
 """
 

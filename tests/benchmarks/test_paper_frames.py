@@ -17,10 +17,10 @@ import torch
 from rod_world import CAMERA, make_scene, rod_state
 
 from neeco.capture.writer import write_capture
-from neeco.experiments.comparison import ComparisonSpec, compare, plan_comparison
-from neeco.experiments.training_job import Budget
 from neeco.labels.labellers import DeltaThresholds
 from neeco.scene.deformation import Deltas
+from neeco.studies.comparison import ComparisonSpec, compare, plan_comparison
+from neeco.studies.training_job import Budget
 
 SMALL = ("deformation.width=8", "deformation.depth=2", "deformation.warm_up=0")
 

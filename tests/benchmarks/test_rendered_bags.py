@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from neeco.cli import main
-from neeco.ingest.logs import read_pose_log, read_reading_log
-from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.recording.file import read_recording
 
 pytest.importorskip("av")
 pytest.importorskip("rosbags")

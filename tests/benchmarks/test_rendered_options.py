@@ -14,9 +14,9 @@ import torch
 from PIL import Image
 
 from neeco.capture import check_capture, errors_only, read_capture
-from neeco.ingest.lens import read_lens
-from neeco.ingest.logs import read_pose_log
-from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.calibration.lens import read_lens
+from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.recording.file import read_recording
 
 WIDTH, HEIGHT, RESOLUTION = 64, 48, 240
 

@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from neeco.ingest.stereofile import read_stereo
+from neeco.ingest.calibration.stereo import read_stereo
 
 
 @pytest.mark.parametrize("name", ["bowel", "stomach"])

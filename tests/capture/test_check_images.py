@@ -15,7 +15,7 @@ from neeco.capture.check_images import agreements, check_images
 from neeco.capture.documents import Node, Parsed, ProblemReport
 from neeco.capture.model import Frame, State
 from neeco.capture.points import PointCloud
-from neeco.raster.types import Camera
+from neeco.geometry.camera import Camera
 
 FRAMES, WIDTH, HEIGHT, FOCAL, DISTANCE = 10, 96, 72, 90.0, 60.0
 

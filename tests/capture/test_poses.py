@@ -14,7 +14,7 @@ from neeco.capture import check_capture, errors_only, read_capture
 from neeco.capture.model import swap_camera_axes
 from neeco.capture.statefile import camera_to_json, read_states
 from neeco.errors import NeecoError
-from neeco.raster.rotations import RIGID_TOLERANCE, rigid_fault, rotation_error
+from neeco.geometry.rotations import RIGID_TOLERANCE, rigid_fault, rotation_error
 
 once_a_folder = settings(
     max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]

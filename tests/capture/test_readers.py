@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture import check_capture, errors_only, read_capture, write_capture
 from neeco.capture.images import read_image, read_labels, read_mask, write_image, write_labels
-from neeco.capture.lens import Lens
 from neeco.capture.model import (
     Capture,
     Frame,
@@ -32,6 +31,7 @@ from neeco.capture.points import points_in_view, read_ply
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import load_reference
+from neeco.geometry.lens import Lens
 from neeco.raster import Camera
 
 ASCII_HEADER = b"ply\nformat ascii 1.0\nelement vertex 1\n" + b"".join(b"property float %c\n" % axis for axis in b"xyz")

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from neeco.cli.ablate import _print_tables
-from neeco.experiments.ablation_study import AblationResult, AblationRow, AblationTable
+from neeco.studies.ablation_study import AblationResult, AblationRow, AblationTable
 
 MEASURES = ["psnr.test", "psnr.unseen", "mask_iou.test", "mask_iou.unseen"]
 

@@ -13,11 +13,11 @@ from neeco.capture.writer import write_capture
 from neeco.cli import main
 from neeco.cli._progress import resumable
 from neeco.errors import NeecoError
-from neeco.experiments import training_job
 from neeco.raster import devices
 from neeco.scene.scene import Scene
 from neeco.scene.training_session import StepResult
 from neeco.scene.training_views import TrainingViews
+from neeco.studies import training_job
 from neeco.training.config import training_config
 from neeco.training.session import GaussianSession
 from neeco.training.train import train

@@ -9,8 +9,8 @@ from typing import ClassVar
 import pytest
 
 from neeco.cli import RENAMED, main
-from neeco.experiments.ablation_study import chosen_ablations
 from neeco.settings import RenamedWarning, new_name, structure, with_fields
+from neeco.studies.ablation_study import chosen_ablations
 
 
 @dataclass(frozen=True)

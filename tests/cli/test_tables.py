@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from neeco.cli._output import fitted
-from neeco.experiments.tables import Cell, Column, Row, Table
+from neeco.studies.tables import Cell, Column, Row, Table
 
 
 @pytest.mark.parametrize("width", [22, 60])

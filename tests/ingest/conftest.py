@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.lens import Lens
-from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
-from neeco.ingest.sfm_strategies import Attempt, strategies
+from neeco.geometry.lens import Lens
+from neeco.ingest.cameras.sfm import SfmResult, StageProgress, StructureFromMotion
+from neeco.ingest.cameras.sfm_strategies import Attempt, strategies
 
 POSE_HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 RECORDING = """\

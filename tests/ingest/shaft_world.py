@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from neeco.ingest.shaft_axis import Scene, unit
+from neeco.ingest.shaft.axis import Scene, unit
 
 WIDTH, HEIGHT, FOCAL, FRAMES, RATE = 160, 120, 142.0, 24, 12.0
 INTRINSICS = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)

@@ -12,7 +12,7 @@ import yaml
 
 from neeco.capture.images import write_image
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.recording.file import read_recording
 from neeco.ingest.result import IngestResult
 
 WIDTH, HEIGHT, FOCAL, FRAMES, RATE = 160, 128, 150.0, 40, 25.0

@@ -7,9 +7,9 @@ import pytest
 from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, disturbed, errors, make_world
 
 from neeco.errors import NeecoError
-from neeco.ingest.base import find_base
-from neeco.ingest.base_search import Seen, search, uniform_rotations
-from neeco.ingest.silhouettes import shaft_lines, silhouettes_of
+from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
+from neeco.ingest.registration.base import find_base
+from neeco.ingest.registration.base_search import Seen, search, uniform_rotations
 
 FRAMES = 44
 ROUGH = (5.0, 3.0)  # sd mm, deg of the prior: errors of 8 mm and 5 degrees are within

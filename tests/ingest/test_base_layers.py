@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.ingest.base_layers import Layers, evenly_lit, fit_layers, line_through_trocar
-from neeco.ingest.base_shape import SHIFTS
-from neeco.ingest.basefile import StatedBase
-from neeco.ingest.clock_search import GIVEN, ClockOffset
-from neeco.ingest.find_bases import place_bases
-from neeco.ingest.logs import PoseLog
-from neeco.ingest.recording import InstrumentLogs
+from neeco.geometry.lens import Lens
+from neeco.ingest.readers.logs import PoseLog
+from neeco.ingest.recording.base import StatedBase
+from neeco.ingest.recording.model import InstrumentLogs
+from neeco.ingest.registration.base_layers import Layers, evenly_lit, fit_layers, line_through_trocar
+from neeco.ingest.registration.base_shape import SHIFTS
+from neeco.ingest.registration.find_bases import place_bases
+from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
 
 WIDTH, HEIGHT, FOCAL = 80, 64, 100.0
 INTRINSICS = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, WORLD_FROM_BASE, World, make_world, rigid
 
-from neeco.ingest.base_marks import with_marks
-from neeco.ingest.base_shape import SHIFTS, Fit, Problem, first_shape, marks_off, surface_points, tips
-from neeco.ingest.silhouettes import silhouettes_of
-from neeco.raster.pinhole import project
+from neeco.geometry.projection import project
+from neeco.ingest.foreground.silhouettes import silhouettes_of
+from neeco.ingest.registration.base_marks import with_marks
+from neeco.ingest.registration.base_shape import SHIFTS, Fit, Problem, first_shape, marks_off, surface_points, tips
 
 FRAMES = 20
 RING_MM = 40.0  # behind the tip, where the shaft turns from light to dark

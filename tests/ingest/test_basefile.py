@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.ingest.basefile import read_dvrk_registration
-from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.recording.base import read_dvrk_registration
+from neeco.ingest.recording.file import read_recording
 
 # rotation about x by a quarter turn, and metres
 TRANSFORM = [[1.0, 0.0, 0.0, 0.05], [0.0, 0.0, -1.0, -0.02], [0.0, 1.0, 0.0, 0.17], [0.0, 0.0, 0.0, 1.0]]

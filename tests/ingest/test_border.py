@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from neeco.ingest.lens import find_border, visible_mask
+from neeco.ingest.calibration.lens import find_border, visible_mask
 
 HEIGHT, WIDTH = 120, 160
 ROWS, COLUMNS = np.indices((HEIGHT, WIDTH))

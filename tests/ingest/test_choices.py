@@ -8,7 +8,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from neeco.cli.ingest import CHOICES, Ingest, run
-from neeco.ingest.choices import axis_directions, find_rotations, largest_step, open_poses, shaft_of
+from neeco.ingest.readers.choices import axis_directions, find_rotations, largest_step, open_poses, shaft_of
 from neeco.report.choice_picture import write_choice_picture
 
 pytest.importorskip("av")

@@ -15,7 +15,7 @@ import yaml
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.recording.file import read_recording
 from neeco.ingest.result import IngestResult
 
 pytest.importorskip("av")
@@ -123,7 +123,7 @@ def test_a_log_that_does_not_meet_the_video_is_refused_before_cameras_are_looked
 INTERRUPTED = """
 import os, sys
 from pathlib import Path
-from neeco.ingest import sfm
+from neeco.ingest.cameras import sfm
 sfm.WORKER = Path(sys.argv[1])
 from neeco.cli import main
 sys.exit(main(["ingest", "recording.yaml", "--output", "new/out"]))

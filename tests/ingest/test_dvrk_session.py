@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import BASE, CAMERA, JointColumns, PoseColumns
-from neeco.ingest.formats import format_of
-from neeco.ingest.logs import read_pose_log, read_reading_log
-from neeco.ingest.recordingfile import read_recording
-from neeco.ingest.template import write_template
+from neeco.ingest.readers import format_of
+from neeco.ingest.readers.columns import BASE, CAMERA, JointColumns, PoseColumns
+from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.template import write_template
 
 BEGIN = 1_768_663_926_000_000_000  # ns, Unix time of the first frame's arrival
 LATENCY = 0.06  # s

@@ -14,12 +14,12 @@ from neeco.capture import Capture, read_capture
 from neeco.capture.check import inspect_capture
 from neeco.cli.ingest import Ingest, print_result, recordings_of, run
 from neeco.errors import NeecoError
-from neeco.ingest.episodes import PAUSE_S, Episodes, episode_names, separate
-from neeco.ingest.frame_selection import assign_splits
-from neeco.ingest.interpolate import poses_at
+from neeco.ingest.cameras.frame_selection import assign_splits
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recording import Recording
-from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import Recording
+from neeco.ingest.timing.episodes import PAUSE_S, Episodes, episode_names, separate
+from neeco.ingest.timing.interpolate import poses_at
 
 BEGINS = (0.0, 2.0, 4.5)  # s of the bar's motion
 

@@ -9,12 +9,12 @@ import pytest
 from ingest.base_world import FOCAL, HEIGHT, INTRINSICS, WIDTH, WORLD_FROM_BASE, disturbed, errors, make_world
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.ingest.basefile import StatedBase
-from neeco.ingest.find_bases import place_bases
-from neeco.ingest.logs import PoseLog
-from neeco.ingest.recording import InstrumentLogs
+from neeco.geometry.lens import Lens
+from neeco.ingest.readers.logs import PoseLog
+from neeco.ingest.recording.base import StatedBase
+from neeco.ingest.recording.model import InstrumentLogs
+from neeco.ingest.registration.find_bases import place_bases
 
 LENS = Lens(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (), (WIDTH, HEIGHT))
 STILL = np.tile(np.eye(4), (44, 1, 1))

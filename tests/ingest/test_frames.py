@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import BASE, CAMERA, PoseColumns
-from neeco.ingest.frames import meaning_in, meaning_of, without_frame
-from neeco.ingest.logs import PoseLog, read_pose_log
-from neeco.ingest.recordingfile import read_recording
-from neeco.ingest.template import write_template
+from neeco.ingest.readers.columns import BASE, CAMERA, PoseColumns
+from neeco.ingest.readers.frame_names import meaning_in, meaning_of, without_frame
+from neeco.ingest.readers.logs import PoseLog, read_pose_log
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.template import write_template
 
 COUNT = 12
 TIMES = np.arange(COUNT) / 25

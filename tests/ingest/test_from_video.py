@@ -16,12 +16,12 @@ from neeco.capture.images import write_image
 from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.ingest.assessment import assess_ingest
-from neeco.ingest.from_video import find_shaft, with_roll
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.posing.hand_posed import HandPose
 from neeco.ingest.posing.posed_capture import PosedCapture
-from neeco.ingest.recordingfile import read_recording, recording_from_flags
-from neeco.ingest.shaft_axis import axis_between, contour_normals, image_lines, unit
+from neeco.ingest.recording.file import read_recording, recording_from_flags
+from neeco.ingest.shaft.axis import axis_between, contour_normals, image_lines, unit
+from neeco.ingest.shaft.from_video import find_shaft, with_roll
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import JointColumns, PoseColumns, Units
-from neeco.ingest.formats import read_table
-from neeco.ingest.logs import read_pose_log, read_reading_log
-from neeco.ingest.template import write_template
+from neeco.ingest.readers import read_table
+from neeco.ingest.readers.columns import JointColumns, PoseColumns, Units
+from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.recording.template import write_template
 
 MM = Units(length="mm")
 

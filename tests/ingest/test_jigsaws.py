@@ -9,12 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import PoseColumns
-from neeco.ingest.formats import format_of
-from neeco.ingest.logs import read_pose_log, read_reading_log
-from neeco.ingest.recordingfile import read_recording
-from neeco.ingest.synchronized import SynchronizedRecording
-from neeco.ingest.template import write_template
+from neeco.ingest.readers import format_of
+from neeco.ingest.readers.columns import PoseColumns
+from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.template import write_template
+from neeco.ingest.timing.synchronized import SynchronizedRecording
 
 ROWS = 40
 ARMS = ("master left", "master right", "slave left", "slave right")

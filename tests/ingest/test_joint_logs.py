@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import JointColumns, Units
-from neeco.ingest.logs import read_reading_log
+from neeco.ingest.readers.columns import JointColumns, Units
+from neeco.ingest.readers.logs import read_reading_log
 
 TABLE = [[600.0, 0.0], [1200.0, 0.35], [1900.0, 0.8], [2900.0, 1.5]]
 

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.ingest.lens import read_lens
+from neeco.geometry.lens import Lens
+from neeco.ingest.calibration.lens import read_lens
 
 OPENCV = """%YAML:1.0
 ---

@@ -15,13 +15,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import CAMERA as CAMERA_FRAME
-from neeco.ingest.columns import PoseColumns, Units
-from neeco.ingest.episodes import separate
-from neeco.ingest.formats import format_of, read_table
-from neeco.ingest.logs import read_pose_log
-from neeco.ingest.recordingfile import read_recording
-from neeco.ingest.template import write_template
+from neeco.ingest.readers import format_of, read_table
+from neeco.ingest.readers.columns import CAMERA as CAMERA_FRAME
+from neeco.ingest.readers.columns import PoseColumns, Units
+from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.template import write_template
+from neeco.ingest.timing.episodes import separate
 
 pytest.importorskip("av")
 pyarrow = pytest.importorskip("pyarrow")
@@ -421,7 +421,7 @@ def test_timestamps_that_stand_still_are_replaced_with_a_note(tmp_path):
 
 
 def test_only_the_rows_of_the_episode_are_read(tmp_path, monkeypatch):
-    from neeco.ingest.formats._lerobotfiles import ParquetFile
+    from neeco.ingest.readers._lerobotfiles import ParquetFile
 
     states = [{STATE: arm(20, number)} for number in range(40)]
     path = data_set(tmp_path, states=states, names={}, cameras=(), group=20)

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.ingest.formats import format_of, read_table
-from neeco.ingest.interpolate import poses_at, readings_at
-from neeco.ingest.logs import read_pose_log, read_reading_log
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.readers import format_of, read_table
+from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.timing.interpolate import poses_at, readings_at
 
 pytest.importorskip("av")
 pytest.importorskip("pyarrow")
@@ -72,7 +72,7 @@ def test_where_motion_does_not_tell_the_clock_that_of_the_file_is_taken(recorded
     def refuse(*given):
         raise NeecoError("its clock cannot be told from the images; give it")
 
-    monkeypatch.setattr("neeco.ingest.registration.clock_from_turning", refuse)
+    monkeypatch.setattr("neeco.ingest.registration.hand_eye.clock_from_turning", refuse)
     recording = read_recording(recorded.folder / "lerobot" / "v2.1" / "recording.yaml")
     result = ingest(recording, tmp_path / "capture", lambda what, done, total: None)
     assert result.registration is not None

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from neeco.capture.lens import Lens
-from neeco.ingest.motion import STEP, ResidualFlow, best_lag, carve_shape, observations_on, project_mask
-from neeco.ingest.sfm import SfmResult
+from neeco.geometry.lens import Lens
+from neeco.ingest.cameras.sfm import SfmResult
+from neeco.ingest.foreground.motion import STEP, ResidualFlow, best_lag, carve_shape, observations_on, project_mask
 
 PINHOLE = Lens(60.0, 60.0, 32.0, 24.0, (), (64, 48))
 ROWS = np.arange(14)

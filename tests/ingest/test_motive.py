@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import PoseColumns
-from neeco.ingest.logs import read_pose_log
-from neeco.ingest.recordingfile import read_recording
-from neeco.ingest.template import write_template
+from neeco.ingest.readers.columns import PoseColumns
+from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.template import write_template
 
 SCALES = {"Meters": 1e-3, "Millimeters": 1.0, "Centimeters": 0.1}
 

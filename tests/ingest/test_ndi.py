@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import PoseColumns, Units
-from neeco.ingest.logs import read_pose_log
-from neeco.ingest.recordingfile import read_recording
-from neeco.ingest.template import write_template
+from neeco.ingest.readers.columns import PoseColumns, Units
+from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.template import write_template
 
 # as NDI Track exports: two tools with two and one markers
 TOOL = "Frame,Time [sec],Face,State,Q0,Qx,Qy,Qz,Tx,Ty,Tz,Error,Markers"

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from neeco.capture import check_capture, read_capture
 from neeco.capture.check import errors_only
-from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
+from neeco.geometry.lens import Lens
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recordingfile import read_recording
-from neeco.ingest.synchronized import SynchronizedRecording
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.timing.synchronized import SynchronizedRecording
 
 pytest.importorskip("pycolmap")
 

@@ -10,11 +10,11 @@ import pytest
 from plus_world import frame_fields, write_mha, write_nrrd
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import PoseColumns
-from neeco.ingest.formats import IMAGES, OTHER, POSES, format_of
-from neeco.ingest.logs import read_pose_log
-from neeco.ingest.recordingfile import read_recording
-from neeco.ingest.template import write_template
+from neeco.ingest.readers import IMAGES, OTHER, POSES, format_of
+from neeco.ingest.readers.columns import PoseColumns
+from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.template import write_template
 
 START = 12.5  # of PLUS's clock, s
 COUNT = 30

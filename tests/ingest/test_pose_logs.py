@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import PoseColumns, Units
-from neeco.ingest.logs import read_pose_log
+from neeco.ingest.readers.columns import PoseColumns, Units
+from neeco.ingest.readers.logs import read_pose_log
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 

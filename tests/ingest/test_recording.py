@@ -10,11 +10,11 @@ from ingest.conftest import POSE_HEADER
 from PIL import Image
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import Units
-from neeco.ingest.logs import read_pose_log, read_reading_log
-from neeco.ingest.recording import IngestSettings, Splits
-from neeco.ingest.recordingfile import read_recording, recording_from_flags
-from neeco.ingest.template import write_template
+from neeco.ingest.readers.columns import Units
+from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.recording.file import read_recording, recording_from_flags
+from neeco.ingest.recording.model import IngestSettings, Splits
+from neeco.ingest.recording.template import write_template
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 

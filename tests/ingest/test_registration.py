@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
-from neeco.ingest.clock_search import GIVEN, STEP, ClockOffset, _best_rate, clock_from_instrument, correlate
-from neeco.ingest.logs import PoseLog
-from neeco.ingest.registration import register_with_laparoscope
+from neeco.ingest.readers.logs import PoseLog
+from neeco.ingest.registration.hand_eye import register_with_laparoscope
+from neeco.ingest.timing.clock_search import GIVEN, STEP, ClockOffset, _best_rate, clock_from_instrument, correlate
 
 HAND_EYE = np.eye(4)
 HAND_EYE[:3, :3] = Rotation.from_euler("xyz", [20, -10, 35], degrees=True).as_matrix()

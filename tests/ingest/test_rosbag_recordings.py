@@ -17,12 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from neeco.cli import main
 from neeco.errors import NeecoError
-from neeco.ingest.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
-from neeco.ingest.formats import format_of, read_table
-from neeco.ingest.logs import read_pose_log, read_reading_log
-from neeco.ingest.recordingfile import read_recording, recording_from_flags
-from neeco.ingest.synchronized import SynchronizedRecording
-from neeco.ingest.template import write_template
+from neeco.ingest.readers import format_of, read_table
+from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
+from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.recording.file import read_recording, recording_from_flags
+from neeco.ingest.recording.template import write_template
+from neeco.ingest.timing.synchronized import SynchronizedRecording
 
 SIZE = (64, 48)  # px
 FOCAL = (60.0, 60.0, 32.0, 24.0)
@@ -308,7 +308,7 @@ def test_files_packed_as_a_whole_are_refused(tmp_path: Path, bags: dict[str, Pat
 
 def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The limit is lowered: a bomb of its real size would take seconds to make."""
-    from neeco.ingest.formats import _bagfile
+    from neeco.ingest.readers import _bagfile
 
     monkeypatch.setattr(_bagfile, "LARGEST_CHUNK", 60_000)
     for kind, packed in (("a.bag", "bz2"), ("b.bag", "lz4"), ("c.bag", None), ("d-mcap", "zstd"), ("e-db3", "zstd")):
@@ -322,7 +322,7 @@ def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path, monkeypa
 
 
 def test_packed_bytes_are_unpacked_up_to_a_limit_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
-    from neeco.ingest.formats import _bagfile
+    from neeco.ingest.readers import _bagfile
 
     monkeypatch.setattr(_bagfile, "LARGEST_CHUNK", 1000)
     assert _bagfile.unpack(bz2.compress(bytes(1000)), "bz2") == bytes(1000)

@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.ingest import sfm
-from neeco.ingest.recording import IngestSettings
-from neeco.ingest.sfm import StructureFromMotion
-from neeco.ingest.sfm_strategies import Attempt, best_attempt, judge, motion_fault, strategies
+from neeco.geometry.lens import Lens
+from neeco.ingest.cameras import sfm
+from neeco.ingest.cameras.sfm import StructureFromMotion
+from neeco.ingest.cameras.sfm_strategies import Attempt, best_attempt, judge, motion_fault, strategies
+from neeco.ingest.recording.model import IngestSettings
 
 SIZE = (1280, 720)
 FREE = strategies(600.0)

@@ -11,7 +11,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
-from neeco.ingest.stereofile import read_stereo
+from neeco.ingest.calibration.stereo import read_stereo
 
 SIZE = (640, 480)
 LEFT = np.array([[701.5, 0, 321.25], [0, 702.5, 243.5], [0, 0, 1]])

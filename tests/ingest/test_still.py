@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from neeco.ingest.still import exposure, find_background, moving_masks, stands_still
+from neeco.ingest.cameras.still import exposure, find_background, moving_masks, stands_still
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 40
 

@@ -14,8 +14,8 @@ from ingest.still_world import BAR, BASELINE, FOCAL, HEIGHT, RATE, TISSUE, WIDTH
 from neeco.capture import read_capture, write_capture
 from neeco.capture.check import inspect_capture
 from neeco.errors import NeecoError
-from neeco.ingest import synchronized
-from neeco.ingest.logs import read_pose_log
+from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.timing import synchronized
 
 
 @pytest.fixture

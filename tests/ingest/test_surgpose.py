@@ -7,11 +7,11 @@ import pytest
 import yaml
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import JointColumns, PoseColumns
-from neeco.ingest.formats import format_of
-from neeco.ingest.logs import read_pose_log, read_reading_log
-from neeco.ingest.recordingfile import read_recording
-from neeco.ingest.template import write_template
+from neeco.ingest.readers import format_of
+from neeco.ingest.readers.columns import JointColumns, PoseColumns
+from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.template import write_template
 from tests.ingest.test_stereofile import LEFT, RIGHT, ini
 
 COUNT = 30

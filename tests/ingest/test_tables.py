@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.ingest.formats import read_table, recording_formats
-from neeco.ingest.logs import Rows
+from neeco.ingest.readers import read_table, recording_formats
+from neeco.ingest.readers.logs import Rows
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from neeco.capture import read_capture
 from neeco.capture.check import inspect_capture
 from neeco.cli.ingest import Ingest, run
 from neeco.errors import NeecoError
-from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.recording.file import read_recording
 from neeco.ingest.tissues import by_tissue
 
 

@@ -13,8 +13,8 @@ from PIL import Image
 from neeco.capture import check_capture, errors_only, read_capture
 from neeco.capture.model import Capture
 from neeco.errors import NeecoError
+from neeco.geometry.distortion import undistorted
 from neeco.ingest.convert import convert_folder
-from neeco.raster.lens import undistorted
 
 WIDTH, HEIGHT, FOCAL, COUNT = 96, 72, 70.0, 5
 BORDERS = 3  # px: beyond the recorded image nothing is known

@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 
 from neeco.errors import NeecoError
-from neeco.ingest.chosen_images import _read_lens
-from neeco.ingest.episodes import Episodes
-from neeco.ingest.recordingfile import read_recording
-from neeco.ingest.video import open_images, open_video
+from neeco.ingest.cameras.chosen_images import _read_lens
+from neeco.ingest.readers.video import open_images, open_video
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.timing.episodes import Episodes
 
 pytest.importorskip("av")
 

@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
 from neeco.labels.annotation import annotate, place_in_image, visibility
 from neeco.labels.drawing import draw, draw_layers
 from neeco.labels.labellers import (
@@ -14,7 +15,6 @@ from neeco.labels.labellers import (
     otsu_of_magnitudes,
 )
 from neeco.raster import rasterize
-from neeco.raster.types import Camera
 from neeco.synthesis.generator import UNOBSERVED_SIDE, UNOBSERVED_TISSUE, Acceptance
 
 

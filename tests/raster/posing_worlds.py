@@ -8,8 +8,8 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
+from neeco.geometry.rotations import rigid_from_vector
 from neeco.raster.posing import ArticulatedBody, pose_bodies
-from neeco.raster.rotations import rigid_from_vector
 
 GAUSSIANS = ("means", "quats", "log_scales", "logits")
 LEARNED = ("world_from_body", "origins", "axes", "values", "shaft_origin", "shaft_direction")

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
+from neeco.geometry.distortion import distorted, field_pinhole, pixels_of_rays, rays_of_pixels, undistorted
+from neeco.geometry.projection import project_world, unproject_world
 from neeco.raster import Camera, Gaussians, Rendering, rasterize
-from neeco.raster.lens import distorted, field_pinhole, pixels_of_rays, rays_of_pixels, undistorted
-from neeco.raster.pinhole import project_world, unproject_world
 
 LEARNED = Camera(torch.eye(4), 60.0, 60.0, 32.0, 24.0, 64, 48)
 BARREL = (-0.3, 0.08, 0.001, -0.002)

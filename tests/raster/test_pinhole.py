@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from neeco.raster.pinhole import in_image, pixel_centers, project, project_world, unproject_world
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import in_image, pixel_centers, project, project_world, unproject_world
 from neeco.raster.reference import camera_from_world
-from neeco.raster.types import Camera
 
 
 def a_camera() -> Camera:

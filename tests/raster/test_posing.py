@@ -15,10 +15,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 from posing_worlds import Tree, assert_same_as_definition, hinges, make_world, posed, trees
 
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import kernels
 from neeco.raster.native import set_threads
 from neeco.raster.posing import MOST_JOINTS, ArticulatedBody, pose_bodies
-from neeco.raster.rotations import quat_to_matrix
 
 
 @pytest.mark.parametrize("roll", [0.0, 2.1])

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
-from neeco.experiments.ablation_study import AblationResult, direction, table_of
-from neeco.experiments.ablations import all_ablations
 from neeco.report.study_pages import write_ablation_report
+from neeco.studies.ablation_study import AblationResult, direction, table_of
+from neeco.studies.ablations import all_ablations
 
 VOID = ("meta", "br", "img", "path", "circle")
 SPLITS = ("test", "unseen")

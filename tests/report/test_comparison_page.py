@@ -12,10 +12,10 @@ from itertools import pairwise
 import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
-from neeco.experiments.comparison import ComparisonResult, summarise
 from neeco.report import study_pages
 from neeco.report.charts import Series, binned, legend, line_chart
 from neeco.report.study_pages import command_of, findings, leader, median_frame, write_comparison_report
+from neeco.studies.comparison import ComparisonResult, summarise
 
 VOID = {"meta", "img", "br", "path", "circle", "link"}
 FIGURES = ("summary.csv", "jobs.csv", "frames.csv", "curves.csv", "distance.csv", "speed.csv")

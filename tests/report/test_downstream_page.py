@@ -13,9 +13,6 @@ import torch
 from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.capture.images import write_labels
-from neeco.experiments.downstream.job import job_folder
-from neeco.experiments.downstream.results import comparisons, findings, summarise_folds, verdict
-from neeco.experiments.downstream.samples import class_names, recorded_samples
 from neeco.report.charts import Level, Series, line_chart
 from neeco.report.downstream_examples import draw_boxes, example_sections
 from neeco.report.downstream_page import (
@@ -25,6 +22,9 @@ from neeco.report.downstream_page import (
     score_chart,
     write_downstream_report,
 )
+from neeco.studies.downstream.job import job_folder
+from neeco.studies.downstream.results import comparisons, findings, summarise_folds, verdict
+from neeco.studies.downstream.samples import class_names, recorded_samples
 
 VOID = {"meta", "img", "br", "path", "link", "wbr"}
 FILES = ("summary.csv", "scores.csv", "frames.csv", "jobs.csv", "validation.csv", "paired.csv", "examples.csv")

@@ -21,13 +21,13 @@ from neeco.capture.documents import Problem
 from neeco.capture.images import write_image
 from neeco.capture.model import Frame, State
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
 from neeco.ingest.assessment import SHOWN, assess_ingest
-from neeco.ingest.base import BaseRegistration
-from neeco.ingest.clock_search import ClockOffset
-from neeco.ingest.motion import RoughShape
-from neeco.ingest.registration import Registration
+from neeco.ingest.foreground.motion import RoughShape
+from neeco.ingest.registration.base import BaseRegistration
+from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.result import Doubt, IngestResult
-from neeco.raster.types import Camera
+from neeco.ingest.timing.clock_search import ClockOffset
 from neeco.report import ingest_page
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
 from neeco.report.ingest_figures import in_view, main_axes, posed_picture, read_tracks, round_length

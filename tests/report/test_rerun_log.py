@@ -13,8 +13,8 @@ from test_ingest_page import SAMPLE, made
 
 from neeco.capture import read_capture
 from neeco.cli import main
-from neeco.ingest.clock_search import ClockOffset
 from neeco.ingest.result import IngestResult
+from neeco.ingest.timing.clock_search import ClockOffset
 from neeco.report.rerun_log import MISSING, write_rrd
 
 

@@ -12,8 +12,8 @@ from safetensors.torch import save_file
 from scene_worlds import TISSUE, grasper_state, make_scene, pose_of
 
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
 from neeco.methods.breathing import HARMONICS, Breathing
-from neeco.raster.types import Camera
 from neeco.scene import Scene
 from neeco.scene.io import load_scene, save_scene
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neeco.capture.model import State
-from neeco.raster.types import Camera
+from neeco.geometry.camera import Camera
 from neeco.scene.canonical import SH_C0, CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
 from neeco.scene.method_registry import make_deformation, method_settings

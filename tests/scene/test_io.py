@@ -14,8 +14,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
+from neeco.geometry.lens import Lens
 from neeco.scene import Scene
 from neeco.scene.io import load_scene, pack_scene, save_scene, save_tensors
 

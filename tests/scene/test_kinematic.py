@@ -13,9 +13,9 @@ from scene_worlds import SURE, TISSUE, grasper_state, pose_of
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import quat_to_matrix, rotate_about
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.kinematic.deformation import Kinematic, Spin
-from neeco.raster.rotations import quat_to_matrix, rotate_about
 from neeco.scene import Scene
 
 POSE = pose_of(0.5, -0.2, 0.9, 10, -4, 70)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from neeco.capture.model import State
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import skew
 from neeco.methods.nerfies.field import (
     PUBLISHED,
     NerfiesSettings,
@@ -25,7 +26,6 @@ from neeco.methods.nerfies.field import (
     stratified_depths,
 )
 from neeco.methods.nerfies.session import elastic_loss, geman_mcclure
-from neeco.raster.rotations import skew
 from neeco.scene.drawable import Recorded
 from neeco.scene.scene import gaussian_scene
 

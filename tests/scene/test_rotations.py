@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from neeco.raster.rotations import (
+from neeco.geometry.rotations import (
     axis_angle_quat,
     matrix_to_quat,
     quat_multiply,

@@ -10,8 +10,8 @@ from scene_worlds import GRASPER, SURE, grasper_state, pose_of
 from torch import Tensor
 
 from neeco.capture.model import State
+from neeco.geometry.camera import Camera
 from neeco.raster import rasterize
-from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
 from neeco.scene.method_registry import make_deformation, method_settings

@@ -15,14 +15,14 @@ from rod_world import CAMERA, FakeRun, rod_state
 
 from neeco import StoredImages
 from neeco.capture.images import write_image
-from neeco.capture.lens import Lens
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import TypicalErrors, estimate_trust, typical_errors_of
+from neeco.geometry.lens import Lens
+from neeco.geometry.rotations import rigid_from_vector
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
-from neeco.raster.rotations import rigid_from_vector
 from neeco.report.run_page import write_annotated_page
 from neeco.scene import Scene
 from neeco.synthesis.annotated import annotate_capture

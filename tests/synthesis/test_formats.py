@@ -14,7 +14,7 @@ from ball_world import RADIUS, at, ball_scene, run_of
 from PIL import Image
 from rod_world import CAMERA, FakeRun
 
-from neeco.raster.pinhole import project
+from neeco.geometry.projection import project
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 

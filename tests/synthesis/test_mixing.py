@@ -16,10 +16,10 @@ from rod_world import CAMERA
 from neeco.capture.model import InstrumentState, State
 from neeco.cli import main
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.raster.native import torch_threads
-from neeco.raster.types import Camera
 from neeco.scene import Scene
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import ENTERS_ANOTHER, Acceptance

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.images import write_image
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
+from neeco.geometry.camera import Camera
 from neeco.methods.kinematic.articulation import LINK_LOGITS
-from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.training.config import config_to_dict, method_defaults

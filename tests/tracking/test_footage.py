@@ -16,7 +16,8 @@ from neeco.capture.images import write_image
 from neeco.capture.model import Capture, PointCloud, State
 from neeco.cli import main
 from neeco.errors import NeecoError
-from neeco.raster.types import Camera
+from neeco.geometry.camera import Camera
+from neeco.ingest.footage_video import read_footage
 from neeco.scene import Scene
 from neeco.tracking import footage_again, footage_scene, footage_tissue
 from neeco.tracking.coordinates import DEG, Coordinates
@@ -24,7 +25,6 @@ from neeco.tracking.drawing import InstrumentDrawer, Tissue
 from neeco.tracking.follow import Step
 from neeco.tracking.footage_scene import Colors, over_tissue
 from neeco.tracking.footage_tissue import passing
-from neeco.tracking.footage_video import read_footage
 from neeco.tracking.motion import Motion
 from neeco.tracking.track import state_of, track_footage
 from neeco.tracking.trust import TrackTrust

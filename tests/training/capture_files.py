@@ -17,8 +17,8 @@ from neeco.capture.images import write_image
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, Tissue
 from neeco.capture.reader import read_capture
 from neeco.capture.writer import write_capture as write_folder
+from neeco.geometry.rotations import rigid_from_vector, rotate_about
 from neeco.raster import Camera, Gaussians, rasterize
-from neeco.raster.rotations import rigid_from_vector, rotate_about
 
 FRAMES = 8
 PIVOT_MM, WRIST_MM = 6.0, -3.0  # along the grasper's shaft, which is z of its frame

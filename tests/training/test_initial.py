@@ -10,8 +10,8 @@ import torch
 
 from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid_from_vector
 from neeco.methods.kinematic.hinge_search import hinge_joints
-from neeco.raster.rotations import rigid_from_vector
 from neeco.training.config import TrainConfig
 from neeco.training.initial import moving_joints
 

@@ -11,10 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from neeco.geometry.camera import Camera
 from neeco.methods.kinematic import label_shares as module
 from neeco.methods.kinematic.articulation import LABEL_SHARE
 from neeco.methods.kinematic.label_shares import store_label_shares
-from neeco.raster.types import Camera, Gaussians
+from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 
 TISSUE, METAL = (0.6, 0.25, 0.2), (0.55, 0.57, 0.6)

@@ -10,7 +10,7 @@ import torch
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, State, Uncertainty
-from neeco.raster.types import Camera
+from neeco.geometry.camera import Camera
 from neeco.scene.drawable import Recorded
 from neeco.training.config import RefineConfig
 from neeco.training.refinement import Refinement

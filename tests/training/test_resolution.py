@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.raster.pinhole import project_world
+from neeco.geometry.projection import project_world
 from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config

@@ -20,8 +20,8 @@ from viewer_world import brighter, grasper_scene, write_recorded_images, write_r
 
 from neeco.capture.statefile import read_states
 from neeco.evaluation.image_metrics import psnr
+from neeco.geometry.camera import Camera
 from neeco.labels.drawing import to_numpy
-from neeco.raster.types import Camera
 from neeco.scene.io import save_scene
 from neeco.viewer.controls import Controls, InstrumentControls, controlled_state, shafts_of
 from neeco.viewer.runs import WatchedRun

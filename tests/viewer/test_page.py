@@ -18,8 +18,8 @@ from wristed_world import make_driver
 
 from neeco.capture.model import State
 from neeco.evaluation.image_metrics import psnr
+from neeco.geometry.camera import Camera
 from neeco.labels.labellers import composited_parts, threshold_of
-from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
 from neeco.scene.scene import Scene

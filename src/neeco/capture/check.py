@@ -37,8 +37,8 @@ from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import STILL, Capture, Frame, Instrument, InstrumentState
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
 from neeco.plausible import Fault, joint_fault, limits_fault, passes_limits
-from neeco.raster.types import Camera
 
 FEWEST_TRAIN_FRAMES = 4  # below, nothing can be learned
 FEW_TRAIN_FRAMES = 20  # below, expect little

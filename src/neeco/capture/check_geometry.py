@@ -15,7 +15,7 @@ from neeco.capture.check_motion import POSES, MotionVerdict, judge_motion
 from neeco.capture.documents import Node, Parsed, errors_only, printable
 from neeco.capture.model import Instrument, swap_camera_axes
 from neeco.capture.motion_evidence import Rays
-from neeco.raster.pinhole import project
+from neeco.geometry.projection import project
 
 FEW_POINTS = 100
 FAR = 10.0  # in sizes of the scene

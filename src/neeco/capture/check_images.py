@@ -20,7 +20,7 @@ from neeco.capture.documents import Parsed
 from neeco.capture.images import exif_orientation
 from neeco.capture.model import evenly_spaced
 from neeco.capture.pose_mistakes import camera_mistakes
-from neeco.raster.pinhole import project
+from neeco.geometry.projection import project
 
 MAX_IMAGES = 48  # compared with the points, evenly spaced over the capture
 QUICK_IMAGES = 12  # of these, with which causes are first compared

@@ -9,9 +9,9 @@ import numpy as np
 from torch import Tensor
 
 from neeco.capture.points import PointCloud
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import project_world
 from neeco.plausible import Fault, mask_fault
-from neeco.raster.pinhole import project_world
-from neeco.raster.types import Camera
 
 LIT = 0.12  # brightness in [0, 1] of a pixel's brightest channel: a round field of view's dark border has less
 MIN_LIT = 0.02  # share of an image: with fewer lit pixels it tells nothing

@@ -24,9 +24,9 @@ from neeco.capture.model import Frame, PointCloud, State
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
+from neeco.geometry.camera import Camera
+from neeco.geometry.rotations import quat_to_matrix
 from neeco.plausible import center_fault, focal_fault, size_fault
-from neeco.raster.rotations import quat_to_matrix
-from neeco.raster.types import Camera
 
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),

@@ -12,12 +12,12 @@ from typing import Any, Literal, NoReturn
 
 import numpy as np
 
-from neeco.capture.lens import Lens
 from neeco.capture.model import Frame, Instrument, InstrumentState
 from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
 from neeco.files import placeholder
-from neeco.raster.rotations import rigid_fault
+from neeco.geometry.lens import Lens
+from neeco.geometry.rotations import rigid_fault
 
 MANY_ALIKE = 3  # problems like another one, from which they are counted instead of listed
 VARYING = re.compile(

@@ -21,8 +21,8 @@ from neeco.capture.points import random_points
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
 from neeco.files import placeholder, visible_entries
+from neeco.geometry.camera import Camera
 from neeco.plausible import focal_fault, size_fault
-from neeco.raster.types import Camera
 
 POSES_FILE = "poses_bounds.npy"
 MASKS = "masks"

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from neeco.errors import NeecoError
-from neeco.raster.rotations import rigid_fault, rotation_from_vector
+from neeco.geometry.rotations import rigid_fault, rotation_from_vector
 
 FIXED, REVOLUTE, PRISMATIC = "fixed", "revolute", "prismatic"
 JOINT_TYPES = (FIXED, REVOLUTE, PRISMATIC)

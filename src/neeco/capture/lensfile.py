@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from neeco.capture.documents import Node
-from neeco.capture.lens import BORDER, COEFFICIENT_NAMES, INTRINSICS, Border, Lens
 from neeco.errors import NeecoError
+from neeco.geometry.camera import COEFFICIENTS
+from neeco.geometry.lens import BORDER, COEFFICIENT_NAMES, INTRINSICS, Border, Lens
 from neeco.plausible import focal_fault, size_fault
-from neeco.raster.types import COEFFICIENTS
 
 MOST_PX = 65_536.0  # no image is as large
 MOST_BENT = 1e6  # nor any coefficient of a lens

@@ -20,12 +20,12 @@ from torch import Tensor
 from neeco.capture.conventions import OPENGL
 from neeco.capture.images import read_image, read_image_bytes, read_mask
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
-from neeco.capture.lens import Lens
 from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
+from neeco.geometry.lens import Lens
+from neeco.geometry.rotations import as_pose, rigid_fault
 from neeco.plausible import Fault, joint_fault
-from neeco.raster.rotations import as_pose, rigid_fault
-from neeco.raster.types import Camera
 
 REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
 STILL = 1e-9  # a coordinate that varies less than this in the recording tells nothing apart

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from neeco.capture.documents import Parsed
 from neeco.capture.model import Frame, evenly_spaced
-from neeco.raster.pinhole import project
+from neeco.geometry.projection import project
 
 FRAMES = 84  # looked at, evenly spaced over the capture
 FEWEST_FRAMES = 12  # with fewer, chance decides

@@ -21,8 +21,8 @@ from neeco.capture.points import PointCloud, random_points, read_ply
 from neeco.capture.statefile import all_instruments, declared_instruments, parse_instruments
 from neeco.errors import NeecoError
 from neeco.files import read_json
+from neeco.geometry.camera import Camera
 from neeco.plausible import LARGEST_SIZE, focal_fault, size_fault, time_fault
-from neeco.raster.types import Camera
 
 SCHEMA = "neeco-capture/1"
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)

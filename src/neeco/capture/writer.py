@@ -23,7 +23,7 @@ from neeco.capture.statefile import camera_to_json, state_to_json
 from neeco.capture.transforms import SCHEMA
 from neeco.errors import NeecoError
 from neeco.files import read_bytes, write_atomically, write_json
-from neeco.raster.rotations import rigid_fault
+from neeco.geometry.rotations import rigid_fault
 
 
 def write_capture(

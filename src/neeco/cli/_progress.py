@@ -17,7 +17,7 @@ from neeco.raster.devices import device_failure
 if TYPE_CHECKING:
     import torch
 
-    from neeco.experiments.study import JobEvent
+    from neeco.studies.study import JobEvent
     from neeco.training.config import TrainConfig
     from neeco.training.train import ProgressRow
 

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from neeco.cli._output import fitted
-from neeco.experiments.ablations import AblationPlan
+from neeco.studies.ablations import AblationPlan
 
 if TYPE_CHECKING:
-    from neeco.experiments.ablation_study import AblationResult
+    from neeco.studies.ablation_study import AblationResult
 
 
 def run(plan: AblationPlan) -> int:
     """Run the ablations with a progress bar, write all files, print the verdicts."""
     from neeco.cli._progress import Bars
-    from neeco.experiments.ablation_study import run_ablations
     from neeco.report.study_pages import write_ablation_report
+    from neeco.studies.ablation_study import run_ablations
 
     with Bars() as bars:
         ablation = run_ablations(plan, bars.job)
@@ -30,7 +30,7 @@ def run(plan: AblationPlan) -> int:
 
 def _print_tables(console: Console, ablation: AblationResult) -> None:
     """Of the paper's tables how many of its directions hold, ours whole, then the notes."""
-    from neeco.experiments.ablation_study import agreement, grid
+    from neeco.studies.ablation_study import agreement, grid
 
     for table in ablation.tables:
         if table.judged:

@@ -13,8 +13,8 @@ from neeco.cli._output import fitted, print_outcome
 from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
-    from neeco.experiments.comparison import ComparisonSpec
-    from neeco.experiments.training_job import Budget
+    from neeco.studies.comparison import ComparisonSpec
+    from neeco.studies.training_job import Budget
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class Compare:
 def run(args: Compare) -> int:
     """Compare with progress bars; print the tables and where the files lie; 1 when a run failed."""
     from neeco.cli._progress import Bars
-    from neeco.experiments.comparison import absent_notes, budget_words, compare, plan_comparison, tables_of
     from neeco.report.study_pages import write_comparison_report
+    from neeco.studies.comparison import absent_notes, budget_words, compare, plan_comparison, tables_of
 
     with Bars() as bars:
         plan = plan_comparison(_spec(args))
@@ -78,7 +78,7 @@ def run(args: Compare) -> int:
 def _spec(args: Compare) -> ComparisonSpec:
     """What the words mean. Raises NeecoError for a budget or masks that cannot be understood."""
     from neeco.errors import NeecoError
-    from neeco.experiments.comparison import ComparisonSpec
+    from neeco.studies.comparison import ComparisonSpec
 
     masks: dict[str, Path] = {}
     for word in args.masks:
@@ -94,7 +94,7 @@ def _spec(args: Compare) -> ComparisonSpec:
 
 def _budget(args: Compare) -> Budget:
     from neeco.errors import NeecoError
-    from neeco.experiments.training_job import Budget
+    from neeco.studies.training_job import Budget
 
     options = {
         "--minutes": args.minutes,

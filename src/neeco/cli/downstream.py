@@ -13,8 +13,8 @@ from neeco.cli._output import fitted, print_outcome
 from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
-    from neeco.experiments.downstream.job import DownstreamSettings
-    from neeco.experiments.downstream.samples import DataSet
+    from neeco.studies.downstream.job import DownstreamSettings
+    from neeco.studies.downstream.samples import DataSet
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,9 @@ class Downstream:
 def run(args: Downstream) -> int:
     """Train and test with progress bars; print tables, findings and where the files are; 1 when a training failed."""
     from neeco.cli._progress import Bars
-    from neeco.experiments.downstream.experiment import plan_downstream, run_downstream
-    from neeco.experiments.downstream.results import failed_jobs, tables_of, write_tables
     from neeco.report.downstream_page import write_downstream_report
+    from neeco.studies.downstream.experiment import plan_downstream, run_downstream
+    from neeco.studies.downstream.results import failed_jobs, tables_of, write_tables
 
     with Bars() as bars:
         plan = plan_downstream(_settings(args))
@@ -92,7 +92,7 @@ def run(args: Downstream) -> int:
 
 def _settings(args: Downstream) -> DownstreamSettings:
     """The study that these words describe. Raises NeecoError for sets and weights that cannot be understood."""
-    from neeco.experiments.downstream.job import DownstreamSettings
+    from neeco.studies.downstream.job import DownstreamSettings
 
     weights = dict(name_and_value("--weights", word, "unet=unet.safetensors") for word in args.weights)
     given = vars(args) | {
@@ -108,7 +108,7 @@ def _settings(args: Downstream) -> DownstreamSettings:
 def _data_set(word: str) -> DataSet:
     """`NAME=DATASET` or `NAME=DATASET:COUNT`; a folder whose name ends so is the folder."""
     from neeco.errors import NeecoError
-    from neeco.experiments.downstream.samples import DataSet
+    from neeco.studies.downstream.samples import DataSet
 
     name, place = name_and_value("--sets", word, "kinematic=dataset")
     folder, colon, count = place.rpartition(":")

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 if TYPE_CHECKING:
     from neeco.ingest.assessment import Assessment
-    from neeco.ingest.recording import Recording
+    from neeco.ingest.recording.model import Recording
     from neeco.ingest.result import IngestResult
 
 PAGE = "ingest.html"
@@ -68,7 +68,7 @@ class Ingest:
 def run(args: Ingest) -> int:
     """Ingest, convert, or write a template."""
     from neeco.errors import NeecoError
-    from neeco.ingest.formats import format_of
+    from neeco.ingest.readers import format_of
 
     if args.formats:
         _refuse_beside(args, "--formats", keep=("formats",))
@@ -111,7 +111,7 @@ def _list_formats() -> int:
     from rich.markup import escape
     from rich.table import Table
 
-    from neeco.ingest.formats import recording_formats
+    from neeco.ingest.readers import recording_formats
 
     table = Table("format", "read of it", "needs")
     for known in recording_formats():
@@ -123,7 +123,7 @@ def _list_formats() -> int:
 def _init(folder: Path) -> int:
     from neeco.errors import NeecoError
     from neeco.files import write_text
-    from neeco.ingest.template import holds_streams, write_template
+    from neeco.ingest.recording.template import holds_streams, write_template
     from neeco.report.choice_picture import write_choice_picture
 
     path = (folder.parent if holds_streams(folder) else folder) / RECORDING
@@ -152,7 +152,7 @@ def _convert(folder: Path, output: Path) -> int:
 def recordings_of(args: Ingest) -> list[Recording]:
     """The recordings that the words name. Raises NeecoError naming the option."""
     from neeco.errors import NeecoError
-    from neeco.ingest.recordingfile import check_frames, read_recording, recording_from_flags
+    from neeco.ingest.recording.file import check_frames, read_recording, recording_from_flags
 
     if args.source:
         _refuse_beside(
@@ -257,7 +257,7 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
 
 def page_of(tissue: str) -> str:
     """The file of the page about one of several tissues; of the only one where it has no name."""
-    from neeco.ingest.episodes import file_name
+    from neeco.ingest.timing.episodes import file_name
 
     return f"{Path(PAGE).stem}_{file_name(tissue)}.html" if tissue else PAGE
 

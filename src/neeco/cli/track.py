@@ -40,10 +40,10 @@ def run(arguments: Arguments) -> int:
     """Track, write the page, and say where both lie."""
     from neeco.cli._progress import Bars, resumable
     from neeco.errors import NeecoError
+    from neeco.ingest.footage_video import read_footage
     from neeco.raster.devices import device_of
     from neeco.report.track_page import write_track_page
     from neeco.scene.scene import gaussian_scene
-    from neeco.tracking.footage_video import read_footage
     from neeco.tracking.track import track_footage
     from neeco.training.run import open_run
 

@@ -19,10 +19,11 @@ from torch import Tensor
 from neeco.capture.images import area_averaged
 from neeco.capture.model import Frame, State
 from neeco.evaluation.photometric_fit import Observed, minimise
+from neeco.geometry.camera import Camera
+from neeco.geometry.rotations import rigid_from_vector
 from neeco.raster import rasterize
-from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.shadow import shadowed
-from neeco.raster.types import Camera, Gaussians
+from neeco.raster.types import Gaussians
 
 if TYPE_CHECKING:
     from neeco.scene import Scene

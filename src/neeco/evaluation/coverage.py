@@ -12,9 +12,10 @@ from torch import Tensor
 
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.evaluation.image_metrics import resize_mask
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import pixel_centers, project, unproject_world
 from neeco.labels.labellers import composited_parts, threshold_of
-from neeco.raster.pinhole import pixel_centers, project, unproject_world
-from neeco.raster.types import Camera, Rendering
+from neeco.raster.types import Rendering
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable

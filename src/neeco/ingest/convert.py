@@ -17,14 +17,14 @@ from neeco.capture.check_masks import masks_fault, measure_hidden, sample_points
 from neeco.capture.documents import Parsed, ProblemReport, condensed
 from neeco.capture.endonerf import MASKS, folder_images
 from neeco.capture.images import read_mask, write_labels
-from neeco.capture.lens import Border
 from neeco.capture.model import Capture, Frame, evenly_spaced
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY, new_folder, own_folder
-from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
-from neeco.ingest.undistortion import undistort_frames
+from neeco.geometry.lens import Border
+from neeco.ingest.calibration.lens import BORDER_SAMPLES, find_border, visible_mask
+from neeco.ingest.cameras.undistortion import undistort_frames
 
 
 def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.capture.lens import Lens
 from neeco.capture.model import (
     REFERENCE_PIXELS,
     Capture,
@@ -23,27 +22,25 @@ from neeco.capture.model import (
 )
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
-from neeco.ingest.base import BaseRegistration
-from neeco.ingest.chosen_images import ChosenImages
-from neeco.ingest.clocks import doubt_frame_rates, find_instrument_clocks, open_clocks, register
-from neeco.ingest.columns import CAMERA
+from neeco.geometry.lens import Lens
+from neeco.ingest.cameras.chosen_images import ChosenImages
+from neeco.ingest.cameras.frame_selection import LEFT_OUT
+from neeco.ingest.cameras.sfm import SfmResult, StageProgress, StructureFromMotion
+from neeco.ingest.cameras.still import LOOKED_AT, find_background, moving_masks, reduced, stands_still
+from neeco.ingest.cameras.still_scene import RightCamera, look_behind, read_right_camera, seen_by, still_cameras
 from neeco.ingest.convert import staged
-from neeco.ingest.episodes import Episodes, separate
-from neeco.ingest.find_bases import refuse_frames, require_no_base, take_bases
-from neeco.ingest.frame_selection import LEFT_OUT
-from neeco.ingest.from_video import FoundShaft
-from neeco.ingest.motion import ResidualFlow, RoughShape, best_lag, carve_shape, observations_on
-from neeco.ingest.passing import passing_masks
+from neeco.ingest.foreground.motion import ResidualFlow, RoughShape, best_lag, carve_shape, observations_on
+from neeco.ingest.foreground.passing import passing_masks
 from neeco.ingest.posing.posed_capture import prepare
-from neeco.ingest.recording import STILL, Recording
-from neeco.ingest.registration import Registration
+from neeco.ingest.readers.columns import CAMERA
+from neeco.ingest.recording.model import STILL, Recording
+from neeco.ingest.registration.base import BaseRegistration
+from neeco.ingest.registration.clocks import doubt_frame_rates, find_instrument_clocks, open_clocks, register
+from neeco.ingest.registration.find_bases import refuse_frames, require_no_base, take_bases
+from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.result import IngestResult
-from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
-from neeco.ingest.splits import split_frames
-from neeco.ingest.still import LOOKED_AT, find_background, moving_masks, reduced, stands_still
-from neeco.ingest.still_scene import RightCamera, look_behind, read_right_camera, seen_by, still_cameras
-from neeco.ingest.synchronized import States
-from neeco.ingest.video_instruments import (
+from neeco.ingest.shaft.from_video import FoundShaft
+from neeco.ingest.shaft.video_instruments import (
     NOT_SEEN,
     find_in_video,
     instruments_of,
@@ -51,6 +48,9 @@ from neeco.ingest.video_instruments import (
     seen_in_video,
     uncertainties,
 )
+from neeco.ingest.splits import split_frames
+from neeco.ingest.timing.episodes import Episodes, separate
+from neeco.ingest.timing.synchronized import States
 
 
 def ingest(

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from neeco.ingest.base import BaseRegistration
-from neeco.ingest.clock_search import ClockOffset
-from neeco.ingest.motion import RoughShape
-from neeco.ingest.registration import Registration
+from neeco.ingest.foreground.motion import RoughShape
+from neeco.ingest.registration.base import BaseRegistration
+from neeco.ingest.registration.hand_eye import Registration
+from neeco.ingest.timing.clock_search import ClockOffset
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from neeco.errors import NeecoError
-from neeco.ingest.episodes import Episodes
-from neeco.ingest.frame_selection import LEFT_OUT, assign_splits
-from neeco.ingest.recording import Splits
-from neeco.ingest.synchronized import States
+from neeco.ingest.cameras.frame_selection import LEFT_OUT, assign_splits
+from neeco.ingest.recording.model import Splits
+from neeco.ingest.timing.episodes import Episodes
+from neeco.ingest.timing.synchronized import States
 
 
 def split_frames(

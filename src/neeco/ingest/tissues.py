@@ -11,12 +11,12 @@ import numpy as np
 from neeco.capture.model import Capture, PointCloud, Tissue
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
+from neeco.ingest.cameras.sfm import StageProgress
 from neeco.ingest.convert import staged
-from neeco.ingest.episodes import check_alike, episode_names, file_name, refuse_other_words, separate
 from neeco.ingest.pipeline import Placed, WorldIngest
-from neeco.ingest.recording import EACH, Recording, Splits
+from neeco.ingest.recording.model import EACH, Recording, Splits
 from neeco.ingest.result import IngestResult
-from neeco.ingest.sfm import StageProgress
+from neeco.ingest.timing.episodes import check_alike, episode_names, file_name, refuse_other_words, separate
 
 
 def ingest_tissues(

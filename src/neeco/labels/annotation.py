@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import State
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import project_seen
 from neeco.labels.drawing import LayeredDrawing, draw_layers, surface_depth, to_numpy
 from neeco.labels.labellers import CompositedLabels, instruments_of
-from neeco.raster.pinhole import project_seen
-from neeco.raster.types import Camera
 from neeco.scene.scene import gaussian_scene
 
 if TYPE_CHECKING:

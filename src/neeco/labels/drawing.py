@@ -18,9 +18,10 @@ from scipy import ndimage
 from torch import Tensor
 
 from neeco.capture.model import State
+from neeco.geometry.camera import Camera
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, composited_parts, instruments_of, threshold_of
 from neeco.raster import rasterize
-from neeco.raster.types import Camera, Rendering
+from neeco.raster.types import Rendering
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable, Scene

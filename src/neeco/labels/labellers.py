@@ -16,8 +16,9 @@ from torch import Tensor
 
 from neeco.capture.model import State, evenly_spaced
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
 from neeco.raster import rasterize
-from neeco.raster.types import Camera, Gaussians, Rendering
+from neeco.raster.types import Gaussians, Rendering
 from neeco.scene.deformation import otsu
 
 if TYPE_CHECKING:

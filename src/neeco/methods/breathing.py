@@ -12,7 +12,7 @@ import torch
 from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 
-from neeco.raster.types import Camera
+from neeco.geometry.camera import Camera
 from neeco.scene.deformation import floored_decay
 
 HARMONICS = 2  # breath is no pure sine: the pause after breathing out is longer

@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
 from neeco.raster.devices import cuda_backend
 from neeco.raster.native import runs_native
 from neeco.raster.optics import draw_through, of_learned_size, widened
 from neeco.raster.shadow import shadowed
 from neeco.raster.triton.ready import require_triton
-from neeco.raster.types import Camera, Gaussians, Rendering
+from neeco.raster.types import Gaussians, Rendering
 
 BACKENDS = ("auto", "reference", "cpu", "cuda", "triton")
 SH_COUNTS = (1, 4, 9, 16)

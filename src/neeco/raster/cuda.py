@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from neeco.geometry.camera import Camera
 from neeco.raster.devices import constant
 from neeco.raster.reference import camera_from_world, headlight_factor, sh_colors, usable_gaussians
-from neeco.raster.types import Camera, Gaussians, Headlight, Rendering
+from neeco.raster.types import Gaussians, Headlight, Rendering
 
 
 def rasterize_cuda(

@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from neeco.errors import NeecoError
-from neeco.raster.types import Camera, Gaussians, Rendering, differentiable
+from neeco.geometry.camera import Camera
+from neeco.raster.types import Gaussians, Rendering, differentiable
 
 Family = Literal["native", "torch"]
 _family: ContextVar[Family] = ContextVar("family of kernels", default="native")

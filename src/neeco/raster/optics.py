@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
-from neeco.raster.lens import field_pinhole, lens_field
+from neeco.geometry.camera import Camera
+from neeco.geometry.distortion import field_pinhole, lens_field
 from neeco.raster.reference import LOW_PASS
-from neeco.raster.types import Camera, Gaussians, Rendering
+from neeco.raster.types import Gaussians, Rendering
 
 # Of the learned size: from here up the backends' own low-pass is near enough. Measured at .9: .1 dB less than averaged.
 COARSE = 0.9

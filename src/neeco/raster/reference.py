@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neeco.raster.pinhole import field_slopes
-from neeco.raster.types import Camera, Gaussians, Headlight, Rendering
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import field_slopes
+from neeco.raster.types import Gaussians, Headlight, Rendering
 
 LOW_PASS = 0.3  # px^2 added to projected covariances
 FAINTEST = 1 / 255  # smallest alpha that is drawn

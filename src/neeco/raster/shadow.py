@@ -16,10 +16,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import grid_sample
 
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import project
 from neeco.raster.devices import constant
 from neeco.raster.native import all_run_native, native
-from neeco.raster.pinhole import project
-from neeco.raster.types import Camera, Gaussians, Rendering, Shadow
+from neeco.raster.types import Gaussians, Rendering, Shadow
 
 RESOLUTION = 0.5  # of the image's
 MARGIN = 0.15  # of the image's size, to each side: what casts may stand beside the image

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from neeco.files import write_atomically
-from neeco.ingest.choices import AXES, OpenPoses, Reading, axis_directions, largest_step, open_poses, shaft_of
-from neeco.ingest.columns import BASE
-from neeco.ingest.formats import IMAGES, VideoSource, format_of
+from neeco.ingest.readers import IMAGES, VideoSource, format_of
+from neeco.ingest.readers.choices import AXES, OpenPoses, Reading, axis_directions, largest_step, open_poses, shaft_of
+from neeco.ingest.readers.columns import BASE
 from neeco.report.charts import page_style
 
 FRAMES = 3  # shown

@@ -14,14 +14,14 @@ from neeco.capture.images import read_labels
 from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline, overlay_parts
 from neeco.evaluation.mask_metrics import box_ious
-from neeco.experiments.downstream.job import AUGMENT, REAL, job_folder, predictions_folder
-from neeco.experiments.downstream.results import MAIN, main_differences, models_and_splits, title_of
-from neeco.experiments.downstream.samples import Example, RecordedSample, recorded_samples
-from neeco.experiments.downstream.scores import MIN_SCORE
-from neeco.experiments.tables import csv_text
 from neeco.files import read_json
 from neeco.report.page import MAX_WIDTH, jpeg
 from neeco.report.study_pages import Images, Section
+from neeco.studies.downstream.job import AUGMENT, REAL, job_folder, predictions_folder
+from neeco.studies.downstream.results import MAIN, main_differences, models_and_splits, title_of
+from neeco.studies.downstream.samples import Example, RecordedSample, recorded_samples
+from neeco.studies.downstream.scores import MIN_SCORE
+from neeco.studies.tables import csv_text
 
 FRAMES = 2  # shown of each kind, best and worst
 CONDITIONS = 4  # side by side

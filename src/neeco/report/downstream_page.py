@@ -14,8 +14,13 @@ from matplotlib.axes import Axes
 
 from neeco.capture.model import Capture
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.experiments.downstream.job import AUGMENT, REAL
-from neeco.experiments.downstream.results import (
+from neeco.files import write_text
+from neeco.report.charts import PALETTE, Level, Series, inline_svg, legend, line_chart, new_axes, page_style
+from neeco.report.downstream_examples import example_sections
+from neeco.report.page import REPORT_FILE, split_counts, write_page
+from neeco.report.study_pages import Figure, Section
+from neeco.studies.downstream.job import AUGMENT, REAL
+from neeco.studies.downstream.results import (
     CONFIDENCE,
     HELPS,
     HURTS,
@@ -37,12 +42,7 @@ from neeco.experiments.downstream.results import (
     title_of,
     verdict,
 )
-from neeco.experiments.machine import machine_words
-from neeco.files import write_text
-from neeco.report.charts import PALETTE, Level, Series, inline_svg, legend, line_chart, new_axes, page_style
-from neeco.report.downstream_examples import example_sections
-from neeco.report.page import REPORT_FILE, split_counts, write_page
-from neeco.report.study_pages import Figure, Section
+from neeco.studies.machine import machine_words
 
 FALSE_POSITIVES = round(1 / (1 - CONFIDENCE))  # of so many comparisons without a difference, one shows one
 QUESTIONS = {  # what a paired difference answers, as `question` finds it

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame, evenly_spaced
 from neeco.evaluation.image_metrics import outline
-from neeco.ingest.motion import RoughShape
-from neeco.raster.pinhole import project_world
-from neeco.raster.types import Camera
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import project_world
+from neeco.ingest.foreground.motion import RoughShape
 from neeco.report.charts import PALETTE, draw_dots, inline_svg, new_axes, page_style
 from neeco.report.page import MAX_WIDTH, jpeg, to_bytes
 

@@ -19,8 +19,8 @@ from neeco.capture.model import Capture, Frame, State
 from neeco.evaluation.image_metrics import FULL_SCALE, PART_COLORS, overlay_outline, overlay_parts
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import pairs_of
+from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
-from neeco.raster.types import Camera
 from neeco.report.charts import SMALL, Series, line_chart, short
 from neeco.report.page import REPORT_FILE, difference, jpeg, preview_uri, split_counts, to_bytes, write_page
 from neeco.scene import Drawable

@@ -16,7 +16,11 @@ from neeco.capture.model import Capture, Frame
 from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.experiments.ablation_study import (
+from neeco.files import write_text
+from neeco.labels.drawing import draw
+from neeco.report.charts import Series, binned, legend, line_chart
+from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
+from neeco.studies.ablation_study import (
     EVEN_DB,
     AblationResult,
     AblationTable,
@@ -25,8 +29,8 @@ from neeco.experiments.ablation_study import (
     grid,
     primary_split,
 )
-from neeco.experiments.ablations import PHASE_1_SHARE, PUBLISHED_STEPS, all_ablations
-from neeco.experiments.comparison import (
+from neeco.studies.ablations import PHASE_1_SHARE, PUBLISHED_STEPS, all_ablations
+from neeco.studies.comparison import (
     MASK_METRICS,
     ComparisonResult,
     absent_notes,
@@ -36,12 +40,8 @@ from neeco.experiments.comparison import (
     job_folder,
     tables_of,
 )
-from neeco.experiments.machine import hardware_words, machine_words
-from neeco.experiments.tables import UNKNOWN, Table, csv_text
-from neeco.files import write_text
-from neeco.labels.drawing import draw
-from neeco.report.charts import Series, binned, legend, line_chart
-from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
+from neeco.studies.machine import hardware_words, machine_words
+from neeco.studies.tables import UNKNOWN, Table, csv_text
 from neeco.training.run import open_run
 
 BINS = 6  # groups of held-out frames by distance

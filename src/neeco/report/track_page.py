@@ -13,8 +13,8 @@ import torch
 
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.evaluation.image_metrics import overlay_parts
+from neeco.geometry.rotations import vector_from_rotation
 from neeco.labels.drawing import draw
-from neeco.raster.rotations import vector_from_rotation
 from neeco.report.charts import SMALL, Level, Series, line_chart
 from neeco.report.page import jpeg, write_page
 from neeco.tracking.track import Tracked, state_of

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
 from neeco.raster.devices import fast_bfloat16
-from neeco.raster.types import Camera, Rendering
+from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import ArticulatedMotion, Skeleton
 from neeco.scene.method import Method

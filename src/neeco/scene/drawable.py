@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.capture.lens import Lens
 from neeco.capture.model import Camera, Capture, Frame, Instrument, InstrumentState, RecordedStates, State, Tissue
+from neeco.geometry.lens import Lens
 from neeco.raster.types import Rendering
 
 Skeleton = tuple[tuple[str, str], ...]  # pairs of keypoints' names that a line joins

@@ -20,7 +20,7 @@ from neeco.capture.lensfile import parse_lens
 from neeco.capture.model import Camera, Instrument, InstrumentState, State, share_lamps
 from neeco.errors import NeecoError
 from neeco.files import HALVES, finite, require_content, require_like, write_atomically
-from neeco.raster.rotations import rigid_fault
+from neeco.geometry.rotations import rigid_fault
 from neeco.scene.deformation import Deformation
 from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.method import Stored

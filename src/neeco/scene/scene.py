@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid_from_vector
 from neeco.raster import rasterize
 from neeco.raster.devices import CachedPredicate
-from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
 from neeco.scene.canonical import SH_COEFFICIENTS, TISSUE, CanonicalGaussians
 from neeco.scene.deformation import UNPERTURBED, Deformation, Deltas, Perturbation

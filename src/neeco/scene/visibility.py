@@ -18,11 +18,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from neeco.capture.model import REFERENCE_PIXELS, State, evenly_spaced
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import in_image, pixel_centers, project_world, unproject_world
+from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import rasterize
 from neeco.raster.devices import constant
-from neeco.raster.pinhole import in_image, pixel_centers, project_world, unproject_world
-from neeco.raster.rotations import quat_to_matrix
-from neeco.raster.types import Camera, Gaussians
+from neeco.raster.types import Gaussians
 from neeco.scene.canonical import TISSUE, CanonicalGaussians, seed_gaussians
 from neeco.scene.drawable import Recorded
 

@@ -20,10 +20,10 @@ from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.align import AlignConfig, Fit, fit_frame, pose_changes
 from neeco.evaluation.trust import Trust, TypicalErrors, estimate_trust, typical_errors_of
+from neeco.geometry.distortion import field_pinhole
 from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
-from neeco.raster.lens import field_pinhole
 from neeco.raster.optics import resampled, supersampled
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.cameras import DrawnCameras

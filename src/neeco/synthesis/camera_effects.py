@@ -22,9 +22,9 @@ from neeco.capture.documents import as_float
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_text
+from neeco.geometry.camera import Camera
 from neeco.labels.annotation import place_in_image, working_ends
 from neeco.labels.drawing import LayeredDrawing, to_numpy
-from neeco.raster.types import Camera
 from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
 from neeco.synthesis.states import rigid
 

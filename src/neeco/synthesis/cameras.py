@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.raster.types import Camera
+from neeco.geometry.camera import Camera
+from neeco.geometry.lens import Lens
 from neeco.scene.drawable import Recorded
 from neeco.synthesis.settings import RECORDED_SIZE, ImageSettings, SizeSettings
 

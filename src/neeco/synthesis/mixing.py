@@ -18,12 +18,13 @@ from torch import Tensor
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import project
 from neeco.labels.annotation import working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
-from neeco.raster.pinhole import project
 from neeco.raster.reference import SH_C0, brightened
-from neeco.raster.types import Camera, Gaussians
+from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies
 from neeco.scene.deformation import Deformation
 from neeco.scene.drawable import Recorded

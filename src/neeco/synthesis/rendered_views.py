@@ -17,8 +17,8 @@ from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE
 from neeco.files import write_json
+from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
-from neeco.raster.types import Camera
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import part_ids
 from neeco.synthesis.samplers import moved_camera, states_file

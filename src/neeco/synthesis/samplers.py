@@ -20,11 +20,11 @@ from neeco.capture.model import RecordedStates, State, evenly_spaced
 from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
+from neeco.geometry.camera import Camera
+from neeco.geometry.distortion import rays_of_pixels
 from neeco.labels.annotation import any_in_image, working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
-from neeco.raster.lens import rays_of_pixels
-from neeco.raster.types import Camera
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Views
 from neeco.synthesis.states import (
     ExtrapolatedStates,

@@ -45,10 +45,10 @@ from neeco.capture.lensfile import parse_lens
 from neeco.capture.model import InstrumentState, State, swap_camera_axes
 from neeco.errors import NeecoError
 from neeco.files import read_json, require_inside, require_like
+from neeco.geometry.camera import Camera
 from neeco.labels.annotation import LabelledImage, keypoint_names
 from neeco.labels.labellers import instruments_of
 from neeco.raster.native import torch_threads
-from neeco.raster.types import Camera
 from neeco.scene.io import load_scene, save_scene
 from neeco.scene.scene import Scene, gaussian_scene
 from neeco.settings import with_fields

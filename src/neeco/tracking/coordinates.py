@@ -12,8 +12,8 @@ from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.scene import Scene
 
 DEG = math.pi / 180

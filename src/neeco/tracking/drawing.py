@@ -10,11 +10,12 @@ from torch import Tensor
 
 from neeco.capture.images import area_averaged
 from neeco.capture.model import Frame, State
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import project_world
 from neeco.labels.labellers import CompositedLabels, composited_labels
 from neeco.raster import rasterize
-from neeco.raster.pinhole import project_world
 from neeco.raster.shadow import GAMMA, shadowed
-from neeco.raster.types import Camera, Gaussians
+from neeco.raster.types import Gaussians
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 
 BLOCK = 8  # px to multiples of which images are trimmed and crops rounded, so that they are halved three times exactly

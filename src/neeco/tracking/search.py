@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from neeco.capture.model import InstrumentState, State, evenly_spaced
-from neeco.raster.types import Camera
+from neeco.geometry.camera import Camera
 from neeco.scene import Recorded
 from neeco.tracking.coordinates import DEG, Coordinates
 from neeco.tracking.drawing import View, reduced

@@ -35,7 +35,6 @@ from neeco.tracking.follow import LOOK_EVERY, Follower, Step
 from neeco.tracking.footage_again import learned_again
 from neeco.tracking.footage_scene import adapted, over_tissue
 from neeco.tracking.footage_tissue import Report, learn_tissue
-from neeco.tracking.footage_video import FOOTAGE
 from neeco.tracking.trust import Reference
 from neeco.training.run import load_run, stored_config, write_config
 
@@ -47,6 +46,7 @@ SCHEMA = "neeco-track/1"
 INFO = "track.json"
 STEPS = "steps"  # the folder of what is done, gone at the end
 SECOND = "second"  # in it: steps by tissue and light that were learned again
+FOOTAGE = "footage"  # the folder of the output in which `neeco track` keeps a video as a capture
 RUN = "run"  # the folder of the scene by which footage over another tissue was tracked: a run
 OTHER_TISSUE = 3.0  # times the misfit over the own tissue that instruments have over tissue learned from footage
 MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out

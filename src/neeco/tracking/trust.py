@@ -27,7 +27,7 @@ from torch import Tensor
 from neeco.capture.model import Frame, State, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import BESIDE, TypicalErrors, estimate_trust, typical_errors_of
-from neeco.raster.types import Camera
+from neeco.geometry.camera import Camera
 from neeco.scene import Recorded
 from neeco.tracking.coordinates import DEG, Coordinates, TrackedInstrument
 from neeco.tracking.drawing import LabelledView

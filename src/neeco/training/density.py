@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster.devices import constant
 from neeco.raster.optimizer import Adam
-from neeco.raster.rotations import quat_to_matrix
 from neeco.scene.canonical import TISSUE, CanonicalGaussians
 from neeco.training.config import DensityConfig
 

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
+from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 from neeco.raster.optimizer import adam_update
-from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.scene.deformation import log_linear
 from neeco.scene.drawable import Recorded
 from neeco.training.config import RefineConfig

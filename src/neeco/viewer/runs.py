@@ -22,8 +22,8 @@ from neeco.errors import NeecoError
 from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou
+from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
-from neeco.raster.types import Camera
 from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.io import load_scene
 from neeco.scene.scene import over_one

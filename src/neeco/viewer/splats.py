@@ -21,9 +21,9 @@ from neeco.capture.model import Camera, State
 from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
 from neeco.files import write_atomically
+from neeco.geometry.rotations import quat_to_matrix, spread_directions
 from neeco.raster import rasterize
 from neeco.raster.reference import brightened, headlight_factor, sh_basis
-from neeco.raster.rotations import quat_to_matrix, spread_directions
 from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
 

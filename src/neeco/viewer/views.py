@@ -11,11 +11,12 @@ from torch import Tensor
 
 from neeco.capture.model import State
 from neeco.evaluation.image_metrics import Pixels, difference_map, overlay_parts
+from neeco.geometry.camera import Camera
 from neeco.labels.drawing import surface_depth
 from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize
 from neeco.raster.devices import readable_failures
-from neeco.raster.types import Camera, Rendering
+from neeco.raster.types import Rendering
 from neeco.scene.scene import gaussian_scene
 from neeco.viewer.controls import Controls, controlled_state, corresponding_frame
 from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRuns, score_frame

@@ -20,8 +20,8 @@ from torch.nn.functional import avg_pool2d, pad
 
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
+from neeco.geometry.projection import project
 from neeco.raster import rasterize
-from neeco.raster.pinhole import project
 from neeco.scene.scene import Scene
 from neeco.scene.training_views import TrainingViews
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Frame, Instrument, State
+from neeco.geometry.camera import Camera
 from neeco.methods.breathing import RATES as BREATHING_RATES
 from neeco.methods.breathing import BreathingTissue
 from neeco.methods.carving.evidence import CarvingSettings
@@ -35,7 +36,7 @@ from neeco.methods.kinematic.label_shares import store_label_shares
 from neeco.methods.kinematic.shadow import find_shadow
 from neeco.methods.kinematic.wrist import place_wrists, replace_wrists
 from neeco.raster.posing import ArticulatedBody, pose_bodies
-from neeco.raster.types import Camera, Rendering
+from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformation import (
     UNPERTURBED,

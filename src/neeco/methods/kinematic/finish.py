@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
+from neeco.geometry.projection import in_image
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments, Articulation
 from neeco.methods.kinematic.wrist import MIN_SOLID, SOLID_OPACITY, color_boundary, solid_extent, solid_gaussians
 from neeco.raster import rasterize
-from neeco.raster.pinhole import in_image
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Recorded
 from neeco.scene.scene import Scene

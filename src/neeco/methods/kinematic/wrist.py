@@ -8,10 +8,10 @@ import math
 import torch
 from torch import Tensor
 
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import pixel_centers, unproject_world
 from neeco.methods.kinematic.articulation import ArticulatedInstruments, Articulation
 from neeco.raster import rasterize
-from neeco.raster.pinhole import pixel_centers, unproject_world
-from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformation import UNPERTURBED, Perturbation
 from neeco.training.session import GaussianSession

@@ -11,11 +11,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
 from neeco.raster.triton.binning import Lists, Tiles, list_per_tile
 from neeco.raster.triton.composite import Images, composite, composite_backward
 from neeco.raster.triton.project import Inputs, Projected, project
 from neeco.raster.triton.project_backward import project_backward
-from neeco.raster.types import Camera, Gaussians, Rendering, differentiable
+from neeco.raster.types import Gaussians, Rendering, differentiable
 
 TILE = 16  # px
 

@@ -7,6 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from neeco.geometry.camera import Camera
 from neeco.raster.triton.binning import ELLIPSE, Tiles, tile_columns, tile_rows
 from neeco.raster.triton.geometry import (
     LOG2_E,
@@ -19,7 +20,6 @@ from neeco.raster.triton.geometry import (
     rotation_matrix,
     sh_color,
 )
-from neeco.raster.types import Camera
 
 BLOCK = 128  # Gaussians per program
 RECORD = tl.constexpr(12)  # floats of a record: x, y, a, b, c, log2 of opacity, red, green, blue, depth, two unused

@@ -7,6 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from neeco.geometry.camera import Camera
 from neeco.raster.triton.composite import HEAD
 from neeco.raster.triton.geometry import (
     LOG2_E,
@@ -21,7 +22,6 @@ from neeco.raster.triton.geometry import (
     view_rotation,
 )
 from neeco.raster.triton.project import RECORD, Inputs, Projected, turned
-from neeco.raster.types import Camera
 
 BLOCK = 128
 CAMERA_SUMS = tl.constexpr(18)  # camera_from_world (rotation 9, translation 3), centre 3, vignette 2, nothing

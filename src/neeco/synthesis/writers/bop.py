@@ -21,13 +21,13 @@ import numpy as np
 import torch
 
 from neeco.capture.images import read_labels, write_labels
-from neeco.capture.lens import INTRINSICS
 from neeco.capture.model import InstrumentState, State, swap_camera_axes
 from neeco.files import write_json
+from neeco.geometry.camera import Camera
+from neeco.geometry.lens import INTRINSICS
 from neeco.labels.annotation import bounding_box
 from neeco.labels.drawing import extended_silhouettes
 from neeco.labels.labellers import Labeller, instruments_of
-from neeco.raster.types import Camera
 from neeco.synthesis.writers.folder import DEPTH_MM_PER_COUNT, Record, link, stem
 
 if TYPE_CHECKING:

@@ -1,0 +1,1 @@
+"""Cameras, lenses, rotations and rigid transforms: numpy and torch alone, below every other room."""

@@ -1,0 +1,139 @@
+"""What a lens makes of an image: OpenCV's distortion, and the round border of an endoscope's field of view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from neeco.geometry.camera import Camera
+
+STEEPEST = 3.0  # slope (72 degrees) of a ray that a lens may bend into the image
+MISSED_PX = 0.05  # by which a ray bent again may miss the pixel that it was found for
+NEWTON_STEPS = 6
+STEP = 4  # px between the pixels whose rays are found; the others' lie between, to a hundredth of a pixel
+NEAR = 1e-6  # slope, over which the derivative of a distortion is taken
+
+
+class LensField(NamedTuple):
+    """What a camera shows through its lens."""
+
+    slopes: np.ndarray  # float32 [H, W, 2]: x/z, y/z of the ray seen by every pixel; NaN where none is
+    lowest: np.ndarray  # [2] of them
+    highest: np.ndarray
+
+
+def distorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    """Slopes [P, 2] (x/z, y/z) as a lens with OpenCV's coefficients k1, k2, p1, p2[, k3, ...] shows them."""
+    if not len(slopes) or not any(distortion):
+        return slopes
+    points = np.concatenate([slopes, np.ones((len(slopes), 1))], 1)
+    found = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), np.array(distortion))[0]
+    return np.asarray(found[:, 0])
+
+
+def undistorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    """The inverse of `distorted`, by Newton's method. Where the lens shows no ray, anything.
+
+    cv2.undistortPoints stops after five steps that each gain a digit at most, and takes no more of them in OpenCV 4.
+    """
+    if not len(slopes) or not any(distortion):
+        return slopes
+    found = slopes.astype(np.float64)
+    with np.errstate(all="ignore"):
+        for _ in range(NEWTON_STEPS):
+            here = distorted(found, distortion)
+            (a, c), (b, d) = (
+                ((distorted(found + NEAR * axis, distortion) - here) / NEAR).T for axis in np.eye(2)
+            )  # columns of the Jacobian
+            x, y = (slopes - here).T
+            found = found + (np.stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)).T
+            found = np.clip(np.nan_to_num(found), -2 * STEEPEST, 2 * STEEPEST)
+    return found
+
+
+def pixels_of_rays(slopes: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels [P, 2] in which `camera` shows the rays of slopes [P, 2] through its lens; NaN where it shows them
+    nowhere."""
+    field = lens_field(camera)
+    margin = 1 / camera.fx  # to the edges of the outermost pixels
+    with np.errstate(invalid="ignore"):
+        inside = ((slopes > field.lowest - margin) & (slopes < field.highest + margin)).all(1)
+    found = np.full(slopes.shape, np.nan)
+    found[inside] = distorted(slopes[inside], camera.distortion) * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    return found if camera.border is None else np.where(within(found, camera.border)[:, None], found, np.nan)
+
+
+def rays_of_pixels(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """Slopes [P, 2] (x/z, y/z) of the rays that `camera` shows in pixels [P, 2] through its lens."""
+    return undistorted((pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy], camera.distortion)
+
+
+def within(pixels: np.ndarray, border: tuple[float, float, float]) -> np.ndarray:
+    """[...] bool: which pixels [..., 2] lie within a round border (centre x, y and radius, px)."""
+    x, y, radius = border
+    return np.hypot(pixels[..., 0] - x, pixels[..., 1] - y) < radius
+
+
+def field_pinhole(camera: Camera) -> Camera:
+    """The pinhole at the same place and of the same focal lengths that sees all that `camera` sees through its lens;
+    where there is no distortion, in the same pixels."""
+    if camera.is_pinhole:
+        return camera
+    field = lens_field(camera)
+    focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    left, top = np.floor(field.lowest * focal + center).astype(int) - 1
+    right, bottom = np.ceil(field.highest * focal + center).astype(int) + 1
+    return replace(
+        camera,
+        cx=camera.cx - float(left),
+        cy=camera.cy - float(top),
+        width=int(right - left),
+        height=int(bottom - top),
+        distortion=(),
+        border=None,
+    )
+
+
+def lens_field(camera: Camera) -> LensField:
+    """What `camera` shows through its lens. The same arrays are given to everyone who asks."""
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    return _lens_field(intrinsics, camera.width, camera.height, camera.distortion, camera.border)
+
+
+@lru_cache(maxsize=4)
+def _lens_field(
+    intrinsics: tuple[float, float, float, float],
+    width: int,
+    height: int,
+    distortion: tuple[float, ...],
+    border: tuple[float, float, float] | None,
+) -> LensField:
+    focal, center = np.array(intrinsics[:2]), np.array(intrinsics[2:])
+    nodes = _centers(width // STEP + 2, height // STEP + 2, STEP)
+    slopes = undistorted((nodes.reshape(-1, 2) - center) / focal, distortion)
+    again = distorted(slopes, distortion) * focal + center
+    shown = (np.abs(slopes) <= STEEPEST).all(1) & (np.abs(again - nodes.reshape(-1, 2)) < MISSED_PX).all(1)
+    slopes = np.where(shown[:, None], slopes, np.nan).reshape(nodes.shape).astype(np.float32)
+    slopes = _between(_between(slopes, height).transpose(1, 0, 2), width).transpose(1, 0, 2)
+    if border is not None:
+        slopes = np.where(within(_centers(width, height), border)[..., None], slopes, np.float32(np.nan))
+    known = slopes[~np.isnan(slopes[..., 0])]
+    lowest, highest = (pick(known, 0).astype(np.float64) if len(known) else np.zeros(2) for pick in (np.min, np.max))
+    return LensField(np.ascontiguousarray(slopes), lowest, highest)
+
+
+def _centers(width: int, height: int, step: int = 1) -> np.ndarray:
+    """[height, width, 2] centres of an image's pixels, or of every `step`-th."""
+    rows, columns = np.mgrid[0:height, 0:width] * step + 0.5
+    return np.stack([columns, rows], -1)
+
+
+def _between(nodes: np.ndarray, count: int) -> np.ndarray:
+    """[count, ...] linear between nodes [N, ...] that are STEP apart; NaN beside a node that is."""
+    place = np.arange(count) // STEP
+    share = (np.arange(count) % STEP / np.float32(STEP)).astype(np.float32)[:, None, None]
+    return (1 - share) * nodes[place] + share * nodes[place + 1]

@@ -1,0 +1,1 @@
+"""Calibration files of one camera or a stereo pair."""

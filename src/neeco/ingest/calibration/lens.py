@@ -1,0 +1,261 @@
+"""What the optics do to the images: the lens, as a calibration has it, and the round field of view."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from neeco.capture.distortion import opencv_distortion, stated_distortion
+from neeco.capture.documents import Node, RaisingReport, as_float, printable
+from neeco.errors import NeecoError
+from neeco.files import require_file
+from neeco.geometry.camera import COEFFICIENTS
+from neeco.geometry.lens import Border, Lens
+from neeco.ingest.calibration.camera_fields import EXPECTED, CameraNumbers, cameras_in, read_calibration
+from neeco.plausible import size_fault
+
+FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
+FISHEYE_MODEL = "OPENCV_FISHEYE"
+LARGEST = 1e9  # of any of a lens's numbers
+
+# The dark border around a round field of view.
+BORDER_SAMPLES = 48  # frames looked at
+DARK = 40.0  # of 255; a border brighter than this in most frames is no border
+MARGIN = 0.015  # of the radius taken off: the border's edge is blurred
+MISFIT = 0.015  # of the radius: how far the edge may be off a circle
+CLEAN = 0.9  # share of the pixels outside the circle that must be dark, of those inside that must not be
+SHARP = 0.6  # share of the brightness inside the edge that must be gone right outside
+
+
+def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
+    """A lens from a calibration in OpenCV's names (YAML, XML, JSON; of two cameras, the left one's), the fields of a
+    nerfstudio JSON, or (fl_x, fl_y, cx, cy) px.
+
+    None: to be estimated. OpenCV's principal point counts from the first pixel's centre, ours from its corner: half a
+    pixel is added. A fisheye lens becomes one of OpenCV's rational model. Raises NeecoError naming file, field and
+    remedy.
+    """
+    if source is None:
+        return None
+    if not isinstance(source, Path):
+        return checked_lens("intrinsics", [*source], (), None)
+    require_file(source, "a calibration as YAML, XML or JSON")
+    document = read_calibration(source)
+    if source.suffix.lower() == ".json" and ("fl_x" in document or not cameras_in(source, document)):
+        return _nerfstudio(source, document)
+    return opencv_lens(source, document)
+
+
+def _nerfstudio(path: Path, document: Any) -> Lens:
+    if not isinstance(document, dict):
+        raise NeecoError(f"{path}: expected an object with fl_x, fl_y, cx, cy")
+    size = image_size(path, document.get("w"), document.get("h"))
+    if "fl_x" not in document and size and isinstance(document.get("camera_angle_x"), int | float):
+        angle = float(document["camera_angle_x"])
+        focal = size[0] / 2 / math.tan(angle / 2) if angle else math.nan
+        document = {"fl_x": focal, "fl_y": focal, "cx": size[0] / 2, "cy": size[1] / 2} | document
+    missing = [key for key in ("fl_x", "cx", "cy") if key not in document]
+    if missing:
+        raise NeecoError(f"{path}: {missing[0]}: missing; give fl_x, fl_y, cx, cy (and k1, k2, p1, p2 if distorted)")
+    values = [document["fl_x"], document.get("fl_y", document["fl_x"]), document["cx"], document["cy"]]
+    stated = stated_distortion(Node(document, str(path), "", RaisingReport()).child)
+    assert stated is not None  # else it raised
+    lens = checked_lens(path, values, (), size)
+    try:
+        return replace(lens, distortion=opencv_distortion(stated.model, stated.coefficients, lens.intrinsics, size))
+    except NeecoError as error:
+        raise NeecoError(f"{path}: distortion: {error}") from None
+
+
+def opencv_lens(where: Path | str, document: Any) -> Lens:
+    """From what a calibration says of its camera, or of the left one of two; `where` begins messages. Raises
+    NeecoError."""
+    cameras = cameras_in(where, document)
+    if not cameras:
+        given = isinstance(document, dict)
+        raise NeecoError(f"{where}: {'camera_matrix: missing' if given else 'no keys'}; expected {EXPECTED}")
+    return lens_of(where, cameras[0])
+
+
+def lens_of(where: Path | str, camera: CameraNumbers) -> Lens:
+    """The lens of one camera of a calibration. Raises NeecoError."""
+    fx, fy, cx, cy = camera.intrinsics
+    size = image_size(where, *camera.size)
+    return checked_lens(where, [fx, fy, cx + 0.5, cy + 0.5], camera.distortion, size, fisheye=camera.fisheye)
+
+
+def checked_lens(
+    source: object,
+    values: Sequence[Any],
+    distortion: Sequence[Any],
+    size: tuple[int, int] | None,
+    *,
+    fisheye: bool = False,
+) -> Lens:
+    """A lens of fl_x, fl_y, cx, cy px (pixel centres at +0.5) and OpenCV's coefficients. Raises NeecoError."""
+    for field, given in (("fl_x, fl_y, cx, cy", values), ("distortion", distortion)):
+        for value in given:
+            number = as_float(value)
+            if number is None or not abs(number) < LARGEST:  # NaN compares false
+                raise NeecoError(f"{source}: {field}: {printable(value)} is not a usable number; calibrate again")
+    if len(values) != 4 or min(values[:2]) <= 0:
+        raise NeecoError(f"{source}: fl_x, fl_y: must be two positive focal lengths in pixels; correct them")
+    coefficients = tuple(float(value) for value in distortion)
+    if fisheye:
+        coefficients = _rational(source, [float(value) for value in values], coefficients, size)
+    if len(coefficients) not in COEFFICIENTS:
+        raise NeecoError(f"{source}: distortion: has {len(coefficients)} coefficients; OpenCV has 4, 5, 8, 12 or 14")
+    if not any(coefficients):
+        coefficients = ()
+    fl_x, fl_y, cx, cy = (float(value) for value in values)
+    return Lens(fl_x, fl_y, cx, cy, coefficients, size)
+
+
+def image_size(path: Path | str, width: Any, height: Any) -> tuple[int, int] | None:
+    """(width, height) px; None where one is not given. Raises NeecoError."""
+    if width is None or height is None:
+        return None
+    sides = [number for value in (width, height) if (number := as_float(value)) is not None]
+    if len(sides) < 2 or size_fault(*sides) is not None:
+        raise NeecoError(f"{path}: image size: {printable(width)} x {printable(height)} is not one; correct it")
+    return int(width), int(height)
+
+
+def _rational(
+    source: object, values: Sequence[float], fisheye: Sequence[float], size: tuple[int, int] | None
+) -> tuple[float, ...]:
+    """OpenCV's coefficients of a lens with four of a fisheye (Kannala & Brandt 2006). Raises NeecoError."""
+    if len(fisheye) != 4:
+        raise NeecoError(
+            f"{source}: distortion: a fisheye lens has 4 coefficients, not {len(fisheye)}; calibrate again"
+        )
+    fl_x, fl_y, cx, cy = values
+    coefficients = dict(zip(FISHEYE_DISTORTION, fisheye, strict=True))
+    try:
+        return opencv_distortion(FISHEYE_MODEL, coefficients, (fl_x, fl_y, cx, cy), size)
+    except NeecoError as error:
+        raise NeecoError(f"{source}: distortion: {error}") from None
+
+
+def find_border(images: Iterable[np.ndarray]) -> Border | None:
+    """The dark border around a round field of view; None when the images have no such border.
+
+    images: uint8 [H, W, 3], frames spread over the recording (10 or more; at most BORDER_SAMPLES are used). The border
+    stays at the black level although the scene lights up pixels beside it. Only one with a circular edge, sharp all
+    along, counts: dark corners of a dim scene are none.
+    """
+    brightness = _brightest(images)
+    if brightness is None or min(brightness.shape) < 32:
+        return None
+    threshold = _dark_threshold(brightness)
+    if threshold is None:
+        return None
+    dark = ndimage.binary_opening(brightness < threshold, iterations=1)
+    outside = _touching_corners(dark)
+    if outside.sum() < 0.01 * outside.size:
+        return None
+    circle = _fit_circle(_border_edge(outside))
+    if circle is None or not _divides_dark_from_bright(circle, outside, brightness, threshold):
+        return None
+    x, y, radius = circle
+    return x + 0.5, y + 0.5, radius  # which the circle counts from the first pixel's centre
+
+
+def visible_mask(border: Border, size: tuple[int, int]) -> np.ndarray:
+    """bool [H, W] of images of `size` (width, height): False on the border and on its blurred edge."""
+    x, y, radius = border
+    rows, columns = np.indices(size[::-1])
+    return np.hypot(columns + 0.5 - x, rows + 0.5 - y) < radius * (1 - MARGIN) - 0.5
+
+
+def _brightest(images: Iterable[np.ndarray]) -> np.ndarray | None:
+    """float [H, W]: how bright each pixel gets in its brightest frames, noise smoothed out."""
+    stack = [image.max(axis=2).astype(np.float32) for image in islice(images, BORDER_SAMPLES)]
+    if not stack:
+        return None
+    # the second brightest of ten, so that one flash or one damaged frame does not light up the border
+    return ndimage.gaussian_filter(np.percentile(np.stack(stack), 90, axis=0), 1.0)
+
+
+def _dark_threshold(brightness: np.ndarray) -> float | None:
+    """The brightness between border and scene, from the corners' black level up."""
+    height, width = brightness.shape
+    size = max(min(height, width) // 40, 2)
+    ends = (slice(size), slice(-size, None))
+    corners = [brightness[rows, columns] for rows in ends for columns in ends]
+    levels = sorted(float(np.median(corner)) for corner in corners)
+    black, spread = levels[1], float(np.median([np.std(corner) for corner in corners]))
+    middle = brightness[height // 4 : -height // 4, width // 4 : -width // 4]
+    scene = float(np.percentile(middle, 25))
+    if black > DARK or scene < black + 6 * max(spread, 0.5) + 4:
+        return None
+    return black + max(0.15 * (scene - black), 4 * max(spread, 0.5))
+
+
+def _touching_corners(dark: np.ndarray) -> np.ndarray:
+    """The dark regions that hold a corner of the image."""
+    labels, _ = ndimage.label(dark)
+    found = {int(labels[row, column]) for row in (1, -2) for column in (1, -2)} - {0}
+    return np.isin(labels, list(found))
+
+
+def _border_edge(outside: np.ndarray) -> np.ndarray:
+    """Pixels [M, 2] (x, y) of the scene beside the dark region, not those cut off by the image's edge."""
+    edge = ndimage.binary_dilation(outside) & ~outside
+    edge[:2] = edge[-2:] = False
+    edge[:, :2] = edge[:, -2:] = False
+    rows, columns = np.nonzero(edge)
+    return np.stack([columns, rows], axis=1).astype(np.float64)
+
+
+def _fit_circle(points: np.ndarray) -> tuple[float, float, float] | None:
+    """Centre and radius of the circle through most points [M, 2] (algebraic fit, Kasa 1976, reweighted)."""
+    if len(points) < 30:
+        return None
+    center = points.mean(axis=0)
+    local = points - center
+    design = np.column_stack([2 * local, np.ones(len(local))])
+    weights = np.ones(len(local))
+    for _ in range(20):
+        normal = design.T @ (design * weights[:, None]) + 1e-9 * np.eye(3)
+        a, b, c = np.linalg.solve(normal, design.T @ (weights * (local**2).sum(axis=1)))
+        radius = float(np.sqrt(max(c + a * a + b * b, 1e-9)))
+        residuals = np.hypot(local[:, 0] - a, local[:, 1] - b) - radius
+        scale = max(1.48 * float(np.median(np.abs(residuals))), 0.3)
+        weights = 1 / (1 + (residuals / (2 * scale)) ** 2) ** 2
+    if np.median(np.abs(residuals)) > max(MISFIT * radius, 1.0):
+        return None
+    return float(center[0] + a), float(center[1] + b), radius
+
+
+def _divides_dark_from_bright(
+    circle: tuple[float, float, float], outside: np.ndarray, brightness: np.ndarray, threshold: float
+) -> bool:
+    """Whether the circle is a plausible edge of the field of view, and divides dark from bright cleanly."""
+    x, y, radius = circle
+    height, width = outside.shape
+    if not (0.25 * min(width, height) < radius < 0.75 * max(width, height)):
+        return False
+    if not (0.25 * width < x < 0.75 * width and 0.2 * height < y < 0.8 * height):
+        return False
+    rows, columns = np.indices(outside.shape)
+    distance = np.hypot(columns - x, rows - y)
+    beyond, within = distance > radius * (1 + 2 * MISFIT) + 1, distance < radius * (1 - 2 * MISFIT) - 1
+    if beyond.sum() < 0.01 * beyond.size:
+        return False
+    ring = within & (distance > 0.9 * radius)
+    bright = np.mean(brightness[ring] >= threshold) if ring.any() else 0.0
+    if np.mean(outside[beyond]) <= CLEAN or np.mean(outside[within]) >= 1 - CLEAN or bright <= CLEAN:
+        return False
+    # a vignette darkens slowly; an edge does it within a few pixels
+    black = float(np.percentile(brightness[beyond], 10))
+    inner = float(np.median(brightness[(distance > 0.94 * radius) & (distance < 0.98 * radius)]))
+    outer = float(np.median(brightness[(distance > 1.02 * radius) & (distance < 1.06 * radius)]))
+    return inner - outer > SHARP * (inner - black)

@@ -1,0 +1,225 @@
+"""Where the tissue behind a still scope lies: from a second camera, else from what the instruments hide.
+
+One camera sees no depth. A second one beside it does, by semi-global matching of the two backgrounds (Hirschmueller
+2008). Without it the tissue is known to lie behind every place where an instrument was recorded: the surface is the
+smoothest one that does. Surfaces are smooth in inverse depth, of which a plane's is linear in the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from neeco.geometry.lens import Lens
+from neeco.geometry.projection import project
+from neeco.ingest.foreground.motion import RoughShape
+
+SPACING = 3  # px, of a reduced image, between points of the tissue
+CELL = 4  # px, of a reduced image, of the grid on which surfaces are smoothed
+STIFFNESS = 30.0  # weight of bending against that of what was measured in a cell
+# times the depth of the deepest place of an instrument: its rough shape lacks what opens and closes, which tissue right
+# behind it would hide
+BEHIND = 1.5
+FARTHEST = 0.75  # of the least inverse depth at which an instrument was
+PULL = 1e-3  # weight by which the tissue is drawn towards the instruments before it, where they may be nearer
+ROUNDS = 30  # in which places are found where it would be before one
+NEAREST = 20.0  # mm from a stereo scope, where the tissue is not
+MATCHED = 0.2  # share of the image that must match for depth from stereo
+OUTLYING = 0.15  # of its depth, by which what was matched may be off its surroundings'
+
+
+@dataclass(frozen=True)
+class TissueSurface:
+    """depth: [h, w] mm along z behind a reduced image's pixels; how: in words, after "the tissue's depth is"; measured:
+    by a second camera."""
+
+    depth: np.ndarray
+    how: str
+    measured: bool = False
+
+    def points(self, colors: np.ndarray, pinhole: Lens, visible: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Points [P, 3] mm, camera frame, all over the image and their colours uint8 [P, 3], from a background float32
+        [H, W, 3] of 255 that `pinhole` sees; none where it is not visible, bool [H, W]."""
+        height, width = colors.shape[:2]
+        scale = width / self.depth.shape[1]
+        v, u = np.mgrid[SPACING / 2 : self.depth.shape[0] : SPACING, SPACING / 2 : self.depth.shape[1] : SPACING]
+        u, v = u.ravel(), v.ravel()
+        depth = self.depth[v.astype(int), u.astype(int)]
+        x, y = np.minimum(u * scale, width - 0.5), np.minimum(v * scale, height - 0.5)
+        row, column = y.astype(int), x.astype(int)
+        shown = np.isfinite(depth) if visible is None else visible[row, column] & np.isfinite(depth)
+        rays = np.stack([(x - pinhole.cx) / pinhole.fl_x, (y - pinhole.cy) / pinhole.fl_y, np.ones(len(x))], -1)
+        return (rays * depth[:, None])[shown], np.rint(colors[row, column][shown]).astype(np.uint8)
+
+
+def surface_behind(
+    shapes: Iterable[tuple[RoughShape, np.ndarray]], pinhole: Lens, deepest: float | None, otherwise: float
+) -> TissueSurface:
+    """The tissue behind the instruments of a still scope.
+
+    shapes: each rough shape with camera_from_instrument [N, 4, 4] mm of all frames; pinhole: of reduced images;
+    deepest: mm of the tracked origins where no shape was found; None: no instrument's place is known, and `otherwise`
+    mm are assumed.
+    """
+    assert pinhole.size is not None
+    width, height = pinhole.size
+    bound = _deepest_instrument(shapes, pinhole)
+    if not bound.any():
+        flat = (otherwise if deepest is None else BEHIND * deepest) * np.ones((height, width))
+        how = (
+            f"not known and taken to be {otherwise:.0f} mm, as nothing says where an instrument was"
+            if deepest is None
+            else f"not known; a plane well behind the deepest recorded pose ({deepest:.0f} mm) stands for it"
+        )
+        return TissueSurface(flat, how)
+    inverse = _smoothest_behind(1 / (BEHIND * np.where(bound > 0, bound, np.inf)))
+    depth = 1 / cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
+    low, high = np.quantile(depth, (0.05, 0.95))
+    how = f"not measured: a smooth surface well behind all places of the instruments ({low:.0f} to {high:.0f} mm)"
+    return TissueSurface(depth, how)
+
+
+def _deepest_instrument(shapes: Iterable[tuple[RoughShape, np.ndarray]], pinhole: Lens) -> np.ndarray:
+    """[rows, columns] mm: the greatest depth of the middle of an instrument in each cell; 0 where none was."""
+    assert pinhole.size is not None
+    columns, rows = -(-pinhole.size[0] // CELL), -(-pinhole.size[1] // CELL)
+    bound = np.zeros((rows, columns))
+    for shape, poses in shapes:
+        for pose in poses:
+            points = shape.points @ pose[:3, :3].T + pose[:3, 3]
+            x, y = project(points, *pinhole.intrinsics, nearest=1.0)
+            with np.errstate(invalid="ignore"):
+                column, row = np.floor(x / CELL), np.floor(y / CELL)
+                inside = (points[:, 2] > 1) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+            cell = row[inside].astype(int) * columns + column[inside].astype(int)
+            count = np.bincount(cell, minlength=rows * columns)
+            total = np.bincount(cell, points[inside, 2], minlength=rows * columns)
+            # the mean: seen from one side only, a rough shape reaches too far to the back and to the front
+            bound = np.maximum(bound, (total / np.maximum(count, 1)).reshape(rows, columns))
+    return bound
+
+
+def _smoothest_behind(most: np.ndarray) -> np.ndarray:
+    """Inverse depths [rows, columns] that bend least, nowhere more than `most` (0: nothing is known there), and near
+    it, or near the least of all: cells at which the surface would come before an instrument hold it back, until none
+    does."""
+    known = most > 0
+    wanted, weight = np.where(known, most, most[known].min()), np.full(most.shape, PULL)
+    for _ in range(ROUNDS):
+        found = _smoothed(wanted, weight)
+        before = known & (found > most * 1.001) & (weight < 1)
+        if not before.any():
+            break
+        weight[before] = 1.0
+    return np.maximum(found, FARTHEST * most[known].min())  # beyond all that is known it may bend to infinity
+
+
+def _smoothed(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """[rows, columns] what bends least and is near `values`, by `weight` of each: a thin plate on springs."""
+    rows, columns = values.shape
+    across, down = (sparse.kron(sparse.eye(rows), _bend(columns)), sparse.kron(_bend(rows), sparse.eye(columns)))
+    twist = sparse.kron(_step(rows), _step(columns))
+    plate = across.T @ across + down.T @ down + 2 * twist.T @ twist
+    system = sparse.diags(weight.ravel()) + STIFFNESS * weight.mean() * plate
+    return np.asarray(spsolve(system.tocsc(), (weight * values).ravel())).reshape(rows, columns)
+
+
+def _step(count: int) -> sparse.spmatrix:
+    return sparse.diags([-1.0, 1.0], [0, 1], shape=(count - 1, count))
+
+
+def _bend(count: int) -> sparse.spmatrix:
+    return sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
+
+
+def surface_from_stereo(
+    left: np.ndarray,
+    right: np.ndarray,
+    pinholes: tuple[Lens, Lens],
+    right_from_left: np.ndarray,
+    seen: np.ndarray,
+    size: tuple[int, int],
+) -> TissueSurface | None:
+    """The tissue by which the backgrounds of two cameras, float32 [H, W, 3] of 255, match; None where too little does.
+
+    pinholes: of these; right_from_left [4, 4] mm; seen: bool [H, W], where the left one shows tissue; size: (width,
+    height) of reduced images.
+    """
+    depth = _matched_depth(left, right, pinholes, right_from_left)
+    depth[~seen] = np.nan
+    if np.isfinite(depth).mean() < MATCHED:
+        return None
+    columns, rows = -(-size[0] // CELL), -(-size[1] // CELL)
+    inverse = _in_cells(1 / depth, rows, columns)
+    for _ in range(2):  # what is far from its surroundings was matched wrongly
+        weight = np.isfinite(inverse).astype(float)
+        smooth = _smoothed(np.where(weight > 0, inverse, 0.0), weight)
+        inverse[np.abs(inverse / smooth - 1) > OUTLYING] = np.nan
+    filled = cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR)
+    fine = 1 / cv2.resize(_median_filled(depth), size, interpolation=cv2.INTER_NEAREST)
+    fine = np.where(np.abs(fine / filled - 1) < OUTLYING, fine, filled)
+    share, far = float(weight.mean()), 1 / np.quantile(fine, (0.95, 0.05))
+    return TissueSurface(
+        1 / fine, f"from the stereo partner, {share:.0%} of the image ({far[0]:.0f} to {far[1]:.0f} mm)", True
+    )
+
+
+def _median_filled(depth: np.ndarray) -> np.ndarray:
+    """Depth [H, W] mm without single outliers; NaN stays."""
+    found = cv2.medianBlur(np.nan_to_num(depth, nan=0.0).astype(np.float32), 5)
+    return np.where(found > 0, found, np.nan)
+
+
+def _in_cells(values: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """[rows, columns] medians of values [H, W] in cells; NaN where fewer than half are known."""
+    tall = np.array_split(values, rows, axis=0)
+    found = np.full((rows, columns), np.nan)
+    for row, band in enumerate(tall):
+        for column, cell in enumerate(np.array_split(band, columns, axis=1)):
+            known = cell[np.isfinite(cell)]
+            if 2 * len(known) >= cell.size:
+                found[row, column] = np.median(known)
+    return found
+
+
+def _matched_depth(
+    left: np.ndarray, right: np.ndarray, pinholes: tuple[Lens, Lens], right_from_left: np.ndarray
+) -> np.ndarray:
+    """[H, W] mm along the left camera's z, NaN where nothing matches."""
+    height, width = left.shape[:2]
+    matrices = [np.array([[p.fl_x, 0, p.cx - 0.5], [0, p.fl_y, p.cy - 0.5], [0, 0, 1]]) for p in pinholes]
+    rotation, shift = right_from_left[:3, :3], right_from_left[:3, 3:]
+    turn_left, turn_right, new_left, new_right, *_ = cv2.stereoRectify(
+        matrices[0], np.zeros(5), matrices[1], np.zeros(5), (width, height), rotation, shift, alpha=0
+    )
+    views = []
+    for image, matrix, turn, new in (
+        (left, matrices[0], turn_left, new_left),
+        (right, matrices[1], turn_right, new_right),
+    ):
+        maps = cv2.initUndistortRectifyMap(matrix, np.zeros(5), turn, new[:3, :3], (width, height), cv2.CV_32FC1)
+        views.append(cv2.remap(np.clip(np.rint(image), 0, 255).astype(np.uint8), *maps, cv2.INTER_LINEAR))
+    length = abs(float(new_right[0, 3]))  # focal length times baseline, px mm
+    most = int(np.ceil(length / NEAREST / 16)) * 16
+    block = 5 if width < 800 else 7
+    matcher = cv2.StereoSGBM.create(
+        0, most, block, 8 * 3 * block**2, 32 * 3 * block**2, 1, 31, 8, 100, 2, cv2.STEREO_SGBM_MODE_HH
+    )
+    disparity = matcher.compute(views[0], views[1]).astype(np.float32) / 16
+    with np.errstate(divide="ignore"):
+        depth = np.where(disparity > 0, length / disparity, np.nan)
+    # from the rectified camera's pixels back to the left one's: both see along rays through one centre
+    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(matrices[0]).T
+    turned = rays @ turn_left.T
+    x = turned[..., 0] / turned[..., 2] * new_left[0, 0] + new_left[0, 2]
+    y = turned[..., 1] / turned[..., 2] * new_left[1, 1] + new_left[1, 2]
+    found = cv2.remap(
+        depth.astype(np.float32), x.astype(np.float32), y.astype(np.float32), cv2.INTER_NEAREST, borderValue=np.nan
+    )
+    return np.asarray(found / turned[..., 2])  # along the rectified z, then along the left camera's

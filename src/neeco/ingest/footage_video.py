@@ -1,0 +1,70 @@
+"""Footage that is a video: `ingest` finds its cameras, as of a recording without logs."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from neeco.capture.model import Capture
+from neeco.capture.reader import read_capture
+from neeco.errors import NeecoError
+from neeco.files import is_vacant, read_json, require_content, write_json
+from neeco.ingest.pipeline import ingest
+from neeco.ingest.recording.file import recording_from_flags
+from neeco.ingest.result import IngestResult
+from neeco.scene import Scene
+from neeco.tracking.footage_tissue import Report
+from neeco.tracking.track import FOOTAGE
+
+SOURCE = "source.json"  # in it: which video that is
+FARTHEST = 0.5  # quantile of the tissue's distances that is what ingest takes for the whole
+
+
+def read_footage(path: Path, output: Path, scene: Scene, resume: bool, report: Report) -> Capture:
+    """The footage at `path`: a capture, or a video file, which becomes the capture `FOOTAGE` in the folder `output`.
+
+    No video tells lengths: those of a moving scope are such that the tissue lies as far from it as from the cameras
+    that `scene` remembers. Raises NeecoError for what is neither, a video without cameras, and an `output` that is not
+    empty (without `resume`) or holds another video.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return read_capture(path)
+    require_content(path)
+    capture_folder = output / FOOTAGE
+    with path.open("rb") as stream:
+        source = {"video_sha256": hashlib.file_digest(stream, "sha256").hexdigest()}
+    if capture_folder.exists() and resume:
+        if read_json(capture_folder / SOURCE) != source:
+            raise NeecoError(f"{capture_folder}: is of another video than {path}; use a new folder")
+        return read_capture(capture_folder)
+    if not is_vacant(output):
+        raise NeecoError(f"{output}: not empty; give another folder, or --resume to go on with footage tracked there")
+    recording = recording_from_flags(path)
+    recording = replace(
+        recording,
+        frames=len(recording.open().times),
+        settings=replace(recording.settings, scene_distance_mm=_distance(scene)),
+    )
+
+    def complete(result: IngestResult, folder: Path) -> None:
+        write_json(folder / SOURCE, source)
+
+    try:
+        ingest(recording, capture_folder, report, complete)
+    except NeecoError as error:
+        raise NeecoError(
+            f"{error} (with more known of it: neeco ingest --video {path} --calibration FILE --output CAPTURE, then "
+            "track CAPTURE with --tissue footage)"
+        ) from None
+    return read_capture(capture_folder)
+
+
+def _distance(scene: Scene) -> float:
+    """mm, of the tissue from the recorded cameras."""
+    tissue = scene.canonical.means[: scene.canonical.counts[0]].cpu()
+    places = torch.stack([camera.world_from_camera[:3, 3].float().cpu() for camera in scene.recorded.cameras])
+    return float(torch.cdist(tissue, places).quantile(FARTHEST, dim=0).median())

@@ -1,0 +1,1 @@
+"""Masks of foreground objects: what moves in front of the tissue."""

@@ -1,0 +1,310 @@
+"""What recordings come in: one module of this folder per format of files or folders.
+
+A format is a subclass of `RecordingFormat`; `format_of` chooses it by what the file is called and holds, and nothing
+else names it. Whatever holds several streams (a bag, an episode, a sequence of images with transforms) lists them, and
+gives each as what the rest of the program takes: poses and readings as a table, images with their times, a lens. What a
+table's columns mean is the same for all formats (`columns.py`, `logs.py`).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from abc import ABC
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from neeco.capture.documents import printable
+from neeco.errors import NeecoError
+from neeco.geometry.lens import Lens
+from neeco.ingest.readers.frame_names import NamedFrame
+from neeco.registry import named_classes
+
+MISSING = {"", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"}
+# NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
+HUGE = 1e20
+MAX_LISTED = 3  # lines named in a message
+MAX_UNLIKE = 0.1  # share by which a video may be longer or shorter than the states of its images
+DELIMITED = (".csv", ".tsv", ".txt")
+
+
+@dataclass(frozen=True)
+class Body:
+    """One of the bodies whose poses stand beside each other in a table. columns: by their index, of which the second
+    and later ones of a name end in `#2`, ...; without that, they are named as a table of this body alone would name
+    them."""
+
+    name: str
+    columns: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    """What a log file, or one stream of it, holds. header: column names, all different; rows: cells, stripped, of which
+    a row may have more or fewer than the header, or numbers [R, C], NaN where missing; lines: int64 [R] the file's line
+    (or record) of each row, from 1; stream: which of the file's; record: what a row is called; stated_in: the
+    file's own name of the frame that poses are stated in, meaning: what that says (None: nothing, taken as a base);
+    notes: what reading it changed or left out, in words; image_hz: images a second of the video, where every row is the
+    state of one of its images; None: rows have times of their own; bodies: where the columns of several stand beside
+    each other, behind those that all share."""
+
+    path: Path
+    header: tuple[str, ...]
+    rows: list[list[str]] | np.ndarray
+    lines: np.ndarray
+    decimal_comma: bool = False
+    stream: str | None = None
+    record: str = "line"
+    stated_in: str | None = None
+    meaning: NamedFrame | None = None
+    notes: tuple[str, ...] = ()
+    image_hz: float | None = None
+    bodies: tuple[Body, ...] = ()
+
+    @property
+    def frame(self) -> str | None:
+        """What poses are stated in, BASE or a camera's frame (`frames.CAMERA_FRAMES`), where the file says it."""
+        return None if self.meaning is None else self.meaning.frame
+
+    @property
+    def where(self) -> str:
+        """Begins a message: the file, and the stream."""
+        return str(self.path) if self.stream is None else f"{self.path}: {self.stream}"
+
+    @property
+    def title(self) -> str:
+        """Begins a note: the same without folders."""
+        return self.path.name if self.stream is None else f"{self.path.name}: {self.stream}"
+
+    def list_rows(self, lines: Sequence[int] | np.ndarray) -> str:
+        """`lines 3, 7, 9, ...`, the first few."""
+        names = ", ".join(str(int(line)) for line in lines[:MAX_LISTED])
+        return f"{self.record}{'' if len(lines) == 1 else 's'} {names}{', ...' if len(lines) > MAX_LISTED else ''}"
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One of what a file holds. name: as a recording says it (`stream: NAME`); kind: POSES, READINGS, IMAGES or OTHER;
+    type: the format's own word for it; count: of its samples; rate_hz: None where nobody knows.
+
+    For a template: offered: is it what is recorded most likely, or only there, too? body: what it is of, where the
+    format tells; joints: (name, column) of the readings worth having, None: all angles; hints: remarks on the body;
+    columns: of the table, those that are the body's (None: all); asks: keys of the log that nothing in the file says,
+    as lines for the user to choose from, those of its columns indented; clock: that of a file without images; problem:
+    why it cannot be read, though the rest of the file can.
+    """
+
+    name: str
+    kind: str
+    type: str
+    count: int
+    rate_hz: float | None = None
+    offered: bool = True
+    body: str | None = None
+    joints: tuple[tuple[str, str], ...] | None = None
+    hints: tuple[str, ...] = ()
+    columns: tuple[str, ...] | None = None
+    asks: tuple[str, ...] = ()
+    clock: str | None = None
+    problem: str | None = None
+
+
+@dataclass(frozen=True)
+class VideoSource:
+    """Frames with their times. size: (width, height) px, as stored; notes: what could not be read, in words; times [N]
+    s, increasing, of a video from its first frame; pixel_aspect: width of a stored pixel by its height."""
+
+    path: Path
+    size: tuple[int, int]
+    notes: tuple[str, ...]
+    times: np.ndarray
+    pixel_aspect: float = field(default=1.0, kw_only=True)
+
+    @property
+    def own_fps(self) -> float | None:
+        """Frames a second that the file itself says where others were asked for; None where it says none, or these."""
+        return None
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        """(index, uint8 [H, W, 3] RGB) of the frames asked for, in increasing order. Raises NeecoError."""
+        raise NotImplementedError
+
+
+class RecordingFormat(ABC):
+    """A format of what was recorded. Subclasses set `format`, `holds` and, unless they look into the files, `suffixes`,
+    and have a constructor without arguments.
+
+    Every method raises NeecoError naming the file, the place and the remedy.
+    """
+
+    format: ClassVar[str]  # what the format is called
+    holds: ClassVar[str]  # what is read of it, in one line
+    suffixes: ClassVar[tuple[str, ...]] = ()  # of its files, in small letters
+    package: ClassVar[str | None] = None  # a module that it needs
+    extra: ClassVar[str | None] = None  # of neeco, that installs this module
+
+    def claims(self, path: Path) -> bool:
+        """Is the file or folder in this format? Looks at little of it, and raises nothing."""
+        return path.suffix.lower() in self.suffixes
+
+    def require_package(self, path: Path) -> None:
+        """Raise NeecoError saying what to install when the module it needs is absent; imports nothing."""
+        if self.package is not None and importlib.util.find_spec(self.package) is None:
+            raise NeecoError(f"{path}: {self.format}: needs {self.package}; pip install 'neeco[{self.extra}]'")
+
+    def streams(self, path: Path) -> tuple[Stream, ...]:
+        """What the file holds; () where it is one table."""
+        return ()
+
+    def read(self, path: Path, stream: str | None = None) -> Table:
+        """Poses or readings as a table. stream: which, where there are several."""
+        raise NeecoError(f"{path}: {self.format} holds no poses and no readings; name a log")
+
+    def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
+        """Its images, with times on the clock that its tables share."""
+        raise NeecoError(f"{path}: {self.format} holds no images; name a video or a folder of images")
+
+    def clock(self, path: Path, stream: str | None) -> str:
+        """What the times of a stream count from: streams of the same share a clock."""
+        return ""
+
+    def of_episode(self, stream: str, episode: int) -> str | None:
+        """The same stream in another episode; None: the format's files hold one."""
+        return None
+
+    def lens(self, path: Path, stream: str | None = None) -> Lens | None:
+        """The lens that the images of `stream` were taken through, where the file says it."""
+        return None
+
+
+POSES, READINGS, IMAGES, OTHER = "poses", "readings", "images", "other"  # kinds of streams
+
+
+@cache
+def recording_formats() -> tuple[RecordingFormat, ...]:
+    """All formats; delimited text, which claims by its suffix what others know by what it holds, last."""
+    kinds = named_classes(RecordingFormat, "format", sys.modules[__name__])
+    return tuple(sorted((kind() for kind in kinds.values()), key=lambda kind: kind.suffixes == DELIMITED))
+
+
+def format_of(path: Path) -> RecordingFormat | None:
+    """The format of a file or folder; None where no format claims it."""
+    return next((known for known in recording_formats() if known.claims(path)), None)
+
+
+def read_table(path: Path, stream: str | None = None) -> Table:
+    """Read a log; what no format claims, as delimited text. stream: which, of a file that holds several. Raises
+    NeecoError."""
+    path = Path(path)
+    known = format_of(path) or recording_formats()[-1]
+    known.require_package(path)
+    return known.read(path, stream)
+
+
+def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kinds: Sequence[str]) -> Stream:
+    """The stream that is wanted, or the only one of these kinds. Raises NeecoError listing what there is."""
+    fitting = [stream for stream in streams if stream.kind in kinds and stream.problem is None]
+    listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
+    if wanted is None:
+        if len(fitting) == 1:
+            return fitting[0]
+        broken = next((stream for stream in streams if stream.kind in kinds and stream.problem is not None), None)
+        if broken is not None and not fitting:
+            raise NeecoError(f"{path}: {broken.name}: {broken.problem}")
+        raise NeecoError(
+            f"{path}: holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream` in the recording: "
+            f"{listed}"
+        )
+    found = next((stream for stream in streams if stream.name == wanted), None)
+    if found is None:
+        raise NeecoError(f"{path}: stream: holds no {printable(wanted)}; name one of {listed}")
+    if found.problem is not None:
+        raise NeecoError(f"{path}: {found.name}: {found.problem}")
+    if found not in fitting:
+        kind = f"{found.type}, not {' or '.join(kinds)}"
+        raise NeecoError(f"{path}: stream: {printable(wanted)} is {kind}; name one of {listed}")
+    return found
+
+
+def compare_counts(
+    file: Path, images: int, rows: int, noun: str, unlike: float = 0.0, remedy: str = "give the whole video of this log"
+) -> tuple[str, ...]:
+    """A note where images and the rows of a log that belong to them one by one are not equally many.
+
+    file: of the images; noun: what a row is; unlike: share by which the numbers may differ, beside one. Raises
+    NeecoError, with the remedy, when they differ by more.
+    """
+    found = f"has {images} images for {rows} {noun}"
+    if abs(images - rows) > unlike * rows + 1:
+        raise NeecoError(f"{file}: {found}; they do not belong together: {remedy}")
+    return () if images == rows else (f"{file.name}: {found}; both are taken to begin together",)
+
+
+def compare_lengths(file: Path, video: VideoSource, rows: int, image_hz: float) -> tuple[str, ...]:
+    """`compare_counts` of states that are one for every image of a video of `image_hz` images a second, whatever rate
+    it has now."""
+    shown = round(float(video.times[-1] - video.times[0]) * image_hz) + 1
+    is_rate = shown != rows and abs(len(video.times) - rows) <= 1
+    remedy = f"as it has {len(video.times)}, say `fps: {image_hz:g}` of it" if is_rate else "give the video of this log"
+    return compare_counts(file, shown, rows, f"states at {image_hz:g} a second", MAX_UNLIKE, remedy)
+
+
+def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[tuple[int, str]]]:
+    """Columns as numbers [R, C]; bool [R] rows where a value is missing; (row, what) for cells that are no numbers.
+
+    Missing or unreadable cells are NaN. Raises NeecoError when a column does not exist.
+    """
+    indices = [column_index(table, name) for name in columns]
+    if isinstance(table.rows, np.ndarray):
+        chosen = table.rows[:, indices]
+        missing = ~(np.abs(chosen) < HUGE)  # NaN compares false
+        return np.where(missing, np.nan, chosen), np.any(missing, axis=1), []
+    values = np.full((len(table.rows), len(columns)), np.nan)
+    bad: list[tuple[int, str]] = []
+    for row, cells in enumerate(table.rows):
+        for slot, index in enumerate(indices):
+            if index >= len(cells):
+                bad.append((row, f"has {len(cells)} cells, the header {len(table.header)}"))
+                break
+            value = parse_number(cells[index].replace(",", ".") if table.decimal_comma else cells[index])
+            if value is None:
+                bad.append((row, f"{columns[slot]} is {printable(cells[index], 24)}, not a number"))
+                break
+            values[row, slot] = value
+    missing = np.any(np.isnan(values), axis=1)
+    missing[[row for row, _ in bad]] = False
+    return values, missing, bad
+
+
+def column_index(table: Table, name: str) -> int:
+    """The column called `name`, in any case of letters when only one is meant. Raises NeecoError."""
+    if name in table.header:
+        return table.header.index(name)
+    matches = [index for index, other in enumerate(table.header) if other.lower() == name.lower()]
+    if len(matches) != 1:
+        names = ", ".join(table.header[:16]) + (", ..." if len(table.header) > 16 else "")
+        raise NeecoError(f"{table.where}: has no column {printable(name)}; its columns are {printable(names, 200)}")
+    return matches[0]
+
+
+def parse_number(text: str) -> float | None:
+    """The number in a cell, NaN where the sample is missing, None where it is no number."""
+    if text.lower() in MISSING:
+        return np.nan
+    if "_" in text:  # Python would read 1_000
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if abs(value) < HUGE else np.nan
+
+
+def count_rows(count: int) -> str:
+    """`1 row`, `12 rows`."""
+    return f"{count} row{'' if count == 1 else 's'}"

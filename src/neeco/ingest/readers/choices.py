@@ -1,0 +1,203 @@
+"""What a log of poses may mean where nothing in its file says it: each order of a quaternion, convention of angles and
+frame, with what tells them apart.
+
+The turn from one frame to the next is the same for both orders of a quaternion. What differs is where a tool's shaft
+points, which goes through the trocar all the time: the lines along the right axis pass near one point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from neeco.errors import NeecoError
+from neeco.ingest.readers import POSES, Stream, format_of, numbers, read_table
+from neeco.ingest.readers.columns import (
+    BASE,
+    EULER,
+    QUATERNION_WXYZ,
+    QUATERNION_XYZW,
+    ROTATION_MATRIX,
+    ROTATION_VECTOR,
+    recognise_pose,
+)
+from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame
+from neeco.ingest.readers.logs import in_opencv, to_quaternions, with_named_frame
+
+UNIT_NORM = 1e-3  # of a quaternion's length, and of R^T R - I: what float32 and rounded text leave
+CONVENTIONS = ("XYZ", "ZYX", "xyz", "zyx")  # of three angles, as scipy names them
+ANGLES = (("roll", "pitch", "yaw"), ("rx", "ry", "rz"), ("alpha", "beta", "gamma"))
+QUATERNION = "quaternion"  # of either order
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class Shaft:
+    """How near all lines along one axis of a body pass to one point. axis: 0 to 2; point [3] and rms in the log's unit
+    of length."""
+
+    axis: int
+    point: np.ndarray
+    rms: float
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One way to read the rotations. title: as recording.yaml writes it; quats [R, 4] wxyz."""
+
+    title: str
+    quats: np.ndarray
+
+
+@dataclass(frozen=True)
+class OpenPoses:
+    """Poses of which something is not said. times [R] s; positions [R, 3] in the file's unit; frame: what they are
+    taken to be stated in, BASE or a camera's frame, whose axes are turned to OpenCV's."""
+
+    title: str
+    times: np.ndarray
+    positions: np.ndarray
+    readings: tuple[Reading, ...]
+    frame: str
+
+
+def find_rotations(values: np.ndarray) -> list[tuple[int, str]]:
+    """(first column, QUATERNION or ROTATION_MATRIX) of what is a rotation by its numbers [R, C]: four of unit length,
+    of which more than one changes, or nine that are a rotation matrix in every row."""
+    values = values.astype(np.float64)
+    values = values[np.isfinite(values).all(axis=1)]
+    if not len(values):
+        return []
+    found, place = [], 0
+    while place <= values.shape[1] - 4:
+        four = values[:, place : place + 4]
+        nine = values[:, place : place + 9]
+        if nine.shape[1] == 9 and _are_rotations(nine.reshape(-1, 3, 3)):
+            found.append((place, ROTATION_MATRIX))
+            place += 9
+        elif np.abs(np.linalg.norm(four, axis=1) - 1).max() < UNIT_NORM and (np.ptp(four, axis=0) > 0).sum() > 1:
+            found.append((place, QUATERNION))
+            place += 4
+        else:
+            place += 1
+    return found
+
+
+def open_poses(source: Path) -> list[OpenPoses]:
+    """The poses of a file of which something is not said, in every frame that may be meant, with every way to read
+    them. Raises NeecoError."""
+    known = format_of(source)
+    streams = () if known is None else known.streams(source)
+    return [poses for stream in streams if stream.kind == POSES and stream.asks for poses in _open(source, stream)]
+
+
+def shaft_of(positions: np.ndarray, quats: np.ndarray) -> Shaft:
+    """The axis of a body whose lines through positions [R, 3] pass nearest to one point, by least squares."""
+    best = None
+    for axis in range(3):
+        lines = axis_directions(quats, axis)
+        across = np.eye(3) - lines[:, :, None] * lines[:, None, :]  # [R, 3, 3] what is off a line
+        # lines that are nearly parallel meet nowhere in particular: the least point then
+        point = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, positions), rcond=1e-6)[0]
+        off = np.einsum("nij,nj->ni", across, positions - point)
+        rms = float(np.sqrt((off**2).sum(1).mean()))
+        if best is None or rms < best.rms:
+            best = Shaft(axis, point, rms)
+    assert best is not None
+    return best
+
+
+def axis_directions(quats: np.ndarray, axis: int) -> np.ndarray:
+    """[R, 3] where an axis of bodies with turns quats [R, 4] wxyz points."""
+    w, x, y, z = quats.T
+    columns = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack(columns[axis], 1)
+
+
+def largest_step(quats: np.ndarray) -> float:
+    """rad, of the turns from one sample to the next."""
+    cosines = np.abs((quats[1:] * quats[:-1]).sum(1)).clip(0, 1)
+    return float(2 * np.arccos(cosines).max(initial=0.0))
+
+
+def _open(source: Path, stream: Stream) -> list[OpenPoses]:
+    table = read_table(source, stream.name)
+    columns = table.header[1:] if not stream.columns else stream.columns
+    poses = recognise_pose(columns)
+    values = numbers(table, columns)[0]
+    position, ways = poses.position, _ways(values, columns, poses.rotation, poses.form)
+    if position is None and ways:
+        place = columns.index(ways[0][1][0])
+        position = tuple(columns[place - 3 : place]) if place >= 3 else None
+    if position is None or not ways:
+        return []
+    places = numbers(table, position)[0]
+    readings, good = [], np.isfinite(places).all(axis=1)
+    for title, used, form, convention in ways:
+        cells = numbers(table, used)[0]
+        degrees = form in (EULER, ROTATION_VECTOR) and float(np.nanmax(np.abs(cells), initial=0.0)) > 4 * np.pi
+        quats, usable = to_quaternions(form, cells, convention, np.pi / 180 if degrees else 1.0)
+        good &= usable
+        readings.append(Reading(f"{title}{' in deg' if degrees else ''}", quats))
+    if good.sum() < 2:
+        return []
+    times = numbers(table, table.header[:1])[0][good, 0]
+    title = f"{stream.name}{f', {stream.body}' if stream.body else ''}"
+    meaning = with_named_frame(table, position).meaning or NamedFrame(BASE)
+    frames = [meaning.frame] if meaning.frame else [frame for frame in meaning.choices if frame in CAMERA_FRAMES]
+    return [
+        OpenPoses(
+            title, times, in_opencv(frame, places[good], readings[0].quats[good])[0],
+            tuple(Reading(way.title, in_opencv(frame, places[good], way.quats[good])[1]) for way in readings), frame,
+        )
+        for frame in frames
+    ]  # fmt: skip
+
+
+_Way = tuple[str, tuple[str, ...], str, str | None]  # title, columns, form, convention
+
+
+def _ways(values: np.ndarray, columns: Sequence[str], rotation: tuple[str, ...] | None, form: str | None) -> list[_Way]:
+    """Every way to read the rotation that some columns hold."""
+    if rotation and form:
+        return [(f"{form}, as named", rotation, form, None)]
+    for names in ANGLES:
+        try:
+            found = tuple(columns[_ending(columns, name)] for name in names)
+        except NeecoError:
+            continue
+        return [
+            *((f"euler_convention: {way}", found, EULER, way) for way in CONVENTIONS),
+            (ROTATION_VECTOR, found, ROTATION_VECTOR, None),
+        ]
+    for place, kind in find_rotations(values)[:1]:
+        if kind == ROTATION_MATRIX:
+            held = tuple(columns[place : place + 9])
+            across = tuple(held[3 * column + row] for row in range(3) for column in range(3))
+            return [
+                ("rotation_matrix, row by row", held, kind, None),
+                ("rotation_matrix, column by column", across, kind, None),
+            ]
+        held = tuple(columns[place : place + 4])
+        return [(way, held, way, None) for way in (QUATERNION_WXYZ, QUATERNION_XYZW)]
+    return []
+
+
+def _ending(columns: Sequence[str], name: str) -> int:
+    """The only column of this name, or whose name ends in it."""
+    fitting = [index for index, column in enumerate(columns) if column.lower().split("_")[-1].split(".")[-1] == name]
+    if len(fitting) != 1:
+        raise NeecoError(f"{name}: no one column")
+    return fitting[0]
+
+
+def _are_rotations(matrices: np.ndarray) -> bool:
+    off = np.einsum("nji,njk->nik", matrices, matrices) - np.eye(3)
+    return bool(np.abs(off).max() < UNIT_NORM and (np.linalg.det(matrices) > 0).all())

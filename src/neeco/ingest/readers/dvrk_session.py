@@ -1,0 +1,348 @@
+"""Sessions of the dVRK's data_collection: videos with the time of every frame, topics in a bag or as CSV.
+
+A session is a folder with `index.json`, videos, beside each a JSON file with its frames' times, and a bag; its
+`extract` writes images named by their times, and a CSV file of each topic. Both count Unix time.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neeco.capture.documents import printable
+from neeco.capture.images import open_image
+from neeco.errors import NeecoError
+from neeco.files import read_json, visible_entries
+from neeco.ingest.readers import (
+    IMAGES,
+    OTHER,
+    POSES,
+    READINGS,
+    RecordingFormat,
+    Stream,
+    Table,
+    VideoSource,
+    choose_stream,
+    compare_counts,
+    numbers,
+)
+from neeco.ingest.readers.delimited import DelimitedText
+from neeco.ingest.readers.frame_names import meaning_of
+from neeco.ingest.readers.rosbag import POSE_HEADER, RosBag
+from neeco.ingest.readers.video import open_video
+
+INDEX, TYPES = "index.json", ("dc_index_v1", "dc::index@", "dvrk_data:index@")
+TOPIC = "# Topic: /"  # begins a CSV file of `extract`
+EXTRACTED = "extracted"
+UNLIKE = 0.02  # share by which a video's frames and their times may differ in number
+_STAMPED = re.compile(r"(?P<name>.+)_(?P<time>\d{9,11}\.\d{3,9})\.(?:jpg|jpeg|png)", re.IGNORECASE)
+_POSE_PARTS = (("pose.position.", "pose.orientation."), ("transform.translation.", "transform.rotation."))
+_POSES = re.compile(r"/(PSM\d)/measured_cp")  # an instrument's; the endoscope's arm reports in another base
+_JOINTS = re.compile(r"/(PSM\d)/(?:jaw/)?measured_js")
+_WRIST = ("wrist_pitch", "wrist_yaw", "jaw")  # of an instrument; the joints before them move all of it
+_SLIDES = re.compile(r"insertion|prismatic", re.IGNORECASE)  # joints in m
+HALVES = {"LR": ("left", "right"), "RL": ("right", "left")}  # what the halves of a video show, from the left on
+
+
+@dataclass(frozen=True)
+class _Film:
+    """Images of a camera: a video, or half of one, or files; times [N] s, Unix."""
+
+    times: np.ndarray
+    files: tuple[Path, ...]
+    half: int | None = None  # 0: the left one, 1: the right one
+
+
+class DvrkSession(RecordingFormat):
+    """A stream is a topic, or a video by its name, with `.left` and `.right` where it shows both. Times count from the
+    first image on."""
+
+    format = "dVRK data_collection"
+    holds = "videos with times, poses and joints by topic: folders of a session, or of its extract"
+
+    def claims(self, path: Path) -> bool:
+        if not path.is_dir():
+            return False
+        try:
+            with (path / INDEX).open(encoding="utf-8", errors="replace") as file:
+                if any(kind in file.read(1 << 16) for kind in TYPES):
+                    return True
+        except OSError:
+            pass
+        return any(_topic_of(file) for file in _tables_in(path)[:1])
+
+    def streams(self, path: Path) -> tuple[Stream, ...]:
+        films, absent = _films(path)
+        found = [Stream(name, IMAGES, "video", 0, problem=why) for name, why in absent.items()]
+        if not films and not absent and visible_entries(path, "*.mp4"):
+            raise NeecoError(f"{path}: nothing says the times of its videos' frames; give the session's own folder")
+        # the left camera's are the frames; others are listed
+        for number, name in enumerate(sorted(films, key=lambda name: ("right" in name, "left" not in name, name))):
+            times = films[name].times
+            rate = (len(times) - 1) / float(np.ptp(times)) if len(times) > 1 and np.ptp(times) > 0 else None
+            found.append(Stream(name, IMAGES, "video", len(times), rate, offered=number == 0))
+        bag = _bag(path)
+        if bag is not None:
+            RosBag().require_package(bag)
+            try:
+                return (*found, *RosBag().streams(bag))
+            except NeecoError as error:
+                return (*found, Stream(bag.name, OTHER, "bag", 0, problem=str(error)))
+        for topic, file in _topics(path).items():
+            try:
+                table = DelimitedText().read(file)
+            except NeecoError as error:
+                found.append(Stream(topic, OTHER, "table", 0, problem=str(error)))
+                continue
+            kind, columns = _columns(table)
+            if kind is not None:
+                found.append(_stream(topic, kind, columns, table))
+        return tuple(found)
+
+    def read(self, path: Path, stream: str | None = None) -> Table:
+        start, bag = _start(path), _bag(path)
+        if bag is not None:
+            table = RosBag().read(bag, stream)
+            rows = np.array(table.rows, np.float64)
+            rows[:, 0] += RosBag().origin_s(bag) - start
+            return replace(table, path=path, rows=rows)
+        chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS))
+        file = _topics(path)[chosen.name]
+        table = DelimitedText().read(file)
+        _, columns = _columns(table)
+        return _converted(path, chosen, table, columns, start)
+
+    def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
+        films, absent = _films(path)
+        if (why := absent.get(re.sub(r"\.(left|right)$", "", stream or ""))) is not None:
+            raise NeecoError(why)
+        name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        if name not in films:
+            raise NeecoError(f"{path}: stream: {printable(name)} is in the bag; name the bag as the video's file")
+        film, start = films[name], _start(path)
+        times, keep = film.times, np.diff(film.times, prepend=-np.inf) > 0
+        notes = (
+            [] if keep.all() else [f"{name}: {int((~keep).sum())} frames are no later than the one before; left out"]
+        )
+        if film.files[0].suffix.lower() != ".mp4":
+            files = tuple(file for file, good in zip(film.files, keep, strict=True) if good)
+            return _Files(path, open_image(files[0]).size, tuple(notes), times[keep] - start, files)
+        video = open_video(film.files[0])
+        count = len(video.times)
+        notes += compare_counts(film.files[0], count, len(times), "times", UNLIKE)
+        usable = np.flatnonzero(keep[:count])
+        width, height = video.size
+        size = (width if film.half is None else width // 2, height)
+        return _Timed(
+            path, size, (*video.notes, *notes), times[usable] - start, video, tuple(usable.tolist()), film.half,
+            pixel_aspect=video.pixel_aspect,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Timed(VideoSource):
+    """Frames of a video, or halves of them, at times of their own."""
+
+    video: VideoSource
+    frames: tuple[int, ...]
+    half: int | None
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        wanted = {self.frames[int(index)]: int(index) for index in indices}
+        for frame, pixels in self.video.read(sorted(wanted)):
+            start = (self.half or 0) * self.size[0]
+            yield wanted[frame], np.ascontiguousarray(pixels[:, start : start + self.size[0]])
+
+
+@dataclass(frozen=True)
+class _Files(VideoSource):
+    files: tuple[Path, ...]
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        for index in sorted({int(index) for index in indices}):
+            pixels = np.array(open_image(self.files[index]).convert("RGB"))
+            if pixels.shape[:2] != self.size[::-1]:
+                raise NeecoError(f"{self.files[index]}: is of another size than the first; give images of one size")
+            yield index, pixels
+
+
+def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:
+    """Images by stream, of a session's videos, else of files named by their times; and why other videos cannot be
+    used."""
+    if not (path / INDEX).is_file():
+        return _stamped_files(path), {}
+    document = read_json(path / INDEX)
+    videos = [video for entry in [document, *_list(document, "streams")] for video in _list(entry, "videos")]
+    found: dict[str, _Film] = {}
+    absent: dict[str, str] = {}
+    for video in videos:
+        name = video.get("file") if isinstance(video, dict) else None
+        if not isinstance(name, str) or Path(name).name != name or not name.lower().endswith(".mp4"):
+            continue
+        file = path / name
+        if not file.is_file():
+            absent[file.stem] = f"{path / INDEX}: videos: {printable(name)} is not there; put it beside {INDEX}"
+            continue
+        try:
+            times, layout = _frame_times(file.with_suffix(".json"))
+        except NeecoError as error:
+            absent[file.stem] = str(error)
+            continue
+        if layout in HALVES:
+            for half, side in enumerate(HALVES[layout]):
+                found[f"{file.stem}.{side}"] = _Film(times, (file,), half)
+        else:
+            found[file.stem] = _Film(times, (file,))
+    return found, absent
+
+
+def _frame_times(sidecar: Path) -> tuple[np.ndarray, str]:
+    """Unix times [N] s of a video's frames, less the camera's latency, and how it shows two cameras."""
+    document = read_json(sidecar)
+    if not isinstance(document, dict):
+        raise NeecoError(f"{sidecar}: expected the times of the video's frames; record again")
+    stamps: Any = document.get("timestamps_ns")
+    if stamps is None:
+        stamps = [frame.get("cpu_ts") if isinstance(frame, dict) else None for frame in _list(document, "frames")]
+    good = isinstance(stamps, list) and all(type(stamp) is int and 0 < stamp < 1 << 62 for stamp in stamps)
+    if not good or len(stamps) < 2:
+        raise NeecoError(f"{sidecar}: frames: expected a cpu_ts (ns) of each frame of the video; record again")
+    latency = document.get("estimated_latency", 0.0)
+    if not isinstance(latency, int | float) or not abs(latency) < 60:
+        raise NeecoError(f"{sidecar}: estimated_latency: {printable(latency)} is none in s; correct it")
+    return np.array(stamps, np.int64) * 1e-9 - float(latency), str(document.get("side_by_side", ""))
+
+
+def _list(document: Any, name: str) -> list[Any]:
+    value = document.get(name) if isinstance(document, dict) else None
+    return value if isinstance(value, list) else []
+
+
+def _stamped_files(path: Path) -> dict[str, _Film]:
+    found: dict[str, list[tuple[float, Path]]] = {}
+    for file in visible_entries(path):
+        if match := _STAMPED.fullmatch(file.name):
+            found.setdefault(match["name"], []).append((float(match["time"]), file))
+    films = {}
+    for name, stamped in found.items():
+        stamped.sort()
+        films[name] = _Film(np.array([time for time, _ in stamped]), tuple(file for _, file in stamped))
+    return films
+
+
+def _start(path: Path) -> float:
+    """Unix time s from which the times of all streams count: the first image's, else 0."""
+    return min((float(film.times[0]) for film in _films(path)[0].values()), default=0.0)
+
+
+def _bag(path: Path) -> Path | None:
+    """The session's bag, where it is there."""
+    try:
+        document = read_json(path / INDEX) if (path / INDEX).is_file() else {}
+    except NeecoError:
+        return None
+    name = document.get("rosbags", document.get("rosbag")) if isinstance(document, dict) else None
+    name = name.get("name") if isinstance(name, dict) else name
+    if not isinstance(name, str) or not name or Path(name).name != name or not (path / name).exists():
+        return None
+    return path / name
+
+
+def _tables_in(path: Path) -> list[Path]:
+    """CSV files of an extract: of this folder, else of the session's first."""
+    return visible_entries(path, "*.csv") or visible_entries(path / EXTRACTED / "full_session", "*.csv")
+
+
+def _topics(path: Path) -> dict[str, Path]:
+    found = {topic: file for file in _tables_in(path) if (topic := _topic_of(file))}
+    if not found and not any(_films(path)):
+        raise NeecoError(f"{path}: holds no videos and no topics; give the folder of a session")
+    return found
+
+
+def _topic_of(file: Path) -> str | None:
+    try:
+        with file.open(encoding="utf-8", errors="replace") as stream:
+            line = stream.readline(400)
+    except OSError:
+        return None
+    return "/" + line.removeprefix(TOPIC).strip() if line.startswith(TOPIC) else None
+
+
+def _columns(table: Table) -> tuple[str | None, list[str]]:
+    """POSES or READINGS, and the columns that hold them; None for other topics."""
+    for position, rotation in _POSE_PARTS:
+        wanted = [*(position + axis for axis in "xyz"), *(rotation + axis for axis in "xyzw")]
+        if set(wanted) <= set(table.header):
+            return POSES, wanted
+    joints: list[str] = []
+    while f"position.{len(joints)}" in table.header:
+        joints.append(f"position.{len(joints)}")
+    return (READINGS if joints else None), joints
+
+
+def _stream(topic: str, kind: str, columns: list[str], table: Table) -> Stream:
+    match = (_POSES if kind == POSES else _JOINTS).fullmatch(topic)
+    body = match[1] if match else None
+    if kind == POSES:
+        stated_in = _frames(table)
+        meaning = meaning_of(stated_in[0] if len(stated_in) == 1 else "", dvrk=True)
+        hints = ("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit",)
+        return Stream(
+            topic, POSES, "poses", len(table.rows), None, match is not None, body, None, (*meaning.hints, *hints),
+            asks=meaning.asks,
+        )  # fmt: skip
+    names = _joint_names(table, columns)
+    wrist = [(known, _joint_column(name)) for known in _WRIST for name in names if name.endswith(known)]
+    if "/jaw/" in topic and len(names) == 1:
+        wrist = [("jaw", _joint_column(names[0]))]
+    return Stream(topic, READINGS, "joints", len(table.rows), None, match is not None, body, tuple(wrist))
+
+
+def _joint_column(name: str) -> str:
+    return f"{name}_{'m' if _SLIDES.search(name) else 'rad'}"
+
+
+def _joint_names(table: Table, columns: list[str]) -> list[str]:
+    """Of columns position.0, position.1, ..., by the first row's name.0, name.1, ..."""
+    first = dict(zip(table.header, table.rows[0], strict=False))
+    return [first.get(f"name.{number}") or f"joint_{number + 1}" for number in range(len(columns))]
+
+
+def _converted(path: Path, stream: Stream, table: Table, columns: list[str], start: float) -> Table:
+    """A topic's CSV as numbers, its times s from `start` on."""
+    when = ["header.stamp.sec", "header.stamp.nanosec"]
+    times = numbers(table, ["timestamp"])[0][:, 0] * 1e-9  # of receipt
+    if set(when) <= set(table.header):
+        stamps = numbers(table, when)[0] @ [1.0, 1e-9]
+        times = np.where(stamps == 0, times, stamps)
+    if stream.kind == POSES:
+        header: tuple[str, ...] = POSE_HEADER
+    else:
+        header = ("t_s", *(_joint_column(name) for name in _joint_names(table, columns)))
+        if len(set(header)) < len(header):
+            raise NeecoError(f"{table.path}: names a joint twice; record again")
+    values, _, bad = numbers(table, columns)
+    notes = [f"{path.name}: {stream.name}: {len(bad)} rows cannot be read; left out"] if bad else []
+    rows = np.column_stack([times - start, values])
+    found = Table(path, header, rows, table.lines, stream=stream.name, notes=tuple(notes))
+    frames = _frames(table)
+    if stream.kind != POSES or not frames:
+        return found
+    if len(frames) > 1:
+        listed = ", ".join(frames[:4])
+        raise NeecoError(f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame")
+    return replace(found, stated_in=frames[0], meaning=meaning_of(frames[0], dvrk=True))
+
+
+def _frames(table: Table) -> list[str]:
+    """Names of the frames that a topic's poses are stated in."""
+    if "header.frame_id" not in table.header:
+        return []
+    index = table.header.index("header.frame_id")
+    return sorted({row[index].lstrip("/") for row in table.rows if len(row) > index})

@@ -1,0 +1,144 @@
+"""What the name of a frame says: a camera's with known axes, a robot's base or a tracker's, or nothing certain.
+
+A frame's name is not its axes: the dVRK's ECM and the optical frame of ROS have one origin and are half a turn apart. A
+name that fits several conventions is asked for, never guessed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from neeco.capture.conventions import CONVENTIONS, DVRK_ECM, OPENCV, ROS_BODY, AxisConvention
+from neeco.capture.documents import printable
+from neeco.ingest.readers.columns import BASE, CAMERA
+
+CAMERA_FRAMES: dict[str, AxisConvention] = {CAMERA: OPENCV, **CONVENTIONS}  # what `frame` in recording.yaml may say
+FRAMES = (*CAMERA_FRAMES, BASE)
+_ECM = re.compile(r"(^|[/_.\-])ecm([/_.\-]|$)")
+_BASE = re.compile(r"(^|[/_.\-])(base|setup|rcm|remote_center|tracker)([/_.\-]|\d|$)")
+_OPTICAL = re.compile(r"(^|[/_.\-])optical([/_.\-]|$)")
+_BODY = re.compile(r"[/_.\-](link|body)$")
+_WORDS = "camera|cam|endoscope|laparoscope|scope|ecm"
+_SIDES = "left|right|rgb|colou?r|stereo|mono|front|head"
+_CAMERA = re.compile(rf"(.*/)?(({_SIDES})_?)*({_WORDS})(_?({_SIDES}|\d+))*(_(link|frame|body))?")
+_DVRK = re.compile(r"(^|[/_.\-:\s])(psm\d?|ecm|dvrk|mtm[lr])([/_.\-:\s]|$)", re.IGNORECASE)
+# a frame in the name of a column, feature or file: `pose_in_ecm`, `camera_frame`
+_NAMED_IN = (
+    r"(?:^|[_.\-/])(?:(?:in|wrt|relative_to)[_.\-/](?:(?:the|left|right)[_.\-/])*({0})|({0})[_.\-/]?frame)(?:[_.\-/]|$)"
+)
+_CAMERA_IN = re.compile(_NAMED_IN.format("camera|cam|ecm|endoscope"), re.IGNORECASE)
+_BASE_IN = re.compile(_NAMED_IN.format(r"(?:robot[_.\-/]?)?base"), re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class NamedFrame:
+    """frame: a key of CAMERA_FRAMES or BASE, None where it must be asked; why: what the name leaves open, or is taken
+    to mean, in words; choices: what may be meant, the likeliest first."""
+
+    frame: str | None
+    why: str = ""
+    choices: tuple[str, ...] = ()
+
+    @property
+    def question(self) -> str:
+        """What a refusal asks; "" where nothing is open."""
+        if self.frame is not None:
+            return ""
+        *others, last = [f"frame: {name} ({_describe(name)})" for name in self.choices]
+        return f"{self.why}; say so in the recording, under poses: {', '.join(others)}, or {last}"
+
+    @property
+    def hints(self) -> tuple[str, ...]:
+        """What is assumed and why, as lines of a template."""
+        return (f"poses are stated in {self.why}",) if self.frame is not None and self.why else ()
+
+    @property
+    def asks(self) -> tuple[str, ...]:
+        """The same as a line of a template."""
+        if self.frame is not None:
+            return ()
+        first, *others = self.choices
+        return (f"frame: {first}   # or {', '.join(others)}: {self.why}",)
+
+
+def meaning_of(name: str, images: Collection[str] = (), *, dvrk: bool = False) -> NamedFrame:
+    """What a frame's own name says. images: frames that the images of the same file are stated in; dvrk: are the poses
+    a dVRK's?"""
+    plain, own = name.strip("/").lower(), {image.strip("/").lower() for image in images}
+    name = printable(name).strip("'")
+    last = plain.rpartition("/")[2]
+    camera = (CAMERA, DVRK_ECM.name) if dvrk or _ECM.search(plain) else (CAMERA,)
+    if plain in own:
+        if (dvrk or _ECM.search(plain)) and not _OPTICAL.search(plain):
+            why = f"{name} is the images' own frame, in which a dVRK's poses may have its own axes or OpenCV's"
+            return NamedFrame(None, why, (DVRK_ECM.name, CAMERA, BASE))
+        if _BODY.search(plain):
+            why = f"{name} is the images' own frame, and a link's axes by its name"
+            return NamedFrame(None, why, (CAMERA, ROS_BODY.name, BASE))
+        return NamedFrame(CAMERA, f"{name}, the frame of the camera: axes as ROS's images have them ({OPENCV.words})")
+    if _OPTICAL.search(plain):
+        if own:
+            why = f"{name} is an optical frame, but the images are stated in {printable(', '.join(sorted(images)))}"
+            return NamedFrame(None, why, (CAMERA, BASE))
+        return NamedFrame(CAMERA, f"{name}, the optical frame of the camera: axes {OPENCV.words}")
+    if last == "ecm":
+        why = f"{name}, the frame of the camera in the dVRK's axes ({DVRK_ECM.words}): turned to OpenCV's"
+        return NamedFrame(DVRK_ECM.name, f"{why} ({OPENCV.words})")
+    if _BASE.search(plain):
+        return NamedFrame(BASE)
+    if _ECM.search(plain) or _CAMERA.fullmatch(plain):
+        why = f"{name} may be the camera's frame, and its axes are not certain"
+        body = (ROS_BODY.name,) if not dvrk and not _ECM.search(plain) else ()
+        choices = (*body, *camera) if _BODY.search(plain) else (*camera, *body)
+        return NamedFrame(None, why, (*choices, BASE))
+    return NamedFrame(BASE)
+
+
+def meaning_in(names: Sequence[str], *, dvrk: bool = False) -> NamedFrame | None:
+    """What all of some names of columns, features or files say of a frame (`pose_in_ecm`, `camera_frame`); None where
+    they name none."""
+    for pattern in (_CAMERA_IN, _BASE_IN):
+        found = [pattern.search(name) for name in names]
+        words = {(match[1] or match[2]).lower() for match in found if match}
+        if not names or not all(found) or len(words) > 1:
+            continue
+        word = words.pop()
+        if pattern is _BASE_IN:
+            return NamedFrame(BASE)
+        if word == "ecm":
+            return meaning_of("ECM")
+        if dvrk:
+            why = f"a dVRK's poses in the {word}'s frame may have its own axes or OpenCV's"
+            return NamedFrame(None, why, (CAMERA, DVRK_ECM.name, BASE))
+        return NamedFrame(CAMERA, f"the {word}'s frame: taken as OpenCV's axes ({OPENCV.words})")
+    return None
+
+
+def without_frame(name: str) -> str:
+    """A name without the frame in it: `psm1` of `psm1_in_ecm`."""
+    left = name
+    for pattern in (_CAMERA_IN, _BASE_IN):
+        left = pattern.sub(lambda match: "_" if match.end() < len(match.string) else "", left)
+    return name if left == name else left.strip("_") or name
+
+
+def unsaid(*, dvrk: bool = False) -> NamedFrame:
+    """The question where nothing names a frame."""
+    return NamedFrame(
+        None, "nothing says what its poses are stated in", (CAMERA, BASE, *((DVRK_ECM.name,) if dvrk else ()))
+    )
+
+
+def of_dvrk(*names: str) -> bool:
+    """Whether any of some names of topics, columns or files is a dVRK's."""
+    return any(_DVRK.search(name) for name in names)
+
+
+def _describe(frame: str) -> str:
+    """What a value of `frame` means, in words."""
+    if frame == BASE:
+        return "a robot's base or a tracker"
+    convention = CAMERA_FRAMES[frame]
+    return f"the camera's, {convention.words}"

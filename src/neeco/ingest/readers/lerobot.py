@@ -1,0 +1,379 @@
+"""LeRobot data sets, versions 2.0, 2.1 and 3.0: an episode's states as tables, and its cameras' images.
+
+A stream is a feature of an episode: `episode 3/observation.state`. Row i of an episode belongs to its image i: both
+have the row's `timestamp`, in s from the episode's first. Nothing in the format says the unit of a length, the order of
+a quaternion or the frame that poses are stated in; where the columns' names do not, the recording must.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from io import BytesIO
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from neeco.capture.documents import printable
+from neeco.errors import NeecoError
+from neeco.ingest.readers import (
+    IMAGES,
+    OTHER,
+    POSES,
+    READINGS,
+    RecordingFormat,
+    Stream,
+    Table,
+    VideoSource,
+    choose_stream,
+    compare_counts,
+)
+from neeco.ingest.readers.choices import find_rotations
+from neeco.ingest.readers.columns import QUATERNION_WXYZ, ROTATION_MATRIX, pose_bodies, recognise_pose, split_unit
+from neeco.ingest.readers.frame_names import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
+
+if TYPE_CHECKING:
+    from neeco.ingest.readers._lerobotfiles import DataSet, Episode, Feature
+
+TIME = "timestamp_s"
+UNNAMED = "instrument"  # what a body is called that nothing names
+LARGEST_IMAGE = 90_000_000  # px, as for files of images
+IMAGES_AT_ONCE = 16  # of those that stand in Parquet
+DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
+_NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
+_OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+_JOINT = re.compile(r"(^|[_.\-/])(jaws?|grip(per)?|finger|wrist|joint)([_.\-/0-9]|$)", re.IGNORECASE)
+
+
+class LeRobot(RecordingFormat):
+    """Folders with `meta/info.json`."""
+
+    format = "LeRobot data set"
+    holds = "poses, readings and images of an episode: folders of versions 2.0, 2.1 and 3.0 (meta/info.json)"
+    package = "pyarrow"
+    extra = "lerobot"
+
+    def claims(self, path: Path) -> bool:
+        try:
+            with (path / "meta" / "info.json").open("rb") as file:
+                return b'"codebase_version"' in file.read(2**20)
+        except (OSError, ValueError):
+            return False
+
+    def streams(self, path: Path) -> tuple[Stream, ...]:
+        """Those of the first episode that is there; all others have the same."""
+        data = self._data_set(path)
+        count, first, last = data.episodes()
+        found = self._episode_streams(data, data.first_present())
+        if count > 1:
+            found = (*found, Stream(f"episodes {first} to {last}", OTHER, "episodes with the same streams", count))
+        return found
+
+    def read(self, path: Path, stream: str | None = None) -> Table:
+        data = self._data_set(path)
+        episode, key = self._chosen(data, stream, (POSES, READINGS))
+        feature, name = data.features[key], f"episode {episode.number}/{key}"
+        times, order, notes = _times(data, episode)
+        from neeco.ingest.readers._lerobotfiles import ParquetFile
+
+        values = ParquetFile(episode.data).read([key], episode.number)[key]
+        if values[0].size != len(feature.names):
+            raise NeecoError(
+                f"{episode.data}: {key}: has {values[0].size} numbers a row, meta/info.json says {len(feature.names)}; "
+                "download the data set again"
+            )
+        rows = np.column_stack([times, values.reshape(len(values), -1)[order].astype(np.float64)])
+        header, lines = (TIME, *feature.names), np.arange(len(rows))
+        meaning = _meaning(key, feature.names)
+        return Table(path, header, rows, lines, stream=name, record="frame", notes=notes, meaning=meaning)
+
+    def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
+        data = self._data_set(path)
+        episode, key = self._chosen(data, stream, (IMAGES,))
+        times, order, notes = _times(data, episode)
+        if data.features[key].dtype == "image":
+            return _open_stored(data, episode, key, times, order, notes)
+        from neeco.ingest.readers.video import open_video
+
+        if key in episode.absent:
+            raise NeecoError(episode.absent[key])
+        film = episode.films[key]
+        part = None if film.start is None or film.end is None else (film.start, film.end)
+        video = open_video(film.file, part=part)
+        numbers = _frame_numbers(video)
+        damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
+        usable = numbers < len(times)
+        last, states = int(numbers[-1]) + 1, f"states of episode {episode.number}"
+        shown = max(last, len(times)) if damaged else max(last, len(numbers)) if last > len(times) else len(numbers)
+        remedy = "download the data set again, or name another episode"
+        notes = (*notes, *compare_counts(film.file, shown, len(times), states, remedy=remedy))
+        frames = tuple(np.flatnonzero(usable).tolist())
+        return _Episode(
+            video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames,
+            pixel_aspect=video.pixel_aspect,
+        )  # fmt: skip
+
+    def clock(self, path: Path, stream: str | None) -> str:
+        match = None if stream is None else _NAME.fullmatch(stream)
+        return "" if match is None else f"episode {int(match[1])}"
+
+    def of_episode(self, stream: str, episode: int) -> str | None:
+        match = _NAME.fullmatch(stream)
+        return f"episode {episode}/{match[2] if match else stream}"
+
+    def _data_set(self, path: Path) -> DataSet:
+        self.require_package(path)
+        from neeco.ingest.readers._lerobotfiles import read_data_set
+
+        return read_data_set(path)
+
+    def _chosen(self, data: DataSet, stream: str | None, kinds: Sequence[str]) -> tuple[Episode, str]:
+        """The episode and the feature that a stream names; the only ones there are where none is named."""
+        match = None if stream is None else _NAME.fullmatch(stream)
+        if match is None:
+            count, first, last = data.episodes()
+            if stream is None and count > 1:
+                examples = ", ".join(
+                    f"episode {first}/{key}" for key, held in data.features.items() if _kind(held) in kinds
+                )
+                raise NeecoError(
+                    f"{data.path}: stream: missing, and there are episodes {first} to {last}; name one, as in "
+                    f"{examples[:300]}"
+                )
+            chosen = choose_stream(data.path, self.streams(data.path), stream, kinds).name
+            match = _NAME.fullmatch(chosen)
+            assert match is not None
+        number, key = int(match[1]), match[2]
+        feature = data.features.get(key)
+        fitting = [f"episode {number}/{name}" for name, other in data.features.items() if _kind(other) in kinds]
+        if feature is None or _kind(feature) not in kinds:
+            what = "holds no" if feature is None else f"is {feature.dtype}, no {' or '.join(kinds)}:"
+            listed = ", ".join(fitting)[:400] or "none"
+            raise NeecoError(f"{data.path}: stream: {what} {printable(key)}; name one of {listed}")
+        return data.episode(number), key
+
+    def _episode_streams(self, data: DataSet, episode: Episode) -> tuple[Stream, ...]:
+        from neeco.ingest.readers._lerobotfiles import ParquetFile
+
+        found = []
+        absent = dict(episode.absent)
+        for key in set(data.features) - set(data.films) - set(ParquetFile(episode.data).names):
+            absent[key] = f"{episode.data}: has no column {printable(key)}; download the data set again"
+        for key in sorted(data.features, key=_camera_order):
+            feature, name = data.features[key], f"episode {episode.number}/{key}"
+            if _kind(feature) == IMAGES:
+                title = f"{feature.dtype} {'x'.join(map(str, feature.shape))}"
+                found.append(Stream(name, IMAGES, title, episode.length, data.fps, problem=absent.get(key)))
+        for key, feature in data.features.items():
+            name, kind = f"episode {episode.number}/{key}", _kind(feature)
+            if kind == READINGS:
+                try:
+                    if key in absent:
+                        raise NeecoError(absent[key])
+                    found += self._table_streams(data, feature, name, episode)
+                except NeecoError as error:
+                    title = f"{feature.dtype} of {len(feature.names)}"
+                    found.append(Stream(name, READINGS, title, episode.length, data.fps, problem=str(error)))
+            elif kind == OTHER and key not in _OWN:
+                found.append(Stream(name, OTHER, f"{feature.dtype} {list(feature.shape)}", episode.length, data.fps))
+        return tuple(found)
+
+    def _table_streams(self, data: DataSet, feature: Feature, name: str, episode: Episode) -> list[Stream]:
+        """A stream for every body that the names of a feature's columns tell apart."""
+        title = f"{feature.dtype} of {len(feature.names)}"
+        plain = Stream(name, READINGS, title, episode.length, data.fps, offered=False)
+        if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
+            return [plain]
+        bodies = pose_bodies(feature.names)
+        found = []
+        for prefix, columns in bodies.items():
+            body = without_frame(prefix)
+            rest = [column for column in feature.names if _JOINT.search(column) and column not in columns]
+            own = [column for column in rest if len(bodies) == 1 or body in re.split(r"[_.\-/]", column)]
+            joints = tuple((_joint_name(column, body), column) for column in own)
+            poses = recognise_pose(columns)
+            if poses.position is None:
+                continue
+            asks = () if poses.rotation else _rotation_asks(self._columns(episode, feature, columns), columns)
+            meaning = _meaning(feature.key, columns)
+            found.append(replace(plain, kind=POSES, offered=True, body=body or UNNAMED, joints=joints, columns=columns,
+                                 hints=meaning.hints, asks=(*meaning.asks, *asks)))  # fmt: skip
+        if found:
+            return found
+        asks = _rotation_asks(self._columns(episode, feature, feature.names), feature.names)
+        if asks:
+            meaning = _meaning(feature.key, feature.names)
+            return [replace(plain, kind=POSES, offered=True, body=UNNAMED, hints=meaning.hints,
+                            asks=(*meaning.asks, *asks), joints=(), columns=())]  # fmt: skip
+        return [plain]
+
+    def _columns(self, episode: Episode, feature: Feature, columns: Sequence[str]) -> np.ndarray:
+        from neeco.ingest.readers._lerobotfiles import ParquetFile
+
+        values = ParquetFile(episode.data).read([feature.key], episode.number)[feature.key]
+        values = values.reshape(len(values), -1)
+        if values.shape[1] != len(feature.names):
+            return np.zeros((len(values), len(columns)))
+        return values[:, [feature.names.index(column) for column in columns]]
+
+
+@dataclass(frozen=True)
+class _Episode(VideoSource):
+    """The frames of a video that have states. frames: which, of the video's."""
+
+    video: VideoSource
+    frames: tuple[int, ...]
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        back = {self.frames[int(index)]: int(index) for index in indices}
+        for number, pixels in self.video.read(list(back)):
+            yield back[number], pixels
+
+
+@dataclass(frozen=True)
+class _Stored(VideoSource):
+    """Images that stand in the Parquet file, as PNG or JPEG. rows: of the episode, in its file, of each image."""
+
+    key: str
+    episode: int
+    rows: tuple[int, ...]
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        wanted = {self.rows[int(index)]: int(index) for index in indices}
+        found = ((wanted[row], cell) for row, cell in _cells(self.path, self.key, self.episode) if row in wanted)
+        ahead: deque[tuple[int, Future[np.ndarray]]] = deque()
+        missing = len(wanted)
+        with ThreadPoolExecutor(DECODERS) as pool:  # zlib lets other threads run
+            for index, cell in islice(found, missing):
+                where = f"{self.path}: {self.key}: frame {index}"
+                ahead.append((index, pool.submit(_decoded, where, cell, self.size)))
+                missing -= 1
+                while len(ahead) > (DECODERS if missing else 0):
+                    index, pixels = ahead.popleft()
+                    yield index, pixels.result()
+        if missing:
+            raise NeecoError(f"{self.path}: {self.key}: is shorter than before; do not change the data set")
+
+
+def _open_stored(
+    data: DataSet, episode: Episode, key: str, times: np.ndarray, order: np.ndarray, notes: tuple[str, ...]
+) -> VideoSource:
+    where = f"{episode.data}: {key}"
+    first = next(iter(_cells(episode.data, key, episode.number)), None)
+    if first is None:
+        raise NeecoError(f"{where}: holds no images of episode {episode.number}; download it again")
+    pixels = _decoded(f"{where}: frame 0", first[1], None)
+    size = (pixels.shape[1], pixels.shape[0])
+    return _Stored(episode.data, size, notes, times, key, episode.number, tuple(order.tolist()))
+
+
+def _cells(file: Path, key: str, episode: int) -> Iterator[tuple[int, Any]]:
+    """(row of the episode, bytes) of a column of images."""
+    import pyarrow
+
+    from neeco.ingest.readers._lerobotfiles import ParquetFile
+
+    row = 0
+    for part in ParquetFile(file).batches(["episode_index", key], episode, IMAGES_AT_ONCE):
+        column = part[key]
+        if pyarrow.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0:
+            column = column.field("bytes")
+        if not (pyarrow.types.is_binary(column.type) or pyarrow.types.is_large_binary(column.type)):
+            raise NeecoError(f"{file}: {key}: holds {printable(str(column.type))}, no images; name another feature")
+        for cell in column:
+            yield row, cell.as_py()
+            row += 1
+
+
+def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np.ndarray:
+    if cell is None:
+        raise NeecoError(f"{where}: has no image in it; write the data set with its images")
+    try:
+        with Image.open(BytesIO(cell), formats=("PNG", "JPEG")) as image:
+            if image.size[0] * image.size[1] > LARGEST_IMAGE:
+                raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
+            pixels = np.array(image.convert("RGB"))
+    except NeecoError:
+        raise
+    except Exception as error:  # Pillow's decoders raise nearly anything
+        raise NeecoError(f"{where}: cannot be decoded; download the episode again") from error
+    if size is not None and pixels.shape[1::-1] != size:
+        raise NeecoError(f"{where}: is {pixels.shape[1]}x{pixels.shape[0]}, the first {size[0]}x{size[1]}")
+    return pixels
+
+
+def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Times [R] s of an episode's rows from the first on, which rows of its file these are, and what is odd of them."""
+    from neeco.ingest.readers._lerobotfiles import ParquetFile
+
+    table = ParquetFile(episode.data).read(["timestamp", "frame_index"], episode.number)
+    frames, stamps = table["frame_index"].reshape(-1), table["timestamp"].reshape(-1).astype(np.float64)
+    if len(frames) != episode.length:
+        raise NeecoError(
+            f"{episode.data}: has {len(frames)} rows of episode {episode.number}, meta says {episode.length}; download "
+            "the data set again"
+        )
+    order = np.argsort(frames, kind="stable")
+    frames, stamps = frames[order], stamps[order]
+    if not np.array_equal(frames, np.arange(len(frames))):
+        raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")
+    steps = np.diff(stamps)
+    if np.isfinite(stamps).all() and (steps > 0).all():
+        return stamps - stamps[0], order, ()
+    note = f"episode {episode.number}: its timestamps do not increase; taken as {data.fps:g} a second"
+    return frames / data.fps, order, (f"{data.path.name}: {note}",)
+
+
+def _frame_numbers(video: VideoSource) -> np.ndarray:
+    """Which frame of the episode each of a video's is: those that cannot be decoded are left out of it."""
+    step = float(np.median(np.diff(video.times)))
+    return np.rint(video.times / step).astype(np.int64)
+
+
+def _kind(feature: Feature) -> str:
+    if feature.dtype in ("video", "image") and not feature.is_depth:
+        return IMAGES
+    return READINGS if feature.names and feature.key not in _OWN else OTHER
+
+
+def _meaning(key: str, columns: Sequence[str]) -> NamedFrame:
+    """What a feature's name, or those of all its columns, says of the frame."""
+    dvrk = of_dvrk(key, *columns)
+    return meaning_in([key], dvrk=dvrk) or meaning_in(columns, dvrk=dvrk) or unsaid(dvrk=dvrk)
+
+
+def _rotation_asks(values: np.ndarray, columns: Sequence[str]) -> tuple[str, ...]:
+    """What may be a rotation by its numbers [R, C], as lines to choose from."""
+    asks = []
+    for place, kind in find_rotations(values):
+        size, why = 4, "or quaternion_xyzw: their length is 1, nothing says their order"
+        if kind == ROTATION_MATRIX:
+            size, why = 9, "or column by column: list them so that they stand row by row"
+        if place >= 3:
+            asks.append(f"  position: {_flow(columns[place - 3 : place])}   # stands before the rotation")
+        form = kind if kind == ROTATION_MATRIX else QUATERNION_WXYZ
+        asks.append(f"  {form}: {_flow(columns[place : place + size])}   # {why}")
+    return tuple(asks)
+
+
+def _flow(columns: Sequence[str]) -> str:
+    return "[" + ", ".join(f'"{column}"' for column in columns) + "]"
+
+
+def _joint_name(column: str, body: str) -> str:
+    """`jaw` of `psm1_jaw`, without the unit."""
+    words = [word for word in re.split(r"[_.\-/]+", split_unit(column, "angle")[0]) if word and word != body]
+    return "_".join(words) or column
+
+
+def _camera_order(key: str) -> tuple[bool, bool, bool, str]:
+    """Endoscopes before cameras at the wrist, the left one before any other but the right one."""
+    name = key.lower()
+    return "wrist" in name or "psm" in name, "right" in name, "left" not in name, key

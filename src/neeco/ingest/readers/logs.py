@@ -1,0 +1,550 @@
+"""Logs of trackers and joint sensors: read, converted to mm, rad, s and quaternions, put in order.
+
+What is left out is noted with how many rows and which. What may as well be a mistake in the recording (units, columns,
+most of the rows unusable) is refused.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
+
+from neeco.capture.conventions import OPENCV
+from neeco.errors import NeecoError
+from neeco.geometry.rotations import rotation_error
+from neeco.ingest.readers import Table, column_index, count_rows, numbers, parse_number, read_table
+from neeco.ingest.readers import columns as named
+from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
+from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_in, meaning_of, of_dvrk
+from neeco.ingest.readers.ndi import tool_columns
+
+MIN_SAMPLES = 4  # of a usable log
+WRONG_ROWS = 0.05  # share of rows that may be wrong (not missing) before the file is refused
+_FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)
+_FRAME_COLUMN = re.compile(r"(?!.*child)(.*[._/])?(reference[._ ]?)?frame([._ ]?id)?")
+LISTED_STATES = 8  # states that drop rows and are named in the notes
+MAX_SAME_TIME = 0.5  # share of rows at the time of another: more, and times are too coarse
+STUCK_S, STUCK_SAMPLES = 0.5, 10  # that a tracker's noise never leaves a pose unchanged for
+GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
+FARTHEST_MM = 20_000.0  # no tracker of instruments sees that far: the unit is wrong
+TWO_TURNS = 4 * np.pi  # rad, more than any joint turns: the unit is wrong
+CLAMPED = 0.05  # of a calibration table's range: readings that far outside it count as its end
+NORM_TOLERANCE = 0.02  # of a quaternion's length: two decimals pass
+ROUNDED_TOLERANCE = 0.02  # of R^T R - I: loggers round to two decimals
+
+
+@dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
+class PoseLog:
+    """Poses tracker_from_sensor over time, on the log's own clock: t_log = t_video + offset.
+
+    times [T] s, increasing; positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; gaps: (last time before,
+    first time after) where samples are missing; notes: what was dropped or repaired, in words; frame: what the poses
+    are stated in, CAMERA (OpenCV's axes) or BASE; stated_in: what the file calls it, None where it does not, or the
+    recording says; image_hz: as in `Table`.
+    """
+
+    path: Path
+    clock: str
+    times: np.ndarray
+    positions: np.ndarray
+    quats: np.ndarray
+    gaps: tuple[tuple[float, float], ...] = ()
+    notes: tuple[str, ...] = ()
+    frame: str = named.BASE
+    stated_in: str | None = None
+    image_hz: float | None = None
+
+
+@dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
+class ReadingLog:
+    """Readings of a joint, rad, over time; fields as in PoseLog."""
+
+    path: Path
+    clock: str
+    times: np.ndarray
+    values: np.ndarray
+    gaps: tuple[tuple[float, float], ...] = ()
+    notes: tuple[str, ...] = ()
+    image_hz: float | None = None
+
+
+class Rows:
+    """Which rows of a table are in use; those left out, by reason, and those repaired, for the notes."""
+
+    def __init__(self, table: Table) -> None:
+        self.table = table
+        self.keep = np.ones(len(table.rows), dtype=bool)
+        self.reasons: dict[str, list[int]] = {}  # the file's lines
+        self.repairs: list[str] = []
+
+    def drop(self, which: np.ndarray | list[int], reason: str) -> None:
+        """Leave rows out (bool [R], or their numbers), and note those that were in use."""
+        lines = self.table.lines[which][self.keep[which]]
+        if len(lines):
+            self.reasons.setdefault(reason, []).extend(lines.tolist())
+        self.keep[which] = False
+
+    def drop_wrong(self, wrong: np.ndarray, reason: str) -> None:
+        """Leave out a few rows that are wrong (bool [R]). Raises NeecoError when they are more than a few."""
+        lines, count = self.table.lines[wrong & self.keep], int(self.keep.sum())
+        if len(lines) > max(1, WRONG_ROWS * count):
+            share = f"{self.table.list_rows(lines)} ({len(lines)} of {count_rows(count)})"
+            raise NeecoError(f"{self.table.where}: {share}: {reason}")
+        self.drop(wrong, reason.split(";")[0])
+
+    def notes(self) -> tuple[str, ...]:
+        """What was done to the rows, one sentence each."""
+        name = self.table.title
+        dropped = (
+            f"{name}: {count_rows(len(lines))} dropped: {reason} ({self.table.list_rows(lines)})"
+            for reason, lines in self.reasons.items()
+        )
+        return (*self.table.notes, *dropped, *(f"{name}: {repair}" for repair in self.repairs))
+
+
+def read_pose_log(source: PoseColumns) -> PoseLog:
+    """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
+    table = tool_columns(read_table(source.path, source.stream), source)
+    given = _given(table, time=source.time, position=source.position, rotation=source.rotation)
+    found = named.recognise_pose(table.header, given)
+    table = with_named_frame(table, (*(source.position or found.position or ()), *(source.rotation or ())))
+    frame = _frame_of(table, source)
+    rows = Rows(table)
+    _keep_measured(rows, source, found.state)
+    times = _times(rows, source, found)
+    positions, quats = _poses(rows, source, found)
+    _drop_stuck(rows, times, np.column_stack([positions, quats]))
+    times, order = _in_order(rows, times)
+    if np.ptp(quats[order], axis=0).max() == 0 and np.ptp(positions[order], axis=0).max() > 0:
+        rows.repairs.append("its rotation never changes: does it hold positions alone?")
+    quats, flips = continuous(quats[order])
+    if flips:
+        rows.repairs.append(f"the quaternion's sign flipped {flips} times; undone")
+    gaps, gap_notes = _gaps(table, times)
+    notes = (*rows.notes(), *gap_notes)
+    stated_in = table.stated_in if source.frame is None else None
+    positions = positions[order]
+    if frame != named.BASE:
+        positions, quats = in_opencv(frame, positions, quats)
+        frame = named.CAMERA
+        if source.frame is None and table.meaning is not None:
+            notes = (*notes, f"{table.title}: poses are stated in {table.meaning.why}")
+    log = PoseLog(table.path, source.clock, times, positions, quats, gaps, notes, frame, stated_in)
+    return replace(log, image_hz=table.image_hz)
+
+
+def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [T, 3] and quaternions [T, 4] wxyz stated in a camera's frame (`frames.CAMERA_FRAMES`), in OpenCV's
+    axes; what is stated in a base stays."""
+    turn = CAMERA_FRAMES[frame].opencv_from_own[:3, :3] if frame != named.BASE else np.eye(3)
+    if np.array_equal(turn, np.eye(3)):
+        return positions, quats
+    turned = Rotation.from_matrix(turn) * Rotation.from_quat(quats, scalar_first=True)
+    return positions @ turn.T, continuous(turned.as_quat(scalar_first=True))[0]
+
+
+def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
+    """The table with what is said of the frame of its poses: by the names of their columns, else by the file, else by a
+    column of frames' names, else by the file's name. Raises NeecoError where the column names several."""
+    dvrk = of_dvrk(table.path.stem, *columns)
+    meaning = meaning_in(columns, dvrk=dvrk)
+    if meaning is None and (table.meaning is not None or table.stream is not None):
+        return table
+    names = [] if meaning is not None else _frame_names(table)
+    if names:
+        return replace(table, stated_in=names[0], meaning=meaning_of(names[0], dvrk=dvrk))
+    return replace(table, meaning=meaning or meaning_in([table.path.stem], dvrk=dvrk))
+
+
+def _frame_names(table: Table) -> list[str]:
+    """The name in a column such as `header.frame_id`; [] where there is none, or it counts or names images."""
+    for index, name in enumerate(table.header):
+        if isinstance(table.rows, np.ndarray) or not _FRAME_COLUMN.fullmatch(name.strip().lower()):
+            continue
+        found = sorted({cells[index].strip("/\"' ") for cells in table.rows if index < len(cells)} - {""})
+        if len(found) > 1 and any(meaning_of(cell).frame != named.BASE for cell in found):
+            listed = ", ".join(found[:4])
+            raise NeecoError(f"{table.where}: {name}: poses are stated in several frames ({listed}); write one a file")
+        if len(found) == 1 and parse_number(found[0]) is None:
+            return found
+    return []
+
+
+def _frame_of(table: Table, source: PoseColumns) -> str:
+    """What poses are stated in: as the recording says, else as the file does. Raises NeecoError where neither does, or
+    the two contradict each other."""
+    if source.frame is None:
+        if table.meaning is not None and table.frame is None:
+            raise NeecoError(f"{table.where}: frame: {table.meaning.question}")
+        return table.frame or named.BASE
+    own = CAMERA_FRAMES.get(table.frame or "")
+    if source.frame == named.CAMERA and own is not None and own.words != OPENCV.words:
+        raise NeecoError(
+            f"{table.where}: frame: {named.CAMERA} means OpenCV's axes ({OPENCV.words}), and the file states its poses "
+            f"in {table.stated_in or own.name}, whose axes are {own.words}; leave it out (or write frame: {own.name}), "
+            f"or frame: {OPENCV.name} where they are turned already"
+        )
+    return source.frame
+
+
+def read_reading_log(source: JointColumns) -> ReadingLog:
+    """Read a joint sensor's log, through its calibration table when there is one. Raises NeecoError naming file,
+    row or column, and remedy."""
+    table = read_table(source.path, source.stream)
+    given = _given(table, time=source.time, value=None if source.value is None else (source.value,))
+    recognised, found = named.recognise_value(table.header, given)
+    value = source.value or recognised
+    if value is None:
+        raise NeecoError(f"{source.path}: header: which column is the joint's reading? Name it as columns.value")
+    rows = Rows(table)
+    times = _times(rows, source, found)
+    values = _cells(rows, (value,))[:, 0]
+    clamped: tuple[str, ...] = ()
+    if source.calibration is not None:
+        values, clamped = _calibrated(rows, value, values, source, source.calibration)
+    else:
+        hint = " Counts need a calibration table, `calibration`."
+        values = values * named.scale_of(table.where, (value,), "angle", source.units.angle, None, hint)
+        impossible = np.abs(np.where(rows.keep, values, 0)) > TWO_TURNS
+        reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
+        rows.drop_wrong(impossible, reason)
+    times, order = _in_order(rows, times)
+    gaps, gap_notes = _gaps(table, times)
+    notes = (*rows.notes(), *clamped, *gap_notes)
+    return ReadingLog(table.path, source.clock, times, values[order], gaps, notes, table.image_hz)
+
+
+def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:
+    """The columns that a recording names, by meaning, as the file spells them. Raises NeecoError for one that is not
+    there, or is named for two things."""
+    given = {
+        meaning: tuple(table.header[column_index(table, name)] for name in names)
+        for meaning, names in columns.items()
+        if names is not None
+    }
+    names = [name for group in given.values() for name in group]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise NeecoError(f"{table.where}: columns: {twice} is named for two things; name a column for each")
+    return given
+
+
+def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
+    table = rows.table
+    form, rotation = _rotation_columns(table, source, found)
+    position = source.position or found.position
+    if form == MATRIX:
+        position, read = tuple(rotation[i] for i in (3, 7, 11)), rotation
+    elif position is None:
+        raise _unclear(table, found, "position", "x, y, z columns")
+    else:
+        read = (*position, *rotation)
+    known = (found, named.recognise_pose(table.header), named.recognise_pose((*position, *rotation)))
+    implied = next((kind.length_unit for kind in known if kind.position == position), None)
+    scale = named.scale_of(table.where, position, "length", source.units.length, implied, "")
+    angle = 1.0
+    if form in (EULER, ROTATION_VECTOR):
+        angle = named.scale_of(table.where, rotation, "angle", source.units.angle, None, "")
+    positions, turns = _parts(table, form, _cells(rows, read))
+    positions = positions * scale
+    if form not in (EULER, ROTATION_VECTOR):  # trackers write zeros where they have no rotation
+        rows.drop((turns == 0).all(axis=1), "the rotation is all zeros (no measurement)")
+    quats, good = to_quaternions(form, turns, source.euler_convention, angle)
+    what = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
+    rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {what}; name the right columns")
+    distance = np.median(np.linalg.norm(positions[rows.keep], axis=1)) if rows.keep.any() else 0.0
+    if distance > FARTHEST_MM:
+        raise NeecoError(
+            f"{table.where}: {', '.join(position)}: half the samples are over {distance / 1000:.3g} m from the tracker"
+            "; correct the unit in the header or in units.length"
+        )
+    return positions, quats
+
+
+def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Unit quaternions wxyz [R, 4] of rotation columns [R, C], and bool [R] where they are rotations at all.
+
+    form: see `columns.FORMS`; matrices by rows, of 4x4 ones the first 9 rotation cells; convention: of Euler angles;
+    scale: of angles, to rad. Rows that are no rotation (or hold NaN) are NaN: scipy would take any numbers for one.
+    """
+    quats = np.full((len(cells), 4), np.nan)
+    finite = np.isfinite(cells).all(axis=1)
+    if form in (named.QUATERNION_WXYZ, named.QUATERNION_XYZW):
+        norms = np.linalg.norm(cells, axis=1)
+        good = finite & (np.abs(norms - 1) <= NORM_TOLERANCE)
+        wxyz = cells if form == named.QUATERNION_WXYZ else cells[:, [3, 0, 1, 2]]
+        quats[good] = wxyz[good] / norms[good, None]
+        return quats, good
+    if form in (named.ROTATION_MATRIX, MATRIX):
+        matrices = cells.reshape(-1, 3, 3)
+        with np.errstate(all="ignore"):
+            good = finite & (rotation_error(matrices) <= ROUNDED_TOLERANCE)
+            good &= np.linalg.det(np.where(finite[:, None, None], matrices, 0)) > 0
+    else:
+        # beyond this, angles are something else (or the sine of them is noise)
+        good = finite & (np.abs(cells * scale) < 1e4).all(axis=1)
+    if good.any():
+        if form in (named.ROTATION_MATRIX, MATRIX):
+            rotations = Rotation.from_matrix(matrices[good])
+        elif form == EULER:
+            rotations = Rotation.from_euler(convention or "", cells[good] * scale)
+        else:
+            rotations = Rotation.from_rotvec(cells[good] * scale)
+        quats[good] = rotations.as_quat(scalar_first=True)
+    return quats, good
+
+
+def continuous(quats: np.ndarray) -> tuple[np.ndarray, int]:
+    """Quaternions [T, 4] with signs such that neighbours lie in one half space, and how often the sign flipped."""
+    flips = np.concatenate([[False], (quats[1:] * quats[:-1]).sum(axis=1) < 0])
+    signs = np.where(np.cumsum(flips) % 2, -1.0, 1.0)
+    return quats * signs[:, None], int(flips.sum())
+
+
+def _keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
+    """Drop the rows whose state does not say that they were measured."""
+    table, name = rows.table, source.state or found
+    if name is None:
+        return
+    index = column_index(table, name)
+    good = {value.lower() for value in source.good}
+    states = [cells[index] if index < len(cells) else "" for cells in table.rows]
+    by_state: dict[str, list[int]] = {}
+    for row, state in enumerate(states):
+        if state.lower() not in good:
+            by_state.setdefault(state[:20], []).append(row)
+    for number, (state, members) in enumerate(by_state.items()):
+        if number < LISTED_STATES:
+            rows.drop(members, f"{name} is {state or 'empty'!r}")
+        rows.keep[members] = False
+    if not rows.keep.any():
+        raise NeecoError(
+            f"{table.where}: {name}: no row is {' or '.join(source.good)} ({table.list_rows(table.lines[:1])} has "
+            f"{states[0][:20]!r}); list the values that mark measured rows in the recording: columns.good"
+        )
+
+
+def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColumns) -> np.ndarray:
+    """Times [R] in s; rows without one are dropped."""
+    table, names, rate = rows.table, source.time or found.time, source.rate_hz
+    if names is None and rate is not None:
+        return np.arange(len(table.rows)) / rate
+    if names is None:
+        raise NeecoError(
+            f"{table.where}: header: no column of times found; name it as columns.time (or add t_s), or say rate_hz "
+            "where its rows come at a fixed rate"
+        )
+    cells = _cells(rows, names)
+    known = named.recognise_time(names)
+    if rate is not None and (len(names) == 2 or known.time_unit or named.split_unit(names[0], "time")[1]):
+        raise NeecoError(
+            f"{table.where}: rate_hz: {', '.join(names)} holds times and counts no frames; leave rate_hz out, or name "
+            "the column that counts as columns.time"
+        )
+    if len(names) == 2:
+        return cells[:, 0] + cells[:, 1] * 1e-9
+    if rate is not None:
+        return cells[:, 0] / rate
+    if known.counts_frames:
+        raise NeecoError(
+            f"{table.where}: {names[0]}: counts frames, and nothing says how many a second; say rate_hz in the "
+            "recording (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
+        )
+    steps = np.diff(cells[rows.keep, 0])
+    steps = steps[steps > 0]
+    hint = ""
+    if len(steps):
+        rates = {unit: 1 / (np.median(steps) * scale) for unit, scale in (("s", 1), ("ms", 1e-3), ("ns", 1e-9))}
+        likely = [f"{unit} would be {rate:.3g} Hz" for unit, rate in rates.items() if 1 <= rate <= 5000]
+        hint = f" Its steps in {', '.join(likely)}." if likely else ""
+    return cells[:, 0] * named.scale_of(table.where, names, "time", source.units.time, known.time_unit, hint)
+
+
+def _cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
+    """Numbers [R, C]; rows with missing or unreadable cells are dropped. Raises NeecoError when those are most."""
+    table = rows.table
+    values, missing, bad = numbers(table, names)
+    rows.drop(missing, f"no value for {', '.join(names)}" if len(names) < 3 else "values are missing")
+    bad = [(row, what) for row, what in bad if rows.keep[row]]
+    if len(bad) > max(3, 0.5 * rows.keep.sum()):
+        alike = f"{len(bad)} of {count_rows(len(table.rows))} like it"
+        raise NeecoError(
+            f"{table.where}: {table.record} {table.lines[bad[0][0]]}: {bad[0][1]} ({alike}); name other columns or "
+            "repair the file"
+        )
+    if bad:
+        rows.drop([row for row, _ in bad], f"not readable, first: {bad[0][1]}")
+    if not rows.keep.any():
+        raise NeecoError(
+            f"{table.where}: {', '.join(names)}: no row has values; name other columns or another file in the recording"
+        )
+    return values
+
+
+def _rotation_columns(table: Table, source: PoseColumns, found: RecognisedColumns) -> tuple[str, tuple[str, ...]]:
+    """Form and columns of the rotation."""
+    rotation, form = (source.rotation, source.form) if source.rotation else (found.rotation, found.form)
+    if rotation is None or form is None:
+        raise _unclear(table, found, "rotation", "qw, qx, qy, qz columns")
+    if len(rotation) not in named.FORMS[form]:
+        wanted = " or ".join(map(str, named.FORMS[form]))
+        raise NeecoError(f"{table.where}: {form}: takes {wanted} columns, not {len(rotation)}; list them all")
+    if form == EULER and not source.euler_convention:
+        listed = ", ".join(rotation)
+        raise NeecoError(f"{table.where}: {listed}: say their euler_convention in the recording (like XYZ)")
+    return form, rotation
+
+
+def _unclear(table: Table, found: RecognisedColumns, what: str, expected: str) -> NeecoError:
+    reason = found.unclear.get(what) or (found.unclear.get("quaternion") if what == "rotation" else None)
+    problem = (
+        f"no {expected} found among {', '.join(table.header[:12])[:120]!r}; name them in the recording under columns: "
+        + ("position" if what == "position" else _FORMS)
+    )
+    return NeecoError(f"{table.where}: header: {f'{what}: {reason}' if reason else problem}")
+
+
+def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [R, 3] in the file's unit and rotation cells [R, C]."""
+    if form != MATRIX:
+        return cells[:, :3], cells[:, 3:]
+    rows = cells[:, :12].reshape(-1, 3, 4)
+    if cells.shape[1] == 16:
+        last, column = cells[:, 12:], cells.reshape(-1, 4, 4)[:, :3, 3]
+        if np.nanmedian(np.abs(last[:, :3])) > 1e-6 and np.nanmax(np.abs(column)) < 1e-9:
+            raise NeecoError(f"{table.where}: matrix: is written by columns; list them in the recording row by row")
+    return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
+
+
+def _drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
+    """Drop the rows of a tracker that repeats its last pose [R, 7] after it lost its tool: exactly the same pose for
+    long, and a jump at an end. What comes to rest slows down before."""
+    used = np.flatnonzero(rows.keep)
+    if len(used) < MIN_SAMPLES:
+        return
+    steps = np.linalg.norm(np.diff(poses[used, :3], axis=0), axis=1)
+    same = np.concatenate([[False], (np.diff(poses[used], axis=0) == 0).all(axis=1), [False]])
+    edges = np.diff(same.astype(int))
+    moving = steps[steps > 0]
+    if not len(moving):
+        return
+    for first, last in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+        # the pose of row `first` is repeated until `last`
+        around = [steps[first - 1]] if first > 0 else []
+        around += [steps[last]] if last < len(steps) else []
+        lasted = times[used[last]] - times[used[first]]
+        if last - first >= STUCK_SAMPLES and lasted > STUCK_S and max(around, default=0.0) > np.median(moving):
+            rows.drop(used[first + 1 : last + 1], "the pose of the row before, repeated (a tracker that lost its tool)")
+
+
+def _in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left."""
+    table, usable = rows.table, np.flatnonzero(rows.keep)
+    order = usable[np.argsort(times[usable], kind="stable")]
+    late = usable[1:][times[usable][1:] < np.maximum.accumulate(times[usable])[:-1]]
+    doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
+    if doubled.sum() > max(MIN_SAMPLES, MAX_SAME_TIME * len(order)):
+        raise NeecoError(
+            f"{table.where}: {count_rows(int(doubled.sum()))} of {len(order)} have the time of another; its times are "
+            "too coarse, or of several tools: name a finer column as columns.time"
+        )
+    rows.drop(np.sort(order[doubled]), "a second row at one time")
+    order = order[~doubled]
+    if len(order) < MIN_SAMPLES:
+        why = "; ".join(note.partition(": ")[2] for note in rows.notes()[:2])
+        raise NeecoError(
+            f"{table.where}: {count_rows(len(order))} of {len(table.rows)} can be used{f' ({why})' if why else ''}; "
+            "record again or name the right columns"
+        )
+    if len(late):
+        listed = table.list_rows(table.lines[late])
+        rows.repairs.append(f"{count_rows(len(late))} out of order in time; sorted ({listed})")
+    return times[order], order
+
+
+def _gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:
+    """Where samples are missing (steps longer than 4 usual ones and 0.15 s), and a note of it."""
+    steps = np.diff(times)
+    longest = max(GAP_STEPS * float(np.median(steps)), GAP_SECONDS)
+    gaps = tuple((float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest))
+    if not gaps:
+        return (), ()
+    total = sum(end - start for start, end in gaps)
+    first = ", ".join(f"{start:.2f}-{end:.2f} s" for start, end in gaps[:3])
+    count = f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''}"
+    return gaps, (f"{table.title}: {count}, {total:.2f} s in all ({first}); not bridged",)
+
+
+def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """A joint sensor's calibration table: counts [K] increasing, angles [K] rad, increasing or decreasing.
+
+    It has two columns; the angle is the one with an angle's unit in its name, else the second. The unit comes from
+    there or from `angle_unit`. Raises NeecoError naming file, row and remedy.
+    """
+    table = read_table(path)
+    names = [name for name in table.header if name]
+    angle_names = [
+        name for name in names if named.split_unit(name, "angle")[1] or named.split_unit(name, "angle")[0] == "angle"
+    ]
+    if len(names) < 2 or (len(names) > 2 and len(angle_names) != 1):
+        raise NeecoError(f"{path}: header: expected two columns, counts and angle_rad (or angle_deg); repair the table")
+    angle_name = angle_names[0] if len(angle_names) == 1 else names[1]
+    count_name = next(name for name in names if name != angle_name)
+    unit = named.split_unit(angle_name, "angle")[1] or angle_unit
+    if unit is None:
+        raise NeecoError(f"{path}: {angle_name}: radians or degrees? Name it {angle_name}_rad or {angle_name}_deg")
+    values, missing, bad = numbers(table, (count_name, angle_name))
+    wrong = [*bad, *((int(row), "has an empty cell") for row in np.flatnonzero(missing))]
+    if wrong:
+        row, what = min(wrong)
+        raise NeecoError(f"{path}: line {table.lines[row]}: {what}; repair or remove the line")
+    order = np.argsort(values[:, 0], kind="stable")
+    counts, angles, lines = values[order, 0], values[order, 1] * named.UNITS["angle"][unit], table.lines[order]
+    if len(counts) < 2:
+        raise NeecoError(f"{path}: has one point; a calibration table needs two or more")
+    same = np.flatnonzero(np.diff(counts) <= 0)
+    if len(same):
+        first, second = lines[same[0] : same[0] + 2]
+        raise NeecoError(f"{path}: lines {first} and {second}: the same count {counts[same[0]]:g} twice; keep one")
+    turning = np.flatnonzero(np.diff(angles) * np.sign(angles[-1] - angles[0]) <= 0)
+    if len(turning):
+        first, second = lines[turning[0] : turning[0] + 2]
+        raise NeecoError(
+            f"{path}: lines {first} and {second}: the angle does not go on rising (or falling) with the counts, so a "
+            "count has no one angle; measure these points again"
+        )
+    if np.abs(angles).max() > TWO_TURNS:
+        raise NeecoError(f"{path}: {angle_name}: goes beyond two turns; correct the column's unit")
+    return counts, angles
+
+
+def _calibrated(
+    rows: Rows, name: str, readings: np.ndarray, source: JointColumns, path: Path
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Angles [R] rad of a column of counts, by PCHIP through the table (Fritsch & Carlson 1980), which is as monotone
+    as its points. Just outside the table, its end is taken, with a note; rows farther outside are dropped."""
+    table = rows.table
+    counts, angles = read_calibration(path, source.units.angle)
+    low, high = counts[0], counts[-1]
+    readings = np.where(rows.keep, readings, low)
+    excess = np.maximum(low - readings, readings - high)
+    outside = excess > CLAMPED * (high - low)
+    values = PchipInterpolator(counts, angles)(np.clip(readings, low, high))
+    clamped = (excess > 0) & ~outside
+    note = ""
+    if clamped.any():
+        note = (
+            f"{table.title}: {count_rows(int(clamped.sum()))} with {name} just outside the table "
+            f"{path.name} ({low:g} to {high:g}, by at most {excess[clamped].max():g}): "
+            f"read as its end ({table.list_rows(table.lines[clamped])})"
+        )
+    reason = f"{name} lies far outside the calibration table {path.name}"
+    rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
+    return values, (note,) if note else ()

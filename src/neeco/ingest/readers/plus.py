@@ -1,0 +1,217 @@
+"""Sequences that the PLUS toolkit and 3D Slicer record: transforms of tools by name, and images."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from neeco.capture.documents import printable
+from neeco.errors import NeecoError
+from neeco.files import require_content
+from neeco.ingest.readers import (
+    IMAGES,
+    OTHER,
+    POSES,
+    RecordingFormat,
+    Stream,
+    Table,
+    VideoSource,
+    choose_stream,
+    parse_number,
+)
+from neeco.ingest.readers._sequencefile import META, NRRD, FrameSequence, SequenceImages, read_sequence
+from neeco.ingest.readers.frame_names import NamedFrame, meaning_of, of_dvrk
+
+TRANSFORM, STATUS, TIME = "Transform", "Status", "Timestamp"
+IMAGE_STATUSES = ("ImageStatus", "Status")  # of MetaImage and NRRD files
+GOOD = "ok"
+IMAGE_STREAM = "images"
+MIN_IMAGES = 2
+_ENDS = re.compile(r"(\w+?)To([A-Z0-9]\w*)")
+HEADER = (
+    "t_s",
+    *(f"m{row}{column}{'_mm' if column == 3 and row < 3 else ''}" for row in range(4) for column in range(4)),
+)
+
+
+class PlusSequence(RecordingFormat):
+    """A stream is a transform, `StylusToTracker` for StylusToTrackerTransform (which maps coordinates of the stylus to
+    the tracker's, mm), or `images`. Times are PLUS's timestamps, from the first image on where there are images."""
+
+    format = "PLUS sequence"
+    holds = "poses by name (StylusToTracker) and images: .igs.mha, .mha, .mhd, .nrrd"
+    suffixes = (*META, *NRRD)
+
+    def streams(self, path: Path) -> tuple[Stream, ...]:
+        sequence = _sequence_of(path)
+        times = _times(sequence)
+        found = []
+        if sequence.has_images:
+            frames, notes = _image_frames(sequence)
+            problem = None if len(frames) >= MIN_IMAGES else _too_few(sequence, frames, notes)
+            color = "grey" if sequence.channels == 1 else "RGB"
+            title = f"{color} images of {sequence.size[0]}x{sequence.size[1]}"
+            rate = _rate(times, sequence.count)
+            found.append(Stream(IMAGE_STREAM, IMAGES, title, len(frames), rate, problem=problem))
+        for name in _transforms(sequence):
+            texts = sequence.fields[name + TRANSFORM]
+            # what is the same in every frame is a calibration (ImageToProbe), no motion
+            fixed = len(texts) > 1 and len(set(texts.values())) == 1
+            title = "fixed transform" if fixed else "transform"
+            body, kind = _ends(name)[0], OTHER if fixed else POSES
+            statuses = sequence.fields.get(name + TRANSFORM + STATUS, {})
+            problem = None
+            if not any(statuses.get(frame, GOOD).lower() == GOOD for frame in texts):
+                status = f"{name}{TRANSFORM}{STATUS} is {printable(next(iter(statuses.values())), 20)}"
+                problem = f"no frame can be used: {status} in all; record again, or name another transform"
+            meaning = _meaning(name)
+            found.append(
+                Stream(
+                    name, kind, title, len(texts), _rate(times, len(texts)), body=body, hints=meaning.hints,
+                    asks=meaning.asks, problem=problem,
+                )
+            )  # fmt: skip
+        return tuple(found)
+
+    def read(self, path: Path, stream: str | None = None) -> Table:
+        sequence = _sequence_of(path)
+        if not _transforms(sequence):
+            raise NeecoError(
+                f"{path}: holds no transforms (Seq_Frame0000_StylusToTrackerTransform); name a log of poses"
+            )
+        wanted = None if stream is None else stream.removesuffix(TRANSFORM)
+        name = choose_stream(path, self.streams(path), wanted, (POSES,)).name
+        times, texts = _times(sequence), sequence.fields[name + TRANSFORM]
+        statuses = sequence.fields.get(name + TRANSFORM + STATUS, {})
+        dropped: dict[str, list[int]] = {}
+        rows, frames = [], []
+        for frame in sorted(texts):
+            status = statuses.get(frame, GOOD)
+            matrix = _matrix(texts[frame])
+            if status.lower() != GOOD:
+                dropped.setdefault(f"{name}{TRANSFORM}{STATUS} is {printable(status, 20)}", []).append(frame)
+            elif frame not in times:
+                dropped.setdefault(f"they have no {TIME}", []).append(frame)
+            elif matrix is None:
+                dropped.setdefault(f"{name}{TRANSFORM} is not 16 numbers", []).append(frame)
+            else:
+                rows.append([times[frame], *matrix])
+                frames.append(frame)
+        values, numbers = np.array(rows).reshape(-1, 17), np.array(frames, np.int64)
+        _, stated_in = _ends(name)
+        table = Table(
+            path, HEADER, values, numbers, stream=name, record="frame", stated_in=stated_in, meaning=_meaning(name)
+        )
+        notes = [
+            f"{table.title}: {len(left)} frame{'' if len(left) == 1 else 's'} dropped: {why} ({table.list_rows(left)})"
+            for why, left in dropped.items()
+        ]
+        if not rows:
+            why = next(iter(dropped))
+            raise NeecoError(f"{table.where}: no frame can be used: {why}; record again, or name another transform")
+        return replace(table, notes=tuple(notes))
+
+    def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
+        sequence = _sequence_of(path)
+        choose_stream(path, self.streams(path), stream, (IMAGES,))
+        frames, notes = _image_frames(sequence)
+        times = _times(sequence)
+        seconds = np.array([times[frame] for frame in frames])
+        return SequenceImages(path, sequence.size, tuple(notes), seconds, sequence, tuple(frames))
+
+
+def _sequence_of(path: Path) -> FrameSequence:
+    path = Path(path)
+    require_content(path)
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise NeecoError(f"{path}: cannot read: {error.strerror or error}; correct the path") from None
+    return _cached(path, state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def _cached(path: Path, size: int, changed: int) -> FrameSequence:
+    return read_sequence(path)
+
+
+def _transforms(sequence: FrameSequence) -> list[str]:
+    names = [name.removesuffix(TRANSFORM) for name in sequence.fields if name.endswith(TRANSFORM)]
+    return sorted(name for name in names if _ENDS.fullmatch(name))
+
+
+def _ends(name: str) -> tuple[str, str]:
+    """What a transform maps from and to: Stylus and Tracker of StylusToTracker."""
+    match = _ENDS.fullmatch(name)
+    assert match is not None
+    return match[1], match[2]
+
+
+def _meaning(name: str) -> NamedFrame:
+    """What the frame is that a transform maps to."""
+    body, frame = _ends(name)
+    return meaning_of(frame, dvrk=of_dvrk(body))
+
+
+def _stamps(sequence: FrameSequence) -> dict[int, float]:
+    """PLUS's timestamps s, by frame."""
+    found = {frame: parse_number(text) for frame, text in sequence.fields.get(TIME, {}).items()}
+    stamps = {frame: stamp for frame, stamp in found.items() if stamp is not None and np.isfinite(stamp)}
+    if not stamps:
+        raise NeecoError(f"{sequence.path}: {TIME}: no frame has one (Seq_Frame0000_{TIME}); record again")
+    return stamps
+
+
+def _image_frames(sequence: FrameSequence) -> tuple[list[int], list[str]]:
+    """The frames whose images can be used, in order, and notes on the others."""
+    stamps = _stamps(sequence)
+    statuses = next((sequence.fields[name] for name in IMAGE_STATUSES if name in sequence.fields), {})
+    bad = [frame for frame in range(sequence.count) if statuses.get(frame, GOOD).lower() != GOOD]
+    invalid, frames, unstamped, latest = set(bad), [], 0, -np.inf
+    for frame in range(sequence.count):
+        if frame in invalid:
+            continue
+        stamp = stamps.get(frame, -np.inf)
+        if stamp <= latest:
+            unstamped += 1
+            continue
+        frames.append(frame)
+        latest = stamp
+    name, notes = sequence.path.name, []
+    if bad:
+        notes.append(f"{name}: {len(bad)} images are not OK and left out")
+    if unstamped:
+        notes.append(f"{name}: {unstamped} images have no {TIME} later than the one before; left out")
+    return frames, notes
+
+
+def _too_few(sequence: FrameSequence, frames: Sequence[int], notes: Sequence[str]) -> str:
+    """Why the images cannot be used, of which only these frames are good."""
+    why = f" ({notes[0].partition(': ')[2]})" if notes else ""
+    return f"{len(frames)} of {sequence.count} images can be used{why}; record again"
+
+
+def _times(sequence: FrameSequence) -> dict[int, float]:
+    """Times s by frame, from the first usable image on where there are images."""
+    stamps = _stamps(sequence)
+    frames = _image_frames(sequence)[0] if sequence.has_images else []
+    first = stamps[frames[0]] if frames else 0.0
+    return {frame: stamp - first for frame, stamp in stamps.items()}
+
+
+def _rate(times: dict[int, float], count: int) -> float | None:
+    span = max(times.values()) - min(times.values())
+    return (count - 1) / span if span > 0 and count > 1 else None
+
+
+def _matrix(text: str) -> Sequence[float] | None:
+    """16 numbers, row by row."""
+    numbers = [parse_number(word) for word in text.split()]
+    if len(numbers) != 16 or any(number is None or not np.isfinite(number) for number in numbers):
+        return None
+    return [number for number in numbers if number is not None]

@@ -1,0 +1,206 @@
+"""SurgPose trajectories: poses and joints of the dVRK's arms in YAML, stereo videos and their calibration.
+
+One row of the YAML files belongs to each frame of the videos at 30 frames a second; positions are m and angles rad, in
+each arm's own base frame, a few mm and degrees off the camera's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neeco.capture.documents import as_float, printable
+from neeco.errors import NeecoError
+from neeco.files import FastYamlLoader, parse_yaml, read_text, visible_entries
+from neeco.geometry.lens import Lens
+from neeco.ingest.calibration.stereo import read_stereo
+from neeco.ingest.readers import (
+    HUGE,
+    IMAGES,
+    OTHER,
+    POSES,
+    READINGS,
+    RecordingFormat,
+    Stream,
+    Table,
+    VideoSource,
+    choose_stream,
+    compare_lengths,
+)
+from neeco.ingest.readers.logs import WRONG_ROWS
+from neeco.ingest.readers.video import open_images, open_video
+
+POSE_FILE, JOINT_FILE = "api_cp_data.yaml", "api_jp_data.yaml"
+FRAMES_PER_SECOND = 30.0
+LARGEST_FILE = 1 << 26  # bytes; 1000 frames of two arms are 1 MB
+JOINTS_BEHIND = "_joints"  # the stream's name, after the arm's
+JOINT_NAMES = ("yaw_rad", "pitch_rad", "insertion_m", "roll_rad", "wrist_pitch_rad", "wrist_yaw_rad", "jaw_rad")
+WRIST = (("wrist_pitch", "wrist_pitch_rad"), ("wrist_yaw", "wrist_yaw_rad"), ("jaw", "jaw_rad"))
+POSE_HEADER = ("t_s", *(f"m{row}{column}{'_m' if column == 3 else ''}" for row in range(3) for column in range(4)))
+LIGHTS = ("regular", "", "green")  # folders of the videos; what is green shows the ultraviolet paint
+
+
+@dataclass(frozen=True, eq=False)  # it holds arrays
+class _Arms:
+    """rows [T, 12] of poses (3x4 by rows) and [T, J] of joints by arm, and the frames [T] they belong to."""
+
+    poses: dict[str, tuple[np.ndarray, np.ndarray]]
+    joints: dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+class SurgPose(RecordingFormat):
+    """A trajectory's folder. A stream is an arm (`PSM1`), its joints (`PSM1_joints`) or a video."""
+
+    format = "SurgPose"
+    holds = "poses and joints of arms, stereo videos, calibration: folders with api_cp_data.yaml"
+
+    def claims(self, path: Path) -> bool:
+        return (path / POSE_FILE).is_file() and path.is_dir()
+
+    def streams(self, path: Path) -> tuple[Stream, ...]:
+        arms = _read(path)
+        videos = _videos(path)
+        count = max(len(frames) for frames, _ in arms.poses.values())
+        # the left camera's are the frames; others are listed
+        found = [
+            Stream(name, IMAGES, "video", count, FRAMES_PER_SECOND, offered=number == 0)
+            for number, name in enumerate(videos)
+        ]
+        for name, (frames, _) in sorted(arms.poses.items()):
+            hints = ("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit",)
+            found.append(Stream(name, POSES, "poses", len(frames), FRAMES_PER_SECOND, body=name, hints=hints))
+        for name, (frames, values) in sorted(arms.joints.items()):
+            wrist = tuple(joint for joint in WRIST if joint[1] in JOINT_NAMES[: values.shape[1]])
+            title = f"{name}{JOINTS_BEHIND}"
+            found.append(Stream(title, READINGS, "joints", len(frames), FRAMES_PER_SECOND, body=name, joints=wrist))
+        labels = sorted(file.name for file in path.glob("keypoints_*.yaml"))
+        return (*found, *(Stream(name, OTHER, "labels", count) for name in labels))
+
+    def read(self, path: Path, stream: str | None = None) -> Table:
+        arms = _read(path)
+        chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS))
+        if chosen.kind == POSES:
+            (frames, values), header = arms.poses[chosen.name], POSE_HEADER
+        else:
+            frames, values = arms.joints[chosen.name.removesuffix(JOINTS_BEHIND)]
+            header = ("t_s", *JOINT_NAMES[: values.shape[1]])
+        rows = np.column_stack([frames / FRAMES_PER_SECOND, values])
+        stated_in = f"{chosen.name}_base" if chosen.kind == POSES else None
+        return Table(path, header, rows, frames, stream=chosen.name, record="frame", stated_in=stated_in)
+
+    def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
+        name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        file = path / name
+        video = open_images(file, FRAMES_PER_SECOND) if file.is_dir() else open_video(file)
+        states = max(int(frames[-1]) + 1 for frames, _ in _read(path).poses.values())
+        notes = compare_lengths(file, video, states, FRAMES_PER_SECOND)
+        return replace(video, notes=(*video.notes, *notes))
+
+    def lens(self, path: Path, stream: str | None = None) -> Lens | None:
+        name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        calibrations = visible_entries(path, "*.ini")
+        if len(calibrations) != 1:
+            return None
+        left, right, _ = read_stereo(calibrations[0])
+        return right if "right" in Path(name).name else left
+
+
+def _videos(path: Path) -> list[str]:
+    """Videos, or folders of their frames, the left one in usual light first."""
+    found = []
+    for light in LIGHTS:
+        for side in ("left", "right"):
+            for name in (f"{side}_video.mp4", f"{side}_video", f"{side}_frames"):
+                if (path / light / name).exists():
+                    found.append((Path(light) / name).as_posix())
+                    break
+    return found
+
+
+def _read(path: Path) -> _Arms:
+    states = []
+    for name in (POSE_FILE, JOINT_FILE):
+        file = path / name
+        if name == JOINT_FILE and not file.exists():
+            continue  # poses can be used without joints
+        try:
+            state = file.stat()
+        except OSError as error:
+            raise NeecoError(f"{file}: cannot read: {error.strerror or error}; put the trajectory's there") from None
+        if state.st_size > LARGEST_FILE:
+            raise NeecoError(f"{file}: is {state.st_size >> 20} MB large, beyond all measure; give one trajectory")
+        states += [state.st_size, state.st_mtime_ns]
+    return _cached(path, tuple(states))
+
+
+@lru_cache(maxsize=2)
+def _cached(path: Path, state: tuple[int, ...]) -> _Arms:
+    poses = _by_arm(path / POSE_FILE, _pose, "R (3x3) and t")
+    joints = {}
+    if (path / JOINT_FILE).exists():
+        joints = _by_arm(path / JOINT_FILE, _joints, "six or seven joints")
+    return _Arms(poses, joints)
+
+
+def _by_arm(file: Path, parse: Any, expected: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Frames [T] and rows [T, C] of each arm, from {frame: {arm: values}}."""
+    document = parse_yaml(file, read_text(file, "states by frame"), "copy it again", FastYamlLoader)
+    if not isinstance(document, dict) or not document:
+        raise NeecoError(f"{file}: expected states by frame, as in '0': {{PSM1: ...}}; copy it again")
+    found: dict[str, list[tuple[int, Sequence[float] | None]]] = {}
+    for key, arms in document.items():
+        frame = _frame(file, key)
+        if not isinstance(arms, dict):
+            raise NeecoError(f"{file}: frame {frame}: expected the state of each arm; copy it again")
+        for arm, value in arms.items():
+            found.setdefault(str(arm), []).append((frame, parse(value)))
+    tables = {}
+    for arm, rows in found.items():
+        rows.sort(key=lambda row: row[0])
+        bad = [frame for frame, row in rows if row is None]
+        if len(bad) > WRONG_ROWS * len(rows):
+            raise NeecoError(f"{file}: frame {bad[0]}: {printable(arm)}: expected {expected}; copy it again")
+        lengths = {len(row) for _, row in rows if row is not None}
+        if len(lengths) > 1:
+            raise NeecoError(f"{file}: {printable(arm)}: has more joints in some frames than in others; copy it again")
+        values = np.array([row or [np.nan] * min(lengths) for _, row in rows])  # as a table has what is missing
+        values[~(np.abs(values) < HUGE)] = np.nan  # which is how a table says that a value is missing
+        tables[arm] = (np.array([frame for frame, _ in rows], np.int64), values)
+    if not tables:
+        raise NeecoError(f"{file}: holds no arm's states; copy it again")
+    return tables
+
+
+def _frame(file: Path, key: Any) -> int:
+    text = str(key)
+    if not (text.isascii() and text.isdigit() and len(text) <= 9):
+        raise NeecoError(f"{file}: {printable(key)} is no number of a frame; copy it again")
+    return int(text)
+
+
+def _pose(value: Any) -> list[float] | None:
+    """R and t as 12 numbers, row by row."""
+    if not isinstance(value, dict):
+        return None
+    turn, shift = _flat(value.get("R")), _flat(value.get("t"))
+    if turn is None or shift is None or len(turn) != 9 or len(shift) != 3:
+        return None
+    return [*turn[0:3], shift[0], *turn[3:6], shift[1], *turn[6:9], shift[2]]
+
+
+def _joints(value: Any) -> list[float] | None:
+    numbers = _flat(value)
+    return numbers if numbers is not None and len(numbers) in (6, 7) else None
+
+
+def _flat(value: Any) -> list[float] | None:
+    if not isinstance(value, list):
+        return None
+    flat = [entry for item in value for entry in (item if isinstance(item, list) else [item])]
+    numbers = [as_float(entry) for entry in flat]
+    return None if None in numbers else [number for number in numbers if number is not None]

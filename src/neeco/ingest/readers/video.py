@@ -1,0 +1,372 @@
+"""Where the frames come from: a video file in any format ffmpeg reads, or a folder of images."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neeco.capture.images import open_image
+from neeco.errors import NeecoError
+from neeco.files import require_content, visible_entries
+from neeco.ingest.readers import VideoSource, numbers, read_table
+from neeco.ingest.readers.columns import recognise_time, scale_of
+
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+MIN_IMAGES = 2
+SQUARE = 0.005  # by which a square pixel's width and height may differ: 1 px of 200
+MAX_RATE = 1000.0  # frames a second, beyond which a file's own number is no rate
+MAX_LEFT_OUT = 0.1  # of a folder's images (or one): more that are missing or of another size are no slip
+SAME_RATE = 2e-4  # relative difference of frame rates that is none
+
+
+def require_installed(name: str) -> None:
+    """Raise NeecoError saying what to install when `name` ("av", "pycolmap") is absent; imports nothing."""
+    if importlib.util.find_spec(name) is None:
+        raise NeecoError("ingest: needs PyAV and pycolmap; pip install 'neeco[ingest]'")
+
+
+def open_video(path: Path, fps: float | None = None, part: tuple[float, float] | None = None) -> VideoSource:
+    """A video file, or the part of it from one time s to another, without it. Its frames are decoded once to find
+    those that can be, with their own times (`fps`: overrides them). What is damaged is left out and noted; raises
+    NeecoError when nothing can be read."""
+    path = Path(path)
+    require_content(path)
+    if not path.is_file():
+        raise NeecoError(f"{path}: {'is a folder; give it as images' if path.is_dir() else 'no such file'}")
+    scan = _Scan(path, part=part).run()
+    if scan.failure or scan.corrupt:
+        # decoding frames in parallel, which of the damaged ones are given up differs from run to run
+        scan = _Scan(path, threads="SLICE", part=part).run()
+    return scan.finish(fps)
+
+
+def open_images(folder: Path, fps: float | None = None, times: Path | None = None) -> VideoSource:
+    """A folder of images, ordered by name (2 before 10), at `fps` or at the times of a CSV file: one column of times,
+    and perhaps one of file names. Images that cannot be read, are of another size than nearly all, or are listed and
+    not there are left out and noted; at `fps`, a gap in their names' numbers is one in time. Raises NeecoError."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise NeecoError(f"{folder}: {'is a file; give a folder of images' if folder.exists() else 'no such folder'}")
+    folder = folder if folder.name else folder.resolve()  # "." says nothing in a message
+    files = sorted((file for file in visible_entries(folder) if file.suffix.lower() in IMAGES), key=_natural_order)
+    if len(files) < MIN_IMAGES:
+        raise NeecoError(f"{folder}: holds {len(files)} images; expected frames as {', '.join(IMAGES[:3])} files")
+    notes: list[str] = []
+    if times is not None:
+        files, stamps = _image_times(folder, files, Path(times), notes)
+    elif fps is not None:
+        stamps = _numbered(folder, files, notes) / fps
+    else:
+        raise NeecoError(f"{folder}: when were the images taken? Give fps, or a CSV file of times, in the recording")
+    sizes: list[tuple[int, int] | None] = []
+    for file in files:
+        try:
+            sizes.append(open_image(file).size)
+        except NeecoError:
+            sizes.append(None)
+    known = Counter(size for size in sizes if size is not None)
+    if known.total() < MIN_IMAGES:
+        raise NeecoError(f"{folder}: {known.total()} of {len(files)} images can be read; replace the damaged files")
+    size, count = known.most_common(1)[0]
+    other = [file for file, found in zip(files, sizes, strict=True) if found not in (None, size)]
+    if not _are_few(len(other), count):
+        listed = " and ".join("x".join(map(str, found)) for found, _ in known.most_common(2))
+        raise NeecoError(f"{other[0]}: the images of this folder are {listed}; give images of one size")
+    bad = [file for file, found in zip(files, sizes, strict=True) if found is None]
+    notes += _left_out(folder, "cannot be read", bad) + _left_out(folder, "are of another size", other)
+    usable = [index for index, found in enumerate(sizes) if found == size]
+    return _Images(folder, size, tuple(notes), stamps[usable], tuple(files[i] for i in usable))
+
+
+def _are_few(count: int, total: int) -> bool:
+    return count <= max(1, MAX_LEFT_OUT * total)
+
+
+def _left_out(folder: Path, why: str, files: Sequence[Path]) -> list[str]:
+    names = ", ".join(file.name for file in files[:3])
+    return [f"{folder.name}: {len(files)} images {why} and are left out ({names})"] if files else []
+
+
+def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarray:
+    """Which place in time each image has, [N] from 0: by the last number in its name, where nearly all names are alike
+    but for it and count on evenly, else by its place in the folder."""
+    places = np.arange(len(files))
+    parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", file.stem) for file in files]
+    if any(part is None for part in parts) or len({(part[1], part[3]) for part in parts if part}) != 1:
+        return places
+    numbers = np.array([int(part[2]) for part in parts if part])
+    steps = np.diff(numbers)
+    step = max(Counter(steps.tolist()).items(), key=lambda item: item[1])[0]
+    if step <= 0 or steps.min() < step or (steps % step).any() or not _are_few(int((steps != step).sum()), len(steps)):
+        return places
+    places = (numbers - numbers[0]) // step
+    missing = int(places[-1]) + 1 - len(files)
+    if missing:
+        first = files[int(np.flatnonzero(steps != step)[0])].name
+        notes.append(
+            f"{folder.name}: {missing} images are missing by their numbers (first after {first}); a gap in time"
+        )
+    return places
+
+
+@dataclass(frozen=True)
+class _Images(VideoSource):
+    files: tuple[Path, ...]
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        for index in sorted({int(i) for i in indices}):
+            try:
+                pixels = np.array(open_image(self.files[index]).convert("RGB"))
+            except NeecoError as error:
+                raise NeecoError(f"{self.files[index]}: cannot be read any more; do not change the images") from error
+            yield index, pixels
+
+
+@dataclass(frozen=True)
+class _Video(VideoSource):
+    stamps: tuple[int, ...]  # of each frame, in the stream's time base; or its number where the stream has no stamps
+    numbered: bool
+    threads: str
+    part: tuple[float, float] | None = None
+    stated_fps: float | None = None
+
+    @property
+    def own_fps(self) -> float | None:
+        return self.stated_fps
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        wanted = {self.stamps[int(index)]: int(index) for index in indices}
+        for number, frame in enumerate(_Scan(self.path, self.threads, self.part).decoded()):
+            if not wanted:
+                return
+            index = wanted.pop(number if self.numbered else frame.pts, None)
+            if index is not None:
+                yield index, _rgb(frame)
+        if wanted:
+            raise NeecoError(f"{self.path}: frame {min(wanted.values())} can no longer be read; do not change the file")
+
+
+@dataclass
+class _Scan:
+    """One pass over a video's frames."""
+
+    path: Path
+    threads: str = "AUTO"
+    part: tuple[float, float] | None = None
+    stamps: list[int | None] = field(default_factory=list)
+    size: tuple[int, int] | None = None
+    rate: float | None = None
+    time_base: float | None = None
+    failure: str | None = None
+    corrupt: int = 0
+    interlaced: bool = False
+    turned: int = 0
+    pixel_aspect: float = 1.0
+    others: tuple[str, ...] = ()  # sizes of the video streams besides the one that is read
+    promised: int = 0  # frames the file's header speaks of
+
+    def decoded(self) -> Iterator[Any]:
+        """Frames as far as they can be decoded; damaged ones are counted and left out."""
+        require_installed("av")
+        import av
+        from av.stream import Disposition
+
+        try:
+            container = av.open(str(self.path))
+        except (av.error.FFmpegError, OSError, ValueError) as error:
+            raise NeecoError(
+                f"{self.path}: cannot be opened as a video ({_reason(error)}); give an intact video file"
+            ) from None
+        with container:
+            if not container.streams.video:
+                raise NeecoError(f"{self.path}: holds no video stream; give the recording's video")
+            # what players show as a file's cover is a video stream, too
+            films = [film for film in container.streams.video if not film.disposition & Disposition.attached_pic]
+            stream, *others = films or container.streams.video
+            self.others = tuple(f"{film.width}x{film.height}" for film in others)
+            aspect = float(stream.sample_aspect_ratio or 1)
+            self.pixel_aspect = 1.0 if abs(aspect - 1) < SQUARE else aspect
+            stream.thread_type = self.threads
+            self.promised = int(stream.frames or 0)
+            self.rate = float(stream.average_rate) if stream.average_rate else None
+            self.time_base = float(stream.time_base) if stream.time_base else None
+            first, last = self._bounds(stream)
+            if first is not None:
+                with suppress(av.error.FFmpegError):  # of a damaged index: then from the film's beginning on
+                    container.seek(first, stream=stream)  # to the key frame before it
+            packets = container.demux(stream)
+            while True:
+                try:
+                    packet = next(packets)
+                    frames = packet.decode()
+                except StopIteration:
+                    return
+                except (av.error.FFmpegError, ValueError) as error:
+                    self.failure = self.failure or _reason(error)
+                    if isinstance(error, av.error.EOFError) or self.corrupt > 1000:
+                        return
+                    self.corrupt += 1
+                    continue
+                for frame in frames:
+                    if first is not None and (frame.pts is None or frame.pts < first):
+                        continue
+                    if last is not None and frame.pts is not None and frame.pts >= last:
+                        return
+                    if frame.is_corrupt:
+                        self.corrupt += 1
+                    else:
+                        yield frame
+
+    def _bounds(self, stream: Any) -> tuple[int | None, int | None]:
+        """The part's first stamp and the one that ends it, in the stream's time base: half a frame early, as times in
+        other files are rounded."""
+        if self.part is None or not self.time_base:
+            return None, None
+        early = 0.5 / self.rate if self.rate else 0.0
+        begin = stream.start_time or 0
+        first, last = (begin + round((time - early) / self.time_base) for time in self.part)
+        return first, last
+
+    def run(self) -> _Scan:
+        """Decode all frames. Raises NeecoError when the file cannot be opened or its frames differ in size."""
+        for frame in self.decoded():
+            size = (frame.width, frame.height)
+            if self.size not in (None, size):
+                raise NeecoError(f"{self.path}: changes from {self.size} to {size} pixels midway; cut it there")
+            self.size = size
+            self.stamps.append(frame.pts)
+            self.interlaced |= bool(frame.interlaced_frame)
+            self.turned = self.turned or int(getattr(frame, "rotation", 0) or 0)
+        return self
+
+    def finish(self, fps: float | None) -> _Video:
+        if self.size is None or len(self.stamps) < MIN_IMAGES:
+            why = f" ({self.failure})" if self.failure else ""
+            raise NeecoError(f"{self.path}: {len(self.stamps)} frames can be decoded{why}; give an intact video file")
+        notes = self._notes()
+        stamps = [stamp for stamp in self.stamps if stamp is not None]
+        order = sorted(set(stamps))
+        if len(stamps) == len(self.stamps) and self.time_base and len(order) > 0.9 * len(stamps):
+            times = (np.array(order, dtype=np.float64) - order[0]) * self.time_base
+            own = None
+            if fps is not None:
+                own = _another_rate(1 / float(np.median(np.diff(times))), fps)
+                times = np.arange(len(order)) / fps
+            if own is not None:
+                notes.append(f"{self.path.name}: says itself {own:.4g} frames a second, the recording {fps:g}")
+            if len(order) < len(stamps):
+                notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
+            return self._video(notes, times, tuple(order), False, own)
+        rate = fps or self.rate
+        if not rate or rate > MAX_RATE:
+            raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
+        if fps is None:
+            notes.append(f"{self.path.name}: its frames have no times; taken as {rate:g} a second")
+        count = len(self.stamps)
+        times = np.arange(count) / rate
+        return self._video(notes, times, tuple(range(count)), True)
+
+    def _video(
+        self,
+        notes: list[str],
+        times: np.ndarray,
+        stamps: tuple[int, ...],
+        numbered: bool,
+        stated_fps: float | None = None,
+    ) -> _Video:
+        assert self.size is not None
+        return _Video(
+            self.path, self.size, tuple(notes), times, stamps, numbered, self.threads, self.part, stated_fps,
+            pixel_aspect=self.pixel_aspect,
+        )  # fmt: skip
+
+    def _notes(self) -> list[str]:
+        notes, read = [], len(self.stamps)
+        if self.failure or self.corrupt:
+            what = f"{self.failure or 'corrupt frames'}; {read} frames could be read, the others are left out"
+            notes.append(f"{self.path.name}: is damaged: {what}")
+        elif self.promised > read and self.part is None:
+            notes.append(f"{self.path.name}: ends early: {read} of {self.promised} frames are there")
+        if self.others:
+            several = (
+                f"holds {1 + len(self.others)} video streams; the first is read (others: {', '.join(self.others)})"
+            )
+            notes.append(f"{self.path.name}: {several}; copy another into a file of its own: ffmpeg -map 0:v:1 -c copy")
+        if self.pixel_aspect != 1:
+            shape = f"are not square ({self.pixel_aspect:.3g} times as wide as high); its frames are used as stored"
+            notes.append(f"{self.path.name}: its pixels {shape}, so fl_x / fl_y is {1 / self.pixel_aspect:.3g}")
+        if self.interlaced:
+            notes.append(f"{self.path.name}: is interlaced; deinterlace it (ffmpeg -vf yadif) for sharper frames")
+        if self.turned:
+            notes.append(f"{self.path.name}: says to be turned by {self.turned} degrees; its frames are used as stored")
+        return notes
+
+
+def _another_rate(own: float, fps: float) -> float | None:
+    """A file's own frame rate where it is another than the one stated."""
+    return None if abs(own / fps - 1) < SAME_RATE else own
+
+
+def _rgb(frame: Any) -> np.ndarray:
+    """uint8 [H, W, 3]. The converter's quick default is over one level too dark, so it is asked for exact rounding."""
+    from av.video.reformatter import Interpolation
+
+    exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.BITEXACT
+    return frame.to_ndarray(format="rgb24", interpolation=exact)
+
+
+def _reason(error: BaseException) -> str:
+    text = getattr(error, "strerror", None) or str(error)
+    return " ".join(str(text).split())[:100] or type(error).__name__
+
+
+def _natural_order(file: Path) -> list[tuple[int, int, str]]:
+    """Sorts frame2 before frame10."""
+    parts = re.split(r"(\d+)", file.name.lower())
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
+
+
+def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[str]) -> tuple[list[Path], np.ndarray]:
+    """The files a table of times names (all of them, in order, when it names none) and their times [N] s."""
+    table = read_table(table_path)
+    found = recognise_time(table.header)
+    column = found.time[0] if found.time else table.header[0] if len(table.header) == 1 else None
+    if column is None:
+        raise NeecoError(f"{table_path}: header: no column of times found; call one t_s")
+    scale = scale_of(table_path, (column,), "time", None, found.time_unit, "")
+    values, missing, bad = numbers(table, (column,))
+    wrong = [*[row for row, _ in bad], *np.flatnonzero(missing)]
+    if wrong:
+        raise NeecoError(f"{table_path}: line {table.lines[min(wrong)]}: {column}: no time; repair or remove the line")
+    times, rows_used = values[:, 0] * scale, list(range(len(values)))
+    by_name = {file.name: file for file in files} | {file.stem: file for file in files}
+    for index in range(len(table.header)):
+        cells = [Path(row[index]).name if index < len(row) else "" for row in table.rows]
+        if sum(cell in by_name for cell in cells) > 0.5 * len(cells):
+            there = [row for row, cell in enumerate(cells) if cell in by_name]
+            absent = [folder / cell for cell in cells if cell not in by_name]
+            if not _are_few(len(absent), len(cells)):
+                row = next(row for row, cell in enumerate(cells) if cell not in by_name)
+                raise NeecoError(
+                    f"{table_path}: line {table.lines[row]}: {cells[row]!r} is not in {folder.name} ({len(absent)} of "
+                    f"{len(cells)} like it); correct the names"
+                )
+            notes += _left_out(folder, "are listed and not there", absent)
+            files, times, rows_used = [by_name[cells[row]] for row in there], times[there], there
+            break
+    else:
+        if len(times) != len(files):
+            raise NeecoError(f"{table_path}: has {len(times)} times for {len(files)} images; add a column of names")
+    falling = np.flatnonzero(np.diff(times) <= 0)
+    if len(falling):
+        line = table.lines[rows_used[falling[0] + 1]]
+        raise NeecoError(f"{table_path}: line {line}: {column} does not increase; sort the rows")
+    return files, times

@@ -1,0 +1,1 @@
+"""What a recording consists of: recording.yaml and the files it names."""

@@ -1,0 +1,394 @@
+"""`neeco ingest --init`: a commented recording.yaml, by looking at the files in a folder."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from neeco.errors import NeecoError
+from neeco.files import placeholder, read_json, require_content
+from neeco.ingest.calibration.lens import read_lens
+from neeco.ingest.readers import IMAGES as IMAGE_STREAMS
+from neeco.ingest.readers import POSES, READINGS, Stream, format_of, read_table
+from neeco.ingest.readers.columns import (
+    MATRIX,
+    PoseColumns,
+    RecognisedColumns,
+    recognise_pose,
+    recognise_time,
+    recognise_value,
+    split_unit,
+)
+from neeco.ingest.readers.frame_names import without_frame
+from neeco.ingest.readers.logs import with_named_frame
+from neeco.ingest.readers.ndi import tool_columns, tool_names
+from neeco.ingest.readers.video import IMAGES
+
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts", ".wmv", ".mxf")
+MAX_FILES = 400  # looked at; a folder with more is not one recording
+MIN_IMAGES = 10  # in a folder of frames
+MAX_CALIBRATION_ROWS = 200
+MAX_OTHERS = 60  # listed as not used
+_EPISODES = re.compile(r"episodes (\d+) to (\d+)")
+_SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class _Log:
+    """A log: its file, relative to the folder, and which stream of it; body: what it is of, hints: lines on it, asks:
+    keys that nothing answers, clock: of its times, where the format says so; is_whole: are all columns the body's?
+    tool: which of several in an NDI export."""
+
+    file: str
+    stream: str | None = None
+    body: str | None = None
+    hints: tuple[str, ...] = ()
+    asks: tuple[str, ...] = ()
+    clock: str | None = None
+    is_whole: bool = True
+    tool: str | None = None
+
+    @property
+    def stem(self) -> str:
+        """What it may be called."""
+        return without_frame(self._name)
+
+    @property
+    def _name(self) -> str:
+        if self.body is not None:
+            return self.body
+        if self.tool is not None:
+            name = re.sub(r"[^A-Za-z0-9]+", "_", self.tool).strip("_")
+            return name if name[:1].isalpha() else f"tool_{name}"
+        return Path(self.file).stem if self.stream is None else re.sub(r"[^A-Za-z0-9]+", "_", self.stream).strip("_")
+
+    def lines(self) -> list[str]:
+        given = [("file", self.file), ("stream", self.stream), ("tool", self.tool)]
+        return [f"{key}: {_scalar(value)}" for key, value in given if value is not None]
+
+
+@dataclass
+class _FolderFiles:
+    """What the files of a folder seem to be, as paths relative to it. others: what there is, too, in words."""
+
+    videos: list[_Log] = field(default_factory=list)
+    images: list[str] = field(default_factory=list)
+    lenses: list[str] = field(default_factory=list)
+    syncs: list[str] = field(default_factory=list)
+    poses: list[tuple[_Log, RecognisedColumns]] = field(default_factory=list)
+    joints: list[tuple[_Log, RecognisedColumns, str, str | None]] = field(default_factory=list)
+    calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
+    others: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)  # of others, those that cannot be read
+    image_problems: list[str] = field(default_factory=list)  # of these, those that may be of images
+    episodes: str | None = None  # of a data set that holds several, "0-9"
+
+    def leave_out(self, what: str, why: str = "", images: bool = False) -> None:
+        """List something as not used. why: what is wrong with it, where anything is; images: may they be in it?"""
+        line = " ".join((f"{what}: {why}" if why else what).split())
+        line = "".join(sign if sign.isprintable() else "?" for sign in line)
+        self.others.append(line)
+        self.problems += [line] if why else []
+        self.image_problems += [line] if why and images else []
+
+
+def write_template(source: Path, report: Callable[[str], None] = lambda problem: None) -> str:
+    """The text of a recording.yaml for the files in a folder and its subfolders, or for one file or folder that holds
+    several streams, to stand beside it; `read_recording` accepts it. report: is told of what cannot be read, which is
+    left out.
+
+    Raises NeecoError when there are no images.
+    """
+    source = Path(source)
+    known = format_of(source)
+    if known is not None and source.exists():
+        known.require_package(source)
+    require_content(source)
+    if source.is_file() and (known is None or not known.streams(source)):
+        raise NeecoError(f"{source}: is a file of no format that holds images and logs; give the recording's folder")
+    if not source.exists():
+        raise NeecoError(f"{source}: not there; give the recording's folder")
+    found = _find_files(source)
+    if not found.videos and not found.images:
+        if found.image_problems:
+            first, *rest = found.image_problems
+            first, more = first.removeprefix(f"{source.name}: "), f" (and {len(rest)} more)" if rest else ""
+            raise NeecoError(f"{source}: holds no images that can be read: {first}{more}")
+        raise NeecoError(f"{source}: holds no video and no folder of images; put the recording's video there")
+    for problem in found.problems:
+        report(problem)
+    frames = [_frames_line(log) for log in found.videos]
+    frames += [f"images: {{folder: {_scalar(folder)}, fps: 25}}" for folder in found.images]
+    if not found.videos:
+        frames[0] += "   # the rate is a guess: correct it"
+    poses = [(log, columns) for log, columns in found.poses if not _SCOPE.search(log.stem)]
+    scopes = [(log, columns) for log, columns in found.poses if _SCOPE.search(log.stem)]
+    environment = Environment(
+        loader=PackageLoader("neeco.ingest.recording", ""),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters["scalar"] = _scalar
+    return environment.get_template("recording.yaml.j2").render(
+        frames=frames,
+        lenses=found.lenses,
+        instruments=_instruments(found, poses),
+        scope=_pose_lines(*scopes[0]) if scopes else None,
+        scope_hints=scopes[0][0].hints if scopes else (),
+        other_scopes=[", ".join(log.lines()) for log, _ in scopes[1:]],
+        sync=next(iter(found.syncs), None),
+        others=found.others[:MAX_OTHERS],
+        episodes=found.episodes,
+        partner=next((line for line in frames[1:] if line.startswith(("video:", "images:"))), "video: right.mp4"),
+    )
+
+
+def holds_streams(source: Path) -> bool:
+    """Is the path a recording in itself (a bag, a data set's folder), rather than a folder of a recording's files?"""
+    return source.is_file() or format_of(source) is not None
+
+
+def _find_files(source: Path) -> _FolderFiles:
+    found = _FolderFiles()
+    if _add_streams(found, source, source.name):
+        return found
+    folder = source
+    for inner in sorted(entry for pattern in ("*", "*/*") for entry in folder.glob(pattern) if entry.is_dir()):
+        _add_streams(found, inner, inner.relative_to(folder).as_posix())
+    held = [folder / log.file for log in [*found.videos, *(log for log, _ in found.poses)]]
+    files = sorted(
+        file for pattern in ("*", "*/*") for file in folder.glob(pattern) if file.is_file() or placeholder(file)
+    )
+    files = [file for file in files if not any(part.startswith(".") for part in file.relative_to(folder).parts)]
+    files = [file for file in files if not any(other in file.parents for other in held)]
+    for parent, count in Counter(file.parent for file in files if file.suffix.lower() in IMAGES).items():
+        if count >= MIN_IMAGES:
+            found.images.append(parent.relative_to(folder).as_posix())
+    for file in [file for file in files if file.suffix.lower() not in IMAGES][:MAX_FILES]:
+        name, suffix = file.relative_to(folder).as_posix(), file.suffix.lower()
+        if problem := placeholder(file):
+            found.leave_out(name, problem, images=True)
+        elif suffix in VIDEOS:
+            found.videos.append(_Log(name))
+        elif format_of(file) is not None:
+            if not _add_streams(found, file, name):
+                _classify_table(found, _Log(name), file)
+        elif suffix == ".json" and _is_sync(file):
+            found.syncs.append(name)
+        elif suffix in (".yaml", ".yml", ".xml", ".json") and _is_lens(file):
+            found.lenses.append(name)
+    return found
+
+
+def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
+    """Add the streams of what holds several, and all of them as a list to choose from."""
+    known = format_of(path)
+    if known is None:
+        return False
+    try:
+        known.require_package(path)
+        streams = known.streams(path)
+    except NeecoError as error:
+        found.leave_out(name, _without_place(str(error), path, name), images=True)
+        return path.is_dir()
+    for stream in streams:
+        log = _Log(name, stream.name, stream.body, stream.hints, stream.asks, stream.clock, stream.columns is None)
+        used = stream.offered and stream.count > 0 and stream.problem is None
+        if used and stream.kind == IMAGE_STREAMS:
+            found.videos.append(log)
+        elif used and stream.kind in (POSES, READINGS):
+            try:
+                _classify_stream(found, log, stream, path)
+            except NeecoError as error:
+                found.leave_out(f"{name}: {stream.name}", _without_place(str(error), path, stream.name))
+        elif stream.problem is not None:
+            why, images = _without_place(stream.problem, path, stream.name), stream.kind == IMAGE_STREAMS
+            found.leave_out(f"{name}: {stream.name}", why, images)
+        else:
+            rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
+            found.leave_out(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}")
+            if (several := _EPISODES.fullmatch(stream.name)) and known.of_episode(stream.name, 0) is not None:
+                found.episodes = f"{several[1]}-{several[2]}"
+    return bool(streams)
+
+
+def _classify_stream(found: _FolderFiles, log: _Log, stream: Stream, path: Path) -> None:
+    table = read_table(path, stream.name)
+    when = recognise_time(table.header)
+    if stream.kind == POSES:
+        header = table.header if stream.columns is None else (*(when.time or ()), *stream.columns)
+        found.poses.append((log, recognise_pose(header)))
+        found.joints += [(log, when, column, joint) for joint, column in stream.joints or ()]
+        return
+    angles = [column for column in table.header if split_unit(column, "angle")[1]]  # every angle is a joint
+    named = [(None, column) for column in angles] if stream.joints is None else stream.joints
+    found.joints += [(log, when, column, joint) for joint, column in named]
+
+
+def _without_place(message: str, path: Path, name: str) -> str:
+    """A message without the file and the stream that it begins with."""
+    return message.removeprefix(f"{path}: ").removeprefix(f"{name}: ").replace(str(path), path.name)
+
+
+def _frames_line(log: _Log) -> str:
+    return f"video: {_scalar(log.file)}" if log.stream is None else f"video: {{{', '.join(log.lines())}}}"
+
+
+def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
+    name = log.file
+    try:
+        table = read_table(file)
+        meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
+    except NeecoError as error:
+        found.leave_out(name, _without_place(str(error), file, name))
+        return
+    if tools := tool_names(table):
+        for tool in tools:
+            try:
+                own = tool_columns(table, PoseColumns(file, tool=tool))
+            except NeecoError as error:
+                found.leave_out(f"{name}: {tool}", _without_place(str(error), file, name))
+                continue
+            found.poses.append((_Log(name, tool=tool), recognise_pose(own.header)))
+        return
+    pose = recognise_pose(table.header)
+    value, when = recognise_value(table.header)
+    columns = [column for column in table.header if column]
+    angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
+    if pose.rotation or "rotation" in pose.unclear:
+        if meaning is not None:
+            log = replace(log, hints=meaning.hints, asks=meaning.asks)
+        found.poses.append((log, pose))
+    elif value and when.time:
+        found.joints.append((log, when, value, None))
+    elif len(columns) == 2 and angles and not when.time and len(table.rows) <= MAX_CALIBRATION_ROWS:
+        found.calibrations.append((name, table.header))
+    elif not (when.time and len(columns) <= 2):
+        found.leave_out(f"{name}: columns {', '.join(columns[:10])[:100]}")
+
+
+def _is_sync(file: Path) -> bool:
+    with suppress(NeecoError):
+        document = read_json(file)
+        return isinstance(document, dict) and any(key == "clocks" or key.endswith("_minus_video_s") for key in document)
+    return False
+
+
+def _is_lens(file: Path) -> bool:
+    with suppress(NeecoError):
+        return read_lens(file) is not None
+    return False
+
+
+def _instruments(found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColumns]]) -> list[dict[str, Any]]:
+    """Name, lines of the pose log and (name, lines) of the joints of every instrument."""
+    if not poses and not found.joints:
+        return []
+    names = _unique([log.stem for log, _ in poses]) or ["instrument"]
+    # a joint's log belongs to the instrument of its body or that its name begins with, else to the first
+    owners = {
+        log: next((name for name in names if log.stem == name), None)
+        or next((name for name in names if log.stem.startswith(name.split("_")[0])), names[0])
+        for log, *_ in found.joints
+    }
+    instruments = []
+    for index, name in enumerate(names):
+        logs = [log for log in found.joints if owners[log[0]] == name]
+        joints = _unique([joint or _joint_name(log, value) for log, _, value, joint in logs])
+        instruments.append(
+            {
+                "name": name,
+                "poses": _pose_lines(*poses[index]) if poses else None,
+                "joints": [(joint, _joint_lines(found, *log[:3])) for joint, log in zip(joints, logs, strict=True)],
+                "hints": poses[index][0].hints if poses else (),
+            }
+        )
+    return instruments
+
+
+def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
+    of_length = (columns.rotation or ())[3:4] if columns.form == MATRIX else columns.position
+    clock = "em" if log.stream is None else log.clock
+    lines = [*log.lines(), *([f"clock: {clock}"] if clock else [])]
+    lines += [f"# {ask}" for ask in log.asks if not ask.startswith(" ")]
+    known_again = log.tool is not None or (log.stream is not None and log.is_whole)
+    if known_again and columns.time and of_length and columns.rotation:
+        return [*lines, *_unit_lines(columns, {"length": of_length})]  # recognised again when read
+    given = [
+        ("time", columns.time),
+        ("position", columns.position),
+        (columns.form or "", columns.rotation),
+        ("state", (columns.state,) if columns.state else None),
+    ]
+    known = [f"  {key}: {_list(names)}" for key, names in given if names and not (log.stream and key == "time")]
+    known += [f"  # {ask.strip()}" for ask in log.asks if ask.startswith(" ")]
+    lines += ["columns:", *known] if known else []
+    lines += ["  good: [OK]"] if columns.state else []
+    lines += [f"# columns: {what} is not clear: {why}" for what, why in columns.unclear.items()]
+    return lines + _unit_lines(columns, {"length": of_length})
+
+
+def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value: str) -> list[str]:
+    time = [f"  time: {_list(when.time)}"] if when.time and log.stream is None else []
+    lines = [*log.lines(), "columns:", *time, f"  value: {_scalar(value)}"]
+    stem = log.stem.lower()
+    tables = [name for name, header in found.calibrations if value in header]
+    tables += [name for name, _ in found.calibrations if Path(name).stem.lower().startswith(stem)]
+    if tables:
+        lines.append(f"calibration: {_scalar(tables[0])}")
+    elif log.stream is None:
+        lines.append("# calibration: table.csv   # of counts and angle_rad, where the values are counts")
+    lines += _unit_lines(when, {} if tables else {"angle": (value,)})
+    return [*lines, "# limits: [0, 1.5]   # rad, of the joint"]
+
+
+def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | None]) -> list[str]:
+    """A line asking for the units that neither the columns' names nor their format say."""
+    lines = []
+    if columns.counts_frames:
+        lines.append("rate_hz: 40   # time counts frames, and this rate is a guess: correct it")
+    elif columns.time is None:
+        lines.append("rate_hz: 40   # nothing says when its rows were taken, and this rate is a guess: correct it")
+    elif columns.time and len(columns.time) == 1 and not (columns.time_unit or split_unit(columns.time[0], "time")[1]):
+        wanted = {"time": columns.time} | wanted
+    implied = {"length": columns.length_unit}
+    unsaid = [
+        kind for kind, names in wanted.items() if names and not implied.get(kind) and not split_unit(names[0], kind)[1]
+    ]
+    if unsaid:
+        choices = {"time": "s", "length": "mm", "angle": "rad"}
+        values = ", ".join(f"{kind}: {choices[kind]}" for kind in unsaid)
+        lines.append(f"# units: {{{values}}}   # nothing says them: correct, and remove the #")
+    return lines
+
+
+def _joint_name(log: _Log, value: str) -> str:
+    if log.stream is not None:
+        return re.sub(r"[^A-Za-z0-9_]+", "_", split_unit(value, "angle")[0]).strip("_")
+    stem = re.sub(r"[^A-Za-z0-9_]+", "_", log.stem)
+    return stem if stem.endswith("angle") else f"{stem}_angle"
+
+
+def _unique(names: list[str]) -> list[str]:
+    return [name if names.index(name) == i else f"{name}_{names[:i].count(name) + 1}" for i, name in enumerate(names)]
+
+
+def _scalar(text: str) -> str:
+    """A name as YAML: in quotes where it needs them."""
+    words = ("yes", "no", "on", "off", "true", "false", "null")
+    plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_./\-]*", text) and text.lower() not in words
+    return text if plain else json.dumps(text)
+
+
+def _list(names: Sequence[str]) -> str:
+    return _scalar(names[0]) if len(names) == 1 else f"[{', '.join(_scalar(name) for name in names)}]"

@@ -1,0 +1,1 @@
+"""Where trackers, robots' bases and clocks stand to the cameras."""

@@ -1,0 +1,235 @@
+"""Tie what was recorded apart: the logs' clocks to the video's, and SfM's cameras to the tracker's frame.
+
+A clock (t_log = offset + rate * t_video) comes from motion that both saw. SfM knows the cameras up to a similarity; the
+tracker knows a sensor on the laparoscope, up to a constant hand-eye transform and its clock. All of it is solved at
+once, robustly:
+
+    world_from_sensor(offset + rate * t_i)  =  similarity(world_from_camera_sfm_i) @ camera_from_sensor
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from neeco.errors import NeecoError
+from neeco.ingest.readers.logs import PoseLog
+from neeco.ingest.recording.model import IngestSettings
+from neeco.ingest.timing.clock_search import SCOPE_MOTION, SURE, ClockOffset, clock_from_turning
+from neeco.ingest.timing.interpolate import poses_at
+
+MIN_FRAMES = 12
+MIN_TURN = 0.05  # rad, spread of the scope's directions below which the hand-eye rotation is not determined
+MIN_TRAVEL = 3.0  # mm, spread of the scope's positions below which the scale is not determined
+DRIFT_KNOT = 2.5  # s between the knots of the tracker's drift
+CORRELATED_S = 1.0  # over which residuals of neighbouring frames are correlated: smoothing and drift of the tracker
+LAG, STRETCH = 13, 14  # the unknowns of the clock
+UNKNOWNS = 15  # beside the drift: scale, rotation, origin, hand-eye rotation, lever, clock
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What ties the reconstruction to the tracker. Lengths mm, angles rad, times s."""
+
+    scale: float  # mm per SfM unit
+    rotation: np.ndarray  # [3, 3] world_from_sfm
+    translation: np.ndarray  # [3] mm
+    camera_from_sensor: np.ndarray  # [4, 4] hand-eye, mm
+    clock: ClockOffset
+    scale_sd: float  # relative, one standard deviation
+    position_residual: np.ndarray  # [N] mm, per frame used
+    rotation_residual: np.ndarray  # [N] rad
+    used: np.ndarray  # [N] indices of the frames used
+
+    def cameras(self, world_from_camera_sfm: np.ndarray) -> np.ndarray:
+        """[N, 4, 4] cameras in the SfM gauge to world_from_camera, mm."""
+        placed = np.array(world_from_camera_sfm, dtype=np.float64)
+        placed[:, :3, :3] = self.rotation @ placed[:, :3, :3]
+        placed[:, :3, 3] = self.points(placed[:, :3, 3])
+        return placed
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """[P, 3] points in the SfM gauge to the world, mm."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+
+def register_with_laparoscope(
+    world_from_camera: np.ndarray,
+    times: np.ndarray,
+    log: PoseLog,
+    known: ClockOffset | None,
+    settings: IngestSettings | None = None,
+) -> Registration:
+    """Similarity, hand-eye and clock from SfM cameras [N, 4, 4] at video `times` [N] s and the scope's log.
+
+    From a closed form all unknowns are refined under a soft-L1 loss, the tracker's slow drift among them: left out, it
+    (a few tenths of a mm over seconds) is taken for scope motion and bends the scale by percents. A known clock is
+    kept; else it is estimated, with a rate where that differs from 1 by more than SURE standard deviations. Raises
+    NeecoError when the scope moved too little.
+    """
+    settings = settings or IngestSettings()
+    clock = clock_from_turning(world_from_camera, times, log) if known is None else known
+    start = _closed_form(world_from_camera, times, log, clock)
+    first_scale, first_rotation, first_translation, first_hand, first_lever = start
+    # centred, so that scale and translation decouple, as lag and stretch do
+    centre, now = world_from_camera[:, :3, 3].mean(0), float(times.mean())
+    arms = world_from_camera[:, :3, 3] - centre
+    turns = Rotation.from_matrix(world_from_camera[:, :3, :3])
+    middle = first_scale * first_rotation.apply(centre) + first_translation
+    _, valid = _sensor_poses(times, log, clock)
+    # on the video's clock: seconds since 1970 leave too few digits for derivatives
+    gaps = tuple((float(before), float(after)) for before, after in clock.video_times(np.reshape(log.gaps, (-1, 2))))
+    near = replace(log, times=clock.video_times(log.times), gaps=gaps)
+
+    @lru_cache(maxsize=4)  # most columns of the Jacobian leave the clock alone
+    def sensor_poses(lag: float, stretch: float) -> tuple[np.ndarray, np.ndarray]:
+        return poses_at(near, times + lag + stretch * (times - now))
+
+    hats = _hat_functions(times, DRIFT_KNOT)  # [N, K]
+    knots = hats.shape[1]
+
+    def unpack(x: np.ndarray) -> tuple[float, Rotation, np.ndarray, Rotation, np.ndarray, float, float]:
+        rotation = Rotation.from_rotvec(x[1:4]) * first_rotation
+        hand = first_hand * Rotation.from_rotvec(x[7:10])
+        origin, lever = middle + x[4:7], first_lever + x[10:13]
+        return first_scale * np.exp(x[0]), rotation, origin, hand, lever, float(x[LAG]), float(x[STRETCH])
+
+    def errors(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Position error [N, 3] mm (drift not yet taken off), rotation error [N, 3] rad, on the log [N]."""
+        scale, rotation, origin, hand, lever, lag, stretch = unpack(x)
+        poses, still = sensor_poses(lag, stretch)
+        placed = rotation * turns
+        position = scale * rotation.apply(arms) + origin + placed.apply(lever) - poses[:, :3, 3]
+        sensors = Rotation.from_matrix(np.where(still[:, None, None], poses[:, :3, :3], np.eye(3)))
+        return position, ((placed * hand).inv() * sensors).as_rotvec(), still & valid
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        position, turn, keep = errors(x)
+        drift = x[UNKNOWNS:].reshape(knots, 3)
+        # a frame that slid off the log counts as wrong by the noise, so that sliding off is never a gain
+        rows = [
+            np.where(keep[:, None], (position - hats @ drift) / settings.tracker_noise_mm, 1.0)[valid],
+            np.where(keep[:, None], turn / settings.tracker_noise_rad, 1.0)[valid],
+            drift / settings.tracker_drift_mm,
+            np.diff(drift, axis=0) / (0.5 * settings.tracker_drift_mm),
+        ]
+        return np.concatenate(rows).ravel()
+
+    def solve(x: np.ndarray, held: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """All unknowns [U] from `x` on, those `held` as there, their covariance, and the standard deviations [2] of
+        LAG and STRETCH."""
+        free = np.setdiff1d(np.arange(len(x)), held)
+
+        def of_free(values: np.ndarray) -> np.ndarray:
+            changed = x.copy()
+            changed[free] = values
+            return residuals(changed)
+
+        solved = least_squares(of_free, x[free], loss="soft_l1", max_nfev=settings.registration_steps)
+        found, covariance, jacobian = x.copy(), np.zeros((len(x), len(x))), np.zeros((len(solved.fun), len(x)))
+        found[free], jacobian[:, free] = solved.x, solved.jac
+        covariance[np.ix_(free, free)] = np.linalg.pinv(solved.jac.T @ solved.jac)
+        return found, covariance, _clock_deviations(solved.fun, jacobian, covariance, times[valid])
+
+    unknowns = np.zeros(UNKNOWNS + 3 * knots)
+    if known is not None:
+        solution, covariance, _ = solve(unknowns, (LAG, STRETCH))
+    else:
+        solution, covariance, sd = solve(unknowns, ())
+        rate = clock.rate * (1 + solution[STRETCH])
+        if abs(rate - 1) < SURE * clock.rate * sd[1]:
+            solution[STRETCH], rate = 1 / clock.rate - 1, 1.0
+            solution, covariance, sd = solve(solution, (STRETCH,))
+        seconds = clock.seconds + clock.rate * solution[LAG] + (clock.rate - rate) * now
+        off = float(np.hypot(sd[0], sd[1] * times.std()))
+        clock = ClockOffset(float(seconds), off, SCOPE_MOTION, float(rate), float(sd[1]))
+    scale, rotation, origin, hand, lever, _, _ = unpack(solution)
+    position, turn, keep = errors(solution)
+    used = np.flatnonzero(keep)
+    camera_from_sensor = np.eye(4)
+    camera_from_sensor[:3, :3], camera_from_sensor[:3, 3] = hand.as_matrix(), lever
+    return Registration(
+        scale,
+        rotation.as_matrix(),
+        origin - scale * rotation.apply(centre),
+        camera_from_sensor,
+        clock,
+        float(np.sqrt(max(covariance[0, 0], 0.0))),
+        np.linalg.norm(position[used], axis=1),
+        np.linalg.norm(turn[used], axis=1),
+        used,
+    )
+
+
+def _clock_deviations(
+    residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, times: np.ndarray
+) -> np.ndarray:
+    """Standard deviations [2] of LAG, s, and STRETCH: the larger of what the stated noise says and of what residuals
+    say that are correlated over CORRELATED_S (Newey & West 1987).
+
+    residuals [Q] and jacobian [Q, U] as `least_squares` returns them: the first are not yet weighted by the soft-L1
+    loss. times [N] s of the frames, whose positions and rotations come first.
+    """
+    clock = [LAG, STRETCH]
+    weighted = residuals * (1 + residuals**2) ** 0.25
+    influence = covariance[clock] @ (jacobian * weighted[:, None]).T  # [2, Q]
+    frames = influence[:, : 6 * len(times)].reshape(2, 2, len(times), 3).sum((1, 3))  # [2, N]
+    near = np.clip(1 - np.abs(times[:, None] - times) / CORRELATED_S, 0, None)
+    correlated = np.einsum("kn,nm,km->k", frames, near, frames)
+    return np.sqrt(np.maximum.reduce([correlated, covariance[clock, clock], np.zeros(2)]))
+
+
+def _sensor_poses(times: np.ndarray, log: PoseLog, clock: ClockOffset) -> tuple[np.ndarray, np.ndarray]:
+    poses, valid = poses_at(log, clock.at(times))
+    if valid.sum() < MIN_FRAMES:
+        raise NeecoError(
+            f"{log.path}: only {int(valid.sum())} video frames fall on its samples (at least {MIN_FRAMES} are needed); "
+            "check the clock offset in `sync` and that log and video are of the same recording"
+        )
+    return poses, valid
+
+
+_Start = tuple[float, Rotation, np.ndarray, Rotation, np.ndarray]
+# scale, world_from_sfm, translation, camera_from_sensor, and the sensor's origin in the camera's frame [3] mm
+
+
+def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog, clock: ClockOffset) -> _Start:
+    """Hand-eye rotation from relative turns (their rotation vectors differ by it alone), the rest linear in turn."""
+    poses, valid = _sensor_poses(times, log, clock)
+    cameras, sensors = world_from_camera[valid], poses[valid]
+    camera_turns, sensor_turns = Rotation.from_matrix(cameras[:, :3, :3]), Rotation.from_matrix(sensors[:, :3, :3])
+    middle = len(cameras) // 2
+    steps = [(0, slice(None)), (middle, slice(None)), (len(cameras) - 1, slice(None))]
+    # relative turns [3N, 3] in the camera's and in the sensor's frame
+    a, b = (
+        np.concatenate([(turns[i].inv() * turns[j]).as_rotvec() for i, j in steps])
+        for turns in (camera_turns, sensor_turns)
+    )
+    spread = np.linalg.svd(b, compute_uv=False) / np.sqrt(len(b))
+    if spread[1] < MIN_TURN:
+        raise NeecoError(
+            f"{log.path}: the laparoscope turned about hardly more than one axis ({np.degrees(spread[1]):.1f} deg "
+            "across the others), so its hand-eye calibration cannot be found; record the scope turning about two axes "
+            "by 10 deg or more"
+        )
+    camera_from_sensor, _ = Rotation.align_vectors(a, b)
+    world_from_sfm = (sensor_turns * camera_from_sensor.inv() * camera_turns.inv()).mean()
+    turned = world_from_sfm.as_matrix() @ cameras[:, :3, :3]  # [N, 3, 3] world_from_camera rotations
+    travel = cameras[:, :3, 3] @ world_from_sfm.as_matrix().T  # [N, 3]
+    system = np.concatenate([travel[:, :, None], np.tile(np.eye(3), (len(cameras), 1, 1)), turned], -1).reshape(-1, 7)
+    solution = np.linalg.lstsq(system, sensors[:, :3, 3].ravel(), rcond=None)[0]
+    if solution[0] <= 0 or np.linalg.norm(travel.std(0)) * solution[0] < MIN_TRAVEL:
+        raise NeecoError(
+            f"{log.path}: the laparoscope travelled too little to tell the scale; move it by 20 mm or more"
+        )
+    return float(solution[0]), world_from_sfm, solution[1:4], camera_from_sensor, solution[4:]
+
+
+def _hat_functions(times: np.ndarray, spacing: float) -> np.ndarray:
+    """[N, K] weights of piecewise linear interpolation between knots every `spacing` s."""
+    knots = np.arange(times[0] - spacing / 2, times[-1] + 1.5 * spacing, spacing)
+    return np.maximum(0.0, 1 - np.abs(times[:, None] - knots) / spacing)

@@ -1,0 +1,117 @@
+"""The instrument of a recording that nothing tracked: found in the video, and from then on as if a tracker had logged
+it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from neeco.capture.model import FromVideo, Instrument, Uncertainty
+from neeco.errors import NeecoError
+from neeco.geometry.lens import Lens
+from neeco.ingest.cameras.sfm import SfmResult
+from neeco.ingest.cameras.still import reduced
+from neeco.ingest.recording.model import InstrumentLogs, Recording
+from neeco.ingest.shaft.axis import Scene
+from neeco.ingest.shaft.from_video import ENOUGH, FoundShaft, find_shaft
+from neeco.ingest.timing.episodes import Episodes
+
+NOT_SEEN = "the shaft is not seen well enough"
+ROLL_DEG = 5.0  # standard deviation of a logged roll
+READING_DEG = 1.0  # of a logged joint
+AROUND = 7  # px about what moves, in which features are not the tissue's
+
+
+def seen_in_video(data: Episodes) -> InstrumentLogs | None:
+    """The instrument that is to be found in the video."""
+    return next((item for item in data.recording.instruments if item.from_video is not None), None)
+
+
+def find_in_video(
+    data: Episodes,
+    item: InstrumentLogs,
+    load: Callable[[int], np.ndarray],
+    masks: np.ndarray,
+    world_from_camera: np.ndarray,
+    times: np.ndarray,
+    episodes: np.ndarray,
+    pinhole: Lens,
+    tissue: float | None,
+) -> FoundShaft:
+    """Find the instrument `item` in frames at times [F] s, of `episodes` [F], and place it in `data`.
+
+    load(row): a frame uint8 [H, W, 3]; masks bool [F, h, w] of the images reduced; world_from_camera [F, 4, 4], in mm
+    if `tissue` is None, else that is the tissue's distance in their unit; pinhole: that of the images reduced. Raises
+    NeecoError, naming the recording, when it is not seen well enough.
+    """
+    asked = item.from_video
+    assert asked is not None
+    images = np.stack([reduced(load(row)) for row in range(len(times))])
+    radius = asked.shaft_diameter_mm / 2
+    scene = Scene(world_from_camera, times, episodes, radius, pinhole.intrinsics, True, scaled=tissue is None)
+    try:
+        found = find_shaft(images, masks, scene, asked.working_length_mm, asked.fixed_trocar, tissue or np.inf)
+    except NeecoError as error:
+        raise NeecoError(f"{data.recording.path}: instrument {item.name!r}, from video: {error}") from error
+    data.place(item.name, times[found.known], found.poses[found.known])
+    data.note(_in_words(item.name, found))
+    for note in found.notes:
+        data.note(f"instrument {item.name!r}, from video: {note}")
+    if item.roll is None:
+        data.note(
+            f"instrument {item.name!r}: its roll is not known (180 degrees in every state's uncertainty); log it, or "
+            "pose frames by hand (`neeco view CAPTURE --annotate`)"
+        )
+    return found
+
+
+def _in_words(name: str, found: FoundShaft) -> str:
+    shifts = np.array([item.translation_mm for item in found.uncertainties])[found.known]
+    turns = np.array([item.rotation_deg[:2] for item in found.uncertainties])[found.known].max(1)
+    left_out = int((~found.known).sum())
+    scale = ""
+    if found.axes.scale_sd is not None:
+        scale = f"; the cameras' scale is known to {found.axes.scale_sd:.0%}, from the trocar"
+    return (
+        f"instrument {name!r} was found in the video: {found.share:.0%} of the frames show two diameters of its shaft "
+        f"({ENOUGH:.0%} are needed); {left_out} of {len(found.known)} show too little of it and are left out; its "
+        f"direction is sure to {np.median(turns):.1f} degrees, its place to {np.median(shifts[:, :2]):.1f} mm across "
+        f"the view and {np.median(shifts[:, 2]):.1f} mm in depth (standard deviations); from the end of the shaft to "
+        f"the tip it is {found.working_length:.0f} mm{scale}"
+    )
+
+
+def on_masks(masks: np.ndarray, sfm: SfmResult, size: tuple[int, int]) -> np.ndarray:
+    """bool [Q]: observations of `sfm` that lie on masks bool [M, h, w] of its rows, or beside them; size: of the images
+    that they count pixels of."""
+    around = np.stack([cv2.dilate(mask.astype(np.uint8), np.ones((AROUND, AROUND), np.uint8)) for mask in masks])
+    _, height, width = masks.shape
+    row, x, y = (sfm.observations[:, column] for column in (0, 2, 3))
+    column = np.clip(x * width / size[0], 0, width - 1).astype(int)
+    return np.asarray(around[row.astype(int), np.clip(y * height / size[1], 0, height - 1).astype(int), column] > 0)
+
+
+def uncertainties(item: InstrumentLogs, found: FoundShaft) -> tuple[Uncertainty, ...]:
+    """How sure every state is, with what was logged beside the video."""
+    assert item.from_video is not None
+    sure = found.uncertainties
+    if item.roll is not None:
+        sure = tuple(replace(one, rotation_deg=(*one.rotation_deg[:2], ROLL_DEG)) for one in sure)
+    joints = dict.fromkeys(item.joints, READING_DEG)
+    return tuple(replace(one, joints_deg=joints) for one in sure)
+
+
+def instruments_of(recording: Recording, found: FoundShaft | None) -> tuple[Instrument, ...]:
+    """The instruments of a recording as the capture states them; found: the one that was found in the video."""
+    stated = []
+    for item in recording.instruments:
+        if item.placed:
+            limits = {name: source.limits for name, source in item.joints.items()}
+            seen = None
+            if found is not None and item.from_video is not None:
+                seen = FromVideo(item.from_video.shaft_diameter_mm, found.working_length)
+            stated.append(Instrument(item.name, limits, item.kinematics, from_video=seen))
+    return tuple(stated)

@@ -1,0 +1,1 @@
+"""Logs and video on one time axis."""

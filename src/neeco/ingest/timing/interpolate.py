@@ -1,0 +1,278 @@
+"""Poses and readings at any time, from noisy logs: robust local regression (LOESS, Cleveland 1979), never across a gap.
+
+At each time a quadratic is fitted to the samples around it, weighted by nearness (tricube) and again by how well they
+fit (bisquare). Rotations are fitted as rotation vectors about their local mean. The window's width is the one that best
+predicts each sample from its neighbours. (Slerp and RotationSpline of scipy go through every sample, noise and all.)
+Where a cubic through the four samples around predicts better than any window, motion between samples is larger than
+their noise, as in logs of few samples a second: then nothing is smoothed, and cubics go through all samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neeco.ingest.readers.logs import PoseLog, ReadingLog
+
+WIDTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0)  # half windows tried, in usual steps
+WIDEST_S = 1.0
+VALIDATED = 600  # samples predicted to choose a width (cross-validation)
+MIN_SAMPLES, MIN_FOR_CURVATURE = 4, 6  # in a window: fewer are interpolated linearly, fitted by a line
+ROUNDS = 3  # of robust reweighting
+CUTOFF = 4.7  # bisquare, in noise sigmas per axis (Beaton & Tukey 1974)
+CHUNK = 300_000  # window samples worked on at once
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """Half widths s of the windows for positions (or readings) and rotations; 0: through the samples. noise: what
+    one sample is off its neighbours' fit, mm (or rad) per axis and rad per axis."""
+
+    position_s: float
+    rotation_s: float
+    position_noise: float
+    rotation_noise: float
+
+
+def poses_at(log: PoseLog, times: np.ndarray, smooth_s: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Poses [N, 4, 4] (mm) at times [N] on the log's clock, and bool [N] where the log has any.
+
+    smooth_s: half width of the window, s; None: as the log's own noise asks (`pose_smoothing`); 0: through the samples.
+    Outside the log and inside its gaps poses are NaN.
+    """
+    times = np.asarray(times, dtype=np.float64)
+    widths = pose_smoothing(log) if smooth_s is None else Smoothing(smooth_s, smooth_s, 0.0, 0.0)
+    positions, rotations = _Series(log, log.positions), _RotationSeries(log, log.quats)
+    valid = positions.covers(times)
+    poses = np.full((len(times), 4, 4), np.nan)
+    poses[valid] = np.eye(4)
+    poses[valid, :3, 3] = positions.fit(times[valid], widths.position_s)
+    if valid.any():
+        poses[valid, :3, :3] = _rotation(rotations.fit(times[valid], widths.rotation_s)).as_matrix()
+    return poses, valid
+
+
+def readings_at(log: ReadingLog, times: np.ndarray, smooth_s: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Readings [N] rad at times [N] on the log's clock, and bool [N] where the log has any; see `poses_at`."""
+    times = np.asarray(times, dtype=np.float64)
+    width = reading_smoothing(log).position_s if smooth_s is None else smooth_s
+    series = _Series(log, log.values[:, None])
+    valid = series.covers(times)
+    values = np.full(len(times), np.nan)
+    values[valid] = series.fit(times[valid], width)[:, 0]
+    return values, valid
+
+
+@lru_cache(maxsize=32)
+def pose_smoothing(log: PoseLog) -> Smoothing:
+    """The windows that best predict each sample of this log from its neighbours (leave-one-out cross-validation)."""
+    position_s, position_noise = _Series(log, log.positions).best_width()
+    rotation_s, rotation_noise = _RotationSeries(log, log.quats).best_width()
+    return Smoothing(position_s, rotation_s, position_noise / 3**0.5, rotation_noise / 3**0.5)
+
+
+@lru_cache(maxsize=32)
+def reading_smoothing(log: ReadingLog) -> Smoothing:
+    """The same for readings (the rotation's fields are 0)."""
+    width, noise = _Series(log, log.values[:, None]).best_width()
+    return Smoothing(width, 0.0, noise, 0.0)
+
+
+class _Series:
+    """Samples [T, D] of a log, in stretches without gaps."""
+
+    def __init__(self, log: PoseLog | ReadingLog, values: np.ndarray) -> None:
+        self.times, self.values = log.times, values
+        starts = np.searchsorted(self.times, [end for _, end in log.gaps])
+        stretch = np.zeros(len(self.times), dtype=np.int64)
+        stretch[starts] = 1
+        self.stretch = np.cumsum(stretch)
+        self.first = np.searchsorted(self.stretch, self.stretch)  # of each sample's stretch
+        self.last = np.searchsorted(self.stretch, self.stretch, side="right")  # one past it
+        self.step = float(np.median(np.diff(self.times)))
+
+    def covers(self, times: np.ndarray) -> np.ndarray:
+        """bool [N]: whether a time lies within a stretch."""
+        left, right = self._around(times)
+        inside = (times >= self.times[0]) & (times <= self.times[-1])
+        exact = (self.times[left] == times) | (self.times[right] == times)
+        return inside & (exact | (self.stretch[left] == self.stretch[right]))
+
+    def fit(self, times: np.ndarray, width: float, leave_out: np.ndarray | None = None) -> np.ndarray:
+        """Values [N, D] at covered times [N]: local quadratics of half width `width` s where that has samples enough,
+        linear elsewhere; without a width, cubics through the two samples on each side where there are so many.
+        leave_out [N]: a sample per time that must not be used."""
+        left, right = self._around(times) if leave_out is None else (leave_out - 1, leave_out + 1)
+        span = self.times[right] - self.times[left]
+        share = np.where(span > 0, (times - self.times[left]) / np.where(span > 0, span, 1), 0.0)
+        if not len(times):
+            return np.zeros((0, self.values.shape[1]))
+        result = self._between(left, right, share[:, None])
+        if width == 0:
+            outer = np.stack([left - 1, left, right, right + 1], axis=-1)  # [N, 4]
+            rows = np.flatnonzero((left < right) & (outer[:, 0] >= self.first[left]) & (outer[:, 3] < self.last[left]))
+            if len(rows):
+                result[rows] = self._combined(outer[rows], _lagrange(self.times[outer[rows]], times[rows]))
+        else:
+            noise = _noise(self._flat())
+            for rows, index, used, offsets in self._windows(times, width, leave_out):
+                result[rows] = self._local_fit(index, used, offsets, noise)
+        return result
+
+    def best_width(self) -> tuple[float, float]:
+        """The half width s with the smallest prediction errors, and the typical size of those."""
+        inner = np.arange(len(self.times))
+        inner = inner[(inner > self.first) & (inner < self.last - 1)]  # never the end of a stretch
+        if not len(inner):
+            return 0.0, 0.0
+        chosen = inner[np.unique(np.linspace(0, len(inner) - 1, VALIDATED).astype(int))]
+        widths = [steps * self.step for steps in WIDTHS if steps == WIDTHS[0] or steps * self.step <= WIDEST_S]
+        widths = [0.0, *widths]
+        errors = [self._errors(self.fit(self.times[chosen], width, chosen), chosen) for width in widths]
+        # outliers are no reason for one width or another
+        limit = 5 * max(float(np.median(errors[0])), 1e-12)
+        scores = [float(np.mean(np.minimum(error, limit) ** 2)) for error in errors]
+        best = int(np.argmin(scores))
+        return widths[best], float(np.sqrt(scores[best]))
+
+    def _between(self, left: np.ndarray, right: np.ndarray, share: np.ndarray) -> np.ndarray:
+        return self.values[left] + share * (self.values[right] - self.values[left])
+
+    def _combined(self, index: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Samples [N, K] by weights [N, K] that add up to 1."""
+        return np.asarray((self.values[index] * weights[..., None]).sum(axis=1))
+
+    def _flat(self) -> np.ndarray:
+        """[T, D] whose second differences show the noise."""
+        return self.values
+
+    def _local_fit(self, index: np.ndarray, used: np.ndarray, offsets: np.ndarray, noise: float) -> np.ndarray:
+        return _local_polynomial(offsets, used, self.values[index], noise)
+
+    def _errors(self, fitted: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(fitted - self.values[chosen], axis=1)
+
+    def _windows(
+        self, times: np.ndarray, width: float, leave_out: np.ndarray | None
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """Times with samples enough within `width`, some at once: which [N], their samples [N, K] with bool [N, K] of
+        those in use, and the samples' offsets [N, K] in half widths."""
+        size = max(int(CHUNK / max(2 * width / self.step, 8)), 1)
+        for start in range(0, len(times), size):
+            rows = np.arange(start, min(start + size, len(times)))
+            near = times[rows]
+            left, right = self._around(near)
+            home = np.where(self.times[right] == near, right, left)
+            low = np.maximum(np.searchsorted(self.times, near - width), self.first[home])
+            high = np.minimum(np.searchsorted(self.times, near + width, side="right"), self.last[home])
+            index = low[:, None] + np.arange(max(int((high - low).max(initial=0)), 1))
+            index, used = np.minimum(index, len(self.times) - 1), index < high[:, None]
+            if leave_out is not None:
+                used &= index != leave_out[rows, None]
+            enough = used.sum(axis=1) >= MIN_SAMPLES
+            if enough.any():
+                rows, index, used = rows[enough], index[enough], used[enough]
+                yield rows, index, used, (self.times[index] - times[rows, None]) / width
+
+    def _around(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The samples before and after each time [N] (twice the same where one is at it)."""
+        right = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
+        left = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
+        return left, right
+
+
+class _RotationSeries(_Series):
+    """Unit quaternions wxyz [T, 4], sign-continuous, fitted about each local mean."""
+
+    def _between(self, left: np.ndarray, right: np.ndarray, share: np.ndarray) -> np.ndarray:
+        start = _rotation(self.values[left])
+        step = (start.inv() * _rotation(self.values[right])).as_rotvec()
+        return (start * Rotation.from_rotvec(step * share)).as_quat(scalar_first=True)
+
+    def _combined(self, index: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        count, size = index.shape
+        center = _rotation(self.values[index[:, size // 2]])
+        turns = center[np.repeat(np.arange(count), size)].inv() * _rotation(self.values[index].reshape(-1, 4))
+        vector = (turns.as_rotvec().reshape(count, size, 3) * weights[..., None]).sum(axis=1)
+        return np.asarray((center * Rotation.from_rotvec(vector)).as_quat(scalar_first=True))
+
+    def _flat(self) -> np.ndarray:
+        """Turns [T, 3] rad summed up from sample to sample, each in its own axes."""
+        steps = (_rotation(self.values[:-1]).inv() * _rotation(self.values[1:])).as_rotvec()
+        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+    def _local_fit(self, index: np.ndarray, used: np.ndarray, offsets: np.ndarray, noise: float) -> np.ndarray:
+        around = self.values[index]  # sign-continuous, so their mean is a mean of rotations
+        mean = _rotation((around * (used * _tricube(offsets))[..., None]).sum(axis=1))
+        flat = np.repeat(np.arange(len(index)), index.shape[1])
+        vectors = (mean[flat].inv() * _rotation(around.reshape(-1, 4))).as_rotvec().reshape(*index.shape, 3)
+        vector = _local_polynomial(offsets, used, vectors, noise)
+        return (mean * Rotation.from_rotvec(vector)).as_quat(scalar_first=True)
+
+    def _errors(self, fitted: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        return (_rotation(fitted).inv() * _rotation(self.values[chosen])).magnitude()
+
+
+def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray, noise: float) -> np.ndarray:
+    """The value [N, D] at offset 0 of quadratics through values [N, K, D] at offsets [N, K] in [-1, 1]."""
+    near = used * _tricube(offsets)
+    powers = np.stack([np.ones_like(offsets), offsets, offsets**2], axis=-1)  # [N, K, 3]
+    # with few samples the curvature is held at 0; the rest only keeps the equations solvable
+    ridge = np.zeros((len(offsets), 3))
+    ridge[:, 1] = 1e-9
+    ridge[:, 2] = np.where(used.sum(axis=1) < MIN_FOR_CURVATURE, 1e6, 1e-9)
+    # start from what the middle of the window says, so that one outlier does not bend the first fit
+    axis_first = np.moveaxis(values, -1, 0)  # [D, N, K]
+    middle = np.moveaxis(_median(axis_first, np.broadcast_to(used, axis_first.shape)), 0, -1)[:, None]
+    residuals = np.linalg.norm(values - middle, axis=-1)
+    scale = np.maximum(_median(residuals, used), noise)
+    weights = near / (1 + (residuals / (3 * scale[:, None])) ** 2)
+    axes = np.sqrt(values.shape[-1])
+    for round_ in range(ROUNDS + 1):
+        normal = np.einsum("nk,nki,nkj->nij", weights, powers, powers) + ridge[:, :, None] * np.eye(3)
+        right = np.einsum("nk,nki,nkd->nid", weights, powers, values)
+        normal[:, 0, 0] += 1e-300
+        coefficients = np.linalg.solve(normal, right)
+        if round_ == ROUNDS:
+            break
+        residuals = np.linalg.norm(values - powers @ coefficients, axis=-1)
+        scale = np.maximum(1.48 * _median(residuals, used) / axes, noise)
+        weights = near * np.clip(1 - (residuals / (CUTOFF * axes * scale[:, None])) ** 2, 0, None) ** 2
+        # a fit that trusts too few samples is no fit
+        distrusting = (weights > 0).sum(axis=1) < MIN_SAMPLES
+        weights[distrusting] = near[distrusting]
+    return coefficients[:, 0]
+
+
+def _lagrange(samples: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """[N, K] weights of the values at samples [N, K] s in the polynomial through them, at times [N] s."""
+    weights = np.ones_like(samples)
+    for one in range(samples.shape[1]):
+        for other in range(samples.shape[1]):
+            if other != one:
+                weights[:, one] *= (times - samples[:, other]) / (samples[:, one] - samples[:, other])
+    return weights
+
+
+def _noise(values: np.ndarray) -> float:
+    """How far one sample [T, D] is off the line through its neighbours, per axis, robustly."""
+    bend = values[1:-1] - (values[:-2] + values[2:]) / 2
+    return max(1.48 * float(np.median(np.abs(bend))) / np.sqrt(1.5), 1e-9)
+
+
+def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Lower median [..., N] of the used among values [..., N, K]."""
+    ordered = np.sort(np.where(used, values, np.inf), axis=-1)
+    return np.take_along_axis(ordered, (used.sum(axis=-1, keepdims=True) - 1) // 2, axis=-1)[..., 0]
+
+
+def _tricube(offsets: np.ndarray) -> np.ndarray:
+    return np.clip(1 - np.abs(offsets) ** 3, 0, None) ** 3
+
+
+def _rotation(quats: np.ndarray) -> Rotation:
+    return Rotation.from_quat(quats, scalar_first=True)

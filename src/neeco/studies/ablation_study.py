@@ -1,0 +1,498 @@
+"""Run the ablations: one job per distinct variant, whatever tables it stands in; then the tables from the jobs."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from neeco import __version__
+from neeco.capture import Capture
+from neeco.capture.check import read_checked
+from neeco.errors import NeecoError
+from neeco.evaluation.evaluate import held_out_splits
+from neeco.files import own_folder, read_json, write_json
+from neeco.raster.devices import device_of
+from neeco.scene.method_registry import method_settings
+from neeco.settings import plain, warn_renamed
+from neeco.studies.ablations import (
+    CHECKPOINTS,
+    PHASE_1_SHARE,
+    PHASE_1_STEPS,
+    PUBLISHED_STEPS,
+    Ablation,
+    AblationPlan,
+    Comparison,
+    Entry,
+    Variant,
+    all_ablations,
+)
+from neeco.studies.derived import derive_capture
+from neeco.studies.machine import machine
+from neeco.studies.masks import LabelScores, score_label_ways
+from neeco.studies.study import JobEvent, Result, check_workers, run_jobs
+from neeco.studies.tables import (
+    UNKNOWN,
+    Cell,
+    Column,
+    Row,
+    Table,
+    csv_text,
+    latex_table,
+    markdown_table,
+    write_files,
+)
+from neeco.studies.training_job import (
+    CURVE_FILE,
+    Budget,
+    TrainingJob,
+    check_settings,
+    read_json_lines,
+    settings_for,
+)
+from neeco.training.config import TISSUE_GAUSSIANS, TrainConfig, training_config
+from neeco.training.run import open_run
+from neeco.training.schedule import MIN_RESET_INTERVAL
+
+SCHEMA = "neeco-ablation/1"
+LABELS_FILE = "label_ways.json"
+MIN_WARM_UP_STEPS = 100  # with the network off: trained on a nearly empty image it moves Gaussians out of sight
+MAX_WARM_UP = 0.25  # share of the run
+INITIAL_SHARE = 0.25  # of the tissue's budget: density control can only differ where it has room to grow
+MIN_KINEMATIC_STEPS = 1_000  # steps: the shaft starts to spin and joints to learn after 600
+EVEN_DB = 0.1  # smaller differences do not count as a direction
+RENAMED_TABLES = {"rim": "extrapolation"}
+FINAL_SCORES = ("psnr", "psnr_instrument", "mask_iou")
+HEADINGS = {
+    "phase_1_psnr": "phase-1 training PSNR",
+    "psnr": "PSNR",
+    "psnr_instrument": "instrument PSNR",
+    "mask_iou": "mask IoU",
+}
+
+Values = dict[str, float | None]  # by measure; empty where the run failed
+
+
+@dataclass(frozen=True)
+class AblationRow:
+    """One setting of a table: its numbers by measure, the paper's, and how both differ from the reference's."""
+
+    comparison: str
+    label: str
+    reference: bool  # what the others of its comparison are measured against
+    run: str
+    values: Values
+    paper: dict[str, float]
+    paper_direction: str  # "worse" where the paper shows it in a figure without numbers
+    difference: Values
+    agrees: dict[str, str | None]  # of each judged measure: do ours and the paper's differ in the same direction
+
+
+@dataclass(frozen=True)
+class AblationTable:
+    """A table with its numbers. `judged`, `measures`: those compared with the paper, and all that are shown."""
+
+    name: str
+    group: str
+    title: str
+    question: str
+    judged: list[str]
+    measures: list[str]
+    rows: list[AblationRow]
+    curves: list[dict[str, Any]]  # held-out PSNR over the run: {comparison, label, iteration, progress, psnr}
+
+
+@dataclass(frozen=True)
+class AblationResult:
+    """What ablation.json holds."""
+
+    schema: str
+    version: str
+    capture: str
+    seed: int
+    iterations: dict[str, int]  # by method
+    machine: dict[str, Any]
+    settings: list[str]
+    splits: list[str]
+    tables: list[AblationTable]
+    runs: list[Result]
+    failures: list[dict[str, str]]  # {run, error}
+    notes: list[str]
+
+
+def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | None = None) -> AblationResult:
+    """Train and score every variant of the chosen tables, write DIR/ablation.json and DIR/tables/, return the first.
+
+    Runs lie in DIR/runs/, derived captures in DIR/captures/. What is finished is not done again; the same command goes
+    on after an interruption. A run that fails leaves its cells empty and its reason under "failures". Raises NeecoError
+    for unknown tables and settings, a capture without instruments, or an output that holds other runs.
+    """
+    device = device_of(plan.device)
+    check_workers(plan.workers, device)
+    chosen = chosen_ablations(plan.tables)
+    variants = distinct_variants(chosen)
+    capture = _open_capture(plan, variants)
+    splits = held_out_splits(capture)
+    with own_folder(plan.output):
+        jobs = [_job(plan, variant) for variant in variants]
+        for job in jobs:
+            job.check()
+        for job, variant in zip(jobs, variants, strict=True):
+            if variant.derived is not None:
+                derive_capture(capture, plan.transforms, variant.derived, plan.seed, job.capture)
+        results = run_jobs(jobs, plan.workers, progress, {plan.capture: capture})
+    finished = {job.name: result for job, result in zip(jobs, results, strict=True) if "error" not in result}
+    failures = [{"run": result["name"], "error": result["error"]} for result in results if "error" in result]
+    folders = {job.name: job.folder for job in jobs if job.name in finished}
+    methods = [method for method in ("neeco", "kinematic") if any(v.method == method for v in variants)]
+    log_intervals = {job.config.method: job.config.log_interval for job in jobs}
+    labels, unscored = _label_scores(chosen, folders, capture, splits, device)
+    result = AblationResult(
+        schema=SCHEMA,
+        version=__version__,
+        capture=str(plan.capture.absolute()),
+        seed=plan.seed,
+        iterations={method: _steps(plan, method) for method in sorted(methods)},
+        machine=machine(device),
+        settings=list(plan.settings),
+        splits=list(splits),
+        tables=[table_of(table, folders, finished, labels, splits) for table in chosen],
+        runs=list(finished.values()),
+        failures=failures + unscored,
+        notes=[
+            note for method in methods for note in _shortcomings(method, _steps(plan, method), log_intervals[method])
+        ],
+    )
+    write_json(plan.output / "ablation.json", plain(result))
+    write_tables(plan.output, result.tables)
+    return result
+
+
+def chosen_ablations(names: Sequence[str]) -> tuple[Ablation, ...]:
+    """The tables behind `paper`, `ours` or their own names, each once. Raises NeecoError for an unknown name."""
+    known = all_ablations()
+    groups = {group: [table for table in known.values() if table.group == group] for group in ("paper", "ours")}
+    chosen: dict[str, Ablation] = {}
+    for given in names:
+        name = RENAMED_TABLES.get(given, given)
+        warn_renamed(f"--tables {given}", f"--tables {name}")
+        if name not in groups and name not in known:
+            raise NeecoError(f"--tables: {name!r} is unknown; choose of paper, ours, {', '.join(known)}")
+        chosen |= {table.name: table for table in groups.get(name) or [known[name]]}
+    if not chosen:
+        raise NeecoError("--tables: names none; leave it out for all of them")
+    return tuple(chosen.values())
+
+
+def distinct_variants(chosen: Sequence[Ablation]) -> list[Variant]:
+    """Every run that the tables need, once."""
+    return list(dict.fromkeys(entry.variant for table in chosen for entry in table.entries))
+
+
+def _open_capture(plan: AblationPlan, variants: Sequence[Variant]) -> Capture:
+    """The capture. Raises NeecoError for what no run could be made of."""
+    for name, value in (("iterations", plan.iterations), ("kinematic-iterations", plan.kinematic_iterations)):
+        if value is not None and value < 1:
+            raise NeecoError(f"--{name}: {value} is no training; give at least 1")
+    check_settings(plan.settings, dict.fromkeys(variant.method for variant in variants), "--seed")
+    capture = read_checked(plan.capture, plan.transforms)
+    if not capture.instruments:
+        raise NeecoError(f"{plan.capture}: instruments: no states are recorded; every ablation needs them")
+    return capture
+
+
+def _steps(plan: AblationPlan, method: str) -> int:
+    """Iterations of a run of `method`."""
+    if method == "neeco":
+        return plan.iterations
+    return plan.kinematic_iterations or max(MIN_KINEMATIC_STEPS, plan.iterations)
+
+
+def _job(plan: AblationPlan, variant: Variant) -> TrainingJob:
+    """The job of one variant. Settings: its method's, then the user's, then what the variant is about."""
+    steps, capture = _steps(plan, variant.method), plan.capture
+    values = {"iterations": steps, "seed": plan.seed, "transforms": plan.transforms}
+    given = settings_for(variant.method, plan.settings)
+    common = _paper_settings(steps) if variant.method == "neeco" else ()
+    config = training_config(variant.method, values, [*common, *given, *variant.settings])
+    if variant.method == "neeco":
+        config = _with_room_to_grow(config)
+    if variant.derived is not None:
+        capture = plan.output / "captures" / variant.derived.name
+        config = replace(config, transforms="transforms.json")
+    folder = plan.output / "runs" / variant.name
+    return TrainingJob(variant.name, plan.seed, capture, folder, config, Budget(None, steps), device=plan.device)
+
+
+def _paper_settings(iterations: int) -> tuple[str, ...]:
+    """The paper's schedule is stated for its own 20,000 steps and scaled to the run. The network is off for its
+    usual share of the run or MIN_WARM_UP_STEPS, whichever is longer."""
+    warm_up = max(method_settings("neeco", {}).warm_up, min(MAX_WARM_UP, MIN_WARM_UP_STEPS / iterations))
+    return (
+        f"schedule.published_steps={PUBLISHED_STEPS}",
+        f"schedule.earliest={PHASE_1_STEPS}",
+        f"deformation.warm_up={round(warm_up, 4)}",
+    )
+
+
+def _with_room_to_grow(config: TrainConfig) -> TrainConfig:
+    """With INITIAL_SHARE of the tissue's budget: were it full of sparse points, density control could do nothing."""
+    if config.initial_points is not None:
+        return config
+    return replace(
+        config, initial_points=max(1, round(INITIAL_SHARE * (config.max_tissue_gaussians or TISSUE_GAUSSIANS)))
+    )
+
+
+def _shortcomings(method: str, steps: int, log_interval: int) -> list[str]:
+    """What runs of so many steps are too short to show."""
+    notes = []
+    if method == "neeco" and PHASE_1_SHARE * steps < log_interval:
+        notes.append(
+            f"phase-1 PSNR: not known, phase 1 of {steps} steps ends before the first row of metrics.jsonl "
+            f"({log_interval} steps); give --iterations {math.ceil(log_interval / PHASE_1_SHARE)} or more"
+        )
+    if method == "neeco" and TrainConfig().growth_stop * steps <= MIN_RESET_INTERVAL:
+        notes.append(
+            f"opacity reset: none comes in {steps} steps (intervals do not scale below {MIN_RESET_INTERVAL}, and "
+            "density control ends half-way), so P_oi changes nothing here"
+        )
+    if method == "kinematic" and steps < MIN_KINEMATIC_STEPS:
+        notes.append(
+            f"kinematic: {steps} steps are few: joints begin to learn and the shaft to spin after 600, labels to "
+            f"sharpen after 1,000; give --kinematic-iterations {MIN_KINEMATIC_STEPS} or more"
+        )
+    return notes
+
+
+def _label_scores(
+    chosen: Sequence[Ablation],
+    folders: Mapping[str, Path],
+    capture: Capture,
+    splits: tuple[str, ...],
+    device: torch.device,
+) -> tuple[dict[str, LabelScores], list[dict[str, str]]]:
+    """Scores by run of both ways to label it, for the runs whose table asks; and what could not be scored."""
+    scores: dict[str, LabelScores] = {}
+    failures = []
+    asked = (entry.variant.name for table in chosen for entry in table.entries if entry.label_way)
+    for name in dict.fromkeys(asked):
+        if name not in folders:
+            continue
+        file = folders[name] / LABELS_FILE
+        stored = read_json(file) if file.exists() else None
+        if stored is None or stored["splits"] != list(splits):
+            try:
+                with open_run(folders[name], device) as run:
+                    scored = score_label_ways(run, capture, splits)
+            except NeecoError as error:
+                failures.append({"run": name, "error": f"label ways: {error}"})
+                continue
+            stored = {"splits": list(splits), "mask_iou": scored}
+            write_json(file, stored)
+        scores[name] = stored["mask_iou"]
+    return scores, failures
+
+
+def table_of(
+    table: Ablation,
+    folders: Mapping[str, Path],
+    results: Mapping[str, Result],
+    labels: Mapping[str, LabelScores],
+    splits: Sequence[str],
+) -> AblationTable:
+    """A table from the runs that finished (`folders`, `results`) and those that are labelled both ways (`labels`)."""
+    primary = primary_split(splits)
+    judged = [measure.format(split=primary) for measure in table.judged]
+    rows, curves = [], []
+    for comparison in table.comparisons:
+        values = {entry.label: _values(entry, folders, results, labels, splits) for entry in comparison.entries}
+        for entry in comparison.entries:
+            rows.append(_row(comparison, entry, values, judged, primary))
+            folder = folders.get(entry.variant.name)
+            if table.group == "paper" and folder is not None:
+                names = {"comparison": comparison.title, "label": entry.label}
+                points = [row for row in read_json_lines(folder / CURVE_FILE) if row["split"] == primary]
+                curves += [names | {key: row[key] for key in ("iteration", "progress", "psnr")} for row in points]
+    final = ("psnr",) if table.group == "paper" else FINAL_SCORES
+    known = dict.fromkeys(key for row in rows for key, value in row.values.items() if value is not None)
+    shown = [key for key in known if key not in judged and key.partition(".")[0] in final]
+    return AblationTable(table.name, table.group, table.title, table.question, judged, [*judged, *shown], rows, curves)
+
+
+def primary_split(splits: Sequence[str]) -> str:
+    """The held-out split that the paper's test numbers are set beside."""
+    return "test" if "test" in splits else splits[0]
+
+
+def _row(
+    comparison: Comparison, entry: Entry, values: Mapping[str, Values], judged: Sequence[str], primary: str
+) -> AblationRow:
+    reference = next(item for item in comparison.entries if item.label == comparison.reference)
+    ours, base = values[entry.label], values[reference.label]
+    paper, paper_base = (dict(zip(judged, item.paper, strict=False)) for item in (entry, reference))
+    difference: Values = {}
+    agrees: dict[str, str | None] = {}
+    if entry is not reference:
+        for key, value in ours.items():
+            other = base.get(key)
+            difference[key] = None if value is None or other is None else round(value - other, 4)
+        for key in judged:
+            expected = paper[key] - paper_base[key] if key in paper else float(entry.expected)
+            agrees[key] = direction(difference.get(key), expected)
+    return AblationRow(
+        comparison.title,
+        entry.label,
+        entry is reference,
+        entry.variant.name,
+        ours,
+        paper,
+        "worse" if entry.expected and entry is not reference else "",
+        difference,
+        agrees,
+    )
+
+
+def direction(ours: float | None, paper: float) -> str | None:
+    """Whether two differences point the same way: "yes", "no", "even" when ours is below EVEN_DB, None unknown."""
+    if ours is None:
+        return None
+    if abs(ours) < EVEN_DB:
+        return "even"
+    return "yes" if (ours > 0) == (paper > 0) else "no"
+
+
+def _values(
+    entry: Entry,
+    folders: Mapping[str, Path],
+    results: Mapping[str, Result],
+    labels: Mapping[str, LabelScores],
+    splits: Sequence[str],
+) -> Values:
+    """Every number of one entry by measure; empty when its run failed."""
+    name = entry.variant.name
+    if entry.label_way is not None:
+        ways = labels.get(name, {})
+        return {f"mask_iou.{split}": ways[entry.label_way][split] for split in splits} if ways else {}
+    if name not in results:
+        return {}
+    folder, result = folders[name], results[name]
+    values: Values = {}
+    if entry.variant.method == "neeco":  # trained in phases: how good it was in the first and on the way
+        values["phase_1_psnr"] = phase_1_psnr(folder, int(result["iterations"]))
+        curve, split = read_json_lines(folder / CURVE_FILE), primary_split(splits)
+        for percent in CHECKPOINTS:
+            values[f"psnr_at_{percent}.{split}"] = psnr_at(curve, split, percent / 100)
+    return values | {f"{score}.{split}": result["splits"][split][score] for score in FINAL_SCORES for split in splits}
+
+
+def phase_1_psnr(folder: Path, iterations: int) -> float | None:
+    """Mean training PSNR (dB) over the rows of metrics.jsonl in the last quarter of phase 1, its last row at least.
+
+    A row averages 50 steps; None when phase 1, or the whole run, was shorter than that.
+    """
+    end = PHASE_1_SHARE * iterations
+    rows = [row for row in read_json_lines(folder / "metrics.jsonl") if row["iteration"] <= end]
+    late = [row["psnr"] for row in rows if row["iteration"] > 0.75 * end or row is rows[-1]]
+    return round(sum(late) / len(late), 4) if late else None
+
+
+def psnr_at(curve: Sequence[Mapping[str, Any]], split: str, share: float) -> float | None:
+    """Held-out PSNR (dB) when `share` of the run was done; None where the curve has no row so near as 5 % of it."""
+    rows = [row for row in curve if row["split"] == split and abs(row["progress"] - share) < 0.05]
+    return min(rows, key=lambda row: abs(row["progress"] - share))["psnr"] if rows else None
+
+
+def write_tables(output: Path, tables: Sequence[AblationTable]) -> None:
+    """Write DIR/tables/NAME.csv, .md and .tex for every table."""
+    for table in tables:
+        texts = {"csv": ablation_csv(table), "md": markdown(table), "tex": latex_table(grid(table), table.title)}
+        write_files(output / "tables", table.name, texts)
+
+
+def heading(measure: str) -> str:
+    """A measure in words, e.g. `test PSNR at 40 %`."""
+    score, _, split = measure.partition(".")
+    if score.startswith("psnr_at_"):
+        return f"{split} PSNR at {score.removeprefix('psnr_at_')} %"
+    return f"{split} {HEADINGS[score]}".strip()
+
+
+def formatted(measure: str, value: float | None, *, signed: bool = False) -> str:
+    """A number as the tables show it: dB with two digits, IoU with three; `-` when not known."""
+    if value is None:
+        return UNKNOWN
+    digits = 3 if measure.startswith("mask_iou") else 2
+    return f"{value:{'+' if signed else ''}.{digits}f}"
+
+
+def grid(table: AblationTable) -> Table:
+    """A table for reading: per judged measure the paper's number, ours and whether they agree; the rest as ours alone.
+
+    What is compared has a column of its own where it is not the same in all rows.
+    """
+    several = len({row.comparison for row in table.rows}) > 1
+    columns = []
+    for measure in table.measures:
+        titles = [f"{heading(measure)}: paper", "ours", "agrees"] if measure in table.judged else [heading(measure)]
+        columns += [Column(measure, title) for title in titles]
+    rows = []
+    for row in table.rows:
+        cells = [text for measure in table.measures for text in _cells(row, measure, measure in table.judged)]
+        keys = (row.comparison, row.label) if several else (row.label,)
+        rows.append(Row(keys, tuple(map(Cell, cells)), reference=row.reference))
+    return Table(table.title, ("", "setting") if several else ("setting",), tuple(columns), tuple(rows))
+
+
+def _cells(row: AblationRow, measure: str, judged: bool) -> list[str]:
+    """Our number with its difference from the reference; where judged, after the paper's and before the verdict."""
+    ours = formatted(measure, row.values.get(measure))
+    if (difference := row.difference.get(measure)) is not None:
+        ours += f" ({formatted(measure, difference, signed=True)})"
+    if not judged:
+        return [ours]
+    paper = formatted(measure, row.paper.get(measure))
+    agrees = "" if row.reference else row.agrees.get(measure) or UNKNOWN
+    return [row.paper_direction if paper == UNKNOWN and row.paper_direction else paper, ours, agrees]
+
+
+def agreement(table: AblationTable) -> str:
+    """How many of the paper's directions ours shows, in words; "" for a table that judges nothing."""
+    counts = Counter(agrees for row in table.rows for agrees in row.agrees.values())
+    if not counts:
+        return ""
+    words = {"even": "even", "no": "the other way", None: "not known"}
+    others = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
+    return ", ".join([f"{counts['yes']} of {counts.total()} as in the paper", *others])
+
+
+def ablation_csv(table: AblationTable) -> str:
+    """One line per setting and measure: every number in full."""
+    rows = [
+        {
+            "table": table.name,
+            "comparison": row.comparison,
+            "setting": row.label,
+            "run": row.run,
+            "measure": measure,
+            "paper": row.paper.get(measure),
+            "ours": row.values.get(measure),
+            "difference": row.difference.get(measure),
+            "agrees": row.agrees.get(measure),
+        }
+        for row in table.rows
+        for measure in dict.fromkeys([*table.measures, *row.values])
+    ]
+    return csv_text(list(rows[0]), rows)
+
+
+def markdown(table: AblationTable) -> str:
+    """A Markdown table under its title."""
+    title, empty, *lines = markdown_table(grid(table))
+    directions = ["", f"Directions: {agreement(table)}."] if table.judged else []
+    return "\n".join([title, empty, table.question, "", *lines, *directions]) + "\n"

@@ -1,0 +1,303 @@
+"""`downstream`: models trained on recorded and on synthetic images within one budget, tested on recorded frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from neeco import __version__
+from neeco.capture import Capture
+from neeco.capture.check import read_checked
+from neeco.errors import NeecoError
+from neeco.files import own_folder, read_json, write_json
+from neeco.raster.devices import device_of
+from neeco.studies.downstream.job import (
+    DEFAULT_EDGES,
+    JOB_FILE,
+    REAL,
+    RESERVED,
+    Condition,
+    DownstreamJob,
+    DownstreamSettings,
+    absolute,
+    default_conditions,
+    labelled_count,
+    parse_condition,
+)
+from neeco.studies.downstream.model import model_class
+from neeco.studies.downstream.results import comparisons, failed_jobs, findings, summarise_folds
+from neeco.studies.downstream.samples import (
+    DataSet,
+    class_names,
+    frame_size,
+    has_labels,
+    recorded_samples,
+    synthetic_samples,
+)
+from neeco.studies.machine import machine, threads_per_worker
+from neeco.studies.study import JobEvent, check_output, check_workers, run_and_record
+
+SCHEMA = "neeco-downstream/1"
+FILE = "downstream.json"
+
+
+@dataclass(frozen=True)
+class DownstreamPlan:
+    """A study whose settings are checked, ready to run."""
+
+    settings: DownstreamSettings  # with the splits that are tested
+    capture: Capture
+    jobs: tuple[DownstreamJob, ...]
+    images: Mapping[str, int]  # of each set
+    labelled: int  # recorded training frames with a label
+    frame_size: tuple[int, int]  # width, height
+    notes: tuple[str, ...]
+
+
+def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
+    """Check all that can be known before the work. Raises NeecoError for what cannot be trained or tested."""
+    for option in ("folds", "steps", "size", "batch"):
+        value = getattr(settings, option)
+        if value is not None and value < 1:
+            raise NeecoError(f"--{option}: {value} is none at all; give at least 1")
+    check_workers(settings.workers, device_of(settings.device, drawing=False))
+    _check_models(settings)
+    conditions = _conditions(settings)
+    capture = read_checked(settings.capture, settings.transforms)
+    settings = replace(settings, splits=_splits(capture, settings.splits))
+    size = frame_size(recorded_samples(capture, settings.splits[0], settings.classes))
+    images = {}
+    for data in settings.sets:
+        edges = {condition.edges for condition in conditions if data.name in condition.sets}
+        for edge in sorted(edges) or [DEFAULT_EDGES]:
+            images[data.name] = len(synthetic_samples(data, class_names(capture, settings.classes), edge, size))
+    counts, labelled = _counts(settings, capture, conditions)
+    _check_inputs(settings, capture, size)
+    entries = settings.output.iterdir() if settings.output.is_dir() else ()
+    if [entry.name for entry in entries if not entry.name.startswith(".")] != [
+        "jobs"
+    ]:  # not just before its first result
+        check_output(settings.output, FILE, SCHEMA, settings.capture, "downstream experiment", "is about")
+    jobs = _jobs(settings, conditions, counts)
+    if not jobs:
+        raise NeecoError("--num-real: leaves nothing to train; add 0 for sets alone, or a number of labelled frames")
+    for job in jobs:
+        job.check()
+    return DownstreamPlan(settings, capture, jobs, images, labelled, size, tuple(_notes(settings, counts)))
+
+
+def _check_models(settings: DownstreamSettings) -> None:
+    if not settings.models:
+        raise NeecoError("--models: none is given; name at least one")
+    for name in settings.models:
+        kind = model_class(name)
+        if missing := kind.missing_requirement():
+            raise NeecoError(f"--models {name}: {missing}")
+        if name in settings.weights and not kind.accepts_weights:
+            raise NeecoError(f"--weights {name}: this model takes none")
+    for name, file in settings.weights.items():
+        if name not in settings.models:
+            raise NeecoError(f"--weights: {name!r} is not among --models {' '.join(settings.models)}")
+        if not file.is_file():
+            raise NeecoError(f"--weights {name}: {file}: no such file")
+
+
+def _conditions(settings: DownstreamSettings) -> list[Condition]:
+    names = [data.name for data in settings.sets]
+    for name in names:
+        if name in RESERVED or "+" in name or not name:
+            raise NeecoError(f"--sets {name}: this name has a meaning of its own; call the set otherwise")
+        if "/" in name or "\\" in name:
+            raise NeecoError(f"--sets {name}: folders are named by it; call the set without / or \\")
+    if len(set(names)) < len(names):
+        raise NeecoError(f"--sets: a name stands twice in {' '.join(names)}; name each set differently")
+    words = default_conditions(names) if settings.conditions is None else settings.conditions
+    conditions = [parse_condition(word, names) for word in dict.fromkeys(words)]
+    for condition in conditions:
+        if condition.edges == "soft" and settings.classes == "parts":
+            raise NeecoError(
+                f"--conditions {condition.name}: soft/ says how much of a pixel is instrument, not of which part; "
+                "use --classes instrument"
+            )
+    return conditions
+
+
+def _splits(capture: Capture, requested: Sequence[str]) -> tuple[str, ...]:
+    for split in requested:
+        if split not in capture.splits:
+            raise NeecoError(f"--splits: {capture.root} has no split {split!r}; it has {', '.join(capture.splits)}")
+        if split == "train":
+            raise NeecoError("--splits: train: what is learned from is not tested; choose other splits")
+        if not has_labels(capture, split):
+            raise NeecoError(f"--splits: {split}: no frame of it has a true mask in {capture.root}; nothing to test on")
+    found = requested or [split for split in capture.splits if split != "train" and has_labels(capture, split)]
+    if not found:
+        raise NeecoError(
+            f"{capture.root}: no frame outside of split train has a true mask (truth/masks or reference_masks); "
+            "nothing to test on"
+        )
+    return tuple(found)
+
+
+def _counts(settings: DownstreamSettings, capture: Capture, conditions: Sequence[Condition]) -> tuple[list[int], int]:
+    """The counts of labelled frames, and how many there are."""
+    for word in settings.num_real:
+        labelled_count(word, 10**9)
+    if not any(condition.real for condition in conditions) or set(settings.num_real) <= {"0"}:
+        return [0] if "0" in settings.num_real else [], 0
+    labelled = len(recorded_samples(capture, "train", settings.classes, settings.labels))
+    return sorted({labelled_count(word, labelled) for word in settings.num_real}), labelled
+
+
+def _check_inputs(settings: DownstreamSettings, capture: Capture, frame: tuple[int, int]) -> None:
+    for name in settings.models:
+        kind = model_class(name)
+        size = settings.input_of(kind, frame)
+        if kind.is_too_small(size):
+            raise NeecoError(
+                f"--models {name}: it would see images of {size[0]}x{size[1]} px, too small for it; give a larger "
+                "--size, or leave it out"
+            )
+        if kind.predicts == "boxes" and len(capture.instruments) > 1:
+            raise NeecoError(
+                f"--models {name}: {capture.root}: labels do not tell the {len(capture.instruments)} "
+                "instruments apart, so there is no box of each; use a model that predicts masks"
+            )
+
+
+def _jobs(
+    settings: DownstreamSettings, conditions: Sequence[Condition], counts: Sequence[int]
+) -> tuple[DownstreamJob, ...]:
+    """The first fold of everything comes first: results halfway are of all conditions. Soft edges are of masks alone:
+    boxes have none, it would be the plain condition again."""
+    return tuple(
+        DownstreamJob(settings, model, condition, real, fold)
+        for fold in range(settings.folds)
+        for model in settings.models
+        for condition in conditions
+        if condition.edges == DEFAULT_EDGES or model_class(model).predicts == "masks"
+        for real in counts
+        if bool(real) == condition.real
+    )
+
+
+def _notes(settings: DownstreamSettings, counts: Sequence[int]) -> list[str]:
+    notes = []
+    if settings.folds < 3:
+        notes.append("intervals of fewer than three folds are wide or absent; give --folds 5 before concluding")
+    if few := [count for count in counts if 0 < count < settings.min_validated]:
+        notes.append(
+            f"{', '.join(map(str, few))} labelled frames: too few to hold some out; trained on them alone the last "
+            "weights are taken, beside a set those that do best on synthetic images"
+        )
+    if settings.labels is not None:
+        notes.append(f"labels of recorded training frames: {settings.labels}; tests are scored by the capture's truth")
+    return notes
+
+
+def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | None = None) -> dict[str, Any]:
+    """Train and test every model in every condition on every fold; writes downstream.json, and returns what it holds.
+
+    Started again after an interruption it continues where it stopped; started again with more models, sets, conditions,
+    labelled frames or folds, it adds them. A failed job is reported in its place.
+    """
+    file, jobs = plan.settings.output / FILE, plan.jobs
+    with own_folder(plan.settings.output):
+        paths = {index: job.folder / JOB_FILE for index, job in enumerate(jobs)}
+        finished = {index: read_json(path) for index, path in paths.items() if path.exists()}
+        captures = {plan.settings.capture: plan.capture}
+
+        def record(results: Sequence[Mapping[str, Any]]) -> None:
+            write_json(file, document(plan, results))
+
+        results = run_and_record(jobs, plan.settings.workers, record, finished, progress, captures)
+        result = document(plan, results) | {"complete": True}
+        write_json(file, result)
+    return result
+
+
+def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What downstream.json holds of these results."""
+    settings = plan.settings
+    kinds = {name: model_class(name) for name in settings.models}
+    predicts = {name: kind.predicts for name, kind in kinds.items()}
+    threads = threads_per_worker(settings.workers) if settings.workers > 1 else None
+    made: dict[str, Any] = {
+        "schema": SCHEMA,
+        "version": __version__,
+        "complete": False,
+        "capture": str(settings.capture.absolute()),
+        "command": settings.command(),
+        "machine": machine(device_of(settings.device, drawing=False))
+        | {"workers": settings.workers, "threads_per_worker": threads},
+        "teaching": {
+            "capture": str(settings.capture.absolute()),
+            "sets": [data.described() for data in settings.sets],
+            "classes": settings.classes,
+            "splits": list(settings.splits),
+            "labels": absolute(settings.labels),
+            "transforms": settings.transforms,
+            "pick": settings.frame_selection,
+            "steps": settings.steps,
+            "side": settings.size,
+            "batch": settings.batch,
+            "device": settings.device,
+        },
+        "classes": list(class_names(plan.capture, settings.classes)),
+        "splits": list(settings.splits),
+        "folds": settings.folds,
+        "labelled": plan.labelled,
+        "held_back_every": settings.validation_every,
+        "sets": [
+            data.described() | {"images": plan.images[data.name], "made_by": _made_by(data)} for data in settings.sets
+        ],
+        "models": [
+            {
+                "name": name,
+                "answers": kind.predicts,
+                "steps": settings.steps_of(kind),
+                "batch": settings.batch_of(kind),
+                "input": list(settings.input_of(kind, plan.frame_size)),
+                "weights": absolute(settings.weights.get(name)),
+            }
+            for name, kind in kinds.items()
+        ],
+        "jobs": list(results),
+        "summary": summarise_folds(results, predicts, settings.splits),
+        "paired": comparisons(results, predicts, settings.splits, [data.name for data in settings.sets]),
+        "notes": [*plan.notes, *_result_notes(results)],
+    }
+    return made | {"answers": findings(made)}
+
+
+def _made_by(data: DataSet) -> dict[str, Any] | None:
+    """What dataset.json says of how a set was synthesized; None where there is none."""
+    info, keys = data.info(), ("settings", "scene", "scene_sha256", "version", "complete")
+    return None if info is None else {key: info.get(key) for key in keys}
+
+
+def _result_notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What failed, what was not trained long enough, and which models are biased."""
+    notes = [f"failed: {line}" for line in failed_jobs({"jobs": results})]
+    done = [job for job in results if "error" not in job]
+    late = sorted({f"{job['model']}, {job['condition']}" for job in done if job["still_learning"]})
+    if late:
+        notes.append(f"still getting better at the last step: {'; '.join(late)}; give more --steps")
+    for model in dict.fromkeys(job["model"] for job in done):
+        alone = [job for job in done if job["model"] == model and job["condition"] == REAL]
+        most = max((job["real"] for job in alone), default=0)  # fewer frames miss what they do not show
+        gaps = [
+            scores["precision"] - scores["recall"]
+            for job in alone
+            if job["real"] == most
+            for scores in job["splits"].values()
+            if scores.get("precision") is not None and scores.get("recall") is not None
+        ]
+        if gaps and abs(sum(gaps) / len(gaps)) > 0.02:
+            how = "over-segments" if sum(gaps) < 0 else "under-segments"
+            notes.append(
+                f"{model}: trained on {most} labelled frames alone it {how} (precision - recall "
+                f"{sum(gaps) / len(gaps):+.3f}); that favours labels with the opposite error"
+            )
+    return notes

@@ -1,0 +1,240 @@
+"""What a model to train says of itself, is given and returns; and the one training loop of all PyTorch modules."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import cv2
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from neeco.capture.model import evenly_spaced
+from neeco.errors import NeecoError
+from neeco.files import placeholder, write_atomically
+from neeco.registry import named_classes
+from neeco.studies.downstream import models
+from neeco.studies.downstream.samples import BatchSampler, Example, Sample
+from neeco.studies.downstream.scores import Prediction, validation_score
+
+WEIGHTS_FILE = "weights.safetensors"
+VALIDATION_IMAGES = 60  # at most: a spread of the held-out images that weights are chosen by
+PREDICTION_BATCH = 16  # images
+REPORT_EVERY = 10  # steps
+
+
+@dataclass(frozen=True)
+class TrainingTask:
+    """What a model is to learn, and within which limits."""
+
+    classes: tuple[str, ...]
+    batches: BatchSampler
+    validation: tuple[Sample, ...]  # may be empty
+    size: tuple[int, int]  # width, height of images as the model sees them
+    steps: int
+    batch: int
+    seed: int
+    device: torch.device
+    folder: Path  # the job's, for what training writes
+    weights: Path | None = None  # to start from; None: from scratch
+    progress: Callable[[float, str], None] = lambda share, text: None
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """`predict` maps uint8 images [H, W, 3] to predictions at their size.
+
+    best_step: the step whose weights are kept. validation: (step, score in [0, 1]) during training.
+    """
+
+    predict: Callable[[Sequence[np.ndarray]], list[Prediction]]
+    best_step: int
+    validation: list[tuple[int, float]] = field(default_factory=list)
+
+
+class Model(ABC):
+    """A detector or segmenter. Its class attributes are what is known before anything is imported."""
+
+    model: ClassVar[str]
+    predicts: ClassVar[Literal["masks", "boxes"]]
+    image_size: ClassVar[int]  # px, the longer side of the images it sees unless --size says otherwise
+    multiple: ClassVar[int]  # both sides are multiples of it
+    steps: ClassVar[int]  # until a few hundred images are learned
+    batch: ClassVar[int]
+    accepts_weights: ClassVar[bool] = True
+    keeps_order: ClassVar[bool] = True  # it sees images in the order of the task's batches
+
+    @classmethod
+    @abstractmethod
+    def missing_requirement(cls) -> str | None:
+        """What it needs and this machine lacks, with the remedy; None when it can be trained."""
+
+    @classmethod
+    def is_too_small(cls, size: tuple[int, int]) -> bool:
+        """Whether images of this size (width, height), as it would see them, are too small for it."""
+        return False
+
+    @abstractmethod
+    def fit(self, task: TrainingTask) -> TrainedModel:
+        """Train it. The same task gives the same model on the CPU. Raises NeecoError for weights that do not fit."""
+
+
+def missing_packages(*packages: str) -> str | None:
+    """`missing_requirement` of a model that needs packages of the extra `downstream`."""
+    absent = [name for name in packages if importlib.util.find_spec(name) is None]
+    return f"needs {' and '.join(absent)}; pip install 'neeco[downstream]'" if absent else None
+
+
+@cache
+def find_models() -> dict[str, type[Model]]:
+    """Every class with a `model` name of its own in a public module of `models/`, by that name."""
+    return named_classes(Model, "model", models)  # type: ignore[type-abstract]
+
+
+def model_class(name: str) -> type[Model]:
+    """The model of that name. Raises NeecoError when there is none."""
+    known = find_models()
+    if name not in known:
+        raise NeecoError(f"--models: {name!r} is unknown; choose of {', '.join(known)}")
+    return known[name]
+
+
+def input_size(frame: tuple[int, int], longer_side: int, multiple: int) -> tuple[int, int]:
+    """(width, height) a model sees of frames of this size: at most `longer_side`, both multiples of `multiple`, the
+    nearest to the frame's shape."""
+    scale = min(1.0, max(multiple, longer_side - longer_side % multiple) / max(frame))
+    width, height = (max(multiple, multiple * round(edge * scale / multiple)) for edge in frame)
+    return width, height
+
+
+class TorchModel(Model):
+    """A model given as a module, a loss and its predictions; `fit` is the same for all.
+
+    AdamW, the same number of steps in every condition; the learning rate rises over the first steps and falls as a
+    cosine (Loshchilov and Hutter, "SGDR", 2017). Of several checkpoints the weights with the best score on the held-out
+    images are kept.
+    """
+
+    learning_rate: ClassVar[float]
+    weight_decay: ClassVar[float] = 1e-4
+    gradient_clip: ClassVar[float] = 0.1  # norm, as in D-FINE
+    warmup: ClassVar[float] = 0.1  # of the steps: the learning rate rises
+    checkpoints: ClassVar[int] = 10  # at which the held-out images are scored
+
+    @abstractmethod
+    def build(self, classes: int) -> nn.Module:
+        """The untrained module, from torch's random numbers."""
+
+    @abstractmethod
+    def loss(self, module: Any, images: Tensor, examples: Sequence[Example]) -> Tensor:
+        """Of a batch: images [B, 3, h, w] in [0, 1] as the model sees them, and the examples they were made from."""
+
+    @abstractmethod
+    def predictions(self, module: Any, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Prediction]:
+        """Of images [B, 3, h, w]; sizes: (height, width) of each prediction."""
+
+    def fit(self, task: TrainingTask) -> TrainedModel:
+        """Train it (see `Model.fit`); writes the kept weights to the folder's weights.safetensors.
+
+        Torch's random numbers start at the task's seed, and continue afterwards as if this had not run.
+        """
+        with torch.random.fork_rng():
+            torch.manual_seed(task.seed)
+            module = self.build(len(task.classes)).to(task.device)
+            module = module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # faster on a CPU
+            if task.weights is not None:
+                load_weights(module, task.weights)
+            curve, best_step = self._train(module, task)
+        state = {name: value.detach().contiguous().cpu() for name, value in module.state_dict().items()}
+        write_atomically(task.folder / WEIGHTS_FILE, lambda path: save_file(_without_aliases(state), path))
+        return TrainedModel(lambda images: self._predict(module, images, task), best_step, curve)
+
+    def _train(self, module: nn.Module, task: TrainingTask) -> tuple[list[tuple[int, float]], int]:
+        optimizer = torch.optim.AdamW(module.parameters(), self.learning_rate, weight_decay=self.weight_decay)
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self._rate(step, task.steps))
+        chosen = evenly_spaced(len(task.validation), VALIDATION_IMAGES)
+        truth = [task.validation[index].load() for index in chosen]
+        checkpoints = {round(task.steps * (k + 1) / self.checkpoints) for k in range(self.checkpoints)}
+        curve: list[tuple[int, float]] = []
+        best_weights, best_step, best = None, task.steps, -1.0
+        module.train()
+        for step in range(1, task.steps + 1):
+            examples = task.batches.batch(task.batch)
+            loss = self.loss(module, to_input([example.image for example in examples], task), examples)
+            if not torch.isfinite(loss):
+                raise NeecoError(
+                    f"{self.model}: its loss is not finite at step {step}; train with more images or other --weights"
+                )
+            optimizer.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(module.parameters(), self.gradient_clip)
+            optimizer.step()
+            schedule.step()
+            if step % REPORT_EVERY == 0 or step == task.steps:
+                score = f"  validation {curve[-1][1]:.3f}" if curve else ""
+                task.progress(step / task.steps, f"step {step}  loss {loss.item():.3f}{score}")
+            if truth and step in checkpoints:
+                predictions = self._predict(module, [example.image for example in truth], task)
+                curve.append((step, validation_score(predictions, truth, len(task.classes))))
+                if curve[-1][1] >= best:
+                    best, best_step = curve[-1][1], step
+                    best_weights = {name: value.clone() for name, value in module.state_dict().items()}
+        if best_weights is not None:
+            module.load_state_dict(best_weights)
+        return curve, best_step
+
+    def _rate(self, step: int, steps: int) -> float:
+        """The learning rate at a step, as a share of the highest."""
+        return min((step + 1) / (1 + self.warmup * steps), (1 + math.cos(math.pi * step / steps)) / 2)
+
+    def _predict(self, module: nn.Module, images: Sequence[np.ndarray], task: TrainingTask) -> list[Prediction]:
+        training = module.training
+        module.eval()
+        found: list[Prediction] = []
+        with torch.inference_mode():
+            for start in range(0, len(images), PREDICTION_BATCH):
+                batch = images[start : start + PREDICTION_BATCH]
+                sizes = [(image.shape[0], image.shape[1]) for image in batch]
+                found += self.predictions(module, to_input(batch, task), sizes)
+        module.train(training)
+        return found
+
+
+def to_input(images: Sequence[np.ndarray], task: TrainingTask) -> Tensor:
+    """[B, 3, h, w] float32 in [0, 1] on the task's device, of uint8 images [H, W, 3]; shrunk by area."""
+    shrunk = np.stack([cv2.resize(image, task.size, interpolation=cv2.INTER_AREA) for image in images])
+    batch = torch.from_numpy(shrunk).permute(0, 3, 1, 2).to(task.device, torch.float32) / 255
+    return batch.contiguous(memory_format=torch.channels_last)
+
+
+def load_weights(module: nn.Module, path: Path) -> None:
+    """Take what fits from a safetensors file: tensors of a name and shape that the module has. Raises NeecoError for a
+    file that cannot be read, or of which less than half of the module's tensors are found."""
+    if problem := placeholder(path):
+        raise NeecoError(f"--weights: {path}: {problem}")
+    try:
+        stored = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise NeecoError(f"--weights: {path}: cannot be read as safetensors: {error}") from error
+    own = module.state_dict()
+    fitting = {name: value for name, value in stored.items() if name in own and own[name].shape == value.shape}
+    if 2 * len(fitting) < len(own):
+        raise NeecoError(f"--weights: {path}: {len(fitting)} of {len(own)} tensors fit; give weights of this model")
+    module.load_state_dict(fitting, strict=False)
+
+
+def _without_aliases(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tied tensors once each: safetensors refuses memory that is stored twice."""
+    first: dict[int, str] = {}
+    for name, value in state.items():
+        first.setdefault(value.data_ptr(), name)
+    return {name: state[name] for name in first.values()}

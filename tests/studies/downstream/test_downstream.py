@@ -1,0 +1,571 @@
+"""An experiment end to end on the tiny world: its jobs, files, numbers, going on, growing, failing, refusing."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import os
+import re
+import shutil
+import signal
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from downstream_world import Pixels, bar_parts, read_grey, save_grey, write_set
+from torch import Tensor
+
+from neeco.errors import NeecoError
+from neeco.evaluation.mask_metrics import iou
+from neeco.studies.downstream import model as models_module
+from neeco.studies.downstream.experiment import plan_downstream, run_downstream
+from neeco.studies.downstream.job import DownstreamSettings, job_folder
+from neeco.studies.downstream.results import failed_jobs, tables_of, write_tables
+from neeco.studies.downstream.samples import DataSet
+from neeco.studies.downstream.scores import Detections
+
+TIMES = ("seconds", "processor_seconds", "machine")
+
+
+class Corners(Pixels):
+    """Always answers with one box, learned or not."""
+
+    model = "corners"
+    predicts = "boxes"
+
+    def predictions(self, module, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Detections]:
+        return [Detections(np.array([[0.0, 0, w / 2, h / 2]]), np.array([1]), np.array([0.9])) for h, w in sizes]
+
+
+@pytest.fixture(autouse=True)
+def small_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.set_num_threads(1)
+    known = models_module.find_models() | {"pixels": Pixels, "corners": Corners}
+    monkeypatch.setattr(models_module, "find_models", lambda: known)
+
+
+@pytest.fixture
+def spec(recorded: Path, drawn: Path, tmp_path: Path) -> DownstreamSettings:
+    """Eight jobs of a fraction of a second: two folds of real, set and both."""
+    return DownstreamSettings(
+        recorded,
+        tmp_path / "out",
+        (DataSet("kin", drawn),),
+        models=("pixels",),
+        num_real=("0", "6", "all"),
+        folds=2,
+        conditions=("real", "kin", "kin+real"),
+        device="cpu",
+        min_validated=5,
+    )
+
+
+def trained(settings: DownstreamSettings, progress=None) -> dict:
+    return run_downstream(plan_downstream(settings), progress)
+
+
+def without_times(value):
+    if isinstance(value, dict):
+        return {key: without_times(item) for key, item in value.items() if key not in TIMES}
+    return [without_times(item) for item in value] if isinstance(value, list) else value
+
+
+def job_files(output: Path) -> dict[str, int]:
+    return {str(file.relative_to(output)): file.stat().st_mtime_ns for file in output.glob("jobs/*/job.json")}
+
+
+def refused(*words: str):
+    return pytest.raises(NeecoError, match=".*".join(map(re.escape, words)))
+
+
+def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamSettings) -> None:
+    stages = []
+    result = trained(spec, lambda news: stages.append((news.index, news.stage)))
+    assert result == json.loads((spec.output / "downstream.json").read_text())
+    assert result["schema"] == "neeco-downstream/1"
+    assert result["complete"]
+    assert result["splits"] == ["test", "unseen"]
+    assert result["labelled"] == 10
+    assert [(job["condition"], job["real"], job["fold"]) for job in result["jobs"]] == [
+        (condition, real, fold)
+        for fold in (0, 1)
+        for condition, real in (("real", 6), ("real", 10), ("kin", 0), ("kin+real", 6), ("kin+real", 10))
+    ]
+    for job in result["jobs"]:
+        folder = job_folder(spec.output, job["model"], job["condition"], job["real"], job["fold"])
+        assert json.loads((folder / "job.json").read_text()) == job
+        assert {"weights.safetensors", "predictions"} <= {path.name for path in folder.iterdir()}
+        assert job["iterations"] == 6
+        assert job["splits"]["test"]["frames"] == 2
+        assert job["splits"]["unseen"]["frames"] == 1
+    assert [index for index, stage in stages if stage == "done"] == list(range(10))
+    assert {"training", "evaluating"} <= {stage for _, stage in stages}
+    assert len(result["summary"]) == 5 * 2
+    assert result["sets"][0]["images"] == 6
+    assert len(result["sets"][0]["sha256"]) == 64
+    assert result["models"][0]["input"] == [48, 40]
+    assert len(result["answers"]) == 3 * 2
+    assert any("fewer than three folds" in note for note in result["notes"])
+
+
+def test_a_jobs_scores_are_of_what_it_answered(spec: DownstreamSettings, recorded: Path) -> None:
+    job = trained(replace(spec, conditions=("real",), num_real=("all",), folds=1))["jobs"][0]
+    folder = job_folder(spec.output, "pixels", "real", 10, 0) / "predictions" / "test"
+    values = []
+    for row in job["splits"]["test"]["per_frame"]:
+        answer, truth = (read_grey(place / f"{row['frame']}.png") for place in (folder, recorded / "truth" / "masks"))
+        values.append(iou(answer > 0, truth > 0))
+        assert row["iou"] == pytest.approx(values[-1], abs=1e-5)
+        assert row["iou_jaws"] is not None
+    assert job["splits"]["test"]["iou"] == pytest.approx(np.mean(values))
+    assert [row["frame"] for row in job["splits"]["test"]["per_frame"]] == ["006", "007"]
+
+
+def test_the_same_words_give_the_same_bits(spec: DownstreamSettings, tmp_path: Path) -> None:
+    small = replace(spec, conditions=("kin+real+augment",), num_real=("6",), folds=1)
+    pytest.importorskip("monai")
+    first, second = (trained(replace(small, output=tmp_path / name)) for name in ("one", "two"))
+    assert without_times(first) == without_times(second)
+    folders = [job_folder(tmp_path / name, "pixels", "kin+real+augment", 6, 0) for name in ("one", "two")]
+    assert len({(folder / "weights.safetensors").read_bytes() for folder in folders}) == 1
+
+
+def test_every_condition_and_model_of_a_fold_has_the_same_labelled_frames(spec: DownstreamSettings) -> None:
+    plan = plan_downstream(
+        replace(spec, models=("pixels", "corners"), conditions=("real", "kin+real"), num_real=("6",), folds=3)
+    )
+    chosen: dict[int, set] = {}
+    for job in plan.jobs:
+        task = job.task(plan.capture)
+        learned = tuple(sample.name for sample in task.batches.sources[0])
+        kept = tuple(sample.name for sample in task.validation)
+        assert len(learned) + len(kept) == 6
+        assert not set(learned) & set(kept)
+        assert {"006", "007", "012"}.isdisjoint({*learned, *kept})
+        assert len(task.batches.sources) == 1 + len(job.condition.sets)
+        chosen.setdefault(job.fold, set()).add((learned, kept))
+    assert [len(chosen[fold]) for fold in range(3)] == [1, 1, 1]
+    assert len(set.union(*chosen.values())) == 3
+
+
+def test_of_few_labelled_frames_none_is_held_back(spec: DownstreamSettings) -> None:
+    plan = plan_downstream(replace(spec, num_real=("3",), conditions=("real", "kin+real")))
+    alone, beside = (job.task(plan.capture) for job in plan.jobs[:2])
+    assert len(alone.batches.sources[0]) == 3
+    assert alone.validation == ()
+    assert [sample.name for sample in beside.validation] == ["000004"]  # a drawn image, then
+    assert any("3 labelled frames: too few to hold some out" in note for note in plan.notes)
+
+
+def test_the_last_steps_see_recorded_frames_alone(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    conditions = ("real", "kin", "kin+real")
+
+    def finish(**changes) -> list[tuple[int | None, bool]]:
+        """Of each job: how many images are mixed, and whether its identity speaks of it."""
+        plan = plan_downstream(replace(spec, num_real=("0", "6"), folds=1, conditions=conditions, **changes))
+        return [(job.task(plan.capture).batches.mixed, job.identity()["finish"] is not None) for job in plan.jobs]
+
+    assert finish() == [(None, False), (None, False), ((6 - 2) * 2, True)]  # of six steps of two
+    assert finish(finetune_share=0.2)[2] == ((6 - 1) * 2, True)
+    assert finish(finetune_epochs=0)[2] == (6 * 2, True)
+    monkeypatch.setattr(Pixels, "keeps_order", False)
+    assert finish() == [(None, False)] * 3
+
+
+# going on and growing
+
+
+def test_what_is_finished_is_not_done_again(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = trained(spec)
+    before = job_files(spec.output)
+    monkeypatch.setattr(Pixels, "fit", lambda *_: pytest.fail("taught again"))
+    assert trained(spec) == first
+    assert job_files(spec.output) == before
+    assert trained(replace(spec, splits=("unseen",)))["splits"] == ["unseen"]
+
+
+def test_more_folds_sets_conditions_models_and_frames_are_added(spec: DownstreamSettings, tmp_path: Path) -> None:
+    small = replace(spec, conditions=("real", "kin"), num_real=("0", "6"), folds=1)
+    trained(small)
+    before = job_files(spec.output)
+    assert len(before) == 2
+    sets = (*spec.sets, DataSet("other", write_set(tmp_path / "other"), 3))
+    conditions = ("real", "kin", "other", "kin+real")
+    more = replace(small, models=("pixels", "corners"), conditions=conditions, num_real=("0", "6", "7"), folds=2)
+    wide = replace(more, sets=sets)
+    result = trained(wide)
+    assert len(result["jobs"]) == 2 * 2 * (2 + 2 + 2)
+    after = job_files(spec.output)
+    assert len(after) == len(result["jobs"])
+    assert {name: after[name] for name in before} == before
+    assert [entry["images"] for entry in result["sets"]] == [6, 3]
+
+
+def test_more_splits_are_tested_after_teaching_again(spec: DownstreamSettings) -> None:
+    small = replace(spec, conditions=("kin",), folds=1)
+    one = trained(replace(small, splits=("unseen",)))["jobs"][0]
+    both = trained(small)["jobs"][0]
+    assert list(one["splits"]) == ["unseen"]
+    assert without_times(both["splits"]["unseen"]) == without_times(one["splits"]["unseen"])
+    assert set(both["splits"]) == {"test", "unseen"}
+
+
+@pytest.mark.parametrize("stopped", [0, 3])
+def test_interrupted_it_goes_on_to_the_same_numbers(
+    stopped: int, spec: DownstreamSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = trained(replace(spec, output=tmp_path / "whole"))
+    loss, fits = Pixels.loss, [-1]
+    fit = Pixels.fit
+
+    def counting(self, task):
+        fits[0] += 1
+        return fit(self, task)
+
+    def interrupted(self, *given):
+        if fits[0] == stopped:
+            os.kill(os.getpid(), signal.SIGINT)
+        return loss(self, *given)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Pixels, "fit", counting)
+        patched.setattr(Pixels, "loss", interrupted)
+        with pytest.raises(KeyboardInterrupt, match=rf"job {stopped + 1} of 10 \(pixels, .*run the same command again"):
+            trained(spec)
+    if stopped:
+        half = json.loads((spec.output / "downstream.json").read_text())
+        assert not half["complete"]
+        assert len(half["jobs"]) == stopped
+    else:
+        assert not spec.output.exists()
+    result = trained(spec)
+    for key in ("jobs", "summary", "paired", "answers", "notes", "sets", "models"):
+        assert without_times(result[key]) == without_times(expected[key])
+
+
+@pytest.mark.parametrize("failing", [0, 2, "all"])
+def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    fit, fits = Pixels.fit, [-1]
+
+    def sometimes(self, task):
+        fits[0] += 1
+        if failing in (fits[0], "all"):
+            raise NeecoError("pixels: its loss is not finite at step 3;\n  begin anew")
+        return fit(self, task)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Pixels, "fit", sometimes)
+        result = trained(replace(spec, num_real=("0", "6")))
+    failed = [index for index, job in enumerate(result["jobs"]) if "error" in job]
+    assert failed == (list(range(6)) if failing == "all" else [failing])
+    job = result["jobs"][failed[0]]
+    assert job["error"] == "pixels: its loss is not finite at step 3; begin anew"
+    assert job["splits"] == {}
+    assert len(failed_jobs(result)) == len(failed)
+    assert any(note.startswith("failed: pixels, ") for note in result["notes"])
+    write_tables(spec.output, result)
+    assert "not finite" in (spec.output / "data" / "jobs.csv").read_text()
+    if failing == "all":
+        assert "failed: pixels" in (spec.output / "downstream.md").read_text()
+    again = trained(replace(spec, num_real=("0", "6")))
+    assert not failed_jobs(again)
+    assert again["complete"]
+
+
+def test_a_failure_that_nobody_foresaw_leaves_its_traceback(spec: DownstreamSettings, monkeypatch) -> None:
+    monkeypatch.setattr(Pixels, "loss", lambda *_: 1 // 0)
+    result = trained(replace(spec, conditions=("kin",), folds=1))
+    record = spec.output / "jobs" / "pixels-kin-real0-fold0.error.txt"
+    assert result["jobs"][0]["error"].startswith("ZeroDivisionError")
+    assert str(record) in result["jobs"][0]["error"]
+    assert "Traceback" in record.read_text()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"steps": 7}, "steps: is 6, not 7"),
+        ({"min_validated": 40}, "min_validated: is 5, not 40"),
+        ({"validation_every": 4}, "validation_every: is 5, not 4"),
+        ({"batch": 3}, "batch: is 2, not 3"),
+        ({"size": 24}, "side: is 48, not 24"),
+        ({"frame_selection": "first"}, "pick: is 'spread', not 'first'"),
+        ({"classes": "parts"}, "classes: is 'instrument', not 'parts'"),
+    ],
+)
+def test_a_folder_of_other_jobs_is_refused_before_the_work(spec, change, told: str, monkeypatch) -> None:
+    small = replace(spec, conditions=("kin",), folds=1)
+    trained(small)
+    monkeypatch.setattr(Pixels, "fit", lambda *_: pytest.fail("taught"))
+    with refused("job.json: ", told, "give another --output"):
+        trained(replace(replace(small, folds=2), **change))
+
+
+def test_another_set_under_the_same_name_is_refused(spec: DownstreamSettings, tmp_path: Path) -> None:
+    small = replace(spec, conditions=("kin",), folds=1)
+    trained(small)
+    for data in (DataSet("kin", write_set(tmp_path / "else")), replace(spec.sets[0], count=3)):
+        with refused("job.json: sets: is", "give another --output"):
+            plan_downstream(replace(small, sets=(data,)))
+
+
+def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSettings, capture: Path) -> None:
+    small = replace(spec, conditions=("kin",), folds=1)
+    spec.output.write_text("a file")
+    with refused(str(spec.output), "is a file; give another --output"):
+        plan_downstream(small)
+    spec.output.unlink()
+    spec.output.mkdir()
+    plan_downstream(small)
+    (spec.output / "precious.txt").write_text("kept")
+    with refused("not empty, and no downstream experiment; give another --output"):
+        plan_downstream(small)
+    (spec.output / "precious.txt").unlink()
+    trained(small)
+    with refused("downstream.json: capture: is about", "give another --output"):
+        plan_downstream(replace(small, capture=capture))
+    for text in ('{"schema": "else"}', "[]"):
+        (spec.output / "downstream.json").write_text(text)
+        with refused("downstream.json: schema", "give another --output"):
+            plan_downstream(small)
+    (spec.output / "downstream.json").write_text('{"schema": "neeco-downstream/1"}')
+    with refused("downstream.json: capture", "give another --output"):
+        plan_downstream(small)
+
+
+# refusals before the work
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"folds": 0}, "--folds: 0 is none at all; give at least 1"),
+        ({"workers": 0}, "--workers: 0 is none at all; give at least 1"),
+        ({"models": ()}, "--models: none is given"),
+        ({"models": ("segformer",)}, "--models: 'segformer' is unknown; choose of"),
+        ({"num_real": ("some",)}, "--num-real: 'some' is neither a number of labelled frames nor all"),
+        ({"num_real": ("11",)}, "--num-real: 11 labelled frames are asked for, the capture has 10; use all"),
+        ({"num_real": ()}, "--num-real: leaves nothing to train"),
+        ({"num_real": ("6",), "conditions": ("kin",)}, "--num-real: leaves nothing to train; add 0"),
+        ({"num_real": ("0",), "conditions": ("real",)}, "--num-real: leaves nothing to train"),
+        ({"conditions": ("kim",)}, "--conditions kim: 'kim' is neither"),
+        ({"weights": {"unet": Path("x")}}, "--weights: 'unet' is not among --models pixels"),
+        ({"weights": {"pixels": Path("/nowhere/w")}}, "--weights pixels: /nowhere/w: no such file"),
+    ],
+)
+def test_what_cannot_be_done_is_refused(spec: DownstreamSettings, change, told: str) -> None:
+    with refused(told):
+        plan_downstream(replace(spec, **change))
+    assert not spec.output.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"steps": 0}, "--steps: 0 is none at all; give at least 1"),
+        ({"size": -1}, "--size: -1 is none at all"),
+        ({"batch": 0}, "--batch: 0 is none at all"),
+        ({"device": "tpu"}, "--device: 'tpu' is unknown"),
+        ({"splits": ("tset",)}, "has no split 'tset'; it has train, test, unseen"),
+        ({"splits": ("train",)}, "--splits: train: what is learned from is not tested"),
+        ({"capture": Path("/nowhere")}, "/nowhere"),
+    ],
+)
+def test_what_cannot_be_taught_is_refused(spec: DownstreamSettings, change, told: str) -> None:
+    with refused(told):
+        plan_downstream(replace(spec, **change))
+
+
+@pytest.mark.parametrize("name", ["real", "augment", "soft", "a+b", "", "../up", "a/b"])
+def test_names_of_sets_that_mean_something_are_refused(spec: DownstreamSettings, name: str) -> None:
+    data = replace(spec.sets[0], name=name)
+    with refused(f"--sets {name}: ", "call the set"):
+        plan_downstream(replace(replace(spec, conditions=None), sets=(data,)))
+
+
+def test_names_of_sets_stand_once(spec: DownstreamSettings) -> None:
+    with refused("--sets: a name stands twice in kin kin"):
+        plan_downstream(replace(spec, sets=spec.sets * 2))
+
+
+def test_captures_without_truth_to_test_on_are_refused(spec: DownstreamSettings, capture: Path) -> None:
+    there = replace(spec, capture=capture)
+    (capture / "truth" / "masks" / "012.png").unlink()
+    assert plan_downstream(there).settings.splits == ("test",)
+    with refused("--splits: unseen: no frame of it has a true mask"):
+        plan_downstream(replace(there, splits=("unseen",)))
+    for name in ("006", "007"):
+        (capture / "truth" / "masks" / f"{name}.png").unlink()
+    with refused(str(capture), "no frame outside of split train has a true mask"):
+        plan_downstream(there)
+
+
+def test_sets_alone_need_no_labelled_frame(spec: DownstreamSettings, capture: Path) -> None:
+    for frame in (0, 1, 2, 3, 4, 5, 8, 9, 10, 11):
+        (capture / "truth" / "masks" / f"{frame:03d}.png").unlink()
+    alone = replace(replace(spec, conditions=("kin",), folds=1), capture=capture)
+    result = trained(alone)
+    assert result["labelled"] == 0
+    assert "error" not in result["jobs"][0]
+    with refused("split train: no frame has a label; give --labels FOLDER"):
+        plan_downstream(replace(alone, conditions=("kin+real",)))
+
+
+def test_labels_of_ones_own_are_taught_and_the_truth_is_tested(
+    spec: DownstreamSettings, tmp_path: Path, recorded: Path
+) -> None:
+    labels = tmp_path / "labels"
+    for name in ("001", "004"):
+        save_grey(labels / f"{name}.png", 255 - (read_grey(recorded / "truth" / "masks" / f"{name}.png") > 0) * 255)
+    result = trained(replace(replace(spec, conditions=("real",), num_real=("all",), folds=1), labels=labels, steps=40))
+    assert result["labelled"] == 2
+    assert result["jobs"][0]["splits"]["test"]["iou"] < 0.3  # it learned the tissue, as it was told
+    assert any(str(labels) in note for note in result["notes"])
+
+
+def test_soft_targets_of_parts_are_refused(spec: DownstreamSettings) -> None:
+    with refused("--conditions kin+soft: ", "use --classes instrument"):
+        plan_downstream(replace(replace(spec, conditions=("kin+soft",)), classes="parts"))
+    assert plan_downstream(replace(replace(spec, conditions=("kin+ignore",)), classes="parts"))
+
+
+def test_edges_that_a_set_lacks_are_refused_before_the_work(spec: DownstreamSettings, drawn: Path) -> None:
+    shutil.rmtree(drawn / "soft")
+    plan_downstream(spec)
+    with refused("--sets kin", "soft", "kin+hard"):
+        plan_downstream(replace(spec, conditions=("kin", "kin+soft")))
+
+
+def test_a_model_that_lacks_something_is_refused_with_the_remedy(spec, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Pixels, "missing_requirement", classmethod(lambda cls: "needs patience; pip install patience"))
+    with refused("--models pixels: needs patience; pip install patience"):
+        plan_downstream(spec)
+
+
+def test_images_too_small_for_a_model_are_refused(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Pixels, "is_too_small", classmethod(lambda cls, size: size[0] < 48))
+    plan_downstream(spec)
+    with refused("--models pixels: it would see images of 24x16 px, too small for it; give a larger --size"):
+        plan_downstream(replace(spec, size=24))
+
+
+def test_boxes_of_instruments_that_labels_do_not_tell_apart_are_refused(
+    spec: DownstreamSettings, capture: Path
+) -> None:
+    file = capture / "transforms.json"
+    stated = json.loads(file.read_text())
+    stated["instruments"].append({"name": "second"})
+    for frame in stated["frames"]:
+        frame["instruments"].append({**frame["instruments"][0], "name": "second"})
+    file.write_text(json.dumps(stated))
+    two = replace(spec, capture=capture)
+    plan_downstream(two)
+    with refused("--models corners", "labels do not tell the 2 instruments apart", "a model that predicts masks"):
+        plan_downstream(replace(two, models=("corners",)))
+
+
+# boxes, parts, notes
+
+
+def test_boxes_are_scored_and_kept(spec: DownstreamSettings) -> None:
+    job = trained(replace(spec, models=("corners",), conditions=("kin",), folds=1))["jobs"][0]
+    scores = job["splits"]["test"]
+    assert {"ap", "ap50", "ap75", "box_precision", "box_recall", "frames"} == set(scores)
+    file = job_folder(spec.output, "corners", "kin", 0, 0) / "predictions" / "test" / "boxes.json"
+    kept = json.loads(file.read_text())
+    assert list(kept) == ["006", "007"]
+    assert kept["006"] == {"boxes": [[0, 0, 24, 20]], "classes": [1], "scores": [0.9]}
+
+
+def test_parts_are_scored_apart_and_take_more_steps(spec: DownstreamSettings) -> None:
+    result = trained(replace(replace(spec, conditions=("kin+real",), folds=1), classes="parts"))
+    assert {job["iterations"] for job in result["jobs"]} == {15}  # not six
+    assert result["classes"] == ["shaft", "wrist", "jaws"]
+    scores = result["jobs"][0]["splits"]["test"]
+    assert {"iou", "shaft.iou", "wrist.iou", "jaws.iou", "iou_jaws"} <= set(scores)
+    titles = [column.title for column in tables_of(result)[0].columns]
+    assert "jaws IoU" in titles
+
+
+def test_a_wrong_file_in_a_set_fails_its_jobs_alone(spec: DownstreamSettings, drawn: Path) -> None:
+    parts = bar_parts(3)
+    parts[0, 0] = 77
+    save_grey(drawn / "parts" / "000003.png", parts)
+    result = trained(replace(spec, folds=1, num_real=("0", "6")))
+    failed = [job["condition"] for job in result["jobs"] if "error" in job]
+    assert failed == ["kin", "kin+real"]
+    assert "000003.png: id 77 has no class" in result["jobs"][1]["error"]
+
+
+def test_a_course_that_still_rises_is_noted(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    from neeco.studies.downstream import model as torch_training
+
+    score = [0.0]
+
+    def rising(*_) -> float:
+        score[0] += 0.01
+        return score[0]
+
+    monkeypatch.setattr(torch_training, "validation_score", rising)
+    result = trained(replace(spec, conditions=("kin",), folds=1))
+    assert result["jobs"][0]["still_learning"]
+    assert "still getting better at the last step: pixels, kin; give more --steps" in result["notes"]
+
+
+# files
+
+
+def test_tables_hold_the_numbers(spec: DownstreamSettings) -> None:
+    result = trained(spec)
+    write_tables(spec.output, result)
+    rows = {(row["condition"], row["real"], row["split"]): row for row in result["summary"]}
+    with (spec.output / "downstream.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    assert len(lines) == 10
+    for line in lines:
+        value = rows[line["condition"], int(line["real"]), line["split"]]["iou"]
+        assert float(line["iou_mean"]) == value["mean"]
+        assert float(line["iou_std"]) == value["std"]
+        assert line["iou_n"] == "2"
+    markdown, latex = ((spec.output / f"downstream.{kind}").read_text() for kind in ("md", "tex"))
+    mean = rows["kin+real", 10, "test"]["iou"]["mean"]
+    assert f"{mean:.3f}" in markdown
+    assert f"{mean:.3f}" in latex
+    assert "pixels: 6 steps of 2 images of 48x40; 2 folds" in markdown
+    assert all(sentence.split(":")[0] in markdown for sentence in result["answers"])
+    assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == len(tables_of(result)) == 4
+    counts = {}
+    for file in (spec.output / "data").glob("*.csv"):
+        with file.open(newline="") as stream:
+            counts[file.name] = len(list(csv.DictReader(stream)))
+    assert counts["scores.csv"] == 20
+    assert counts["frames.csv"] == 30
+    assert counts["jobs.csv"] == 10
+    assert counts["paired.csv"] == len(result["paired"]) > 0
+    assert counts["validation.csv"] == sum(len(job["validation"]) for job in result["jobs"]) > 0
+
+
+def test_jobs_are_handed_the_capture(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    from neeco.studies.downstream import job
+
+    monkeypatch.setattr(job, "read_capture", lambda *_: pytest.fail("read again"))
+    assert trained(replace(spec, conditions=("kin",), folds=1))["complete"]
+
+
+def test_a_set_of_others_is_no_less_a_set(spec: DownstreamSettings, tmp_path: Path) -> None:
+    root = write_set(tmp_path / "others", info=False)
+    result = trained(replace(replace(spec, conditions=("kin",), folds=1), sets=(DataSet("kin", root),)))
+    assert result["sets"][0]["made_by"] is None
+    assert "error" not in result["jobs"][0]
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray")
+def test_two_workers_give_the_same_numbers(spec: DownstreamSettings, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.undo()
+    small = replace(replace(spec, models=("unet",), conditions=("kin", "real"), num_real=("0", "6"), folds=1), steps=3)
+    here, there = (trained(replace(small, output=tmp_path / str(workers), workers=workers)) for workers in (1, 2))
+    assert without_times(here["jobs"]) == without_times(there["jobs"])

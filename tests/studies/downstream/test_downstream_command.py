@@ -1,0 +1,165 @@
+"""`neeco downstream` as it is typed: what it prints, its exit status, and one line for what is wrong."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from downstream_world import read_grey, save_grey
+
+from neeco.cli import main
+from neeco.errors import NeecoError
+
+pytest.importorskip("monai")
+
+from neeco.studies.downstream.models.unet import UNet
+
+SHORT = ["--steps", "2", "--batch", "2", "--size", "48", "--folds", "1", "--device", "cpu"]
+PAGE = "neeco.report.downstream_page"
+
+
+@pytest.fixture(autouse=True)
+def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One thread, a small model, and a page even where there is none to write."""
+    torch.set_num_threads(1)
+    monkeypatch.setattr("neeco.studies.downstream.models.unet.UNet.channels", (4, 4, 8, 8, 8))
+    monkeypatch.setenv("COLUMNS", "160")
+    if importlib.util.find_spec(PAGE) is None:
+        page = ModuleType(PAGE)
+        page.write_downstream_report = lambda output, experiment, capture: output / "downstream.html"  # type: ignore
+        monkeypatch.setitem(sys.modules, PAGE, page)
+
+
+@pytest.fixture
+def words(recorded: Path, drawn: Path, tmp_path: Path) -> list[str]:
+    named = [str(recorded), "--output", str(tmp_path / "out"), "--sets", f"kin={drawn}", "--num-real", "0", "6"]
+    return ["downstream", *named, *SHORT]
+
+
+def stopped_by(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line that it ends in, exit status 1."""
+    assert main(words) == 1
+    told = capsys.readouterr()
+    assert "Traceback" not in told.err + told.out
+    assert len(told.err.strip().splitlines()) == 1
+    assert told.err.startswith("neeco: error: ")
+    return told.err
+
+
+def test_it_prints_tables_answers_and_where_all_of_it_lies(words, tmp_path: Path, capsys) -> None:
+    assert main(words) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    output = tmp_path / "out"
+    result = json.loads((output / "downstream.json").read_text())
+    assert result["complete"]
+    assert [job["condition"] for job in result["jobs"]] == ["real", "real+augment", "kin", "kin+real"]
+    assert {"downstream.csv", "downstream.md", "downstream.tex", "data", "jobs"} <= {p.name for p in output.iterdir()}
+    assert all(sentence in shown for sentence in result["answers"])
+    assert "unet, split test" in shown
+    assert f"{output}/: downstream.json, data/" in shown
+    before = {file: file.stat().st_mtime_ns for file in output.glob("jobs/*/job.json")}
+    assert main(words) == 0
+    assert {file: file.stat().st_mtime_ns for file in output.glob("jobs/*/job.json")} == before
+
+
+def test_a_count_behind_a_set_takes_so_many(words, drawn: Path, tmp_path: Path) -> None:
+    words[words.index(f"kin={drawn}")] = f"kin={drawn}:4"
+    assert main([*words, "--conditions", "kin"]) == 0
+    result = json.loads((tmp_path / "out" / "downstream.json").read_text())
+    assert result["sets"][0]["images"] == 4
+    assert result["sets"][0]["path"] == str(drawn)
+
+
+def test_a_failing_training_is_told_and_is_exit_1(words, tmp_path: Path, monkeypatch, capsys) -> None:
+    fit = UNet.fit
+
+    def sometimes(self, task):
+        if "kin+real" in str(task.folder):
+            raise NeecoError("unet: its loss is not finite at step 1; begin from other --weights")
+        return fit(self, task)
+
+    monkeypatch.setattr(UNet, "fit", sometimes)
+    assert main([*words, "--conditions", "real", "kin+real"]) == 1
+    told = capsys.readouterr()
+    last = told.err.strip().splitlines()[-1]
+    assert last.startswith("neeco: error: 1 of 2 trainings failed: unet, kin+real, 6 labelled, fold 0: unet: its loss")
+    assert "report: " in told.out  # the others' results are there all the same
+    assert (tmp_path / "out" / "downstream.md").is_file()
+
+
+def test_ctrl_c_says_how_to_go_on(words, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(UNet, "loss", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+    assert main(words) == 130
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith("neeco: interrupted: job 1 of 4 (unet, real, 6 labelled, fold 0)")
+    assert "run the same command again to go on, nothing finished is lost" in last
+
+
+def test_weights_of_one_experiment_begin_another(words, recorded: Path, tmp_path: Path, capsys) -> None:
+    assert main([*words, "--conditions", "kin"]) == 0
+    weights = tmp_path / "out" / "jobs" / "unet-kin-real0-fold0" / "weights.safetensors"
+    again = [str(tmp_path / "next") if word == str(tmp_path / "out") else word for word in words]
+    assert main([*again, "--conditions", "real", "--weights", f"unet={weights}"]) == 0
+    result = json.loads((tmp_path / "next" / "downstream.json").read_text())
+    assert result["models"][0]["weights"] == str(weights)
+    capsys.readouterr()
+    bad = tmp_path / "bad.safetensors"
+    bad.write_text("nothing of the kind")
+    other = [str(tmp_path / "third") if word == str(tmp_path / "out") else word for word in words]
+    assert main([*other, "--conditions", "real", "--weights", f"unet={bad}"]) == 1
+    assert "cannot be read as safetensors" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (["--sets", "kin"], "--sets: 'kin' is not NAME=VALUE; write such as kinematic=dataset"),
+        (["--sets", "=x"], "--sets: '=x' is not NAME=VALUE"),
+        (["--sets", "kin=nowhere:0"], "--sets kin=nowhere:0: 0 images is nothing to learn from; give at least 1"),
+        (["--sets", "kin=nowhere"], "--sets kin: nowhere: no folder images/; give what `neeco synthesize` wrote"),
+        (["--sets", "kin=nowhere:many"], "--sets kin: nowhere:many: no folder images/"),
+        (["--models", "yolov9"], "--models: 'yolov9' is unknown; choose of dfine, unet, yolo"),
+        (["--num-real", "few"], "--num-real: 'few' is neither a number of labelled frames nor all"),
+        (["--num-real", "99"], "--num-real: 99 labelled frames are asked for, the capture has 10; use all"),
+        (["--conditions", "kin+reel"], "--conditions kin+reel: 'reel' is neither"),
+        (["--conditions", "kin+soft+ignore"], "one of hard, soft, ignore at most"),
+        (["--folds", "0"], "--folds: 0 is none at all; give at least 1"),
+        (["--workers", "0"], "--workers: 0 is none at all"),
+        (["--steps", "0"], "--steps: 0 is none at all"),
+        (["--size", "0"], "--size: 0 is none at all"),
+        (["--batch", "-1"], "--batch: -1 is none at all"),
+        (["--splits", "tset"], "has no split 'tset'; it has train, test, unseen"),
+        (["--labels", "nowhere"], "nowhere: no such folder; give a folder of masks"),
+        (["--weights", "unet"], "--weights: 'unet' is not NAME=VALUE; write such as unet=unet.safetensors"),
+        (["--weights", "unet=nowhere"], "--weights unet: nowhere: no such file"),
+        (["--weights", "dfine=nowhere"], "--weights: 'dfine' is not among --models unet"),
+        (["--device", "tpu"], "--device: 'tpu' is unknown"),
+        (["--transforms", "nowhere.json"], "nowhere.json"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_1(
+    more: list[str], told: str, words, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert told in stopped_by([*words, *more], capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_yolo_without_its_program_is_one_line(words, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert "--models yolo: needs the program `yolo`" in stopped_by([*words, "--models", "yolo"], capsys)
+
+
+def test_parts_are_asked_of_labels_that_tell_them(words, recorded: Path, tmp_path: Path, capsys) -> None:
+    for name in ("000", "001"):
+        mask = (read_grey(recorded / "truth" / "masks" / f"{name}.png") > 0) * 255
+        save_grey(tmp_path / "labels" / f"{name}.png", mask)
+    more = ["--classes", "parts", "--labels", str(tmp_path / "labels"), "--num-real", "2"]
+    assert "--classes parts: the labels in" in stopped_by([*words, *more], capsys)

@@ -1,0 +1,298 @@
+"""Models learn an easy task, the same bits from the same seed, and nothing from pixels that do not count."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from downstream_world import Held, Pixels, square, squares, task_of
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from neeco.errors import NeecoError
+from neeco.evaluation.mask_metrics import iou
+from neeco.studies.downstream.model import WEIGHTS_FILE, find_models, input_size, load_weights, model_class
+from neeco.studies.downstream.models import dfine
+from neeco.studies.downstream.models.dfine import DFine
+from neeco.studies.downstream.models.unet import UNet, targets
+from neeco.studies.downstream.samples import BatchSampler, Example
+from neeco.studies.downstream.scores import Detections
+
+
+def needs(model: str) -> None:
+    if lack := model_class(model).missing_requirement():
+        pytest.skip(lack)
+
+
+# the models
+
+
+def test_a_unet_learns_bright_rectangles_and_repeats_bit_for_bit(tmp_path: Path) -> None:
+    needs("unet")
+    tested, told = [square(200 + k) for k in range(3)], []
+    folders = [tmp_path / "one", tmp_path / "two"]
+    for folder in folders:
+        task = task_of(folder, steps=25, batch=3, progress=lambda share, text: told.append((share, text)))
+        fitted = UNet().fit(task)
+    answers = fitted.predict([example.image for example in tested])
+    assert all(answer.dtype == np.uint8 and answer.shape == (64, 64) for answer in answers)
+    assert np.mean([iou(a > 0, e.classes > 0) for a, e in zip(answers, tested, strict=True)]) > 0.7
+    first, second = ((folder / WEIGHTS_FILE).read_bytes() for folder in folders)
+    assert first == second
+    assert [step for step, _ in fitted.validation] == [2, 5, 8, 10, 12, 15, 18, 20, 22, 25]
+    assert dict(fitted.validation)[fitted.best_step] == max(score for _, score in fitted.validation)
+    assert [share for share, _ in told[:3]] == [10 / 25, 20 / 25, 1.0]
+    assert "step 25" in told[2][1]
+
+
+def test_another_seed_or_other_threads_of_random_numbers_give_other_or_the_same_weights(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    Pixels().fit(task_of(tmp_path / "a"))
+    torch.manual_seed(2)
+    before = torch.random.get_rng_state()
+    Pixels().fit(task_of(tmp_path / "b"))
+    assert torch.equal(before, torch.random.get_rng_state())  # nobody else's numbers are used or spent
+    Pixels().fit(task_of(tmp_path / "c", seed=1))
+    a, b, c = ((tmp_path / name / WEIGHTS_FILE).read_bytes() for name in "abc")
+    assert a == b != c
+
+
+@pytest.fixture
+def small_dfine(monkeypatch: pytest.MonkeyPatch) -> None:
+    needs("dfine")
+    monkeypatch.setattr(DFine, "stages", (16, 32, 64, 64))
+    monkeypatch.setattr(DFine, "width", 32)
+    monkeypatch.setattr(DFine, "queries", 6)
+    monkeypatch.setattr(DFine, "learning_rate", 2e-3)
+
+
+def test_a_dfine_learns_where_rectangles_are(small_dfine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    losses, loss = [], DFine.loss
+
+    def watched(self, *given) -> Tensor:
+        value = loss(self, *given)
+        losses.append(value.item())
+        return value
+
+    monkeypatch.setattr(DFine, "loss", watched)
+    fitted = DFine().fit(task_of(tmp_path, batches=BatchSampler([squares(2)], 0), validation=(), steps=40))
+    assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:5])
+    assert (fitted.best_step, fitted.validation) == (40, [])
+    (answer,) = fitted.predict([square(0).image])
+    assert isinstance(answer, Detections)
+    assert answer.boxes.shape == (6, 4)
+
+
+def test_dfines_answers_are_boxes_of_each_image_best_first() -> None:
+    logits = torch.tensor([[[-1.0, 2.0], [0.5, -3.0]]])  # two queries of two classes
+    boxes = torch.tensor([[[0.5, 0.5, 0.5, 0.25], [0.9, 0.1, 0.4, 0.2]]])
+    output = SimpleNamespace(logits=logits, pred_boxes=boxes)
+    (answer,) = DFine().predictions(lambda pixel_values: output, torch.zeros(1, 3, 32, 32), [(40, 80)])
+    assert isinstance(answer, Detections)
+    assert answer.classes.tolist() == [2, 1, 1, 2]
+    assert answer.scores == pytest.approx(torch.tensor([2.0, 0.5, -1, -3]).sigmoid().numpy())
+    assert answer.boxes == pytest.approx(
+        np.array([[20, 15, 60, 25], [56, 0, 80, 8], [20, 15, 60, 25], [56, 0, 80, 8]]), abs=1e-4
+    )  # in pixels of the image as it was given, and inside it
+
+
+def test_a_dfine_repeats_bit_for_bit_and_bears_images_without_an_instrument(small_dfine, tmp_path: Path) -> None:
+    empty = replace(square(0), classes=np.zeros((64, 64), np.uint8), instruments=np.zeros((64, 64), np.uint8))
+    for name in ("one", "two"):
+        feed = BatchSampler([[Held(empty), Held(empty), *squares(1)]], 0)
+        DFine().fit(task_of(tmp_path / name, batches=feed, validation=(Held(empty),), steps=3))
+    first, second = ((tmp_path / name / WEIGHTS_FILE).read_bytes() for name in ("one", "two"))
+    assert first == second
+
+
+def test_a_dfine_begins_from_its_own_weights_exactly(small_dfine, tmp_path: Path) -> None:
+    DFine().fit(task_of(tmp_path, steps=2, validation=()))
+    with torch.random.fork_rng():
+        torch.manual_seed(9)
+        module = DFine().build(1)
+    load_weights(module, tmp_path / WEIGHTS_FILE)
+    stored, own = load_file(tmp_path / WEIGHTS_FILE), module.state_dict()
+    assert all(torch.equal(value, own[name]) for name, value in stored.items())
+    shared = {value.data_ptr() for name, value in own.items() if name in stored}
+    assert all(value.data_ptr() in shared for value in own.values())  # what is not stored is tied to what is
+
+
+def test_what_dfine_is_told_of_an_image() -> None:
+    classes = np.zeros((40, 80), np.uint8)
+    classes[10:20, 20:60] = 2
+    example = Example(np.zeros((40, 80, 3), np.uint8), classes, (classes > 0).astype(np.uint8))
+    labels = dfine._labels(example, torch.device("cpu"))
+    assert labels["class_labels"].tolist() == [1]
+    assert labels["boxes"].tolist() == [[0.5, 0.375, 0.5, 0.25]]
+
+
+def test_a_dfine_needs_as_many_places_as_boxes(small_dfine, tmp_path: Path) -> None:
+    assert not DFine.is_too_small((64, 32))
+    DFine().fit(task_of(tmp_path, size=(64, 32), steps=1))
+    assert DFine.is_too_small((32, 32))
+    assert not UNet.is_too_small((16, 16))
+
+
+# what every model's training does
+
+
+def test_the_weights_that_did_best_on_what_is_held_back_are_kept(tmp_path: Path, monkeypatch) -> None:
+    from neeco.studies.downstream import model as training
+
+    scores, states = iter([0.1, 0.4, 0.9, 0.2, 0.9, 0.3, 0.3, 0.2, 0.1, 0.5]), []
+    monkeypatch.setattr(training, "validation_score", lambda *_: next(scores))
+    loss = Pixels.loss
+
+    def watched(self, module, *given) -> Tensor:
+        states.append({name: value.clone() for name, value in module.state_dict().items()})  # before the step
+        return loss(self, module, *given)
+
+    monkeypatch.setattr(Pixels, "loss", watched)
+    fitted = Pixels().fit(task_of(tmp_path, steps=20))
+    assert fitted.best_step == 10  # the later of two that are as good
+    stored = load_file(tmp_path / WEIGHTS_FILE)
+    assert all(torch.equal(value, states[10][name]) for name, value in stored.items())
+    assert not torch.equal(stored["weight"], states[19]["weight"])
+
+
+def test_without_validation_the_last_weights_are_kept(tmp_path: Path) -> None:
+    fitted = Pixels().fit(task_of(tmp_path, validation=()))
+    assert (fitted.best_step, fitted.validation) == (4, [])
+
+
+@pytest.mark.parametrize("steps", [1, 3, 7])
+def test_few_steps_are_steps_too(steps: int, tmp_path: Path) -> None:
+    fitted = Pixels().fit(task_of(tmp_path, steps=steps))
+    assert 1 <= fitted.best_step <= steps
+    assert fitted.validation[-1][0] == steps
+
+
+def test_a_loss_that_is_not_finite_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loss = Pixels.loss
+    monkeypatch.setattr(Pixels, "loss", lambda *given: loss(*given) * float("nan"))
+    with pytest.raises(NeecoError, match="pixels: its loss is not finite at step 1"):
+        Pixels().fit(task_of(tmp_path))
+    assert not (tmp_path / WEIGHTS_FILE).exists()
+
+
+def test_many_images_are_answered_in_pieces_the_same(tmp_path: Path) -> None:
+    fitted = Pixels().fit(task_of(tmp_path))
+    images = [square(k).image for k in range(35)]
+    together = fitted.predict(images)
+    assert len(together) == 35
+    assert all(
+        np.array_equal(fitted.predict([image])[0], answer) for image, answer in zip(images, together, strict=True)
+    )
+    assert fitted.predict([]) == []
+
+
+# weights to begin from
+
+
+def test_weights_are_begun_from(tmp_path: Path) -> None:
+    Pixels().fit(task_of(tmp_path / "first", steps=30))
+    begun = Pixels.learning_rate
+    try:
+        Pixels.learning_rate = 0.0
+        Pixels().fit(task_of(tmp_path / "second", seed=3, weights=tmp_path / "first" / WEIGHTS_FILE))
+    finally:
+        Pixels.learning_rate = begun
+    first, second = (load_file(tmp_path / name / WEIGHTS_FILE) for name in ("first", "second"))
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_weights_of_other_models_or_none_are_refused(tmp_path: Path) -> None:
+    save_file({"weight": torch.zeros(2, 3, 1, 1), "else": torch.zeros(3)}, tmp_path / "half.safetensors")
+    Pixels().fit(task_of(tmp_path / "job", weights=tmp_path / "half.safetensors"))  # one of two tensors fits
+    save_file({"weight": torch.zeros(5, 3, 1, 1), "bias": torch.zeros(5)}, tmp_path / "other.safetensors")
+    (tmp_path / "text.safetensors").write_text("not weights at all, but a text of some length")
+    for name, told in (("other", "0 of 2 tensors fit; give weights of this model"), ("text", "cannot be read as")):
+        with pytest.raises(NeecoError, match=f"--weights: .*{name}.safetensors: {told}") as refused:
+            Pixels().fit(task_of(tmp_path / "job", weights=tmp_path / f"{name}.safetensors"))
+        assert "\n" not in str(refused.value)
+
+
+# what a unet learns of every pixel
+
+
+def half_counted(seed: int, side: int = 64) -> Example:
+    return replace(square(seed, side), valid=np.random.default_rng(seed).random((side, side)) > 0.4)
+
+
+@pytest.mark.parametrize("side", [64, 48, 20, 96])
+def test_labels_of_pixels_that_do_not_count_change_no_loss(side: int) -> None:
+    torch.manual_seed(0)
+    module, images = Pixels().build(1), torch.rand(3, 3, side, side)
+    examples = [half_counted(seed) for seed in range(3)]
+    other = [replace(e, classes=np.where(e.valid, e.classes, 1 - e.classes).astype(np.uint8)) for e in examples]
+    soft = [replace(e, coverage=(0.7 * e.classes).astype(np.float32)) for e in examples]
+    dull = [replace(e, coverage=np.where(e.valid, e.coverage, 0.2).astype(np.float32)) for e in soft]
+    for these, those in ((examples, other), (soft, dull)):
+        losses = [Pixels().loss(module, images, some).item() for some in (these, those)]
+        assert losses[0] == pytest.approx(losses[1], abs=1e-6)
+    whole = [replace(example, valid=None) for example in examples]
+    assert Pixels().loss(module, images, whole).item() != pytest.approx(
+        Pixels().loss(module, images, examples).item(), abs=1e-4
+    )
+
+
+def test_where_nothing_counts_the_loss_is_finite() -> None:
+    none = replace(square(0), valid=np.zeros((64, 64), bool))
+    loss = Pixels().loss(Pixels().build(1), torch.rand(1, 3, 32, 32), [none])
+    assert torch.isfinite(loss)
+
+
+def test_targets_are_shares_of_area() -> None:
+    classes = np.zeros((4, 8), np.uint8)
+    classes[:2, :1], classes[:, 4:6] = 1, 2
+    counted = np.ones((4, 8), bool)
+    counted[2:, 6:] = False
+    example = Example(np.zeros((4, 8, 3), np.uint8), classes, classes, counted)
+    shares, weights = targets([example], 3, (2, 4))
+    assert shares[0].sum(0).tolist() == [[1, 1, 1, 1], [1, 1, 1, 0]]
+    assert shares[0, 1].tolist() == [[0.5, 0, 0, 0], [0, 0, 0, 0]]
+    assert shares[0, 2].tolist() == [[0, 0, 1, 0], [0, 0, 1, 0]]
+    assert weights[0].tolist() == [[1, 1, 1, 1], [1, 1, 1, 0]]
+
+
+def test_soft_targets_are_the_share_of_instrument() -> None:
+    example = replace(square(0), coverage=np.full((64, 64), 0.3, np.float32))
+    shares, weights = targets([example, square(0)], 2, (16, 16))
+    assert shares[0, 1].numpy() == pytest.approx(np.full((16, 16), 0.3), abs=1e-6)
+    assert shares[0, 0].numpy() == pytest.approx(np.full((16, 16), 0.7), abs=1e-6)
+    assert shares[1, 1].max() == 1
+    assert weights.min() == 1
+
+
+# finding them
+
+
+def test_models_are_found_by_their_names() -> None:
+    assert list(find_models()) == ["dfine", "unet", "yolo"]
+    assert model_class("unet") is UNet
+    with pytest.raises(NeecoError, match=re.escape("--models: 'u-net' is unknown; choose of dfine, unet, yolo")):
+        model_class("u-net")
+
+
+@pytest.mark.parametrize(
+    ("frame", "side", "multiple", "size"),
+    [
+        ((1280, 1024), 160, 16, (160, 128)),
+        ((1024, 1280), 160, 16, (128, 160)),
+        ((1920, 1080), 192, 32, (192, 96)),
+        ((48, 40), 160, 16, (48, 32)),
+        ((640, 20), 160, 16, (160, 16)),
+        ((1280, 1024), 100, 16, (96, 80)),
+        ((1280, 1024), 110, 16, (96, 80)),
+        ((1280, 1024), 5, 16, (16, 16)),
+    ],
+)
+def test_images_are_seen_no_larger_than_asked(frame, side: int, multiple: int, size: Sequence[int]) -> None:
+    assert input_size(frame, side, multiple) == tuple(size)

@@ -1,0 +1,370 @@
+"""What files say: which pixels are which class, which count, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from downstream_world import bar_parts, picture_of, read_grey, save_grey, save_rgb, write_ids, write_set
+
+from neeco.capture import read_capture
+from neeco.errors import NeecoError
+from neeco.studies.downstream.samples import (
+    WHOLE,
+    DataSet,
+    Example,
+    class_names,
+    frame_size,
+    has_labels,
+    recorded_samples,
+    synthetic_samples,
+)
+
+SIZE = (48, 40)
+
+
+PARTS = ("shaft", "wrist", "jaws")
+
+
+def loaded(root: Path, classes=WHOLE, edges="hard", count=None) -> list[Example]:
+    return [sample.load() for sample in synthetic_samples(DataSet("set", root, count), classes, edges, SIZE)]
+
+
+def refused(*words: str):
+    """A line that has all of these in this order."""
+    return pytest.raises(NeecoError, match=".*".join(map(re.escape, words)))
+
+
+# drawn images
+
+
+def test_one_class_is_every_part(drawn: Path) -> None:
+    example = loaded(drawn)[1]
+    assert np.array_equal(example.classes, (bar_parts(1) > 0).astype(np.uint8))
+    assert np.array_equal(example.instruments, example.classes)
+    assert example.image.dtype == example.classes.dtype == np.uint8
+    assert np.array_equal(example.image, picture_of(bar_parts(1), 1))
+    assert example.valid is None
+    assert example.coverage is None
+
+
+def test_of_parts_both_jaws_are_one_class(drawn: Path) -> None:
+    example = loaded(drawn, PARTS)[2]
+    assert np.array_equal(example.classes, np.minimum(bar_parts(2), 3))
+    assert set(np.unique(example.instruments)) == {0, 1}
+
+
+def test_parts_of_any_name_are_classes_as_the_truth_names_them(capture: Path, drawn: Path) -> None:
+    names = [
+        {"id": number, "part": part} for number, part in enumerate(("rod", "cone", "blade_left", "blade_right"), 1)
+    ]
+    (capture / "truth" / "masks" / "parts.json").write_text(json.dumps({"ids": names}))
+    assert class_names(read_capture(capture), "parts") == ("rod", "cone", "blades")
+    sample = recorded_samples(read_capture(capture), "test", "parts")[0]
+    assert {1, 3} <= set(np.unique(sample.load().classes)) <= {0, 1, 2, 3}
+    assert set(sample.pairs()) == {"blades"}
+    with refused("--sets set", "none of the parts rod, cone, blades"):
+        loaded(drawn, ("rod", "cone", "blades"))
+
+
+def test_ids_mean_what_dataset_json_says(drawn: Path) -> None:
+    write_ids(drawn, (("bar", "jaw_right"), ("bar", "shaft"), ("bar", "jaw_left"), ("bar", "wrist")))
+    parts, classes = bar_parts(0), loaded(drawn, PARTS)[0].classes
+    assert [set(np.unique(classes[parts == number])) for number in (1, 2, 3, 4)] == [{3}, {1}, {3}, {2}]
+
+
+def test_two_instruments_have_boxes_apart(drawn: Path) -> None:
+    write_ids(drawn, (("left", "shaft"), ("left", "jaw_left"), ("right", "shaft"), ("right", "jaw_right")))
+    top, left = (int(edge) for edge in np.argwhere(bar_parts(0))[0])
+    boxes, classes = loaded(drawn)[0].boxes()
+    assert boxes.tolist() == [[left, top, left + 10, top + 8], [left + 10, top, left + 20, top + 8]]
+    assert classes.tolist() == [1, 1]
+    boxes, classes = loaded(drawn, PARTS)[0].boxes()
+    assert classes.tolist() == [1, 3, 1, 3]
+    assert boxes[:, 0].tolist() == [left, left + 5, left + 10, left + 15]
+
+
+def test_boxes_end_after_the_last_pixel_and_nothing_has_none() -> None:
+    classes = np.zeros((6, 9), np.uint8)
+    classes[2, 3] = 1
+    blank = np.zeros((6, 9, 3), np.uint8)
+    boxes, numbers = Example(blank, classes, classes).boxes()
+    assert boxes.tolist() == [[3, 2, 4, 3]]
+    assert numbers.dtype == np.int64
+    boxes, numbers = Example(blank, classes * 0, classes * 0).boxes()
+    assert boxes.shape == (0, 4)
+    assert numbers.shape == (0,)
+
+
+def test_edges_are_read_where_they_are_asked_for(drawn: Path) -> None:
+    parts = bar_parts(0)
+    top = int(np.argwhere(parts)[0][0])
+    soft, ignore = loaded(drawn, edges="soft")[0], loaded(drawn, edges="ignore")[0]
+    assert soft.valid is None
+    assert soft.coverage is not None
+    assert soft.coverage.dtype == np.float32
+    assert np.allclose(soft.coverage, (parts > 0) * 200 / 255)
+    assert ignore.coverage is None
+    assert ignore.valid is not None
+    assert not ignore.valid[top : top + 2].any()
+    assert ignore.valid.sum() == (40 - 2) * 48
+    assert np.array_equal(ignore.classes, loaded(drawn)[0].classes)
+
+
+def test_a_count_takes_the_first_images(drawn: Path) -> None:
+    samples = synthetic_samples(DataSet("set", drawn, 4), WHOLE, "hard", SIZE)
+    assert [sample.name for sample in samples] == ["000000", "000001", "000002", "000003"]
+    assert len(synthetic_samples(DataSet("set", drawn), WHOLE, "hard", SIZE)) == 6
+
+
+def annotated(drawn: Path, splits: list[str]) -> Path:
+    """The set as if `neeco annotate` had written it."""
+    info = json.loads((drawn / "dataset.json").read_text())
+    (drawn / "dataset.json").write_text(json.dumps(info | {"settings": {"annotates": "/captures/one"}}))
+    lines = [{"image": f"images/{k:06d}.png", "recorded_split": split} for k, split in enumerate(splits)]
+    (drawn / "states.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return drawn
+
+
+def test_of_annotated_frames_only_those_trained_on_are_learned_from(drawn: Path) -> None:
+    splits = ["test", "train", "train", "unseen", "train", "test"]
+    samples = synthetic_samples(DataSet("set", annotated(drawn, splits)), WHOLE, "hard", SIZE)
+    assert [sample.name for sample in samples] == ["000001", "000002", "000004"]
+
+
+def test_annotated_frames_that_say_no_split_are_refused(drawn: Path) -> None:
+    with refused("--sets set", "none of its frames is of split train"):
+        loaded(annotated(drawn, ["test"] * 6))
+    with refused("--sets set", "states.jsonl: not as `neeco annotate` writes it"):
+        loaded(annotated(drawn, ["train"] * 5))
+    (drawn / "states.jsonl").write_text("[" * 100_000)
+    with refused("--sets set", "states.jsonl: not as `neeco annotate` writes it"):
+        loaded(drawn)
+    (drawn / "states.jsonl").unlink()
+    with refused("states.jsonl: no such file"):
+        loaded(drawn)
+
+
+@pytest.mark.parametrize("value", [1, 255])
+def test_of_a_set_of_others_masks_are_enough(value: int, tmp_path: Path) -> None:
+    root = write_set(tmp_path / "others", info=False)
+    shutil.rmtree(root / "parts")
+    for file in (root / "masks").iterdir():
+        save_grey(file, (read_grey(file) > 0) * value)
+    (root / "images" / ".hidden.png").write_bytes(b"half written")
+    (root / "images" / "notes.txt").write_text("not an image")
+    examples = loaded(root)
+    assert len(examples) == 6
+    assert np.array_equal(examples[3].classes, bar_parts(3) > 0)
+    with refused("--sets set", "dataset.json", "use --classes instrument"):
+        loaded(root, PARTS)
+
+
+def test_sets_that_cannot_be_read_are_refused(drawn: Path, tmp_path: Path) -> None:
+    with refused("--sets set", "no folder images/", "neeco synthesize"):
+        loaded(tmp_path / "nowhere")
+    (tmp_path / "empty" / "images").mkdir(parents=True)
+    with refused("--sets set", "has no image", "neeco synthesize"):
+        loaded(tmp_path / "empty")
+    with refused("--sets set", "has 6 images, not 7; synthesize more"):
+        loaded(drawn, count=7)
+    with refused("--sets set", "is 48x40, the capture's frames are 60x50"):
+        synthetic_samples(DataSet("set", drawn), WHOLE, "hard", (60, 50))
+    (drawn / "parts" / "000005.png").unlink()
+    assert len(loaded(drawn, count=5)) == 5
+    with refused("--sets set", "000005.png", "every image needs its labels"):
+        loaded(drawn)
+
+
+def test_an_image_of_another_size_is_refused_wherever_it_stands(drawn: Path) -> None:
+    save_rgb(drawn / "images" / "000004.png", picture_of(bar_parts(4, (24, 20)), 4))
+    with refused("--sets set", "000004.png is 24x20", "48x40"):
+        loaded(drawn)
+    write_set(drawn)
+    save_grey(drawn / "parts" / "000004.png", np.zeros((20, 24)))
+    with refused("000004.png", "24x20"):
+        loaded(drawn)
+
+
+@pytest.mark.parametrize("linked", ["images", "images/000003.png", "parts/000003.png", "soft", "dataset.json"])
+def test_a_set_is_read_from_its_own_folder_alone(linked: str, drawn: Path, tmp_path: Path) -> None:
+    (drawn / linked).rename(tmp_path / "elsewhere")
+    (drawn / linked).symlink_to(tmp_path / "elsewhere")
+    with refused(linked, "a link leads out of"):
+        loaded(drawn, edges="soft")
+
+
+@pytest.mark.parametrize("edges", ["soft", "ignore"])
+def test_a_set_without_its_edges_is_refused(edges, drawn: Path) -> None:
+    (drawn / edges / "000002.png").unlink()
+    with refused("--sets set", f"{edges}/000002.png", "set+hard"):
+        loaded(drawn, edges=edges)
+    assert len(loaded(drawn)) == 6
+
+
+def test_ids_that_mean_nothing_are_refused(drawn: Path) -> None:
+    parts = bar_parts(0)
+    parts[0, 0] = 9
+    save_grey(drawn / "parts" / "000000.png", parts)
+    with refused("000000.png: id 9 has no class", "dataset.json"):
+        synthetic_samples(DataSet("set", drawn), WHOLE, "hard", SIZE)  # known before the work
+
+
+def test_a_description_with_numbers_that_are_none_is_refused(drawn: Path) -> None:
+    """It would go into downstream.json, which could not be written."""
+    stated = json.loads((drawn / "dataset.json").read_text())
+    (drawn / "dataset.json").write_text(json.dumps(stated | {"settings": {"count": float("nan")}}))
+    with refused("--sets set", "dataset.json: holds NaN or an infinite number; synthesize the set again"):
+        loaded(drawn)
+
+
+def test_parts_are_refused_where_labels_tell_none(drawn: Path) -> None:
+    write_ids(drawn, tuple((name, "instrument") for name in "abcd"))
+    assert loaded(drawn)[0].instruments.max() == 4
+    with refused("--sets set", "none of the parts", "use --classes instrument"):
+        loaded(drawn, PARTS)
+
+
+@pytest.mark.parametrize(
+    "ids",
+    [
+        None,
+        {},
+        "ids",
+        5,
+        [{"id": 0}, {"id": 1}],
+        [{"id": 0}, 3],
+        [{"id": 0}, {"id": "x", "instrument": "a", "part": "shaft"}],
+        [{"id": 0}, {"id": 300, "instrument": "a", "part": "shaft"}],
+        [{"id": 0}, {"id": -1, "instrument": "a", "part": "shaft"}],
+    ],
+)
+def test_a_damaged_dataset_json_is_refused(ids, drawn: Path) -> None:
+    (drawn / "dataset.json").write_text(json.dumps({} if ids is None else {"ids": ids}))
+    with refused("--sets set", "dataset.json: ids: not as `neeco synthesize` writes them"):
+        loaded(drawn)
+
+
+@pytest.mark.parametrize("text", ["[]", "7", "{"])
+def test_a_dataset_json_that_is_none_is_refused(text: str, drawn: Path) -> None:
+    (drawn / "dataset.json").write_text(text)
+    with refused("dataset.json"):
+        loaded(drawn)
+
+
+# recorded frames
+
+
+def test_recorded_frames_are_as_their_truth(capture: Path) -> None:
+    samples = recorded_samples(read_capture(capture), "train", "parts")
+    assert [sample.name for sample in samples] == [f"{k:03d}" for k in (0, 1, 2, 3, 4, 5, 8, 9, 10, 11)]
+    example, truth = samples[2].load(), read_grey(capture / "truth" / "masks" / "002.png")
+    assert set(np.unique(truth)) == {0, 1, 3}
+    assert np.array_equal(example.classes, truth)  # jaw_left is 3 there, jaws here
+    assert example.valid is None
+    one = recorded_samples(read_capture(capture), "train", "instrument")[2].load()
+    assert np.array_equal(one.classes, truth > 0)
+    assert frame_size(samples) == SIZE
+
+
+def test_ignored_pixels_of_a_frame_do_not_count(capture: Path) -> None:
+    mask = np.full((40, 48), 255)
+    mask[:7] = 0
+    save_grey(capture / "ignored" / "000.png", mask)
+    file = capture / "transforms.json"
+    stated = json.loads(file.read_text())
+    stated["frames"][0]["mask_path"] = "ignored/000.png"
+    file.write_text(json.dumps(stated))
+    first, second = (sample.load() for sample in recorded_samples(read_capture(capture), "train", "instrument")[:2])
+    assert first.valid is not None
+    assert np.array_equal(first.valid, mask > 0)
+    assert second.valid is None
+
+
+def test_frames_without_labels_are_left_out(capture: Path) -> None:
+    for name in ("000", "009"):
+        (capture / "truth" / "masks" / f"{name}.png").unlink()
+    names = [sample.name for sample in recorded_samples(read_capture(capture), "train", "instrument")]
+    assert names == ["001", "002", "003", "004", "005", "008", "010", "011"]
+
+
+def test_no_label_at_all_is_refused_with_the_remedy(capture: Path, tmp_path: Path) -> None:
+    read = read_capture(capture)
+    save_grey(tmp_path / "labels" / "elsewhere.png", bar_parts(0))
+    with refused("--labels", str(tmp_path / "labels"), "no frame has a label"):
+        recorded_samples(read, "train", "instrument", tmp_path / "labels")
+    shutil.rmtree(capture / "truth")
+    assert not has_labels(read, "test")
+    with refused(str(capture), "split train: no frame has a label", "give --labels FOLDER"):
+        recorded_samples(read, "train", "instrument")
+
+
+def test_labels_come_from_the_folder_given(capture: Path, tmp_path: Path) -> None:
+    labels = tmp_path / "labels"
+    save_grey(labels / "001_parts.png", bar_parts(1))
+    save_grey(labels / "004_parts.png", bar_parts(4))
+    save_grey(labels / "007_parts.png", bar_parts(0))  # a test frame
+    samples = recorded_samples(read_capture(capture), "train", "parts", labels)
+    assert [sample.name for sample in samples] == ["001", "004"]
+    assert np.array_equal(samples[1].load().classes, np.minimum(bar_parts(4), 3))
+
+
+@pytest.mark.parametrize("value", [1, 255])
+def test_black_and_white_labels_tell_no_parts(value: int, capture: Path, tmp_path: Path) -> None:
+    save_grey(tmp_path / "labels" / "001.png", (bar_parts(1) > 0) * value)
+    (sample,) = recorded_samples(read_capture(capture), "train", "instrument", tmp_path / "labels")
+    assert np.array_equal(sample.load().classes, bar_parts(1) > 0)
+    with refused("--classes parts", "use --classes instrument"):
+        recorded_samples(read_capture(capture), "train", "parts", tmp_path / "labels")
+
+
+def test_labels_that_name_no_part_are_not_taken_for_tissue(capture: Path, tmp_path: Path) -> None:
+    labels = tmp_path / "labels"
+    save_grey(labels / "001_parts.png", bar_parts(1) > 0)
+    (labels / "parts.json").write_text(json.dumps({"ids": [{"id": 1, "part": "instrument"}]}))
+    (sample,) = recorded_samples(read_capture(capture), "train", "instrument", labels)
+    assert sample.load().classes.max() == 1
+    with refused("--classes parts", str(labels), "use --classes instrument"):
+        recorded_samples(read_capture(capture), "train", "parts", labels)
+
+
+def test_an_id_of_the_truth_that_means_nothing_is_not_taken_for_tissue(capture: Path) -> None:
+    save_grey(capture / "truth" / "masks" / "002.png", np.full((40, 48), 7))
+    samples = recorded_samples(read_capture(capture), "train", "instrument")
+    with refused("002.png: id 7 has no class"):
+        samples[2].load()
+
+
+def test_reference_masks_are_truth_too_beside_parts(capture: Path) -> None:
+    truth = capture / "truth" / "masks" / "002.png"
+    save_grey(capture / "reference_masks" / "002.png", (read_grey(truth) > 0) * 255)
+    expected = read_grey(truth) > 0
+    truth.unlink()
+    samples = recorded_samples(read_capture(capture), "train", "instrument")
+    assert np.array_equal(samples[2].load().classes, expected)
+    other = read_grey(capture / "truth" / "masks" / "003.png")
+    assert 3 in other
+    assert np.array_equal(samples[3].load().classes, other > 0)  # parts of the others are instrument all the same
+    with refused("--classes parts", "use --classes instrument"):
+        recorded_samples(read_capture(capture), "train", "parts")
+
+
+def test_labels_whose_ids_are_unnamed_say_where_to_name_them(capture: Path, tmp_path: Path) -> None:
+    labels = tmp_path / "labels"
+    save_grey(labels / "001.png", bar_parts(1) * 9)
+    with refused("001.png: id 9", "say what ids mean", "parts.json"):
+        recorded_samples(read_capture(capture), "train", "instrument", labels)
+    (labels / "parts.json").write_text(json.dumps({"ids": [{"id": 9, "part": "shaft"}]}))
+    with refused("001.png: id 18", "parts.json"):
+        recorded_samples(read_capture(capture), "train", "instrument", labels)
+
+
+def test_labels_of_another_size_are_refused(capture: Path, tmp_path: Path) -> None:
+    save_grey(tmp_path / "labels" / "001.png", np.full((20, 24), 255))
+    (sample,) = recorded_samples(read_capture(capture), "train", "instrument", tmp_path / "labels")
+    with refused("001.png", "24x20", "48x40", "label the frames as recorded"):
+        sample.load()

@@ -1,0 +1,216 @@
+"""Scores against masks and boxes whose right answer is known by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from downstream_world import square
+
+from neeco.studies.downstream.samples import Example
+from neeco.studies.downstream.scores import (
+    BOX_SCORES,
+    MASK_SCORES,
+    Detections,
+    box_scores,
+    mask_scores,
+    mean_scores,
+    near,
+    validation_score,
+)
+
+ONE = ("instrument",)
+PARTS = ("shaft", "wrist", "jaws")
+
+
+def truth_of(classes: np.ndarray, counted: np.ndarray | None = None) -> Example:
+    ids = np.asarray(classes, np.uint8)
+    return Example(np.zeros((*ids.shape, 3), np.uint8), ids, (ids > 0).astype(np.uint8), counted)
+
+
+def rows(*lines: str) -> np.ndarray:
+    return np.array([[int(letter) for letter in line] for line in lines], np.uint8)
+
+
+# masks
+
+
+def test_scores_of_a_mask_by_hand() -> None:
+    truth, said = rows("1110", "1110", "0000"), rows("0111", "0110", "0000")
+    scores = mask_scores(said, truth_of(truth), ONE)
+    assert tuple(scores) == MASK_SCORES
+    assert scores["iou"] == pytest.approx(4 / 7)
+    assert scores["dice"] == pytest.approx(8 / 11)
+    assert scores["precision"] == pytest.approx(4 / 5)
+    assert scores["recall"] == pytest.approx(4 / 6)
+
+
+def test_a_perfect_mask_scores_one_throughout() -> None:
+    truth = rows("0110", "0110", "0000")
+    assert mask_scores(truth, truth_of(truth), ONE) == dict.fromkeys(MASK_SCORES, 1.0)
+
+
+def test_empty_sides() -> None:
+    some, none = rows("0110", "0000"), rows("0000", "0000")
+    assert all(math.isnan(value) for value in mask_scores(none, truth_of(none), ONE).values())
+    missed = mask_scores(none, truth_of(some), ONE)
+    assert missed == dict.fromkeys(MASK_SCORES, 0.0)
+    invented = mask_scores(some, truth_of(none), ONE)
+    assert math.isnan(invented.pop("recall"))
+    assert invented == {"iou": 0, "dice": 0, "precision": 0, "boundary_f": 0}
+
+
+def test_pixels_that_do_not_count_change_nothing() -> None:
+    random = np.random.default_rng(0)
+    truth, said = (random.random((2, 12, 16)) > 0.6).astype(np.uint8)
+    counted = random.random((12, 16)) > 0.5
+    scores = mask_scores(said, truth_of(truth, counted), ONE)
+    other = np.where(counted, said, 1 - said)
+    changed = mask_scores(other, truth_of(truth, counted), ONE)
+    assert {key: scores[key] for key in MASK_SCORES[:4]} == {key: changed[key] for key in MASK_SCORES[:4]}
+    kept = counted & (truth > 0)
+    assert scores["recall"] == pytest.approx((kept & (said > 0)).sum() / kept.sum())
+    nothing = mask_scores(said, truth_of(truth, np.zeros_like(counted)), ONE)
+    assert math.isnan(nothing["iou"])
+    assert math.isnan(nothing["precision"])
+
+
+def test_of_several_classes_each_is_told_and_their_mean() -> None:
+    truth, said = rows("1122", "1122", "0000"), rows("1122", "1111", "0000")
+    scores = mask_scores(said, truth_of(truth), PARTS)
+    assert scores["shaft.iou"] == pytest.approx(4 / 6)
+    assert scores["wrist.iou"] == pytest.approx(2 / 4)
+    assert math.isnan(scores["jaws.iou"])
+    assert scores["iou"] == pytest.approx((4 / 6 + 2 / 4) / 2)  # of those that are there
+    assert scores["shaft.recall"] == 1
+    assert scores["wrist.precision"] == 1
+
+
+def test_means_are_over_frames_that_have_the_score() -> None:
+    assert mean_scores([{"a": 1.0, "b": math.nan}, {"a": 0.5, "b": math.nan}, {"c": 0.25}]) == {
+        "a": 0.75,
+        "b": None,
+        "c": 0.25,
+    }
+    assert mean_scores([]) == {}
+
+
+def test_near_reaches_as_far_as_told() -> None:
+    pixels = np.zeros((11, 11), bool)
+    pixels[5, 5] = True
+    close = near(pixels, 3.0)
+    assert close[5, 8]
+    assert not close[5, 9]
+    assert close[7, 7]
+    assert not close[8, 8]
+    assert not near(pixels & False, 3.0).any()
+
+
+# boxes
+
+
+def boxes_of(*boxes: tuple[float, ...], classes: tuple[int, ...] = ()) -> Detections:
+    """Each x0, y0, x1, y1, score; best first."""
+    table = np.array(sorted(boxes, key=lambda box: -box[4]), np.float64).reshape(-1, 5)
+    return Detections(table[:, :4], np.array(classes or (1,) * len(table), np.int64), table[:, 4])
+
+
+def boxed(*boxes: tuple[int, int, int, int], side: int = 64) -> Example:
+    """An instrument in each box."""
+    classes, instruments = np.zeros((2, side, side), np.uint8)
+    for number, (x0, y0, x1, y1) in enumerate(boxes):
+        classes[y0:y1, x0:x1] = 1
+        instruments[y0:y1, x0:x1] = number + 1
+    return Example(np.zeros((side, side, 3), np.uint8), classes, instruments)
+
+
+HERE = (10, 10, 30, 30)
+THERE = (35, 35, 60, 60)
+
+
+def test_what_is_found_exactly_scores_one() -> None:
+    scores = box_scores([boxes_of((*HERE, 0.9)), boxes_of((*THERE, 0.6))], [boxed(HERE), boxed(THERE)], ONE)
+    assert scores == pytest.approx(dict.fromkeys(BOX_SCORES, 1.0))
+
+
+def test_what_is_not_found_scores_nothing() -> None:
+    truth = [boxed(HERE), boxed(THERE)]
+    for answers in ([boxes_of(), boxes_of()], [boxes_of((0, 0, 5, 5, 0.9)), boxes_of((*HERE, 0.9))]):
+        assert box_scores(answers, truth, ONE) == dict.fromkeys(BOX_SCORES, 0.0)
+
+
+def test_without_a_true_box_there_is_nothing_to_score() -> None:
+    assert box_scores([boxes_of((*HERE, 0.9))], [boxed()], ONE) == dict.fromkeys(BOX_SCORES)
+
+
+def test_half_found_is_half() -> None:
+    scores = box_scores([boxes_of((*HERE, 0.9)), boxes_of()], [boxed(HERE), boxed(THERE)], ONE)
+    assert scores["ap"] == pytest.approx(51 / 101)  # precision 1 up to recall .5: recalls 0, .01 … .5
+    assert scores["box_precision"] == 1
+    assert scores["box_recall"] == 0.5
+
+
+def test_worse_answers_below_the_right_ones_take_nothing() -> None:
+    right, wrong = (*HERE, 0.9), (40, 40, 50, 50, 0.3)
+    scores = box_scores([boxes_of(right, wrong)], [boxed(HERE)], ONE)
+    assert scores["ap"] == pytest.approx(1)
+    assert scores["box_precision"] == 1  # 0.3 is no answer at .5
+    above = box_scores([boxes_of((*HERE, 0.2), (40, 40, 50, 50, 0.8))], [boxed(HERE)], ONE)
+    assert above["ap"] == pytest.approx(0.5)
+    assert above["box_precision"] == 0
+    assert above["box_recall"] == 0
+
+
+def test_wrong_answers_in_images_without_an_instrument_take_something() -> None:
+    answers = [boxes_of((*HERE, 0.7)), boxes_of((*HERE, 0.9))]
+    assert box_scores(answers, [boxed(HERE), boxed()], ONE)["ap"] == pytest.approx(0.5)
+
+
+def test_finding_it_twice_counts_once() -> None:
+    scores = box_scores([boxes_of((*HERE, 0.9), (11, 10, 31, 30, 0.8))], [boxed(HERE)], ONE)
+    assert scores["box_precision"] == 0.5
+    assert scores["box_recall"] == 1
+    assert scores["ap"] == pytest.approx(1)  # at recall 1 already by the first
+
+
+def test_ap_is_the_mean_over_overlaps() -> None:
+    shifted = (13, 10, 33, 30, 0.9)  # 17 of 23 columns: IoU .739, right at .5 to .7
+    scores = box_scores([boxes_of(shifted)], [boxed(HERE)], ONE)
+    assert scores["ap"] == pytest.approx(5 / 10)
+    assert scores["ap50"] == pytest.approx(1)
+    assert scores["ap75"] == 0
+
+
+def test_two_instruments_in_an_image_are_two_boxes() -> None:
+    answers = boxes_of((*HERE, 0.9), (*THERE, 0.7))
+    assert box_scores([answers], [boxed(HERE, THERE)], ONE) == pytest.approx(dict.fromkeys(BOX_SCORES, 1.0))
+
+
+def test_of_several_classes_those_in_the_truth_are_scored() -> None:
+    classes = np.zeros((64, 64), np.uint8)
+    classes[10:30, 10:30], classes[35:60, 35:60] = 1, 3
+    example = truth_of(classes)
+    swapped = boxes_of((*HERE, 0.9), (*THERE, 0.8), classes=(1, 1))
+    scores = box_scores([swapped], [example], PARTS)
+    assert scores["shaft.ap"] == pytest.approx(1)
+    assert scores["jaws.ap"] == 0
+    assert "wrist.ap" not in scores
+    assert scores["ap"] == pytest.approx(0.5)
+    assert scores["box_recall"] == pytest.approx(0.5)
+    assert scores["box_precision"] == pytest.approx(0.25)  # one of two shafts, none of no jaws
+
+
+# the number that weights are chosen by
+
+
+def test_validation_is_by_iou_of_masks_or_ap_of_boxes() -> None:
+    example = square(0)
+    (box,), _ = example.boxes()
+    assert validation_score([example.classes], [example], 1) == 1
+    assert validation_score([example.classes * 0], [example], 1) == 0
+    assert validation_score([boxes_of((*box, 0.9))], [example], 1) == pytest.approx(1)
+    assert validation_score([boxes_of()], [example], 1) == 0
+    empty = truth_of(example.classes * 0)
+    assert validation_score([example.classes * 0], [empty], 1) == 0  # nothing to say, and no failure
+    assert validation_score([boxes_of()], [empty], 1) == 0

@@ -1,0 +1,448 @@
+"""Jobs stand on their own: done once, resumed, refused, and one that fails leaves the others alone."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import socket
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from neeco import cluster
+from neeco.capture import read_capture
+from neeco.errors import NeecoError
+from neeco.raster.native import set_threads
+from neeco.settings import with_fields
+from neeco.studies import study
+from neeco.studies import training_job as module
+from neeco.studies.machine import peak_memory_mb, reset_peak_memory, threads_per_worker
+from neeco.studies.study import check_workers, run_jobs
+from neeco.studies.training_job import UNLIMITED, Budget, HeldOutFrames
+from neeco.training import train as train_module
+from neeco.training.config import training_config
+from neeco.training.run import checkpoint_path, write_config
+from neeco.training.session import GaussianSession
+
+TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb")
+
+
+def without_times(value):
+    """Numbers that the same seed must repeat."""
+    if isinstance(value, dict):
+        return {key: without_times(item) for key, item in value.items() if key not in TIMES}
+    return [without_times(item) for item in value] if isinstance(value, list) else value
+
+
+def curve_of(job) -> list[dict]:
+    return [json.loads(line) for line in (job.folder / "curve.jsonl").read_text().splitlines()]
+
+
+def test_a_job_leaves_a_run_its_curve_and_its_numbers(make_job) -> None:
+    job = make_job()
+    reported: list[tuple[str, float]] = []
+    result = job.run(lambda stage, share, text: reported.append((stage, share)))
+    assert result == json.loads((job.folder / "job.json").read_text())
+    assert result["schema"] == "neeco-job/1"
+    assert (result["name"], result["method"], result["seed"], result["iterations"]) == ("3dgs", "3dgs", 0, 12)
+    assert result["budget"] == {"minutes": None, "iterations": 12, "clock": "wall"}
+    assert result["seconds"] > 0
+    assert result["processor_seconds"] > 0
+    assert result["num_gaussians"] > 50
+    assert list(result["splits"]) == ["test", "unseen"]
+    assert result["splits"]["test"]["frames"] == 2
+    assert 5 < result["splits"]["test"]["psnr"] < 60
+    assert result["splits"]["test"]["lpips"] is None
+    assert {"training", "evaluating"} <= {stage for stage, _ in reported}
+    assert {"config.yaml", "scene.safetensors", "evaluation.json"} <= {path.name for path in job.folder.iterdir()}
+    rows = curve_of(job)
+    assert {row["split"] for row in rows} == {"test", "unseen"}
+    assert [row["iteration"] for row in rows if row["split"] == "test"] == [1, 2, 3, 4, 5, 6, 8, 9, 10, 11, 12]
+    final = next(row["psnr"] for row in rows if row["iteration"] == 12 and row["split"] == "test")
+    assert final == pytest.approx(result["splits"]["test"]["psnr"], abs=1e-3)  # every frame is in the curve here
+
+
+def test_a_finished_job_is_not_done_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = make_job().run()
+    monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
+    monkeypatch.setattr(module, "evaluate_run", lambda *_, **__: pytest.fail("scored again"))
+    assert make_job().run() == first
+
+
+def test_a_begun_run_keeps_what_its_processor_decided(make_job) -> None:
+    job = make_job(config=training_config("neeco", {}))
+    for half in (True, False):  # one of them is not what this processor would decide
+        write_config(job.folder, job.capture, with_fields(job.train_config, {"deformation.half": half}), "")
+        job.check()
+    with pytest.raises(NeecoError, match="deformation: this run has"):
+        make_job(config=training_config("neeco", {}, ["deformation.half=true"])).check()
+
+
+def test_the_numbers_of_a_capture_that_changed_are_not_given_again(make_job) -> None:
+    job = make_job()
+    job.run()
+    config = job.folder / "config.yaml"
+    config.write_text(re.sub("capture_sha256: .*", "capture_sha256: of another capture", config.read_text()))
+    with pytest.raises(NeecoError, match=f"{job.capture} has changed since this run was begun"):
+        job.run()
+
+
+def test_other_splits_are_scored_without_training_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = make_job().run()
+    monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
+    again = make_job(splits=("unseen",)).run()
+    assert list(again["splits"]) == ["unseen"]
+    assert without_times(again["splits"]["unseen"]) == without_times(first["splits"]["unseen"])
+    assert again["seconds"] == first["seconds"]
+
+
+@pytest.mark.parametrize("stop", [1, 7, 12])
+def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
+    stop: int, make_job, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = make_job(folder=tmp_path / "whole")
+    expected = whole.run()
+    cut = make_job(folder=tmp_path / "cut")
+    step = GaussianSession.step
+
+    def interrupted(session: GaussianSession):
+        result = step(session)
+        if session.iteration == stop:
+            os.kill(os.getpid(), signal.SIGINT)
+        return result
+
+    with monkeypatch.context() as patched:
+        patched.setattr(GaussianSession, "step", interrupted)
+        with pytest.raises(KeyboardInterrupt, match=rf"job 1 of 1 \(3dgs, seed 0\), at iteration {stop}; run the same"):
+            run_jobs([cut])
+    assert not (cut.folder / "job.json").exists()
+    result = run_jobs([cut])[0]
+    assert without_times(result) == without_times(expected)
+    assert result["seconds"] > 0 or stop == 1
+    assert (cut.folder / "scene.safetensors").read_bytes() == (whole.folder / "scene.safetensors").read_bytes()
+    iterations = [row["iteration"] for row in curve_of(cut) if row["split"] == "test"]
+    assert iterations == sorted(set(iterations))
+    assert iterations[-1] == 12
+    assert [row["psnr"] for row in curve_of(cut)] == [row["psnr"] for row in curve_of(whole)]
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "reported"),
+    [
+        ("job.json", {"splits": {"test": {"psnr": "good"}}}, "splits: test: psnr: is not as neeco writes it"),
+        ("job.json", {"budget": None}, "budget: is not as neeco writes it"),
+        ("begun.json", {"seconds": []}, "seconds: is not as neeco writes it"),
+        ("begun.json", {"budget": {}}, "budget: minutes is missing"),
+        ("begun.json", {"budget": {"minutes": None, "iterations": None, "clock": "wall"}}, "budget: give minutes or"),
+    ],
+)
+def test_a_damaged_job_is_reported_by_file_and_field(name: str, change: dict, reported: str, make_job) -> None:
+    job = make_job()
+    job.run()
+    file = job.folder / name
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    if name == "begun.json":
+        (job.folder / "job.json").unlink()
+    with pytest.raises(NeecoError, match=f"{name}: {reported}.*remove that run's folder"):
+        job.run()
+
+
+def test_a_damaged_curve_is_reported_by_its_line(make_job) -> None:
+    job = make_job()
+    job.run()
+    (job.folder / "job.json").unlink()
+    with (job.folder / "curve.jsonl").open("a") as stream:
+        stream.write("[[[")
+    with pytest.raises(NeecoError, match=r"curve.jsonl: line \d+: not valid JSON"):
+        job.run()
+
+
+def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = training_config("3dgs", {}, ["checkpoint_interval=5"])
+    whole, cut = (make_job(folder=tmp_path / name, config=config) for name in ("whole", "cut"))
+    expected = whole.run()
+    step = GaussianSession.step
+
+    def killed(session: GaussianSession):
+        if session.iteration == 8:
+            raise MemoryError("killed")
+        return step(session)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(GaussianSession, "step", killed)
+        assert "memory: too little" in run_jobs([cut])[0]["error"]
+    assert without_times(cut.run()) == without_times(expected)
+    assert [row["iteration"] for row in curve_of(cut)] == [row["iteration"] for row in curve_of(whole)]
+
+
+def test_kinematic_finishes_where_no_wrist_is_found(make_job) -> None:
+    from neeco.training.run import load_run
+
+    job = make_job("kinematic", config=training_config("kinematic", {}))  # the bar has no joint to find a wrist by
+    result = job.run()
+    assert float(load_run(job.folder).scene.deformation.articulations[0].wrist_start) == float("-inf")
+    assert result["splits"]["test"]["psnr"] > 5
+
+
+def test_drawing_the_curve_changes_no_bit_of_the_scene(make_job, tmp_path) -> None:
+    job = make_job()
+    job.run()
+    plain = train_module.train(job.capture, tmp_path / "plain", job.train_config)
+    assert (plain / "scene.safetensors").read_bytes() == (job.folder / "scene.safetensors").read_bytes()
+
+
+def test_minutes_end_a_run_whatever_its_iterations(make_job) -> None:
+    config = training_config("3dgs", {"iterations": 2})
+    job = make_job(config=config, budget=Budget(0.005, None, "processor"))
+    assert job.train_config.iterations == UNLIMITED
+    result = job.run()
+    assert result["iterations"] > 2
+    assert result["processor_seconds"] == pytest.approx(0.3, abs=0.25)
+
+
+def test_time_of_drawing_the_curve_is_not_counted(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    from neeco.studies.training_job import HeldOutFrames
+
+    score = HeldOutFrames.score
+
+    def slow(self, scene):
+        time.sleep(0.1)
+        return score(self, scene)
+
+    monkeypatch.setattr(HeldOutFrames, "score", slow)
+    result = make_job().run()
+    assert result["seconds"] < 1.0  # eleven drawings took 1.1 s
+
+
+def test_one_failing_job_leaves_the_others_alone(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    step = GaussianSession.step
+
+    def diverging(session: GaussianSession):
+        if session.config.seed == 1:
+            raise NeecoError("training: the loss became nan at iteration 1, frame 000; train anew")
+        return step(session)
+
+    monkeypatch.setattr(GaussianSession, "step", diverging)
+    reported: list[str] = []
+    results = run_jobs([make_job(seed=seed) for seed in (0, 1, 2)], progress=lambda event: reported.append(event.stage))
+    assert [("error" in result) for result in results] == [False, True, False]
+    assert "loss became nan" in results[1]["error"]
+    assert results[1]["splits"] == {}
+    assert not (make_job(seed=1).folder / "job.json").exists()
+    assert [stage for stage in reported if stage in ("done", "failed")] == ["done", "failed", "done"]
+
+
+def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = make_job()
+    with monkeypatch.context() as patched:
+        patched.setattr(GaussianSession, "step", lambda session: 1 // 0)
+        error = run_jobs([job])[0]["error"]
+    record = job.folder.with_name("3dgs-seed0.error.txt")
+    assert error.startswith("ZeroDivisionError")
+    assert str(record) in error
+    assert "Traceback" in record.read_text()
+    assert "error" not in run_jobs([job])[0]
+    assert not record.exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "reported"),
+    [
+        ({"budget": Budget(None, 13)}, "budget: this run has 12 iterations, not 13 iterations"),
+        (
+            {"budget": Budget(None, 12, "processor")},
+            "budget: this run has 12 iterations, not 12 iterations, CPU time",
+        ),
+        (
+            {"config": training_config("3dgs", {"max_tissue_gaussians": 99})},
+            "max_tissue_gaussians: this run has None, not 99",
+        ),
+    ],
+)
+def test_a_folder_of_another_job_is_refused_before_any_work(make_job, changes, reported, monkeypatch) -> None:
+    make_job().run()
+    monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained"))
+    with pytest.raises(NeecoError, match=f"{reported}; give another --output"):
+        run_jobs([make_job(seed=1), make_job(**changes)])
+
+
+def test_a_run_of_another_capture_is_refused(make_job, tmp_path) -> None:
+    job = make_job()
+    job.run()
+    with pytest.raises(NeecoError, match="capture: this run was trained on"):
+        run_jobs([replace(job, capture=tmp_path / "other")])
+
+
+@pytest.mark.parametrize(
+    ("budget", "reported"),
+    [
+        (Budget(None, None), "give minutes or iterations"),
+        (Budget(1.0, 5), "one of them"),
+        (Budget(0.0, None), "more than 0"),
+        (Budget(float("inf"), None), "more than 0"),
+        (Budget(None, 0), "at least 1"),
+        (Budget(1.0, None, "sun"), "clock 'sun' is unknown"),  # type: ignore[arg-type]
+    ],
+)
+def test_budgets_that_cannot_be_spent_are_refused(budget: Budget, reported: str, make_job) -> None:
+    with pytest.raises(NeecoError, match=reported):
+        run_jobs([make_job(budget=budget)])
+
+
+def test_several_workers_without_ray_are_refused_with_the_remedy(make_job, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(NeecoError, match=r"install neeco\[cluster\]"):
+        run_jobs([make_job()], workers=2)
+
+
+def test_a_cluster_that_does_not_answer_is_reported_at_once(make_job, monkeypatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        closed = server.getsockname()[1]
+    monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{closed}")
+    with pytest.raises(NeecoError, match=f"RAY_ADDRESS: no Ray cluster answers at 127.0.0.1:{closed}"):
+        run_jobs([make_job()], workers=2)
+
+
+@pytest.mark.parametrize(
+    ("workers", "device", "reported"),
+    [
+        (3, "cuda", r"--workers: 3 for 2 GPU\(s\); give at most 2"),
+        (2, "cuda:1", "each has a GPU of its own"),
+        (2, "cuda", ""),
+    ],
+)
+def test_workers_have_a_gpu_each(workers: int, device: str, reported: str, monkeypatch) -> None:
+    monkeypatch.setattr(study, "require_ray", lambda: None)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    check_workers(workers, torch.device("cpu"))
+    check_workers(1, torch.device(device))
+    if reported:
+        with pytest.raises(NeecoError, match=reported):
+            check_workers(workers, torch.device(device))
+    else:
+        check_workers(workers, torch.device(device))
+
+
+class FakeRay:
+    """Two GPUs, and the one that a job was given."""
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 4.0, "GPU": 2.0}
+
+    def get_runtime_context(self) -> FakeRay:
+        return self
+
+    def get_accelerator_ids(self) -> dict[str, list[str]]:
+        return {"GPU": ["1"]}
+
+
+def test_a_job_in_a_worker_sees_the_gpu_it_was_given(make_job, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", FakeRay())
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+    monkeypatch.setattr(study, "attempt_job", lambda job: {"seen": os.environ["CUDA_VISIBLE_DEVICES"]})
+    threads = torch.get_num_threads()
+    try:
+        assert study._run_in_worker(make_job(), 1, os.getcwd()) == {"seen": "1"}
+    finally:
+        set_threads(0)
+        torch.set_num_threads(threads)
+
+
+def test_gpus_are_asked_for_where_jobs_compute_on_them(make_job, monkeypatch) -> None:
+    here, there = ([replace(make_job(), device=word)] for word in ("cpu", "auto"))
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cpu"))
+    assert [study._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 0]
+    monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cuda"))
+    assert [study._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 2]
+    monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cpu"))
+    monkeypatch.setenv("RAY_ADDRESS", "head:6379")  # whose machines may have what this one has not
+    assert [study._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 2]
+
+
+def test_workers_share_the_cores() -> None:
+    assert [threads_per_worker(workers, 8) for workers in (1, 2, 3, 16)] == [8, 4, 2, 1]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux has a mark that can be reset")
+def test_peak_memory_is_of_the_work_since_the_reset() -> None:
+    assert reset_peak_memory()
+    before = peak_memory_mb()
+    block = bytearray(b"x" * (64 << 20))
+    during = peak_memory_mb()
+    del block
+    assert reset_peak_memory()
+    after = peak_memory_mb()
+    assert before is not None
+    assert during is not None
+    assert after is not None
+    assert during > before + 50
+    assert after < during - 50
+
+
+@pytest.mark.slow
+def test_ray_gives_the_same_numbers(make_job, tmp_path) -> None:
+    pytest.importorskip("ray")
+    here = [make_job(seed=seed, folder=tmp_path / "here" / str(seed)) for seed in (0, 1)]
+    there = [make_job(seed=seed, folder=tmp_path / "there" / str(seed)) for seed in (0, 1)]
+    assert without_times(run_jobs(there, workers=2)) == without_times(run_jobs(here))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(240)
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers in /proc")
+def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(make_job, tmp_path, monkeypatch) -> None:
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    config, budget = replace(training_config("3dgs", {}), checkpoint_interval=20), Budget(None, 300)
+    here, there = (
+        make_job(config=config, budget=budget, folder=tmp_path / where / "run") for where in ("here", "there")
+    )
+    expected = without_times(run_jobs([here]))
+    events, killed = [], []
+    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    try:
+        for _ in range(2):
+            nodes.add_node(num_cpus=1)
+        monkeypatch.setenv("RAY_ADDRESS", nodes.address)
+        watcher = threading.Thread(
+            target=kill_when, args=(checkpoint_path(there.folder), "ray::_run_in_worker", killed)
+        )
+        watcher.start()
+        assert without_times(run_jobs([there], progress=events.append)) == expected  # one worker, and on the cluster
+        watcher.join()
+    finally:
+        nodes.shutdown()
+    assert killed
+    assert any("its worker died" in event.text and event.stage == "training" for event in events)
+
+
+def kill_when(file: Path, name: str, killed: list[int]) -> None:
+    """Kill a process once a file is there."""
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and not killed:
+        for path in Path("/proc").glob("[0-9]*/cmdline") if file.exists() else ():
+            with contextlib.suppress(OSError):
+                if path.read_bytes().startswith(name.encode()):
+                    os.kill(int(path.parent.name), signal.SIGKILL)
+                    killed.append(int(path.parent.name))
+        time.sleep(0.05)
+
+
+def test_a_field_which_draws_slowly_is_drawn_less_often_for_its_curve(capture: Path) -> None:
+    gaussians, field = (HeldOutFrames(read_capture(capture), ("train",), field=kind) for kind in (False, True))
+    assert len(field.frames["train"]) < len(gaussians.frames["train"])
+    assert len(field.shares) < len(gaussians.shares)
+    assert field.shares[-1] == gaussians.shares[-1] == 1  # both end with the finished scene
