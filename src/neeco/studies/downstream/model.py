@@ -104,7 +104,9 @@ def model_class(name: str) -> type[Model]:
     """The model of that name. Raises NeecoError when there is none."""
     known = find_models()
     if name not in known:
-        raise NeecoError(f"--models: {name!r} is unknown; choose of {', '.join(known)}, or install the package that has it")
+        raise NeecoError(
+            f"--models: {name!r} is unknown; choose of {', '.join(known)}, or install the package that has it"
+        )
     return known[name]
 
 
