@@ -10,13 +10,13 @@ import re
 import shutil
 import signal
 import statistics
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
 
+from neeco import workers
 from neeco.capture import read_capture
 from neeco.cli import main
 from neeco.errors import NeecoError
@@ -281,8 +281,9 @@ def test_a_setting_that_cannot_be_shared_is_refused(spec: ComparisonSpec, given:
     assert not spec.output.exists()
 
 
-def test_workers_without_ray_are_refused_before_anything_is_written(spec: ComparisonSpec, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
+def test_a_cluster_without_ray_is_refused_before_anything_is_written(spec: ComparisonSpec, monkeypatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
+    monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(NeecoError, match=r"neeco\[cluster\]"):
         compared(replace(spec, workers=2))
     assert not spec.output.exists()

@@ -54,9 +54,9 @@ from neeco.scene.scene import Scene, gaussian_scene
 from neeco.settings import with_fields
 from neeco.synthesis.dataset import INFO, SCENE_FILE
 from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, StatesRefused, limit_threads
+from neeco.synthesis.parallel import PackedSpec
 from neeco.synthesis.samplers import make_sampler
 from neeco.synthesis.settings import PATH_PREFIX, LabelWay, Settings, Views
-from neeco.synthesis.workers import PackedSpec
 from neeco.synthesis.writers.folder import read_public_records, stem
 from neeco.training.run import Run, load_run
 
