@@ -39,7 +39,14 @@ TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb", "speed", "mach
 
 @pytest.fixture
 def spec(capture: Path, tmp_path: Path) -> ComparisonSpec:
-    return ComparisonSpec(capture, tmp_path / "out", ("3dgs", "3dgs+dta"), Budget(None, 10), seeds=2, device="cpu")
+    return ComparisonSpec(
+        capture=capture,
+        output=tmp_path / "out",
+        methods=("3dgs", "3dgs+dta"),
+        budget=Budget(None, 10),
+        seeds=2,
+        device="cpu",
+    )
 
 
 def compared(spec: ComparisonSpec, **reported):

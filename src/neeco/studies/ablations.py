@@ -20,7 +20,7 @@ PHASE_1_STEPS = 8_000
 PHASE_1_SHARE = PHASE_1_STEPS / PUBLISHED_STEPS
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AblationPlan:
     """Take parts of the methods away one by one, as the paper does and beyond; tables, figures and a page of both.
 
@@ -103,7 +103,7 @@ class Comparison:
     entries: tuple[Entry, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Ablation:
     """A table. `judged`: the measures whose direction is compared with the paper's (none in our own tables); {split} in
     them is the first held-out split, `test` where there is one. phase_1_psnr is of training frames, as in the paper.

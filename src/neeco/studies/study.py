@@ -71,7 +71,7 @@ class Job(Protocol):
         """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class JobEvent:
     """Progress of one job: `stage` is training, evaluating, done or failed, `share` in [0, 1] of that stage; `result`
     is set once the job is done or has failed."""
@@ -196,14 +196,20 @@ def _failed(job: Job, error: str) -> Result:
 def _end(index: int, total: int, job: Job, result: Result) -> JobEvent:
     """The event that a job is done or has failed."""
     failure = result.get("error", "")
-    return JobEvent(index, total, job, "failed" if failure else "done", 1.0, failure, result)
+    return JobEvent(
+        index=index, total=total, job=job, stage="failed" if failure else "done", share=1.0, text=failure, result=result
+    )
 
 
 def _run_here(index: int, jobs: Sequence[Job], capture: Capture | None, report: Callable[[JobEvent], None]) -> Result:
     """One of the jobs in this process."""
     job, total = jobs[index], len(jobs)
+
+    def progress(stage: str, share: float, text: str) -> None:
+        report(JobEvent(index=index, total=total, job=job, stage=stage, share=share, text=text))
+
     try:
-        result = attempt_job(job, lambda *news: report(JobEvent(index, total, job, *news)), capture)
+        result = attempt_job(job, progress, capture)
     except KeyboardInterrupt as interrupt:
         moment = " ".join(map(str, interrupt.args)).split(";")[0]
         where = f"job {index + 1} of {total} ({job.title}){', ' + moment if moment else ''}"
@@ -253,7 +259,7 @@ def _run_in_workers(jobs: Sequence[Job], workers: int, report: Callable[[JobEven
                 running.add(index)
                 if event.stage in ("started", "died"):
                     text = f"its worker died ({reason}); it goes on from its checkpoint" if reason else ""
-                    report(JobEvent(index, len(jobs), job, "training", text=text))
+                    report(JobEvent(index=index, total=len(jobs), job=job, stage="training", text=text))
                     continue
                 running.remove(index)
                 results[index] = reason if event.stage == "done" else _failed(job, f"its worker died: {reason}")

@@ -92,11 +92,27 @@ def annotate_capture(
     output = Path(output)
     info = description(run, settings)
     begun = check_output(output, info, resume)
-    folder = DataSetFolder(output, len(capture.frames), begun, info, scene, labeller, formats)
+    folder = DataSetFolder(
+        output=output,
+        count=len(capture.frames),
+        begun=begun,
+        info=info,
+        scene=scene,
+        labeller=labeller,
+        formats=formats,
+    )
     with folder.being_written() as records:
         typical = typical_errors(scene, labeller, trained_on)
         info["usual_errors"] = asdict(typical)
-        annotator = _Annotator(scene, labeller, typical, min_trust, output, images, cameras)
+        annotator = _Annotator(
+            scene=scene,
+            labeller=labeller,
+            typical=typical,
+            min_trust=min_trust,
+            output=output,
+            images=images,
+            cameras=cameras,
+        )
         start: Tensor | None = None  # each fit starts from that of the frame before it in time
         in_time = sorted(range(len(capture.frames)), key=lambda k: capture.frames[k].state.time)
         for done, index in enumerate(in_time, 1):
@@ -112,7 +128,7 @@ def annotate_capture(
     return Annotated(output, capture, [records[index] for index in sorted(records)])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Annotator:
     """Fits, draws, judges and writes frames."""
 

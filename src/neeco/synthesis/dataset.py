@@ -128,7 +128,15 @@ def synthesize(
         info["tissues"] = list(scene.recorded.tissues)
     if generator.gains:
         info["color_gains"] = [[round(value, 4) for value in gain] for gain in generator.gains]
-    folder = DataSetFolder(output, settings.count, begun, info, generator.scene, generator.labeller, formats)
+    folder = DataSetFolder(
+        output=output,
+        count=settings.count,
+        begun=begun,
+        info=info,
+        scene=generator.scene,
+        labeller=generator.labeller,
+        formats=formats,
+    )
     with folder.being_written() as records:
         if records:
             on_progress(len(records))
@@ -197,7 +205,7 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
     return True
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DataSetFolder:
     """The folder of a data set that is made now: what dataset.json says of the making (`info`), whether it was `begun`
     before, and what its index files need."""

@@ -112,7 +112,7 @@ class Acceptance:
         return None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SampleGenerator:
     """Draws the samples of one data set; writes nothing."""
 
@@ -155,7 +155,17 @@ class SampleGenerator:
         if settings.tissue_check and tolerance is None:
             tolerance = find_tolerance(scene, labeller)
         acceptance = Acceptance(settings.min_share, tolerance, settings.max_unobserved, groups)
-        return cls(scene, labeller, sampler, acceptance, settings, effects, motion, gains, cameras)
+        return cls(
+            scene=scene,
+            labeller=labeller,
+            sampler=sampler,
+            acceptance=acceptance,
+            settings=settings,
+            effects=effects,
+            motion=motion,
+            gains=gains,
+            cameras=cameras,
+        )
 
     def draw(self, index: int) -> LabelledSample:
         """Draw sample `index`.

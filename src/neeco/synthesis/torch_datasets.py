@@ -104,7 +104,7 @@ def sample_states(
         for state, camera in neeco.sample_states("runs/sample", 3, states="extrapolate"):
             print(state.instruments["maryland"].joints, camera.width, camera.height)
     """
-    settings = Settings(count, seed, states, margin, views)
+    settings = Settings(count=count, seed=seed, states=states, margin=margin, views=views)
     settings.check()
     sampler = make_sampler(_opened(scene)[0], settings.states, margin, views, count)
     return [sampler(index, np.random.default_rng(np.random.SeedSequence([seed, index]))) for index in range(count)]
@@ -336,7 +336,7 @@ def _opened(given: SceneLike) -> tuple[Scene, Path | None]:
 def _settings(count: int, seed: int, camera_effects: str | Path | None, **given: Any) -> Settings:
     """The settings of a data set, `given` by the names of their fields."""
     effects = None if camera_effects is None else str(camera_effects)
-    return with_fields(Settings(count, seed), {"camera_effects": effects} | given)
+    return with_fields(Settings(count=count, seed=seed), {"camera_effects": effects} | given)
 
 
 def _spec(opened: Sequence[tuple[Scene, Path | None]], settings: Settings) -> GeneratorSpec | PackedSpec:

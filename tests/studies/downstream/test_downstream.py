@@ -51,9 +51,9 @@ def small_models(monkeypatch: pytest.MonkeyPatch) -> None:
 def spec(recorded: Path, drawn: Path, tmp_path: Path) -> DownstreamSettings:
     """Eight jobs of a fraction of a second: two folds of real, set and both."""
     return DownstreamSettings(
-        recorded,
-        tmp_path / "out",
-        (DataSet("kin", drawn),),
+        capture=recorded,
+        output=tmp_path / "out",
+        sets=(DataSet("kin", drawn),),
         models=("pixels",),
         num_real=("0", "6", "all"),
         folds=2,
