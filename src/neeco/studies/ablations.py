@@ -42,7 +42,7 @@ class AblationPlan:
     seed: int = 0
     """Of every run, and of the noise put on tracker poses."""
     workers: int = 1
-    """Runs at once (more than one needs neeco[cluster])."""
+    """Runs at once, in processes of their own, here or on RAY_ADDRESS's cluster."""
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     settings: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set")] = ()

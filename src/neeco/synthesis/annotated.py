@@ -162,7 +162,7 @@ class _Annotator:
         labels = annotate(self.scene, drawing, self.labeller.names)
         if missing is not None:
             labels = [_without_keypoints_in(missing, label) for label in labels]
-        return write_sample(self.output, index, drawing, labels, {}, facts, self.images.jpeg_quality)
+        return write_sample(self.output, index, drawing, labels, facts=facts, quality=self.images.jpeg_quality)
 
     def _as_written(self, drawing: LayeredDrawing, image: Tensor) -> tuple[LayeredDrawing, Tensor | None]:
         """The recorded `image` with the labels of `drawing`, as the images asked for, and where it shows nothing of a

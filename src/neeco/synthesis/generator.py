@@ -263,7 +263,9 @@ def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Reco
             return write_skipped(output, index, error.refused)
         raise NeecoError(f"{output}: {error}") from None
     quality = generator.settings.jpeg_quality
-    return write_sample(output, index, sample.drawing, sample.labels, sample.refused, sample.facts, quality)
+    return write_sample(
+        output, index, sample.drawing, sample.labels, refused=sample.refused, facts=sample.facts, quality=quality
+    )
 
 
 def find_tolerance(scene: Scene, labeller: Labeller) -> float:

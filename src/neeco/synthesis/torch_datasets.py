@@ -298,11 +298,11 @@ class StoredImages(Dataset[Sample]):
         labelled = LabelledImage.of(
             read_image(image, size),
             torch.from_numpy(depth),
-            read_labels(files["parts"], size),
-            read_labels(files["ignore"], size) == self._ignored,
-            record["labels"],
-            self.part_names,
-            self.keypoint_names,
+            parts=read_labels(files["parts"], size),
+            ignore=read_labels(files["ignore"], size) == self._ignored,
+            labels=record["labels"],
+            part_names=self.part_names,
+            keypoint_names=self.keypoint_names,
         )
         state = State(
             {i["name"]: InstrumentState(i["pose"], i["joints"]) for i in record["instruments"]},
