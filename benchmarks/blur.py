@@ -20,9 +20,8 @@ from neeco.capture.images import read_image, read_labels
 from neeco.evaluation.image_metrics import psnr
 from neeco.labels.drawing import draw, draw_layers
 from neeco.labels.labellers import CompositedLabels
-from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.camera_effects import average_exposure, motion_between, subframes
-from neeco.training.run import open_run
+from neeco.training.run import open_gaussian_run
 
 
 @torch.no_grad()
@@ -35,8 +34,8 @@ def main() -> None:
     arguments = parser.parse_args()
     rows = []
     print("frame    sharp: whole, inside    exposed: whole, inside    drawings")
-    with open_run(arguments.run) as run:
-        scene = gaussian_scene(run.scene, "blur")
+    with open_gaussian_run(arguments.run, "blur") as run:
+        scene = run.scene
         labeller, recorded = CompositedLabels(scene), scene.recorded
         known = {Path(name).stem: k for k, name in enumerate(recorded.names)}
         order = sorted(known.values(), key=lambda k: recorded.states[k].time)

@@ -30,7 +30,7 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.files import write_text
 from neeco.raster.native import set_threads
-from neeco.scene import Drawable
+from neeco.scene import DrawableScene
 from neeco.scene.training_session import Session
 from neeco.training.config import training_config
 from neeco.training.run import load_run
@@ -73,7 +73,7 @@ class HeldOut:
                 rows.append((frame, frame.load_image(), None if reference is None else reference.mask))
 
     @torch.no_grad()
-    def score(self, scene: Drawable) -> dict[str, tuple[float, float]]:
+    def score(self, scene: DrawableScene) -> dict[str, tuple[float, float]]:
         """Mean PSNR per split over whole images and inside the true masks (NaN where there are none), dB."""
         scores = {}
         for split, rows in self.frames.items():

@@ -22,8 +22,7 @@ from neeco.evaluation.evaluate import held_out_splits
 from neeco.evaluation.image_metrics import psnr
 from neeco.raster.native import set_threads
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.scene import gaussian_scene
-from neeco.training.run import open_run
+from neeco.training.run import open_gaussian_run
 
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 
@@ -37,8 +36,8 @@ def kept(canonical: CanonicalGaussians, keep: Tensor) -> CanonicalGaussians:
 @torch.no_grad()
 def prune(path: Path, count: int) -> None:
     """Print the rows of one run, scored on `count` frames of each held-out split."""
-    with open_run(path) as run:
-        scene, capture = gaussian_scene(run.scene, "pruning"), thinned(run.capture(), count)
+    with open_gaussian_run(path, "pruning") as run:
+        scene, capture = run.scene, thinned(run.capture(), count)
     canonical, seen = scene.canonical, scene.visibility().sum(1)  # [N]
     for share in SHARES:
         scene.canonical = kept(canonical, seen.argsort().argsort() >= round(share * len(canonical)))

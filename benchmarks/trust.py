@@ -26,9 +26,8 @@ from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.trust import estimate_trust
 from neeco.geometry.rotations import rigid_from_vector
 from neeco.labels.labellers import CompositedLabels
-from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.annotated import fitted, typical_errors
-from neeco.training.run import open_run
+from neeco.training.run import open_gaussian_run
 
 BAD = 0.9  # IoU
 OFF = (0.12, 5.0)  # rad and mm, standard deviation about and along every axis
@@ -67,8 +66,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     rng, rows = np.random.default_rng(arguments.seed), []
-    with open_run(arguments.run) as run:
-        scene, capture = gaussian_scene(run.scene, "trust"), run.capture()
+    with open_gaussian_run(arguments.run, "trust") as run:
+        scene, capture = run.scene, run.capture()
         labeller = CompositedLabels(scene)
         usual = typical_errors(scene, labeller, capture)
         for split in held_out_splits(capture):

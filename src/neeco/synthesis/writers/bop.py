@@ -31,13 +31,13 @@ from neeco.labels.labellers import Labeller, instruments_of
 from neeco.synthesis.writers.folder import DEPTH_MM_PER_COUNT, Record, link, stem
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import GaussianScene
 
 FOLDER, SCENE = "bop", "000000"
 NOWHERE = [-1, -1, -1, -1]
 
 
-def write_bop(root: Path, records: Sequence[Record], scene: Scene, labeller: Labeller) -> None:
+def write_bop(root: Path, records: Sequence[Record], scene: GaussianScene, labeller: Labeller) -> None:
     """(Re)write everything; `scene` and `labeller` are those that the images were drawn with. Raises NeecoError."""
     instruments = instruments_of(labeller.names)
     write_json(root / FOLDER / "objects.json", {str(k): name for k, name in enumerate(instruments, 1)})
@@ -76,7 +76,7 @@ def _pose(label: dict[str, Any], number: int) -> dict[str, Any]:
     return {"cam_R_m2c": pose[:3, :3].ravel().tolist(), "cam_t_m2c": pose[:3, 3].tolist(), "obj_id": number}
 
 
-def _masks(root: Path, folder: Path, record: Record, scene: Scene, labeller: Labeller) -> list[dict[str, Any]]:
+def _masks(root: Path, folder: Path, record: Record, scene: GaussianScene, labeller: Labeller) -> list[dict[str, Any]]:
     """Write whole and visible mask of every instrument; returns their scene_gt_info entries."""
     name, width, height = stem(record["index"]), record["width"], record["height"]
     parts = read_labels(root / "parts" / f"{name}.png").numpy()
