@@ -241,7 +241,7 @@ def settings_for(method: str, assignments: Sequence[str]) -> list[str]:
     """Those of `assignments`, one list for several methods, that `method` has: `deformation.FIELD` is a method's own,
     all others are everybody's."""
     kind = method_class(method).Settings
-    own = {field.name for field in dataclasses.fields(kind)} | set(getattr(kind, "renamed", {}))
+    own = {field.name for field in dataclasses.fields(kind)}
     groups = [assignment.partition("=")[0].partition(".") for assignment in assignments]
     taken = [group != "deformation" or name in own for group, _, name in groups]
     return list(itertools.compress(assignments, taken))

@@ -192,7 +192,7 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
         return False
     if not isinstance(begun.get("settings"), dict):
         raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
-    settings = Settings.with_new_names(begun["settings"])
+    settings = begun["settings"]
     if begun.get("version") in SAME_IMAGES:
         begun["version"] = description["version"]
     compared = [(key, begun.get(key), description[key]) for key in ("schema", "version", "scene_sha256")]
