@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
 from neeco.settings import Device
-from neeco.synthesis.settings import AS_RECORDED, MIN_TRUST, Format, ImageSettings
+from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, formats_help
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,7 @@ class Arguments:
     """Another recording of the same instruments over the same tissue; the run's own when not given."""
     min_trust: float = MIN_TRUST
     """Frames trusted less are listed, not written: 0 to 1, about the overlap (IoU) that the image speaks for."""
-    formats: tuple[Format, ...] = ("coco", "yolo")
-    """Index files beside the plain images, masks, parts and depth."""
+    formats: Annotated[tuple[str, ...], tyro.conf.arg(help=formats_help())] = DEFAULT_FORMATS
     images: tyro.conf.OmitArgPrefixes[ImageSettings] = AS_RECORDED
     resume: bool = False
     """Continue a data set begun with the same settings."""

@@ -10,7 +10,7 @@ import tyro
 
 from neeco.errors import NeecoError
 from neeco.settings import Device
-from neeco.synthesis.settings import Format, Settings
+from neeco.synthesis.settings import DEFAULT_FORMATS, Settings, formats_help
 
 # what is drawn of a scene that was seen from one place
 VIEWS_OF_STILL = {
@@ -33,8 +33,7 @@ class Arguments:
     output: Path
     """Data set folder to write; must be empty or absent unless --resume."""
     settings: tyro.conf.OmitArgPrefixes[Settings]
-    formats: tuple[Format, ...] = ("coco", "yolo")
-    """Index files beside the plain images, masks, parts and depth."""
+    formats: Annotated[tuple[str, ...], tyro.conf.arg(help=formats_help())] = DEFAULT_FORMATS
     resume: bool = False
     """Continue a data set begun with the same settings, or make it larger."""
     workers: int = 1

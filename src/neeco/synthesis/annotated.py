@@ -6,7 +6,7 @@ What trust is: `neeco.evaluation.trust`.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +28,7 @@ from neeco.raster.optics import resampled, supersampled
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
-from neeco.synthesis.settings import AS_RECORDED, MIN_TRUST, Format, ImageSettings, Settings
+from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings
 from neeco.synthesis.writers.folder import Record, write_sample, write_skipped
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def annotate_capture(
     *,
     capture: Capture | None = None,
     min_trust: float = MIN_TRUST,
-    formats: tuple[Format, ...] = ("coco", "yolo"),
+    formats: Sequence[str] = DEFAULT_FORMATS,
     images: ImageSettings = AS_RECORDED,
     resume: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
