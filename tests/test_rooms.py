@@ -136,9 +136,9 @@ def test_no_circle_between_modules() -> None:
     ],
 )
 def test_an_import_upward_is_seen_wherever_it_stands(source: str) -> None:
-    known = {"neeco", "neeco.cli", "neeco.raster", "neeco.raster.api"}
-    imports = {"neeco.raster.api": imports_of(source, "neeco.raster", known)}
-    assert upward(imports) == ["neeco.raster.api -> neeco.cli"]
+    known = {"neeco", "neeco.cli", "neeco.raster", "neeco.raster.rasterization"}
+    imports = {"neeco.raster.rasterization": imports_of(source, "neeco.raster", known)}
+    assert upward(imports) == ["neeco.raster.rasterization -> neeco.cli"]
 
 
 def test_rooms_of_one_line_do_not_know_each_other() -> None:

@@ -17,7 +17,7 @@ from neeco.capture.dvrk import read_dvrk_tool
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.kinematicsfile import kinematics_of
 from neeco.errors import NeecoError
-from neeco.raster.posing import ArticulatedBody, pose_bodies
+from neeco.raster.articulated import ArticulatedBody, pose_bodies
 
 WRISTED = {
     "pose_of": "tip",

@@ -20,7 +20,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from neeco.capture.model import Frame, evenly_spaced
-from neeco.methods.kinematic.shadow import find_shadow
+from neeco.methods.kinematic.lamp_search import find_shadow
 from neeco.raster.reference import SH_C0
 from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.canonical import join_bodies

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from neeco.methods.breathing import Breathing
-from neeco.methods.carving.evidence import Evidence, gather_evidence
+from neeco.methods.space_carving import Evidence, gather_evidence
 from neeco.methods.static import Static
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
