@@ -27,10 +27,11 @@ import cv2
 import numpy as np
 
 from neeco.capture import read_capture
-from neeco.capture.model import REFERENCE_PIXELS, Capture, FromVideo, InstrumentState, State, swap_camera_axes
+from neeco.capture.model import REFERENCE_PIXELS, Capture, FromVideo, InstrumentState, State
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.files import write_json
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project_world
 from neeco.ingest.cameras.sfm import SfmResult

@@ -26,7 +26,7 @@ import torch
 from matplotlib.figure import Figure
 
 from neeco.capture import Capture
-from neeco.capture.check import read_checked
+from neeco.capture.checks import read_checked
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.training.config import training_config
 from neeco.training.train import train

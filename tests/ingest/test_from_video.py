@@ -11,7 +11,7 @@ import yaml
 from ingest.shaft_world import FOCAL, HEAD, HEIGHT, INTRINSICS, RADIUS, RATE, WIDTH, ShaftWorld
 
 from neeco.capture import errors_only, read_capture
-from neeco.capture.check import check_capture
+from neeco.capture.checks import check_capture
 from neeco.capture.images import write_image
 from neeco.capture.model import State
 from neeco.errors import NeecoError

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.fromvideofile import UNKNOWN_DEG
-from neeco.capture.model import Uncertainty, evenly_spaced
+from neeco.capture.model import UNKNOWN_DEG, Uncertainty, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.ingest.foreground.silhouettes import shaft_lines
 from neeco.ingest.shaft.axis import Axes, Edges, Scene, across_axes, edge_distances, solve_axes, unit

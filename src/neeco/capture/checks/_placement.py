@@ -10,11 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neeco.capture.check_images import agreements
-from neeco.capture.check_motion import POSES, MotionVerdict, judge_motion
-from neeco.capture.documents import Node, Parsed, errors_only, printable
-from neeco.capture.model import Instrument, swap_camera_axes
-from neeco.capture.motion_evidence import Rays
+from neeco.capture.checks.colors import agreements
+from neeco.capture.checks.motion import POSES, MotionVerdict, judge_motion
+from neeco.capture.checks.motion_evidence import Rays
+from neeco.capture.documents import Node, errors_only, printable
+from neeco.capture.model import Instrument
+from neeco.capture.readers.parsed import Parsed
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.projection import project
 
 FEW_POINTS = 100
