@@ -8,7 +8,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import yaml
 
@@ -16,7 +16,7 @@ from neeco.errors import NeecoError
 from neeco.files import YamlLoader
 from neeco.scene.method_registry import DEFAULT, method_class, method_settings
 from neeco.scene.training_session import RunLength
-from neeco.settings import name_and_value, new_name, plain, structure, warn_renamed, with_fields
+from neeco.settings import name_and_value, plain, structure, with_fields
 from neeco.training.resolution import ResolutionConfig, size_factor
 from neeco.training.schedule import Part, ScheduleConfig
 
@@ -95,12 +95,6 @@ class RefineConfig:
 @dataclass(frozen=True)
 class TrainConfig:
     """Settings of one run."""
-
-    renamed: ClassVar[Mapping[str, str]] = {
-        "views_per_step": "batch_size",
-        "tissue_budget": "max_tissue_gaussians",
-        "instrument_budget": "max_instrument_gaussians",
-    }
 
     method: str = DEFAULT
     iterations: int = 6000  # frames rendered and learned from
@@ -319,10 +313,8 @@ def _check_length(config: TrainConfig) -> None:
 
 def _assign(values: dict[str, Any], config: TrainConfig, assignment: str) -> None:
     """Set what NAME=VALUE says in `values`, those of `config` as plain dicts; whether the value fits its type is
-    checked later. Fields may be named as they were called before, with a warning."""
-    given, text = name_and_value("--set", assignment, "ssim_weight=0.2")
-    name = _new_path(config, given)
-    warn_renamed(f"--set {given}", f"--set {name}")
+    checked later."""
+    name, text = name_and_value("--set", assignment, "ssim_weight=0.2")
     *path, last = name.split(".")
     target: Any = values
     for part in path:
@@ -343,10 +335,3 @@ def _assign(values: dict[str, Any], config: TrainConfig, assignment: str) -> Non
     if isinstance(old, dict) and not isinstance(value, dict):
         raise NeecoError(f"--set {name}: is a group of fields; give one of {', '.join(old) or 'them'}, as {name}.FIELD")
     target[last] = value
-
-
-def _new_path(settings: Any, path: str) -> str:
-    """`path`, a field of `settings` (dots reach into nested ones), as it is called now."""
-    first, dot, rest = path.partition(".")
-    name = new_name(type(settings), first)
-    return f"{name}.{_new_path(getattr(settings, name, None), rest)}" if dot else name
