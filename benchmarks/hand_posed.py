@@ -30,7 +30,7 @@ from neeco.capture.model import REFERENCE_PIXELS, FromVideo, Uncertainty
 from neeco.files import read_json
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.still import reduced
+from neeco.ingest.frames.views import reduced
 from neeco.ingest.posing.hand_posed import HandPose, write_answers
 from neeco.ingest.posing.posed_capture import PosedCapture, Posing, prepare
 from neeco.ingest.shaft.axis import Scene
