@@ -25,7 +25,7 @@ from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import GaussianScene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class AlignedFrame:
 class _AlignmentProblem:
     """A frame at one resolution (see `FitProblem`)."""
 
-    scene: Scene
+    scene: GaussianScene
     state: State
     camera: Camera  # of the image's size; its pose is the recorded one
     parameters: StateParameters
@@ -91,7 +91,7 @@ class _AlignmentProblem:
 
 @torch.no_grad()
 def align_frame(
-    scene: Scene, frame: Frame, image: Tensor, start: Tensor | None = None, config: AlignConfig | None = None
+    scene: GaussianScene, frame: Frame, image: Tensor, start: Tensor | None = None, config: AlignConfig | None = None
 ) -> AlignedFrame:
     """Fit the state and camera of `frame` to its recorded `image` [H, W, 3].
 

@@ -15,7 +15,7 @@ from neeco.geometry.projection import project_world
 from neeco.raster import rasterize
 from neeco.raster.shadow import GAMMA, shadowed
 from neeco.raster.types import Gaussians
-from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 
 BLOCK_PX = 8  # images are trimmed and crops rounded to multiples of it, so that they can be halved three times exactly
 MAX_PIXELS = 160_000  # of images worked on, to which larger ones are reduced
@@ -129,7 +129,7 @@ def reduced(image: Tensor, size: float) -> Tensor:
 class InstrumentRenderer:
     """Renders a scene's instruments without its tissue; images are on the CPU whatever device renders."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: GaussianScene) -> None:
         self.scene = scene
         self.alone = _without_tissue(scene)
         self._black = scene.canonical.means.new_zeros(3)
@@ -184,7 +184,7 @@ class InstrumentRenderer:
 class TissueRenderer:
     """Renders the tissue of a learned scene, with the shadow that its instruments cast."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: GaussianScene) -> None:
         self.scene = scene
         self._rows = slice(0, scene.canonical.counts[0])
 
@@ -204,13 +204,13 @@ class TissueRenderer:
         return rasterize(gaussians.select(self._rows), camera).color.clamp(0, 1).cpu()
 
 
-def _without_tissue(scene: Scene) -> Scene:
+def _without_tissue(scene: GaussianScene) -> GaussianScene:
     """Return a scene of the instruments alone: the same modules, Gaussians of its own."""
     scene.visibility()  # measured on the whole scene, where training did not store it
     tissue, *others = scene.canonical.counts
     tensors = {name: tensor[tissue:].contiguous() for name, tensor in scene.canonical.tensors().items()}
     own = CanonicalGaussians.from_tensors(tensors, (0, *others))
-    alone = Scene(scene.method, own, scene.deformation, scene.instruments, scene.recorded, scene.center)
+    alone = GaussianScene(scene.method, own, scene.deformation, scene.instruments, scene.recorded, scene.center)
     alone.load_state_dict(scene.state_dict())
     alone.sh_degree = scene.sh_degree
     return alone.to(scene.center.device).requires_grad_(False)

@@ -14,7 +14,7 @@ from neeco.fitting.fitter import Fitter
 from neeco.fitting.layers import InstrumentRenderer, TissueRenderer
 from neeco.fitting.parameters import InstrumentParameters, StateParameters
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 
 RANGE_BELOW, RANGE_ABOVE = 0.1, 0.5  # of a joint's recorded range: how far below and above it a joint may be
 
@@ -36,7 +36,7 @@ class TrackedParameters(StateParameters):
     instruments: tuple[TrackedInstrument, ...]
 
     @classmethod
-    def of(cls, scene: Scene) -> TrackedParameters:
+    def of(cls, scene: GaussianScene) -> TrackedParameters:
         """Take them from a scene. Raises NeecoError for one that does not keep tissue and instruments apart, or has no
         instrument."""
         deformation = scene.deformation
@@ -77,7 +77,7 @@ class TrackedParameters(StateParameters):
 TrackingFitter = Fitter[TrackedParameters]
 
 
-def fitter_of(scene: Scene) -> TrackingFitter:
+def fitter_of(scene: GaussianScene) -> TrackingFitter:
     """Return the fitter of a scene's instruments over its tissue. Raises NeecoError as `TrackedParameters.of`."""
     return Fitter(InstrumentRenderer(scene), TrackedParameters.of(scene), TissueRenderer(scene))
 
