@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from neeco.fitting.refinement import RefineConfig
 from neeco.methods.breathing import Breathing
 from neeco.methods.carving.evidence import Evidence, gather_evidence
 from neeco.methods.static import Static
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
-from neeco.training.config import RefineConfig, TrainConfig, method_defaults
+from neeco.training.config import TrainConfig, method_defaults
 from neeco.training.session import new_session
 
 DENSITY_START = 200  # steps of a longer fit of the tissue before it adds Gaussians
