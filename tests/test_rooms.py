@@ -83,7 +83,7 @@ def room(module: str) -> str:
 
 
 def folders(imports: Graph) -> Graph:
-    """The imports between folders; a package's own names count as its folder's."""
+    """The imports between folders. A package's own names count as its folder's; what it re-exports does not."""
     packages = {name for name, path in modules().items() if path.name == "__init__.py"}
 
     def folder(module: str) -> str:
@@ -91,7 +91,9 @@ def folders(imports: Graph) -> Graph:
 
     found: Graph = {folder(module): set() for module in imports}
     for module, others in imports.items():
-        found[folder(module)] |= {folder(other) for other in others} - {folder(module)}
+        inside = f"{module}." if module in packages else None
+        imported = {folder(other) for other in others if inside is None or not other.startswith(inside)}
+        found[folder(module)] |= imported - {folder(module)}
     return found
 
 
