@@ -33,13 +33,14 @@ from neeco.errors import NeecoError
 from neeco.files import write_json
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project_world
-from neeco.ingest.cameras.sfm import SfmResult
-from neeco.ingest.cameras.still import moving_masks, reduced
+from neeco.ingest.cameras.still import moving_masks
 from neeco.ingest.foreground.motion import ResidualFlow
 from neeco.ingest.foreground.passing import passing_masks
+from neeco.ingest.frames.views import SfmResult, reduced
 from neeco.ingest.recording.model import IngestSettings
 from neeco.ingest.shaft.axis import ShaftVideo
-from neeco.ingest.shaft.from_video import FoundShaft, find_shaft, with_roll
+from neeco.ingest.shaft.from_video import FoundShaft, find_shaft
+from neeco.ingest.timing.synchronized import with_roll
 
 LOGGED_DEG = 1.0  # standard deviation stated of a roll that is the truth's
 

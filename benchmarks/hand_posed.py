@@ -29,7 +29,7 @@ from neeco.capture import Capture, Instrument, InstrumentState, State, read_capt
 from neeco.capture.model import REFERENCE_PIXELS, FromVideo, Uncertainty, swap_camera_axes
 from neeco.files import read_json
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.still import reduced
+from neeco.ingest.frames.views import reduced
 from neeco.ingest.posing.hand_posed import HandPose, write_answers
 from neeco.ingest.posing.posed_capture import PosedCapture, Posing, prepare
 from neeco.ingest.shaft.axis import ShaftVideo

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from neeco.cli import RENAMED, VERBS
+from neeco.cli import VERBS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("notes/*.md")])
@@ -32,8 +32,6 @@ OLD_NAMES = {
     *("Teaching", "casts", "goes_native", "photograph", "made_up", "rim", "lost", "told", "said", "kept", "standings"),
     *("shots", "drawn"),
 }
-# fields of files that 0.1 wrote and that are read as they are
-FILE_FIELDS: set[str] = set()
 OLD_PHRASES = re.compile(r"\b(photographs?|made up|roads? not walked|processor (?:minutes?|time)|goes native)\b", re.I)
 
 
@@ -54,14 +52,6 @@ def test_links_of_a_page_lead_somewhere(page: Path) -> None:
         target = (page.parent / path).resolve() if path else page
         assert target.exists(), f"{page.name}: {link}"
         assert not anchor or anchor in anchors(target), f"{page.name}: {link}"
-
-
-def test_pages_name_no_flag_of_before() -> None:
-    for page in SPOKEN:
-        text = page.read_text(encoding="utf-8")
-        for (verb, old), new in RENAMED.items():
-            named = re.search(rf"neeco {verb}\b[^\n]*(?:\\\n[^\n]*)*\s{old}(?![\w-])", text)
-            assert named is None, f"{page.name}: neeco {verb} {old} is called {new} now"
 
 
 def test_pages_name_only_verbs_that_there_are() -> None:
@@ -86,7 +76,7 @@ def names_of(source: str) -> set[str]:
 
 def test_the_code_speaks_no_old_words() -> None:
     spoken = {
-        str(path.relative_to(ROOT)): sorted(names_of(path.read_text(encoding="utf-8")) & (OLD_NAMES - FILE_FIELDS))
+        str(path.relative_to(ROOT)): sorted(names_of(path.read_text(encoding="utf-8")) & OLD_NAMES)
         for path in sorted((ROOT / "src" / "neeco").rglob("*.py"))
     }
     assert {path: names for path, names in spoken.items() if names} == {}

@@ -11,7 +11,6 @@ import math
 import re
 import types
 import typing
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Annotated, Any, TypeVar
@@ -26,44 +25,17 @@ MOST = 2**63  # no whole number of ours is as large, and torch takes none that i
 WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
 
-class RenamedWarning(FutureWarning):
-    """Something that a user gave has another name now."""
-
-
 def structure(kind: type[T], values: Mapping[str, Any], where: str = "", owner: str = "it") -> T:
     """The dataclass `kind` with `values`; fields left out keep their defaults. `owner` has them, in messages.
 
-    A dataclass whose fields were called otherwise before says so in a class attribute `renamed` (old name -> new name);
-    both are read. Raises NeecoError naming the field (`where` and its dotted path) that is unknown or does not fit its
-    type.
+    Raises NeecoError naming the field (`where` and its dotted path) that is unknown or does not fit its type.
     """
     from cattrs.errors import BaseValidationError
 
     try:
-        return _converter().structure(with_new_names(kind, values), kind)
+        return _converter().structure(values, kind)
     except BaseValidationError as error:
         raise NeecoError(next(_problems(error, where, owner))) from None
-
-
-def with_new_names(kind: Any, values: Any) -> Any:
-    """`values` for the dataclass `kind`, its fields under the names they have now, nested dataclasses included."""
-    if not (dataclasses.is_dataclass(kind) and isinstance(values, Mapping)):
-        return values
-    hints = typing.get_type_hints(kind)
-    named = {new_name(kind, key): value for key, value in values.items()}
-    return {key: with_new_names(hints.get(key), value) for key, value in named.items()}
-
-
-def new_name(kind: Any, name: str) -> str:
-    """What the field `name` of the dataclass `kind` is called now (see `structure`)."""
-    renamed: Mapping[str, str] = getattr(kind, "renamed", {})
-    return renamed.get(name, name)
-
-
-def warn_renamed(old: str, new: str) -> None:
-    """Warn that a user gave `old`, which is called `new` now: for one version both are read."""
-    if old != new:
-        warnings.warn(f"{old} is called {new} now; the old name goes with the next version", RenamedWarning, 3)
 
 
 def name_and_value(option: str, text: str, example: str) -> tuple[str, str]:
@@ -85,9 +57,8 @@ def with_fields(settings: Any, values: Mapping[str, Any]) -> Any:
     """The dataclass `settings` with fields changed by name; dots reach into nested ones (`refine.latency`)."""
     for name, value in values.items():
         first, _, rest = name.partition(".")
-        field = new_name(type(settings), first)
-        changed = with_fields(getattr(settings, field), {rest: value}) if rest else value
-        settings = dataclasses.replace(settings, **{field: changed})
+        changed = with_fields(getattr(settings, first), {rest: value}) if rest else value
+        settings = dataclasses.replace(settings, **{first: changed})
     return settings
 
 

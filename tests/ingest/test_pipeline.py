@@ -146,7 +146,7 @@ def states_with_limits(recording: Path, limits: list[float]) -> list[float]:
     document["instruments"][0]["joints"]["jaw_angle"]["limits"] = limits
     document["sync"]["em"] = OFFSET
     recording.write_text(yaml.safe_dump(document))
-    synchronized = SynchronizedRecording(read_recording(recording), silent)
+    synchronized = SynchronizedRecording(read_recording(recording))
     states, usable = synchronized.states_at(synchronized.times)
     return states["tool"][1]["jaw_angle"][usable].tolist()
 

@@ -13,7 +13,6 @@ import neeco.files
 from neeco.capture.statefile import state_to_json
 from neeco.cli import main
 from neeco.errors import NeecoError
-from neeco.settings import with_fields
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import Acceptance, SampleGenerator
 from neeco.synthesis.settings import Settings
@@ -150,24 +149,3 @@ def test_a_given_state_with_its_own_camera_is_tried_once_and_not_counted_as_draw
     made = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=2, states=str(path)))
     assert (made.images, made.made_now, made.skipped) == (1, 1, [0])
     assert made.refused == {"leaves the image": 1}
-
-
-def test_a_data_set_begun_under_the_old_names_is_continued(run, tmp_path):
-    output = tmp_path / "dataset"
-    synthesize(run, output, replace(SETTINGS, count=2, states="extrapolate"))
-    info = json.loads((output / "dataset.json").read_text())
-    settings = info["settings"] | {"states": "beyond"}
-    for old, new in (("speckle", "min_component"), ("max_unseen", "max_unobserved")):
-        settings[old] = settings.pop(new)
-    (output / "dataset.json").write_text(json.dumps(info | {"settings": settings, "version": "0.1.0"}))
-    with pytest.warns(FutureWarning, match="--states beyond is called extrapolate now"):
-        again = replace(SETTINGS, states="beyond")
-    assert synthesize(run, output, again, resume=True).made_now == 2
-    assert json.loads((output / "dataset.json").read_text())["settings"]["min_component"] == SETTINGS.min_component
-    with pytest.raises(NeecoError, match=r"settings.states: begun with 'extrapolate', now 'interpolate'"):
-        synthesize(run, output, SETTINGS, resume=True)
-
-
-def test_settings_are_read_under_their_old_names():
-    changed = with_fields(SETTINGS, {"speckle": 0.5, "tries": 7, "max_unseen": 0.1})
-    assert (changed.min_component, changed.max_attempts, changed.max_unobserved) == (0.5, 7, 0.1)

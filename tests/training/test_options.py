@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args, get_type_hints
@@ -14,7 +13,6 @@ from neeco.capture.model import Instrument
 from neeco.errors import NeecoError
 from neeco.scene.method_registry import method_class, method_settings, methods
 from neeco.training.config import (
-    TrainConfig,
     config_from_dict,
     config_to_dict,
     method_defaults,
@@ -189,18 +187,6 @@ def test_a_batch_is_of_gaussians_and_at_least_one_frame() -> None:
         training_config("3dgs", {}, ["batch_size=0"])
     with pytest.raises(NeecoError, match=r"--batch-size: method nerfies draws rays .* deformation\.rays=NUMBER"):
         training_config("nerfies", {"batch_size": 2})
-
-
-@pytest.mark.parametrize(("old", "new"), TrainConfig.renamed.items())
-def test_old_names_are_read_from_the_command_line_with_a_warning_and_from_config_yaml_without(
-    old: str, new: str
-) -> None:
-    with pytest.warns(FutureWarning, match=f"--set {old} is called --set {new} now"):
-        config = training_config("3dgs", {}, [f"{old}=3"])
-    assert getattr(config, new) == 3
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert getattr(config_from_dict({"method": "3dgs", old: 3}), new) == 3
 
 
 @pytest.mark.parametrize(

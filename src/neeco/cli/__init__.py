@@ -22,7 +22,6 @@ from typing import Any, get_type_hints
 from neeco import __version__
 from neeco.errors import NeecoError, memory_failure
 from neeco.files import require_utf8
-from neeco.settings import RenamedWarning, warn_renamed
 
 VERBS = {
     "demo": "The whole main job on the bundled sample capture, in five minutes.",
@@ -41,19 +40,6 @@ VERBS = {
     "refine": "Train a run again, with frames that were tracked by it.",
     "downstream": "Train detectors and segmenters on drawn images; test them on recorded frames.",
     "ablate": "Take parts of the methods away one by one; the paper's tables and ours.",
-}
-
-# (verb, old) -> new: flags and words of version 0.1, read for one more version
-RENAMED = {
-    ("train", "--views-per-step"): "--batch-size",
-    ("train", "--tissue-budget"): "--max-tissue-gaussians",
-    ("train", "--instrument-budget"): "--max-instrument-gaussians",
-    ("synthesize", "--speckle"): "--min-component",
-    ("synthesize", "--max-unseen"): "--max-unobserved",
-    ("synthesize", "--tries"): "--max-attempts",
-    ("compare", "--processor-minutes"): "--cpu-minutes",
-    ("downstream", "--pick"): "--frame-selection",
-    ("downstream", "--real"): "--num-real",
 }
 
 DESCRIPTION = "Labelled images of surgical instruments in states nobody recorded."
@@ -100,7 +86,6 @@ def _status(words: list[str]) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
-            warnings.simplefilter("always", RenamedWarning)
             return _dispatch(words)
     except BrokenPipeError:
         raise
@@ -158,7 +143,6 @@ def _dispatch(words: list[str]) -> int:
         return 0
     import tyro
 
-    words = _renamed(words)
     run, arguments = _verb(words) if words and words[0] in VERBS else (None, None)
     choices: dict[str, Callable[..., Any]] = {
         name: arguments if arguments is not None and name == words[0] else _named_only(name, line)
@@ -179,20 +163,8 @@ def _dispatch(words: list[str]) -> int:
         return run(parsed)
 
 
-def _renamed(words: list[str]) -> list[str]:
-    """`words` with the flags' names of today; a warning for each that was called otherwise."""
-    verb = words[0] if words else ""
-    renamed = []
-    for word in words:
-        flag, equals, value = word.partition("=")
-        new = RENAMED.get((verb, flag.replace("_", "-")), flag)
-        warn_renamed(flag, new)
-        renamed.append(f"{new}{equals}{value}")
-    return renamed
-
-
 def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    """A warning as one line on the error stream."""
+    """Print a warning as one line on the error stream."""
     print(f"neeco: warning: {_printable(' '.join(str(message).split()))}", file=sys.stderr)
 
 

@@ -54,8 +54,6 @@ class HexPlaneSettings:
     `width` of the network; `warm_up`: share of the training over which all of it is off; `rate_scale` multiplies the
     learning rates; `space_smoothness`, `time_smoothness`, `time_l1`: weights of the regularisation."""
 
-    renamed: ClassVar[Mapping[str, str]] = {"moments": "time_resolution"}
-
     channels: int = 16
     resolution: int = 64
     levels: int = 2

@@ -19,7 +19,7 @@ from neeco.evaluation.evaluate import held_out_splits
 from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.method_registry import method_settings
-from neeco.settings import plain, warn_renamed
+from neeco.settings import plain
 from neeco.studies.ablations import (
     CHECKPOINTS,
     PHASE_1_SHARE,
@@ -56,7 +56,7 @@ from neeco.studies.training_job import (
     settings_for,
 )
 from neeco.training.config import TISSUE_GAUSSIANS, TrainConfig, training_config
-from neeco.training.run import open_run
+from neeco.training.run import open_gaussian_run
 from neeco.training.schedule import MIN_RESET_INTERVAL
 
 SCHEMA = "neeco-ablation/1"
@@ -66,7 +66,6 @@ MAX_WARM_UP = 0.25  # share of the run
 INITIAL_SHARE = 0.25  # of the tissue's budget: density control can only differ where it has room to grow
 MIN_KINEMATIC_STEPS = 1_000  # steps: the shaft starts to spin and joints to learn after 600
 EVEN_DB = 0.1  # smaller differences do not count as a direction
-RENAMED_TABLES = {"rim": "extrapolation"}
 FINAL_SCORES = ("psnr", "psnr_instrument", "mask_iou")
 HEADINGS = {
     "phase_1_psnr": "phase-1 training PSNR",
@@ -178,9 +177,7 @@ def chosen_ablations(names: Sequence[str]) -> tuple[Ablation, ...]:
     known = all_ablations()
     groups = {group: [table for table in known.values() if table.group == group] for group in ("paper", "ours")}
     chosen: dict[str, Ablation] = {}
-    for given in names:
-        name = RENAMED_TABLES.get(given, given)
-        warn_renamed(f"--tables {given}", f"--tables {name}")
+    for name in names:
         if name not in groups and name not in known:
             raise NeecoError(f"--tables: {name!r} is unknown; choose of paper, ours, {', '.join(known)}")
         chosen |= {table.name: table for table in groups.get(name) or [known[name]]}
@@ -288,7 +285,7 @@ def _label_scores(
         stored = read_json(file) if file.exists() else None
         if stored is None or stored["splits"] != list(splits):
             try:
-                with open_run(folders[name], device) as run:
+                with open_gaussian_run(folders[name], "label ways", device) as run:
                     scored = score_label_ways(run, capture, splits)
             except NeecoError as error:
                 failures.append({"run": name, "error": f"label ways: {error}"})

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar, Literal, get_args
+from importlib.metadata import entry_points
+from typing import Any, Literal, get_args
 
 from neeco.errors import NeecoError
-from neeco.settings import warn_renamed
 
 LabelWay = Literal["composited", "threshold"]
-Format = Literal["coco", "yolo", "webdataset", "bop", "imagefolder"]
 Views = Literal["recorded", "perturbed", "orbit"]
+FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")  # of our own writers
+DEFAULT_FORMATS = ("coco", "yolo")
+WRITERS = "neeco.writers"  # the group of entry points of others'
 PATH_PREFIX = "path:"
 SIZE = re.compile(r"[1-9]\d{0,5}[xX][1-9]\d{0,5}")
 SAMPLERS = ("interpolate", "extrapolate", "grid")  # what `states` may be beside a file
-RENAMED_SAMPLERS = {"inside": "interpolate", "beyond": "extrapolate"}
 
 MAX_PIXELS = 2**26  # of an image
 JPEG_QUALITY = 95  # of 100, where none is asked for
@@ -103,18 +103,22 @@ class ImageSettings(SizeSettings):
         }
 
 
+def format_names() -> tuple[str, ...]:
+    """Return the names that `--formats` takes: ours, then those of installed packages. Loads none of them."""
+    return tuple(dict.fromkeys((*FORMATS, *sorted(point.name for point in entry_points(group=WRITERS)))))
+
+
+def formats_help() -> str:
+    """Return the help of `--formats`."""
+    return f"Index files beside the plain images, masks, parts and depth: {', '.join(format_names())}."
+
+
 RECORDED_SIZE, AS_RECORDED = SizeSettings(), ImageSettings()
 
 
 @dataclass(frozen=True)
 class Settings(ImageSettings):
     """What decides the pixels and labels of a data set, apart from the scene. Every field goes into dataset.json."""
-
-    renamed: ClassVar[Mapping[str, str]] = {
-        "speckle": "min_component",
-        "max_unseen": "max_unobserved",
-        "tries": "max_attempts",
-    }
 
     count: int
     """How many images."""
@@ -147,11 +151,6 @@ class Settings(ImageSettings):
     """YAML file of blur, noise, smoke and the like, and the ranges they are drawn from (docs/synthesis.md)."""
     max_attempts: int = 50
     """How often to draw a state anew when it is refused."""
-
-    def __post_init__(self) -> None:
-        if (new := RENAMED_SAMPLERS.get(self.states)) is not None:
-            warn_renamed(f"--states {self.states}", new)
-            object.__setattr__(self, "states", new)
 
     def check(self) -> None:
         """Raises NeecoError naming the option that makes no sense."""
@@ -191,12 +190,4 @@ class Settings(ImageSettings):
             del values["count"]
         if self.delta_thresholds is not None:
             values["delta_thresholds"] = list(self.delta_thresholds)
-        return values
-
-    @classmethod
-    def with_new_names(cls, identity: Mapping[str, Any]) -> dict[str, Any]:
-        """An `identity` read from a data set that older names may describe, by today's names."""
-        values = {cls.renamed.get(name, name): value for name, value in identity.items()}
-        if isinstance(states := values.get("states"), str):
-            values["states"] = RENAMED_SAMPLERS.get(states, states)
         return values

@@ -8,15 +8,16 @@ import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import yaml
 
 from neeco.errors import NeecoError
 from neeco.files import YamlLoader
+from neeco.fitting.refinement import RefineConfig
 from neeco.scene.method_registry import DEFAULT, method_class, method_settings
 from neeco.scene.training_session import RunLength
-from neeco.settings import name_and_value, new_name, plain, structure, warn_renamed, with_fields
+from neeco.settings import name_and_value, plain, structure, with_fields
 from neeco.training.resolution import ResolutionConfig, size_factor
 from neeco.training.schedule import Part, ScheduleConfig
 
@@ -67,40 +68,8 @@ class DensityConfig:
 
 
 @dataclass(frozen=True)
-class RefineConfig:
-    """What of the recorded geometry may be corrected while training; each part switches on its own."""
-
-    registration: bool = False  # one constant tracker-to-world correction (rigid + scale)
-    latency: bool = False  # one clock offset between images and poses
-    frame_poses: bool = False  # every training frame's instrument pose, smooth in time
-    frame_joints: bool = False  # every training frame's readings of joints in stated kinematics
-    cameras: bool = False  # every training frame's camera
-    start: int = 400  # iteration
-    rotation_rate: float = 6e-4  # rad, Adam's learning rate of frame_poses
-    translation_rate: float = 4e-2  # mm
-    camera_rate: float = 0.2  # times the rates of poses: SfM cameras are better than tracked instruments
-    joint_rate: float = 2e-3  # rad; where a joint slides, this and its priors count as so much at 20 mm from a pivot
-    unrecorded_rate: float = 2e-2  # of joints that nobody recorded
-    latency_rate: float = 2e-5  # s
-    prior_weight: float = 2e-5
-    prior_rotation: float = 4.4e-3  # rad, standard deviation of the prior: a tracker's 0.25 deg
-    prior_translation: float = 0.3  # mm
-    prior_joint: float = 1.5e-2  # rad: play and noise of encoders
-    prior_unrecorded: float = 0.1  # rad by which a joint that nobody recorded departs from the instants beside
-    registration_rotation_rate: float = 1e-4  # rad
-    registration_translation_rate: float = 1e-2  # mm
-    registration_scale_rate: float = 1e-4  # of the log scale
-
-
-@dataclass(frozen=True)
 class TrainConfig:
     """Settings of one run."""
-
-    renamed: ClassVar[Mapping[str, str]] = {
-        "views_per_step": "batch_size",
-        "tissue_budget": "max_tissue_gaussians",
-        "instrument_budget": "max_instrument_gaussians",
-    }
 
     method: str = DEFAULT
     iterations: int = 6000  # frames rendered and learned from
@@ -319,10 +288,8 @@ def _check_length(config: TrainConfig) -> None:
 
 def _assign(values: dict[str, Any], config: TrainConfig, assignment: str) -> None:
     """Set what NAME=VALUE says in `values`, those of `config` as plain dicts; whether the value fits its type is
-    checked later. Fields may be named as they were called before, with a warning."""
-    given, text = name_and_value("--set", assignment, "ssim_weight=0.2")
-    name = _new_path(config, given)
-    warn_renamed(f"--set {given}", f"--set {name}")
+    checked later."""
+    name, text = name_and_value("--set", assignment, "ssim_weight=0.2")
     *path, last = name.split(".")
     target: Any = values
     for part in path:
@@ -343,10 +310,3 @@ def _assign(values: dict[str, Any], config: TrainConfig, assignment: str) -> Non
     if isinstance(old, dict) and not isinstance(value, dict):
         raise NeecoError(f"--set {name}: is a group of fields; give one of {', '.join(old) or 'them'}, as {name}.FIELD")
     target[last] = value
-
-
-def _new_path(settings: Any, path: str) -> str:
-    """`path`, a field of `settings` (dots reach into nested ones), as it is called now."""
-    first, dot, rest = path.partition(".")
-    name = new_name(type(settings), first)
-    return f"{name}.{_new_path(getattr(settings, name, None), rest)}" if dot else name

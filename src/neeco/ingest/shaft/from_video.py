@@ -327,13 +327,6 @@ def _poses(video: ShaftVideo, axes: ShaftAxes) -> np.ndarray:
     return poses
 
 
-def with_roll(poses: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """Return poses [F, 4, 4] turned about their own z by roll [F] rad."""
-    turned = np.tile(np.eye(4), (len(poses), 1, 1))
-    turned[:, :3, :3] = Rotation.from_rotvec(roll[:, None] * [0.0, 0.0, 1.0]).as_matrix()
-    return np.asarray(poses @ turned)
-
-
 def _uncertainties(
     axes: ShaftAxes, poses: np.ndarray, along_sd: np.ndarray, video: ShaftVideo
 ) -> tuple[tuple[Uncertainty, ...], np.ndarray, np.ndarray]:

@@ -12,8 +12,7 @@ import numpy as np
 from neeco.capture.model import FromVideo, Instrument, Uncertainty
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.sfm import SfmResult
-from neeco.ingest.cameras.still import reduced
+from neeco.ingest.frames.views import SfmResult, reduced
 from neeco.ingest.recording.model import InstrumentLogs, Recording
 from neeco.ingest.shaft.axis import ShaftVideo
 from neeco.ingest.shaft.from_video import MIN_SHARE, FoundShaft, find_shaft

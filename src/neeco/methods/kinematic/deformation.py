@@ -74,8 +74,6 @@ class KinematicSettings:
     as found from the images); `stated_axes`, `stated_readings`: whether the axes stated there, and offsets and gains of
     the readings, are corrected; `carving`: of the search for instruments (see `CarvingSettings`)."""
 
-    renamed: ClassVar[Mapping[str, str]] = {"wrist_again": "refine_wrists", "rim": "extrapolate_tissue"}
-
     shaft_roll: float = 0.5
     shaft_roll_start: int = 600
     opacity_penalty: float = 0.002
