@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 import neeco
-from neeco.capture.kinematicsfile import kinematics_of
+from neeco.capture.readers import kinematics_of
 from neeco.errors import NeecoError
 from neeco.methods.kinematic.stated_links import StatedLinks
 

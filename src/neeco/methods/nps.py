@@ -19,9 +19,9 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
-from neeco.methods.space_carving import CarvingSettings, carved_shape
+from neeco.methods.space_carving import CarvingSettings
 from neeco.methods.swept_volume import SweptVolume, bound_volume
-from neeco.methods.tissue_fit import tissue_evidence
+from neeco.methods.tissue_fit import carve_seeds
 from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
 from neeco.scene.deformation import (
@@ -39,7 +39,7 @@ from neeco.scene.deformation import (
     state_of,
 )
 from neeco.scene.training_session import GaussianTraining
-from neeco.training.session import GaussianSession, gaussian_session
+from neeco.training.session import gaussian_session
 
 # What one unit of the head's output means. With unit features a first Adam step moves every output by about
 # width * rate = 0.2; without these the first steps throw Gaussians across the scene.
@@ -219,7 +219,7 @@ class NPS(LabelledByMotion):
                 bound_volume(session, self.gate)
         if self.settings.seeds:
             with session.searching():
-                found = _carve_seeds(session)
+                found = carve_seeds(session)
             session.scene.canonical = self._with_seeds(session.scene.canonical, found)
 
     def _with_seeds(self, canonical: CanonicalGaussians, found: Sequence[tuple[Tensor, float]]) -> CanonicalGaussians:
@@ -362,14 +362,3 @@ def _ranges(vectors: Tensor) -> tuple[Tensor, Tensor]:
 def members(canonical: CanonicalGaussians) -> Tensor:
     """[N, 1 + I] in [0, 1]: how far each Gaussian belongs to the tissue and to each instrument; rows sum to 1."""
     return nn.functional.pad(canonical.extras[MEMBER_LOGITS], (1, 0)).softmax(1)
-
-
-def _carve_seeds(session: GaussianSession) -> list[tuple[Tensor, float]]:
-    """Points [P, 3] mm on every instrument in its own frame, and its shaft's radius, mm. Raises NeecoError as
-    `find_instruments` does."""
-    session.report("looking for the instruments, on which Gaussians begin")
-    evidence = tissue_evidence(session.scene, session.views, session.config)
-    generator = torch.Generator().manual_seed(session.config.seed)
-    names = [instrument.name for instrument in session.scene.instruments]
-    shapes = [carved_shape(session, evidence, name, generator) for name in names]
-    return [(shape.seeds, shape.radius) for shape in shapes]

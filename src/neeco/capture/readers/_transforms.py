@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -11,21 +10,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.capture.distortion import StatedDistortion, opencv_distortion, stated_distortion
-from neeco.capture.documents import Node, Parsed, ParsedTissue, ProblemReport, inside, printable, relative_name
-from neeco.capture.images import EXTENSIONS, image_size
-from neeco.capture.lensfile import parse_lens
-from neeco.capture.missing import NOWHERE, missing_file
-from neeco.capture.model import Frame, Instrument, State, swap_camera_axes
+from neeco.capture.documents import Node, ProblemReport, printable
+from neeco.capture.images import EXTENSIONS
+from neeco.capture.model import SCHEMA, TEST_EVERY, Frame, Instrument, State
 from neeco.capture.points import PointCloud, random_points, read_ply
-from neeco.capture.statefile import all_instruments, declared_instruments, parse_instruments
+from neeco.capture.readers._states import all_instruments, declared_instruments, parse_instruments
+from neeco.capture.readers.cameras import CameraFields, parse_lens, placeholder_camera
+from neeco.capture.readers.parsed import NOWHERE, Parsed, ParsedTissue, inside, missing_file, relative_name
 from neeco.errors import NeecoError
 from neeco.files import read_json
-from neeco.geometry.camera import Camera
-from neeco.plausible import LARGEST_SIZE, focal_fault, size_fault, time_fault
+from neeco.geometry.conventions import swap_camera_axes
+from neeco.plausible import time_fault
 
-SCHEMA = "neeco-capture/1"
-TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
 BLENDER_HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there
 STATE_LIKE = ("instrument", "instrument_pose", "instrument_states", "tool", "tools", "joints", "states")  # frames' keys
 _MILLIMETRES = ("mm", "millimeter", "millimetre", "millimeters", "millimetres")
@@ -177,14 +173,12 @@ def _parse_frames(
         instruments, tissue = parse_instruments(node), _tissue_of(node, parsed)
         if image_path is None:
             continue
-        camera = _Intrinsics(node, header.document, image_path, parsed).camera()
+        camera = CameraFields(node, header.document, image_path, parsed).camera()
         if name is None or time is None or instruments is None:
             continue
         if pose is None or camera is None:
             parsed.without_camera.add(len(parsed.frames))
-        if camera is None:  # a placeholder: images and states can still be checked
-            width, height = _size_or_largest(image_path)
-            camera = Camera(torch.eye(4), width, width, width / 2, height / 2, width, height)
+        camera = camera or placeholder_camera(image_path)
         if pose is not None:
             opencv = torch.from_numpy(swap_camera_axes(pose)).to(torch.float32)
             camera = replace(camera, world_from_camera=opencv)
@@ -339,100 +333,3 @@ class _HeaderReport(ProblemReport):
             concerned = "" if self.frames == 1 else f", for {count} of {self.frames} frames"
             merged.append(replace(problem, message=problem.message + concerned))
         self.report.problems[self.first : self.first] = merged
-
-
-def _size_or_largest(image_path: Path) -> tuple[int, int]:
-    try:
-        return image_size(image_path)
-    except NeecoError:  # reported when the images are checked
-        return LARGEST_SIZE, LARGEST_SIZE
-
-
-class _Intrinsics:
-    """Looks a camera's numbers up in the frame first, then at the top level, and checks them."""
-
-    def __init__(self, frame: Node, document: Node, image_path: Path, parsed: Parsed) -> None:
-        self.frame, self.document, self.image_path, self.parsed = frame, document, image_path, parsed
-
-    def camera(self) -> Camera | None:
-        """The frame's camera at the origin; None, and reported, where its numbers are wrong."""
-        stated = self._distortion()
-        size = self._size()
-        width, height = size or _size_or_largest(self.image_path)
-        fx = self._focal("fl_x", "camera_angle_x", width)
-        fy = self._focal("fl_y", "camera_angle_y", height) if self._has("fl_y", "camera_angle_y") else fx
-        cx, cy = self._center("cx", width), self._center("cy", height)
-        if size is None or fx is None or fy is None or cx is None or cy is None or stated is None:
-            return None
-        if (fault := focal_fault(fx, fy, width, height)) is not None:
-            self._node("fl_x" if self._has("fl_x") else "camera_angle_x").error(*fault)
-            return None
-        try:
-            distortion = opencv_distortion(stated.model, stated.coefficients, (fx, fy, cx, cy), size)
-        except NeecoError as error:
-            (stated.place or self._node("camera_model")).error_from(error)
-            return None
-        return Camera(torch.eye(4), fx, fy, cx, cy, width, height, distortion=distortion)
-
-    def _has(self, *keys: str) -> bool:
-        return any(self.frame.has(key) or self.document.has(key) for key in keys)
-
-    def _node(self, key: str) -> Node:
-        return (self.frame if self.frame.has(key) else self.document).child(key)
-
-    def _distortion(self) -> StatedDistortion | None:
-        """None, and reported, where it cannot be read, and for distorted images that are read in place."""
-        stated = stated_distortion(self._node)
-        if stated is None or stated.place is None or self.parsed.as_source:
-            return stated
-        message = f"is {printable(stated.place.value)}: only PINHOLE is drawn, and the images are distorted"
-        stated.place.error(message, f"undistort them: neeco ingest {self.parsed.root} --output CAPTURE")
-        return None
-
-    def _size(self) -> tuple[int, int] | None:
-        """(width, height), from the image itself where not stated."""
-        if not self._has("w", "h"):
-            try:
-                return image_size(self.image_path)
-            except NeecoError as error:
-                message = str(error).removeprefix(f"{self.image_path}: ")
-                self.frame.child("file_path").error(f"{printable(self.image_path.name)}: {message}")
-                return None
-        width, height = (self._positive(key) for key in ("w", "h"))
-        if width is None or height is None:
-            return None
-        if (fault := size_fault(width, height)) is not None:
-            self._node("w").error(*fault)
-            return None
-        return int(width), int(height)
-
-    def _focal(self, key: str, angle_key: str, extent: int) -> float | None:
-        """Focal length in px, from the field of view where only that is given."""
-        if self._has(key) or not self._has(angle_key):
-            return self._positive(key)
-        angle = self._positive(angle_key)
-        if angle is not None and angle >= math.pi:
-            self._node(angle_key).error(f"is {angle:g} rad, not below pi", "give the field of view in radians")
-            return None
-        return None if angle is None else 0.5 * extent / math.tan(0.5 * angle)
-
-    def _center(self, key: str, extent: int) -> float | None:
-        """Principal point in px: inside the image, its middle where not stated."""
-        if not self._has(key):
-            return extent / 2
-        value = self._node(key).number()
-        if value is not None and not 0 < value < extent:
-            self._node(key).error(f"is {value:g}, outside the image (0 .. {extent})", "give it in pixels of this image")
-            return None
-        return value
-
-    def _positive(self, key: str) -> float | None:
-        node = self._node(key)
-        if node.value is None:
-            node.error("is missing", "give the camera's intrinsics at the top level or in every frame")
-            return None
-        value = node.number()
-        if value is not None and value <= 0:
-            node.error(f"is {value:g}, must be positive")
-            return None
-        return value

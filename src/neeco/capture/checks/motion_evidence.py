@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from neeco.capture.documents import Parsed
 from neeco.capture.model import Frame, evenly_spaced
+from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.projection import project
 
 FRAMES = 84  # looked at, evenly spaced over the capture

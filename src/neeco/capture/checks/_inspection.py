@@ -18,24 +18,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.capture.check_geometry import check_geometry
-from neeco.capture.check_images import check_images
-from neeco.capture.check_masks import Hidden, masks_fault, measure_hidden, sample_points
-from neeco.capture.check_motion import check_motion
-from neeco.capture.documents import (
-    Node,
-    Parsed,
-    Problem,
-    ProblemReport,
-    condensed,
-    errors_only,
-    key_name,
-    printable,
-)
+from neeco.capture.checks._placement import check_geometry
+from neeco.capture.checks.colors import check_images
+from neeco.capture.checks.masks import Hidden, masks_fault, measure_hidden, sample_points
+from neeco.capture.checks.motion import check_motion
+from neeco.capture.documents import Node, Problem, ProblemReport, condensed, errors_only, key_name, printable
 from neeco.capture.images import is_repeated
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import STILL, Capture, Frame, Instrument, InstrumentState
-from neeco.capture.reader import capture_of, parse_capture
+from neeco.capture.readers import capture_of, parse_capture
+from neeco.capture.readers.parsed import Parsed
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.plausible import Fault, joint_fault, limits_fault, passes_limits

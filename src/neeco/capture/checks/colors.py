@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neeco.capture.documents import Parsed
+from neeco.capture.checks._mistakes import camera_mistakes
 from neeco.capture.images import exif_orientation
 from neeco.capture.model import evenly_spaced
-from neeco.capture.pose_mistakes import camera_mistakes
+from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.projection import project
 
 MAX_IMAGES = 48  # compared with the points, evenly spaced over the capture

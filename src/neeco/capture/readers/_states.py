@@ -11,17 +11,16 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from neeco.capture.documents import Node, RaisingReport, printable
-from neeco.capture.fromvideofile import parse_from_video, parse_uncertainty
-from neeco.capture.kinematicsfile import parse_kinematics
-from neeco.capture.model import Frame, Instrument, InstrumentState, State, swap_camera_axes
+from neeco.capture.model import Frame, FromVideo, Instrument, InstrumentState, State, Uncertainty
+from neeco.capture.readers.kinematics import parse_kinematics
 from neeco.errors import NeecoError
 from neeco.files import read_text
+from neeco.geometry.conventions import swap_camera_axes
 
 Limits = tuple[float, float] | None
 
@@ -50,22 +49,6 @@ def read_states(path: Path, instruments: Sequence[Instrument], tissues: Sequence
     if not states:
         raise NeecoError(f"{path}: no states in it; give one JSON object per line")
     return states
-
-
-def state_to_json(state: State) -> dict[str, Any]:
-    """The state as `read_states` takes it."""
-    return ({} if state.tissue is None else {"tissue": state.tissue}) | {
-        "time": state.time,
-        "instruments": [
-            {"name": name, "pose": instrument.pose.tolist(), "joints": dict(sorted(instrument.joints.items()))}
-            for name, instrument in state.instruments.items()
-        ],
-    }
-
-
-def camera_to_json(world_from_camera: np.ndarray) -> list[list[float]]:
-    """world_from_camera [4, 4] with OpenCV axes, as transforms.json writes it (OpenGL axes)."""
-    return (swap_camera_axes(world_from_camera) + 0.0).tolist()  # + 0.0: no negative zeros
 
 
 def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
@@ -138,6 +121,51 @@ def all_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) -
         replace(stated[name], joints=limits) if name in stated else Instrument(name, limits)
         for name, limits in joints.items()
     )
+
+
+def parse_from_video(node: Node) -> FromVideo | None:
+    """`{"shaft_diameter_mm", "working_length_mm"}`; None, and reported, where it is not that."""
+    if not node.is_object():
+        return None
+    diameter = node.child("shaft_diameter_mm").number(above=0)
+    working = node.child("working_length_mm").number(least=0)
+    return None if diameter is None or working is None else FromVideo(diameter, working)
+
+
+def parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty | None:
+    """`{"translation_mm": [x, y, z], "rotation_deg": [x, y, z], "joints_deg": {name: sd}}`, of a state with `joints`;
+    None, and reported, where it is not that."""
+    if not node.is_object():
+        return None
+    translation = _deviations(node.child("translation_mm"), "in the camera's axes, mm")
+    rotation = _deviations(node.child("rotation_deg"), "about the instrument's x, y, z, degrees")
+    named: dict[str, float] = {}
+    good = translation is not None and rotation is not None
+    if node.has("joints_deg"):
+        given = node.child("joints_deg")
+        good &= given.is_object()
+        for name in given.value if isinstance(given.value, dict) else ():
+            deviation = given.child(name).number(least=0)
+            if name not in joints:
+                given.child(name).error("the state has no such joint", "leave it out")
+                good = False
+            elif deviation is None:
+                good = False
+            else:
+                named[name] = deviation
+    if not good or translation is None or rotation is None:
+        return None
+    return Uncertainty(translation, rotation, named)
+
+
+def _deviations(node: Node, what: str) -> tuple[float, float, float] | None:
+    found = node.numbers(3, f"standard deviations {what}")
+    if found is None:
+        return None
+    if min(found) < 0:
+        node.error(f"{min(found):g} is no standard deviation", "give numbers of 0 or more")
+        return None
+    return found[0], found[1], found[2]
 
 
 def _trust(item: Node) -> float | None:

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.capture.colmap import find_model, parse_colmap
-from neeco.capture.documents import Node, Parsed, ProblemReport, errors_only, inside
-from neeco.capture.endonerf import is_endonerf_folder, parse_endonerf
+from neeco.capture.documents import Node, ProblemReport, errors_only
 from neeco.capture.model import Capture, Frame, Instrument, State, Tissue, share_lamps
 from neeco.capture.points import PointCloud, points_in_view
-from neeco.capture.transforms import is_blender, load_document, parse_blender, parse_transforms
+from neeco.capture.readers._colmap import find_model, parse_colmap
+from neeco.capture.readers._transforms import is_blender, load_document, parse_blender, parse_transforms
+from neeco.capture.readers.endonerf import is_endonerf_folder, parse_endonerf
+from neeco.capture.readers.parsed import Parsed, inside
 from neeco.errors import NeecoError
 from neeco.files import require_utf8
 

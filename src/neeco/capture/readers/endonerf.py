@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.capture.conventions import LLFF
-from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable
+from neeco.capture.documents import Node, ProblemReport, printable
 from neeco.capture.images import EXTENSIONS
-from neeco.capture.model import Frame, PointCloud, State
+from neeco.capture.model import TEST_EVERY, Frame, PointCloud, State
 from neeco.capture.points import random_points
-from neeco.capture.transforms import TEST_EVERY
+from neeco.capture.readers.parsed import Parsed, inside
 from neeco.errors import NeecoError
 from neeco.files import placeholder, visible_entries
 from neeco.geometry.camera import Camera
+from neeco.geometry.conventions import LLFF
 from neeco.plausible import focal_fault, size_fault
 
 POSES_FILE = "poses_bounds.npy"

@@ -9,7 +9,7 @@ from itertools import permutations, product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.conventions import DVRK_ECM, OPENGL
+from neeco.geometry.conventions import DVRK_ECM, OPENGL
 
 UNITS = {"centimetres": 10.0, "inches": 25.4, "metres": 1000.0}  # mm
 SCALES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 2.0)

@@ -10,11 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neeco.capture.check_images import agreements
-from neeco.capture.check_motion import POSES, MotionVerdict, judge_motion
-from neeco.capture.documents import Node, Parsed, errors_only, printable
-from neeco.capture.model import Instrument, swap_camera_axes
-from neeco.capture.motion_evidence import Rays
+from neeco.capture.checks.colors import agreements
+from neeco.capture.checks.motion import POSES, MotionVerdict, judge_motion
+from neeco.capture.checks.motion_evidence import Rays
+from neeco.capture.documents import Node, errors_only, printable
+from neeco.capture.model import Instrument
+from neeco.capture.readers.parsed import Parsed
+from neeco.geometry.conventions import swap_camera_axes
+from neeco.geometry.lines import across_projectors
 from neeco.geometry.projection import project
 
 FEW_POINTS = 100
@@ -293,7 +296,7 @@ def _visible_body_point(cameras: _Cameras, poses: np.ndarray) -> tuple[np.ndarra
     Least squares: the body point nearest to all optical axes.
     """
     axes = cameras.poses[:, :3, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    across = across_projectors(axes)
     rows = (across @ poses[:, :3, :3]).reshape(-1, 3)
     target = (across @ (cameras.centers - poses[:, :3, 3])[:, :, None]).reshape(-1)
     point = np.linalg.lstsq(rows, target, rcond=1e-6)[0]

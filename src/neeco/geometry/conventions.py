@@ -56,3 +56,12 @@ DVRK_ECM = AxisConvention("ecm", "dVRK, ECM", "left", "up", "forward")
 OPENGL = AxisConvention("opengl", "OpenGL, Blender, nerfstudio", "right", "up", "back")
 LLFF = AxisConvention("llff", "LLFF, EndoNeRF", "down", "right", "back")
 CONVENTIONS = {item.name: item for item in (OPENCV, COLMAP, ROS_OPTICAL, ROS_BODY, DVRK_ECM, OPENGL, LLFF)}
+
+
+def swap_camera_axes(world_from_camera: np.ndarray) -> np.ndarray:
+    """Turn camera poses [..., 4, 4] from OpenGL axes (x right, y up, z back) to OpenCV axes (y down, z forward), or
+    back.
+
+    The only place where the two conventions meet.
+    """
+    return world_from_camera * np.diag(OPENGL.opencv_from_own)  # exact, and its own inverse

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.conventions import CONVENTIONS, OPENGL
-from neeco.capture.model import swap_camera_axes
+from neeco.geometry.conventions import CONVENTIONS, OPENGL, swap_camera_axes
 
 DOCS = Path(__file__).parents[2] / "docs" / "capture.md"
 SEEN = [-20.0, -10.0, 100.0]  # 20 mm to the left, 10 up, 100 in front, in OpenCV's axes

@@ -16,8 +16,8 @@ from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import BORDER_SAMPLES, find_border, visible_mask
-from neeco.ingest.cameras.frame_selection import choose_frames, describe_ranges, frame_features, frozen_frames
-from neeco.ingest.cameras.sfm import StageProgress
+from neeco.ingest.frames.selection import choose_frames, describe_ranges, frame_features, frozen_frames
+from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.timing.episodes import Episodes

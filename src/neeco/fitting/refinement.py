@@ -1,13 +1,13 @@
 """Corrections to the recorded geometry: instrument poses and joints per frame, one latency, cameras per frame.
 
-The constant tracker-to-world correction is the scene's own (`Scene.registration`), since new states need it as well.
+The constant tracker-to-world correction is the scene's own (`GaussianScene.registration`): new states need it too.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -18,7 +18,6 @@ from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 from neeco.raster.optimizer import adam_update
 from neeco.scene.deformation import log_linear
 from neeco.scene.drawable import Recorded
-from neeco.training.config import RefineConfig
 
 LEARNED = ("poses", "joints", "cameras", "latency")
 MM_PER_RAD = 20.0  # what a joint that slides is taken to move as one that turns does
@@ -26,6 +25,32 @@ FASTER = 10.0  # times the usual rates, at most, where a pose is less sure than 
 SUREST = 1e-4  # rad, mm: a standard deviation of 0 would hold a pose for ever
 SMOOTH_S = 1.0  # s between instants that tell something of each other
 STATE = (*LEARNED, "frame_steps")  # tensors of a checkpoint beside the moments
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """What of the recorded geometry may be corrected while training; each part switches on its own."""
+
+    registration: bool = False  # one constant tracker-to-world correction (rigid + scale)
+    latency: bool = False  # one clock offset between images and poses
+    frame_poses: bool = False  # every training frame's instrument pose, smooth in time
+    frame_joints: bool = False  # every training frame's readings of joints in stated kinematics
+    cameras: bool = False  # every training frame's camera
+    start: int = 400  # iteration
+    rotation_rate: float = 6e-4  # rad, Adam's learning rate of frame_poses
+    translation_rate: float = 4e-2  # mm
+    camera_rate: float = 0.2  # times the rates of poses: SfM cameras are better than tracked instruments
+    joint_rate: float = 2e-3  # rad; where a joint slides, this and its priors count as so much at 20 mm from a pivot
+    unrecorded_rate: float = 2e-2  # of joints that nobody recorded
+    latency_rate: float = 2e-5  # s
+    prior_weight: float = 2e-5
+    prior_rotation: float = 4.4e-3  # rad, standard deviation of the prior: a tracker's 0.25 deg
+    prior_translation: float = 0.3  # mm
+    prior_joint: float = 1.5e-2  # rad: play and noise of encoders
+    prior_unrecorded: float = 0.1  # rad by which a joint that nobody recorded departs from the instants beside
+    registration_rotation_rate: float = 1e-4  # rad
+    registration_translation_rate: float = 1e-2  # mm
+    registration_scale_rate: float = 1e-4  # of the log scale
 
 
 class Refinement:
@@ -169,7 +194,7 @@ class Refinement:
     @torch.no_grad()
     def center(self) -> None:
         """Take the mean correction out, of every tissue's poses: a constant one belongs to the instrument's shape (and
-        to `Scene.registration`)."""
+        to `GaussianScene.registration`)."""
         seen = (self.frame_steps > 0).nonzero()[:, 0]
         if len(seen):
             rows = torch.tensor(sorted({self.pose_rows[frame] for frame in seen.tolist()}), device=self.poses.device)

@@ -16,15 +16,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.capture.conventions import COLMAP
-from neeco.capture.distortion import opencv_distortion
-from neeco.capture.documents import Node, Parsed, Problem, ProblemReport, inside, printable, relative_name
-from neeco.capture.missing import NOWHERE, missing_file
-from neeco.capture.model import Frame, PointCloud, State
-from neeco.capture.transforms import TEST_EVERY
+from neeco.capture.documents import Node, Problem, ProblemReport, printable
+from neeco.capture.model import TEST_EVERY, Frame, PointCloud, State
+from neeco.capture.readers.cameras import opencv_distortion
+from neeco.capture.readers.parsed import NOWHERE, Parsed, inside, missing_file, relative_name
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
+from neeco.geometry.conventions import COLMAP
 from neeco.geometry.rotations import quat_to_matrix
 from neeco.plausible import center_fault, focal_fault, size_fault
 

@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.documents import Parsed, printable
+from neeco.capture.checks._mistakes import placement_mistakes, rotation_mistakes
+from neeco.capture.checks.motion_evidence import Rays, Timeline
+from neeco.capture.documents import printable
 from neeco.capture.model import Instrument, InstrumentState
-from neeco.capture.motion_evidence import Rays, Timeline
-from neeco.capture.pose_mistakes import placement_mistakes, rotation_mistakes
+from neeco.capture.readers.parsed import Parsed
 
 SHORT_SHIFT = 16  # steps of time, at most a fifth of a recording's: shifts so small explain much even where wrong
 MOST_SHIFTS = 600  # that are tried over a whole recording
