@@ -40,7 +40,7 @@ from neeco.ingest.frames.views import SfmResult, reduced
 from neeco.ingest.recording.model import IngestSettings
 from neeco.ingest.shaft.axis import Scene
 from neeco.ingest.shaft.from_video import FoundShaft, find_shaft
-from neeco.ingest.timing.synchronized import with_roll
+from neeco.ingest.timing.episodes import with_roll
 
 LOGGED_DEG = 1.0  # standard deviation stated of a roll that is the truth's
 
