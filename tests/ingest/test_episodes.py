@@ -12,7 +12,7 @@ from rendered_truth import benchmarks  # noqa: F401
 
 from neeco.capture import Capture, read_capture
 from neeco.capture.check import inspect_capture
-from neeco.cli.ingest import Ingest, print_result, recordings_of, run
+from neeco.cli.ingest import Ingest, recordings_of, run
 from neeco.errors import NeecoError
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers.interpolate import poses_at
@@ -53,12 +53,9 @@ def ingested(paths: list[Path], output: Path) -> Capture:
     return read_capture(ingest([read_recording(path) for path in paths], output, silent).capture)
 
 
-def test_recordings_of_a_still_scope_become_one_capture_with_every_pose_in_its_place(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_recordings_of_a_still_scope_become_one_capture_with_every_pose_in_its_place(tmp_path: Path) -> None:
     result = ingest([read_recording(path) for path in still_recordings(tmp_path, (1, 1))], tmp_path / "capture", silent)
-    print_result(result)
-    assert f"episode take_1: {FRAMES} of {FRAMES} frames kept" in capsys.readouterr().out
+    assert f"episode take_1: {FRAMES} of {FRAMES} frames kept" in result.lines()
     capture = read_capture(result.capture)
     assert capture.still
     assert capture.registered

@@ -114,3 +114,21 @@ class IngestResult:
             "notes": list(self.notes),
             "search": list(self.search),
         }
+
+    def lines(self) -> list[str]:
+        """Return what was found, for a terminal."""
+        numbers = self.as_json()
+        shown = [f"{numbers['kept']} of {numbers['video_frames']} video frames kept, {numbers['points']} points"]
+        for name, (first, last) in self.episodes.items():
+            count = int(((self.selected >= first) & (self.selected <= last)).sum())
+            shown.append(f"episode {name}: {count} of {last + 1 - first} frames kept")
+        if self.still:
+            shown.append(f"still scope: the world is its camera's frame; the tissue's depth is {self.tissue}")
+        if not self.registered:
+            shown.append("not registered: instrument poses stay in their tracker's frame")
+        elif self.registration is not None:
+            fit = numbers["registration"]
+            shown.append(f"registered to {fit['position_rms_mm']:.2f} mm, {fit['rotation_rms_deg']:.2f} deg rms")
+        shown += [f"clock {name}: {clock} ({clock.source})" for name, clock in self.clocks.items()]
+        shown += [f"cameras: {sentence}" for sentence in self.search]
+        return shown + [f"note: {note}" for note in self.notes]
