@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from neeco.capture import read_capture
-from neeco.capture.check import Problem, errors_only, inspect_capture
+from neeco.capture.checks import inspect_capture
+from neeco.capture.documents import Problem, errors_only
 from neeco.errors import NeecoError
 from neeco.files import finite
 from neeco.ingest.assessment import Assessment, assess_ingest
