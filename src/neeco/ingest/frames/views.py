@@ -7,16 +7,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 
 from neeco.capture.model import REFERENCE_PIXELS
-from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
 
 StageProgress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SfmResult:
     """A reconstruction by structure from motion, in a frame and unit of its own."""
 
@@ -62,6 +60,7 @@ class Views:
 def reduced(image: np.ndarray) -> np.ndarray:
     """Return an image uint8 [H, W, 3] (or [H, W]) scaled down to REFERENCE_PIXELS, in which motion is looked for."""
     height, width = image.shape[:2]
-    small = Camera(torch.eye(4), width, width, width / 2, height / 2, width, height).within(REFERENCE_PIXELS)
+    whole = Lens(width, width, width / 2, height / 2, (), (width, height)).camera(np.eye(4))
+    small = whole.within(REFERENCE_PIXELS)
     size = small.width, small.height
     return image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)

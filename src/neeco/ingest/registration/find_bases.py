@@ -172,7 +172,7 @@ class _Observed:
         return self.views.world_from_camera[self.rows]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Arm:
     """An instrument whose base is to be found, and its log's poses and readings."""
 
@@ -229,7 +229,10 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
         assert stated.sd_mm is not None
         assert stated.sd_deg is not None
         prior = (_in_world(stated, observed.cameras), stated.sd_mm, stated.sd_deg)
-    return _Arm(item, str(data.recording.path), clock, readings, prior, base_from_shaft, wrists)
+    return _Arm(
+        item=item, where=str(data.recording.path), clock=clock, readings=readings, prior=prior,
+        poses_at=base_from_shaft, wrists=wrists,
+    )  # fmt: skip
 
 
 def _find(
