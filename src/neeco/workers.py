@@ -37,14 +37,14 @@ TASKS_PER_WORKER = 2  # submitted to a cluster, so that no worker waits for the 
 TaskFunction = Callable[[Any, Any, int], Any]
 Events = Generator["TaskEvent", None, None]
 Outcome = Literal["done", "failed", "died"]
-Stage = Literal["started", "done", "failed", "died", "lost"]
+Stage = Literal["started", "done", "failed", "died", "abandoned"]
 
 
 @dataclass(frozen=True)
 class TaskEvent:
     """Progress of one task: `value` is its result once it is done, or the reason why it failed or its worker died.
 
-    A task whose worker died is begun again, RETRIES times at most; then it is lost.
+    A task whose worker died is begun again, RETRIES times at most; then it is abandoned.
     """
 
     index: int
@@ -123,10 +123,10 @@ def run_tasks(
                     yield TaskEvent(index, "started")
                 for index, outcome, value in pool.finished():
                     deaths[index] += outcome == "died"
-                    lost = deaths[index] > RETRIES
-                    if outcome == "died" and not lost:
+                    given_up = deaths[index] > RETRIES
+                    if outcome == "died" and not given_up:
                         waiting.insert(0, index)
-                    yield TaskEvent(index, "lost" if lost else outcome, value)
+                    yield TaskEvent(index, "abandoned" if given_up else outcome, value)
         finally:
             pool.stop()
 

@@ -82,7 +82,7 @@ def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], w
             for event in events:
                 if event.stage == "failed":
                     raise NeecoError(event.value)
-                if event.stage == "lost":
+                if event.stage == "abandoned":
                     raise NeecoError(
                         f"--workers: workers keep dying over image {tasks[event.index][0]} ({event.value}); is there "
                         "memory enough? use fewer workers and --resume"
