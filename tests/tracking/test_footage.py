@@ -95,8 +95,8 @@ def test_no_colours_to_compare_change_nothing() -> None:
 
 def test_recoloured_instruments_look_so_and_tissue_stays() -> None:
     scene, colors = make_scene(), Colors((0.8, 0.9, 1.1), 1.2)
-    before = InstrumentRenderer(scene).draw(grasper_state(), CAMERA)
-    after = InstrumentRenderer(colors.of(scene)).draw(grasper_state(), CAMERA)
+    before = InstrumentRenderer(scene).render(grasper_state(), CAMERA)
+    after = InstrumentRenderer(colors.of(scene)).render(grasper_state(), CAMERA)
     solid = before[1] > 0.99
     expected = torch.tensor(colors.gain) * (before[0] / before[1][..., None])[solid] ** colors.gamma
     seen = (after[0] / after[1][..., None])[solid]
@@ -110,7 +110,7 @@ def test_instruments_stand_before_the_tissue_of_another_scene() -> None:
     own, other = make_scene(), other_wall()
     joined = over_tissue(own, other)
     state = grasper_state()
-    (color, alpha), (expected, opacity) = (InstrumentRenderer(scene).draw(state, CAMERA) for scene in (joined, own))
+    (color, alpha), (expected, opacity) = (InstrumentRenderer(scene).render(state, CAMERA) for scene in (joined, own))
     assert torch.equal(color, expected)
     assert torch.equal(alpha, opacity)
     rows = ~joined.canonical.of_instruments
@@ -121,7 +121,7 @@ def test_what_passes_before_the_tissue_is_masked_with_a_rim(tmp_path: Path) -> N
     scene = make_scene()
     frame = record(scene, tmp_path, [grasper_state()], "train").frames[0]
     mask = foreground(frame, TissueRenderer(scene))
-    label = InstrumentRenderer(scene).draw(grasper_state(), CAMERA)[1].numpy() > 0.5
+    label = InstrumentRenderer(scene).render(grasper_state(), CAMERA)[1].numpy() > 0.5
     assert mask[label].mean() > 0.95
     assert mask.mean() < 0.5
 
