@@ -31,9 +31,9 @@ MAX_NEIGHBOUR_S = 1.0  # s between instants whose unrecorded joints are similar
 MAX_VELOCITY_S = 0.5  # s between frames that velocities are taken from
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RefineConfig:
-    """What of the recorded geometry may be corrected while training; each part switches on its own."""
+    """Corrections of the recorded geometry while training; each is switched on by itself."""
 
     registration: bool = False  # one constant tracker-to-world correction (rigid + scale)
     latency: bool = False  # one clock offset between images and poses
@@ -44,14 +44,14 @@ class RefineConfig:
     rotation_rate: float = 6e-4  # rad, Adam's learning rate of frame_poses
     translation_rate: float = 4e-2  # mm
     camera_rate: float = 0.2  # times the rates of poses: SfM cameras are better than tracked instruments
-    joint_rate: float = 2e-3  # rad; where a joint slides, this and its priors count as so much at 20 mm from a pivot
+    joint_rate: float = 2e-3  # rad; of a prismatic joint, this and its priors are arcs at 20 mm from a pivot
     unrecorded_rate: float = 2e-2  # of joints that nobody recorded
     latency_rate: float = 2e-5  # s
     prior_weight: float = 2e-5
     prior_rotation: float = 4.4e-3  # rad, standard deviation of the prior: a tracker's 0.25 deg
     prior_translation: float = 0.3  # mm
     prior_joint: float = 1.5e-2  # rad: play and noise of encoders
-    prior_unrecorded: float = 0.1  # rad by which a joint that nobody recorded departs from the instants beside
+    prior_unrecorded: float = 0.1  # rad by which an unrecorded joint departs from its neighbours in time
     registration_rotation_rate: float = 1e-4  # rad
     registration_translation_rate: float = 1e-2  # mm
     registration_scale_rate: float = 1e-4  # of the log scale
