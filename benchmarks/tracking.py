@@ -42,9 +42,10 @@ from torch import Tensor
 
 from neeco.capture import read_capture, write_capture
 from neeco.capture.images import write_image
-from neeco.capture.model import Frame, InstrumentState, State, swap_camera_axes
+from neeco.capture.model import Frame, InstrumentState, State
 from neeco.evaluation.mask_folders import load_reference
 from neeco.geometry.camera import Camera
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 from neeco.labels.drawing import draw

@@ -11,7 +11,7 @@ from ingest.still_world import FRAMES, RATE, Theatre
 from rendered_truth import benchmarks  # noqa: F401
 
 from neeco.capture import Capture, read_capture
-from neeco.capture.check import inspect_capture
+from neeco.capture.checks import inspect_capture
 from neeco.cli.ingest import Ingest, print_result, recordings_of, run
 from neeco.errors import NeecoError
 from neeco.ingest.frames.selection import assign_splits

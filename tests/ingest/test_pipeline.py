@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from neeco.capture import check_capture, read_capture
-from neeco.capture.check import errors_only
+from neeco.capture.documents import errors_only
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.pipeline import ingest

@@ -21,7 +21,7 @@ from torch import Tensor
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.fitting.fitter import StateFit, loose_prior
 from neeco.fitting.layers import working_size
-from neeco.methods.kinematic.shadow import find_shadow
+from neeco.methods.kinematic.lamp_search import find_shadow
 from neeco.raster.reference import SH_C0
 from neeco.scene import CanonicalGaussians, GaussianScene
 from neeco.scene.canonical import join_bodies

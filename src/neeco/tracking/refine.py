@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from neeco.capture.model import Capture, Frame
-from neeco.capture.reader import read_capture
+from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_begun, read_bytes, read_json, require_same, write_json

@@ -22,7 +22,7 @@ import torch
 
 import neeco
 from neeco.capture.model import Capture, Frame, InstrumentState, State
-from neeco.capture.reader import read_capture
+from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, own_folder, read_begun, read_bytes, read_json, require_same, write_json
