@@ -156,15 +156,15 @@ def track_footage(
             if tissue == "footage":
                 scene = load_gaussians(output / RUN / "scene.safetensors", "track", scene.center.device)
         registered = trained_on.registered or tissue == "footage"
-        kept = replace(footage, frames=_trusted(frames, info["frames"], min_trust), registered=registered)
-        if kept.frames:
-            write_tracked(kept, output, scene, trained_on)
+        trusted = replace(footage, frames=_with_trust(frames, info["frames"], min_trust), registered=registered)
+        if trusted.frames:
+            write_tracked(trusted, output, scene, trained_on)
         if tissue == "footage" and not stored.get("complete"):
             _write_run(output, run, scene)
         write_json(output / INFO, info)
         if (output / STEPS).exists():
             shutil.rmtree(output / STEPS)
-    return Tracked(output, footage, info["frames"], len(kept.frames), min_trust, scene)
+    return Tracked(output, footage, info["frames"], len(trusted.frames), min_trust, scene)
 
 
 def scene_digest(run: GaussianRun) -> str:
@@ -315,7 +315,7 @@ def state_of(record: dict[str, Any]) -> State:
     return State(instruments, record["time"])
 
 
-def _trusted(frames: Sequence[Frame], records: Sequence[dict[str, Any]], min_trust: float) -> tuple[Frame, ...]:
+def _with_trust(frames: Sequence[Frame], records: Sequence[dict[str, Any]], min_trust: float) -> tuple[Frame, ...]:
     """Return the frames of enough trust, with their states."""
     return tuple(
         replace(frame, state=state_of(record))
@@ -324,14 +324,14 @@ def _trusted(frames: Sequence[Frame], records: Sequence[dict[str, Any]], min_tru
     )
 
 
-def write_tracked(kept: Capture, output: Path, scene: GaussianScene, trained_on: Capture) -> None:
+def write_tracked(trusted: Capture, output: Path, scene: GaussianScene, trained_on: Capture) -> None:
     """Write tracked frames as a capture, whose states tell every joint.
 
     All else that is known of the footage (its lens, a still scope) holds for them.
     """
-    points = kept.points if kept.points.measured else trained_on.points
+    points = trusted.points if trusted.points.measured else trained_on.points
     instruments = tuple(replace(item, unrecorded=()) for item in scene.instruments)
-    write_capture(replace(kept, instruments=instruments, points=points), output, overwrite=True)
+    write_capture(replace(trusted, instruments=instruments, points=points), output, overwrite=True)
 
 
 def _first_state(footage: Capture, frame: Frame, scene: GaussianScene) -> State:
