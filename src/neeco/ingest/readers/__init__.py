@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib.util
 from abc import ABC
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import ClassVar
@@ -57,6 +57,7 @@ class Table:
     header: tuple[str, ...]
     rows: list[list[str]] | np.ndarray
     lines: np.ndarray
+    _: KW_ONLY
     decimal_comma: bool = False
     stream: str | None = None
     record: str = "line"
@@ -104,6 +105,7 @@ class Stream:
     type: str
     count: int
     rate_hz: float | None = None
+    _: KW_ONLY
     offered: bool = True
     body: str | None = None
     joints: tuple[tuple[str, str], ...] | None = None

@@ -1,7 +1,7 @@
-"""Messages of ROS 1 and ROS 2 bags and MCAP files, by `rosbags`, within limits.
+"""Messages of ROS 1 and ROS 2 bags and MCAP files, read by `rosbags` within limits on memory.
 
-Nothing that a bag says is executed: `rosbags` makes Python of message definitions, so those in the bag are not given to
-it. The types that are read have been the same for years, and a bag whose digests say otherwise is refused.
+Nothing in a bag is executed: `rosbags` compiles message definitions to Python, so a bag's own are not passed to it. The
+types that are read have been the same for years, and a bag with other digests is refused.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _REMEDIES = {
 
 @dataclass(frozen=True)
 class Topic:
-    """type: as ROS writes it, package/Type; count: of its messages; problem: why it cannot be read, in words."""
+    """A topic of a bag. type: as ROS writes it, package/Type; count: of messages; problem: why it cannot be read."""
 
     name: str
     type: str
@@ -113,8 +113,8 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """A bag for the block: a ROS 1 `.bag`, a ROS 2 folder, or one `.mcap` or `.db3` of it. Raises NeecoError when it
-    cannot be read, as `Bag.messages` does."""
+    """Open a bag for the block: a ROS 1 `.bag`, a ROS 2 folder, or one `.mcap` or `.db3` of it. Raises NeecoError when
+    it cannot be read, as `Bag.messages` does."""
     for file in visible_entries(path) if path.is_dir() else [path]:
         require_content(file)
     with ExitStack() as stack:
@@ -151,7 +151,7 @@ def _damage_named(path: Path) -> Iterator[None]:
 
 
 def plain(name: str) -> str:
-    """A name out of a bag without what a terminal, or a recording.yaml, would take for more than its letters."""
+    """Return a name from a bag without the characters that control a terminal or a recording.yaml."""
     return "".join(letter if letter.isprintable() else "?" for letter in name[:MAX_NAME_LENGTH])
 
 
@@ -175,8 +175,8 @@ def _limit_chunks(reader: Any) -> None:
     if isinstance(reader, McapReader):
         if not reader.chunks and reader.metadata.message_count:
             raise ReaderError("its messages are not in chunks")
-        for chunk in reader.chunks:
-            _check_size(max(chunk.uncompressed_size, chunk.compressed_size))
+        for listed in reader.chunks:
+            _check_size(max(listed.uncompressed_size, listed.compressed_size))
     elif isinstance(reader, Ros1Reader):
         names = {known: name for name, known in decompressors.items()}
         for place, chunk in reader.chunks.items():
@@ -204,7 +204,7 @@ def _check_metadata(folder: Path) -> None:
 
 @cache
 def _store(ros1: bool) -> Any:
-    """The types of messages, as ROS has them."""
+    """Return the message types of ROS itself."""
     if not ros1:
         return get_typestore(Stores.ROS2_HUMBLE)
     store = get_typestore(Stores.ROS1_NOETIC)

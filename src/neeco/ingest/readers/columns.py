@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -62,6 +62,7 @@ class PoseColumns:
 
     path: Path
     clock: str = TRACKER_CLOCK
+    _: KW_ONLY
     time: tuple[str, ...] | None = None
     position: tuple[str, ...] | None = None
     rotation: tuple[str, ...] | None = None
@@ -83,6 +84,7 @@ class JointColumns:
 
     path: Path
     clock: str
+    _: KW_ONLY
     time: tuple[str, ...] | None = None
     value: str | None = None
     units: Units = field(default_factory=Units)
@@ -92,7 +94,7 @@ class JointColumns:
     stream: str | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RecognisedColumns:
     """The columns that a header seems to name. None: not found; unclear: what was found in several ways or in part."""
 

@@ -40,7 +40,8 @@ class DelimitedText(RecordingFormat):
         if not rows:
             raise NeecoError(f"{path}: has a header but no rows; record again or name another file")
         cells = [line.cells for line in rows]
-        return Table(path, unique_names(names), cells, np.array([line.number for line in rows]), lines[0].decimal_comma)
+        numbers, comma = np.array([line.number for line in rows]), lines[0].decimal_comma
+        return Table(path, unique_names(names), cells, numbers, decimal_comma=comma)
 
 
 @dataclass(frozen=True)

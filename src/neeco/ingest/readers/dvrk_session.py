@@ -33,7 +33,7 @@ from neeco.ingest.readers import (
 )
 from neeco.ingest.readers.delimited import DelimitedText
 from neeco.ingest.readers.frame_names import meaning_of
-from neeco.ingest.readers.rosbag import POSE_HEADER, RosBag
+from neeco.ingest.readers.rosbag import DVRK_HINT, POSE_HEADER, RosBag, joint_column, wrist_joints
 from neeco.ingest.readers.video import open_video
 
 INDEX, TYPES = "index.json", ("dc_index_v1", "dc::index@", "dvrk_data:index@")
@@ -44,8 +44,6 @@ _STAMPED = re.compile(r"(?P<name>.+)_(?P<time>\d{9,11}\.\d{3,9})\.(?:jpg|jpeg|pn
 _POSE_PARTS = (("pose.position.", "pose.orientation."), ("transform.translation.", "transform.rotation."))
 _POSES = re.compile(r"/(PSM\d)/measured_cp")  # an instrument's; the endoscope's arm reports in another base
 _JOINTS = re.compile(r"/(PSM\d)/(?:jaw/)?measured_js")
-_WRIST = ("wrist_pitch", "wrist_yaw", "jaw")  # of an instrument; the joints before them move all of it
-_SLIDES = re.compile(r"insertion|prismatic", re.IGNORECASE)  # joints in m
 HALVES = {"LR": ("left", "right"), "RL": ("right", "left")}  # what the halves of a video show, from the left on
 
 
@@ -292,20 +290,12 @@ def _stream(topic: str, kind: str, columns: list[str], table: Table) -> Stream:
     if kind == POSES:
         stated_in = _frames(table)
         meaning = meaning_of(stated_in[0] if len(stated_in) == 1 else "", dvrk=True)
-        hints = ("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit",)
         return Stream(
-            topic, POSES, "poses", len(table.rows), None, match is not None, body, None, (*meaning.hints, *hints),
-            asks=meaning.asks,
+            topic, POSES, "poses", len(table.rows), offered=match is not None, body=body,
+            hints=(*meaning.hints, DVRK_HINT), asks=meaning.asks,
         )  # fmt: skip
-    names = _joint_names(table, columns)
-    wrist = [(known, _joint_column(name)) for known in _WRIST for name in names if name.endswith(known)]
-    if "/jaw/" in topic and len(names) == 1:
-        wrist = [("jaw", _joint_column(names[0]))]
-    return Stream(topic, READINGS, "joints", len(table.rows), None, match is not None, body, tuple(wrist))
-
-
-def _joint_column(name: str) -> str:
-    return f"{name}_{'m' if _SLIDES.search(name) else 'rad'}"
+    joints = wrist_joints(_joint_names(table, columns), "/jaw/" in topic)
+    return Stream(topic, READINGS, "joints", len(table.rows), offered=match is not None, body=body, joints=joints)
 
 
 def _joint_names(table: Table, columns: list[str]) -> list[str]:
@@ -324,7 +314,7 @@ def _converted(path: Path, stream: Stream, table: Table, columns: list[str], sta
     if stream.kind == POSES:
         header: tuple[str, ...] = POSE_HEADER
     else:
-        header = ("t_s", *(_joint_column(name) for name in _joint_names(table, columns)))
+        header = ("t_s", *map(joint_column, _joint_names(table, columns)))
         if len(set(header)) < len(header):
             raise NeecoError(f"{table.path}: names a joint twice; record again")
     values, _, bad = numbers(table, columns)

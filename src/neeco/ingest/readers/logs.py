@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +54,7 @@ class PoseLog:
     times: np.ndarray
     positions: np.ndarray
     quats: np.ndarray
+    _: KW_ONLY
     gaps: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = ()
     frame: str = named.BASE
@@ -69,6 +70,7 @@ class ReadingLog:
     clock: str
     times: np.ndarray
     values: np.ndarray
+    _: KW_ONLY
     gaps: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = ()
     image_hz: float | None = None
@@ -135,8 +137,10 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
         frame = named.CAMERA
         if source.frame is None and table.meaning is not None:
             notes = (*notes, f"{table.title}: poses are stated in {table.meaning.why}")
-    log = PoseLog(table.path, source.clock, times, positions, quats, gaps, notes, frame, stated_in)
-    return replace(log, image_hz=table.image_hz)
+    return PoseLog(
+        table.path, source.clock, times, positions, quats, gaps=gaps, notes=notes, frame=frame, stated_in=stated_in,
+        image_hz=table.image_hz,
+    )  # fmt: skip
 
 
 def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -217,7 +221,7 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     times, order = _in_order(rows, times)
     gaps, gap_notes = _gaps(table, times)
     notes = (*rows.notes(), *clamped, *gap_notes)
-    return ReadingLog(table.path, source.clock, times, values[order], gaps, notes, table.image_hz)
+    return ReadingLog(table.path, source.clock, times, values[order], gaps=gaps, notes=notes, image_hz=table.image_hz)
 
 
 def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:

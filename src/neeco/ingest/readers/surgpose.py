@@ -33,6 +33,7 @@ from neeco.ingest.readers import (
     compare_lengths,
 )
 from neeco.ingest.readers.logs import WRONG_ROWS
+from neeco.ingest.readers.rosbag import DVRK_HINT
 from neeco.ingest.readers.video import open_images, open_video
 
 POSE_FILE, JOINT_FILE = "api_cp_data.yaml", "api_jp_data.yaml"
@@ -72,8 +73,7 @@ class SurgPose(RecordingFormat):
             for number, name in enumerate(videos)
         ]
         for name, (frames, _) in sorted(arms.poses.items()):
-            hints = ("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit",)
-            found.append(Stream(name, POSES, "poses", len(frames), FRAMES_PER_SECOND, body=name, hints=hints))
+            found.append(Stream(name, POSES, "poses", len(frames), FRAMES_PER_SECOND, body=name, hints=(DVRK_HINT,)))
         for name, (frames, values) in sorted(arms.joints.items()):
             wrist = tuple(joint for joint in WRIST if joint[1] in JOINT_NAMES[: values.shape[1]])
             title = f"{name}{JOINTS_BEHIND}"

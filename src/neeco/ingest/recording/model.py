@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 
 from neeco.capture.kinematics import KinematicTree
@@ -38,6 +38,7 @@ class InstrumentLogs:
     that was logged."""
 
     name: str
+    _: KW_ONLY
     poses: PoseColumns | None = None
     joints: Mapping[str, JointColumns] = field(default_factory=dict)
     kinematics: KinematicTree | None = None
@@ -62,11 +63,12 @@ class Splits:
     unseen_by: str | None = None
     test: tuple[tuple[int, int], ...] = ()
     unseen: tuple[tuple[int, int], ...] = ()
+    _: KW_ONLY
     test_episodes: tuple[str, ...] = ()
     unseen_episodes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class IngestSettings:
     """Numbers that decide what comes of a recording (`settings` in recording.yaml). All are above 0."""
 
@@ -110,6 +112,7 @@ class Recording:
     several is called, where the file says it; tissue: over which of several it was taken, EACH: one of its own."""
 
     path: Path
+    _: KW_ONLY
     video: Path | None = None
     images: Path | None = None
     fps: float | None = None

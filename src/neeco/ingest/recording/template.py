@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,7 @@ class _Log:
 
     file: str
     stream: str | None = None
+    _: KW_ONLY
     body: str | None = None
     hints: tuple[str, ...] = ()
     asks: tuple[str, ...] = ()
@@ -202,7 +203,10 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         found.leave_out(name, _without_place(str(error), path, name), images=True)
         return path.is_dir()
     for stream in streams:
-        log = _Log(name, stream.name, stream.body, stream.hints, stream.asks, stream.clock, stream.columns is None)
+        log = _Log(
+            name, stream.name, body=stream.body, hints=stream.hints, asks=stream.asks, clock=stream.clock,
+            is_whole=stream.columns is None,
+        )  # fmt: skip
         used = stream.offered and stream.count > 0 and stream.problem is None
         if used and stream.kind == IMAGE_STREAMS:
             found.videos.append(log)
