@@ -252,7 +252,7 @@ def test_a_camera_that_was_not_downloaded_hides_no_other(tmp_path, version):
     assert re.match(rf".*: episode 0/{wrist}: .*\.mp4: no such file", problems[0])
     recording = read_recording(place)
     assert recording.stream == f"episode 0/{CAMERA}"
-    assert len(recording.open().times) == len(EPISODES[0][STATE])
+    assert len(recording.source.open().times) == len(EPISODES[0][STATE])
     with pytest.raises(NeecoError, match=r"wrist.*\.mp4: no such file"):
         format_of(path).open_images(path, f"episode 0/{wrist}")
     shutil.rmtree(path / "videos")

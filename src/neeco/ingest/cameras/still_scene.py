@@ -71,7 +71,7 @@ def read_right_camera(
     """Write the right camera's images at the `selected` [K] video frames, called as `stems`, undistorted, into
     `folder`. times [V] s: of the left video's frames. The two videos begin together. Raises NeecoError."""
     _, lens, right_from_left = read_stereo(partner.calibration)
-    video = partner.open()
+    video = partner.source.open()
     lens.check_size(video.size, partner.calibration)
     rows = {_nearest(video.times, times, int(frame), len(times)): row for row, frame in enumerate(selected)}
     rows.pop(-1, None)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Annotated
 
+from neeco.capture.documents import Node, printable
 from neeco.errors import NeecoError
 
 TRACKER_CLOCK = "em"  # what a tracker's clock is called unless the recording names it
@@ -39,13 +41,25 @@ _ALIASES = {
 _UNIT_SUFFIX = re.compile(r"^(?P<base>.*?)(?:[\s_\-/]+|[\s_]*[\[(]\s*)(?P<unit>[a-zµ°]+)\s*[\])]?$")
 
 
+def _unit(kind: str) -> Callable[[Node], str]:
+    """Return the parser of a unit."""
+
+    def parse(node: Node) -> str:
+        unit = canonical_unit(str(node.value))
+        if unit not in UNITS[kind]:
+            node.error(f"{printable(node.value)} is no unit of {kind}", f"use {', '.join(UNITS[kind])}")
+        return unit
+
+    return parse
+
+
 @dataclass(frozen=True)
 class Units:
     """Units that a recording states; None: the columns' names state it."""
 
-    time: str | None = None
-    length: str | None = None
-    angle: str | None = None
+    time: Annotated[str, _unit("time")] | None = None
+    length: Annotated[str, _unit("length")] | None = None
+    angle: Annotated[str, _unit("angle")] | None = None
 
 
 @dataclass(frozen=True)

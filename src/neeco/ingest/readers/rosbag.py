@@ -243,8 +243,8 @@ def _meaning(survey: Survey, name: str) -> NamedFrame:
 
 
 def _camera_from_stated(survey: Survey, name: str) -> np.ndarray | None:
-    """Return [4, 4] mm from the frame of a stream's poses to the images', where its name leaves the axes open but static
-    transforms state them; else None."""
+    """Return [4, 4] mm from the frame of a stream's poses to the images', where the name leaves the axes open
+    but static transforms state them; else None."""
     from neeco.ingest.readers._bagsurvey import fixed_transform
 
     frame, images = next(iter(survey.poses[name].frames), ""), _image_frames(survey)

@@ -21,7 +21,14 @@ from neeco.ingest.cameras.still import same_place
 from neeco.ingest.readers import VideoSource, format_of
 from neeco.ingest.readers.logs import PoseLog, ReadingLog
 from neeco.ingest.recording.base import same_base
-from neeco.ingest.recording.model import MIN_FRAMES, IngestSettings, InstrumentLogs, Recording
+from neeco.ingest.recording.model import (
+    MIN_FRAMES,
+    ImageFolder,
+    IngestSettings,
+    InstrumentLogs,
+    Recording,
+    VideoFile,
+)
 from neeco.ingest.result import Doubt
 from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
 from neeco.ingest.timing.synchronized import States, SynchronizedRecording
@@ -373,6 +380,11 @@ def _of_episode(recording: Recording, episode: int) -> Recording:
         moved += 1
         return known.of_episode(stream, episode)
 
+    def source_of(source: VideoFile | ImageFolder, key: str) -> VideoFile | ImageFolder:
+        if isinstance(source, ImageFolder):
+            return source
+        return replace(source, stream=stream_of(source.file, source.stream, key))
+
     instruments = []
     for item in recording.instruments:
         poses = item.poses and replace(item.poses, stream=stream_of(item.poses.path, item.poses.stream, "poses"))
@@ -383,11 +395,10 @@ def _of_episode(recording: Recording, episode: int) -> Recording:
         roll = item.roll and replace(item.roll, stream=stream_of(item.roll.path, item.roll.stream, "roll"))
         instruments.append(replace(item, poses=poses, joints=joints, roll=roll))
     scope, partner = recording.laparoscope, recording.stereo
-    stream = stream_of(recording.video, recording.stream, "video")
     changed = replace(
-        recording, stream=stream, instruments=tuple(instruments),
+        recording, source=source_of(recording.source, "video"), instruments=tuple(instruments),
         laparoscope=scope and replace(scope, stream=stream_of(scope.path, scope.stream, "laparoscope")),
-        stereo=partner and replace(partner, stream=stream_of(partner.video, partner.stream, "stereo")),
+        stereo=partner and replace(partner, source=source_of(partner.source, "stereo")),
         episode=f"episode_{episode}",
     )  # fmt: skip
     if not moved:

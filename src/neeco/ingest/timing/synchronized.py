@@ -43,7 +43,7 @@ class SynchronizedRecording:
         self.scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
         self._check_bases()
         progress("reading video", 0, 0)
-        self.video = recording.open()
+        self.video = recording.source.open()
         self.times = self.video.times  # [V] s, every frame
         logs: list[PoseLog | ReadingLog] = [*self.poses.values(), *([self.scope] if self.scope else [])]
         logs += [log for joints in self.joints.values() for log in joints.values()] + [*self.rolls.values()]
@@ -154,7 +154,7 @@ class SynchronizedRecording:
         rate, length = 1 / float(np.median(np.diff(times))), times[-1] - times[0]
         if not (SLOWEST < rate < FASTEST and length < LONGEST):
             raise NeecoError(
-                f"{self.recording.times or video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
+                f"{video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
                 "cannot be; correct fps or the times' unit"
             )
         if min(video.size) < SMALLEST:
