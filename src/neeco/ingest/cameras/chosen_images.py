@@ -15,7 +15,7 @@ from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Border, Lens
-from neeco.ingest.calibration.lens import BORDER_SAMPLES, find_border, visible_mask
+from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.cameras.frame_selection import choose_frames, describe_ranges, frame_features, frozen_frames
 from neeco.ingest.cameras.sfm import StageProgress
 from neeco.ingest.readers import VideoSource
@@ -84,7 +84,7 @@ class ChosenImages:
 
     def _find_border(self) -> Border | None:
         """The endoscope's dark border, in the frames as recorded."""
-        sample = self.selected[evenly_spaced(len(self.selected), BORDER_SAMPLES, floor=True)]
+        sample = self.selected[evenly_spaced(len(self.selected), MAX_BORDER_FRAMES, floor=True)]
         border = find_border(image for _, image in self.data.video.read(sample.tolist()))
         if border is not None:
             dark = 1 - visible_mask(border, self.size).mean()

@@ -21,19 +21,19 @@ from neeco.files import require_content
 from neeco.ingest.readers import VideoSource
 
 META, NRRD = (".mha", ".mhd"), (".nrrd", ".nhdr")
-LONGEST_LINE = 1 << 16
-LONGEST_HEADER = 1 << 29  # 100 000 frames of 20 transforms
-MOST_FRAMES = 10_000_000
-LARGEST_SIDE = 8192  # px
-BEST_RATIO = 1032  # of zlib: more comes out of no data
-CHUNK = 1 << 20
+MAX_LINE_BYTES = 1 << 16
+MAX_HEADER_BYTES = 1 << 29  # 100 000 frames of 20 transforms
+MAX_FRAMES = 10_000_000
+MAX_SIDE = 8192  # px
+MAX_RATIO = 1032  # of unpacked to packed bytes by zlib
+CHUNK_BYTES = 1 << 20
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w{1,200})")
 _UCHAR = ("met_uchar", "uchar", "unsigned char", "uint8", "uint8_t")
 
 
 @dataclass(frozen=True)
 class FrameSequence:
-    """What a sequence's header says. size: (width, height) px, (0, 0) without images; count: of its frames; channels: 1
+    """The header of a sequence. size: (width, height) px, (0, 0) without images; count: of its frames; channels: 1
     or 3; fields: by name, each frame's text by its number; data: the file that holds the images, and from which byte;
     window: of zlib, None where the images are not compressed."""
 
@@ -90,8 +90,8 @@ def read_sequence(path: Path) -> FrameSequence:
 
 def _lines(path: Path, stream: BinaryIO) -> Iterator[str]:
     """The lines of a header, of which the last may end with the file."""
-    while line := stream.readline(LONGEST_LINE):
-        if len(line) == LONGEST_LINE or stream.tell() > LONGEST_HEADER:
+    while line := stream.readline(MAX_LINE_BYTES):
+        if len(line) == MAX_LINE_BYTES or stream.tell() > MAX_HEADER_BYTES:
             raise _unended(path)
         yield line.decode("utf-8", "replace").strip()
 
@@ -186,7 +186,7 @@ def _dimensions(header: _Header, name: str, sizes: list[int], kinds: list[str]) 
     if len(sizes) not in (3, 4) or (len(sizes) == 4 and sizes[2] > 1):
         raise NeecoError(f"{header.path}: {name}: {sizes} is no sequence of images; expected width, height, frames")
     width, height, count = sizes[0], sizes[1], sizes[-1]
-    if max(width, height) > LARGEST_SIDE or count > MOST_FRAMES:
+    if max(width, height) > MAX_SIDE or count > MAX_FRAMES:
         raise NeecoError(f"{header.path}: {name}: {sizes} is beyond all measure; export the sequence again")
     return (width, height), count, channels
 
@@ -220,7 +220,7 @@ def _checked(header: _Header, sequence: FrameSequence) -> FrameSequence:
         what = f"holds {held / frame:.4g} images, its header speaks of {sequence.count}"
     elif sequence.window is not None and re.fullmatch(r"\d{1,18}", stored) and held < int(stored):
         what = f"holds {held} bytes of compressed images, its header speaks of {stored}"
-    elif sequence.window is not None and promised > BEST_RATIO * (held + 64):
+    elif sequence.window is not None and promised > MAX_RATIO * (held + 64):
         what = f"holds {held} bytes, of which no {sequence.count} images of {sequence.size} can come"
     else:
         return sequence
@@ -275,7 +275,7 @@ def _unpacked(sequence: FrameSequence, numbers: list[int]) -> Iterator[bytes]:
             reached = 0
             for number in numbers:
                 while reached < number * length:
-                    reached += len(source.take(min(number * length - reached, CHUNK)))
+                    reached += len(source.take(min(number * length - reached, CHUNK_BYTES)))
                 content = source.take(length)
                 reached += length
                 yield content
@@ -311,12 +311,12 @@ class _Unpacker:
     def _more(self, most: int) -> bytes:
         while True:
             if self.machine.eof:
-                self.packed = self.machine.unused_data or self.stream.read(CHUNK)
+                self.packed = self.machine.unused_data or self.stream.read(CHUNK_BYTES)
                 if not self.packed or self.window == zlib.MAX_WBITS:
                     return b""
                 self.machine = zlib.decompressobj(self.window)
             elif not self.packed:
-                self.packed = self.stream.read(CHUNK)
+                self.packed = self.stream.read(CHUNK_BYTES)
             ended = not self.packed
             try:
                 part = self.machine.decompress(self.packed, most)

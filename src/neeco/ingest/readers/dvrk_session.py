@@ -299,7 +299,7 @@ def _stream(topic: str, kind: str, columns: list[str], table: Table) -> Stream:
 
 
 def _joint_names(table: Table, columns: list[str]) -> list[str]:
-    """Of columns position.0, position.1, ..., by the first row's name.0, name.1, ..."""
+    """Return the joints of columns position.0, position.1, ..., by the first row's name.0, name.1, ..."""
     first = dict(zip(table.header, table.rows[0], strict=False))
     return [first.get(f"name.{number}") or f"joint_{number + 1}" for number in range(len(columns))]
 

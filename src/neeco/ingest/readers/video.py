@@ -1,4 +1,4 @@
-"""Where the frames come from: a video file in any format ffmpeg reads, or a folder of images."""
+"""Frames of a video file in any format that ffmpeg reads, or of a folder of images."""
 
 from __future__ import annotations
 
@@ -96,8 +96,8 @@ def _left_out(folder: Path, why: str, files: Sequence[Path]) -> list[str]:
 
 
 def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarray:
-    """Which place in time each image has, [N] from 0: by the last number in its name, where nearly all names are alike
-    but for it and count on evenly, else by its place in the folder."""
+    """Return each image's place in time, [N] from 0: by the last number in its name, where the names differ in it alone
+    and count on evenly, else by its place in the folder."""
     places = np.arange(len(files))
     parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", file.stem) for file in files]
     if any(part is None for part in parts) or len({(part[1], part[3]) for part in parts if part}) != 1:
