@@ -169,7 +169,7 @@ def measure(path: Path) -> None:
     from neeco.ingest.timing.synchronized import SynchronizedRecording
 
     started = time.process_time()
-    data = SynchronizedRecording(read_recording(path), lambda what, done, total: None)
+    data = SynchronizedRecording(read_recording(path))
     logs = time.process_time() - started
     frames = sum(1 for _ in data.video.read(range(len(data.times))))
     seconds = time.process_time() - started

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.files import write_text
+from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.timing.interpolate import poses_at, readings_at
 from rendered.lerobotwriter import Episode, LeRobotWriter
 
 CAMERA, STATE = "observation.images.endoscope.left", "observation.state"
@@ -29,7 +29,7 @@ def write_data_sets(folder: Path, clocks_s: Mapping[str, float]) -> None:
     a data set has the states at its images, NaN where a log has none."""
     recording = read_recording(folder / "recording.yaml")
     instrument, scope = recording.instruments[0], recording.laparoscope
-    film = recording.open()
+    film = recording.source.open()
     states, names = [], []
     for body, source in (("psm1", instrument.poses), ("ecm", scope)):
         if source is None:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.sfm import SfmResult
 from neeco.ingest.foreground.motion import STEP, ResidualFlow, best_lag, carve_shape, observations_on, project_mask
+from neeco.ingest.frames.views import SfmResult
 
 PINHOLE = Lens(60.0, 60.0, 32.0, 24.0, (), (64, 48))
 ROWS = np.arange(14)

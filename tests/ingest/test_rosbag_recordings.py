@@ -114,7 +114,7 @@ def test_a_dvrks_bag_becomes_a_recording_by_one_command(
     lens, _ = recording.read_lens()
     assert lens is not None
     assert lens.intrinsics == FOCAL
-    data = SynchronizedRecording(recording, lambda what, done, total: None)
+    data = SynchronizedRecording(recording)
     times = data.times[2:-2]
     states, usable = data.states_at(times)
     assert usable.all()
@@ -139,10 +139,10 @@ def test_a_laparoscope_in_another_base_than_the_arms_is_not_taken_for_registrati
         path.write_text(yaml.safe_dump(document | {"laparoscope": scope | ({"frame": frame} if frame else {})}))
         recording = read_recording(path)
         if refused:
-            message = refusal(lambda recording=recording: SynchronizedRecording(recording, lambda *_: None))
+            message = refusal(lambda recording=recording: SynchronizedRecording(recording))
             assert "laparoscope: its poses are stated in ECM_base, those of PSM1 in PSM_base" in message
         else:
-            SynchronizedRecording(recording, lambda *_: None)
+            SynchronizedRecording(recording)
 
 
 def test_bags_of_other_robots_offer_what_was_measured(tmp_path: Path) -> None:
@@ -173,7 +173,7 @@ def test_a_bag_alone_is_enough_where_it_holds_one_of_each(tmp_path: Path) -> Non
             bag.pose("/tool/pose", time, shaft(time), [1, 0, 0, 0], "tracker")
             bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
     recording = recording_from_flags(bag.path, bag.path)
-    data = SynchronizedRecording(recording, lambda *_: None)
+    data = SynchronizedRecording(recording)
     states, usable = data.states_at(data.times)
     assert usable.all()
     np.testing.assert_allclose(states["instrument"][0][20, :3, 3], 1000 * shaft(0.8), atol=0.01)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.ingest.cameras.frame_selection import LEFT_OUT, UNSEEN_MARGIN, assign_splits
+from neeco.ingest.frames.selection import LEFT_OUT, UNSEEN_MARGIN, assign_splits
 from neeco.ingest.recording.model import Splits
 
 FRAMES = np.arange(200)

@@ -34,15 +34,15 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Annotate, write the page, and say where both lie."""
-    from neeco.capture.check import read_checked
+    from neeco.capture.checks import read_checked
     from neeco.cli._progress import counting, resumable
     from neeco.raster.devices import device_of
     from neeco.report.run_page import write_annotated_page
     from neeco.synthesis.annotated import annotate_capture
-    from neeco.training.run import open_run
+    from neeco.training.run import open_gaussian_run
 
     arguments.images.check()
-    with open_run(arguments.run, device_of(arguments.device)) as trained:
+    with open_gaussian_run(arguments.run, "annotate", device_of(arguments.device)) as trained:
         capture = None if arguments.capture is None else read_checked(arguments.capture)
         with (
             counting("annotate") as advance,

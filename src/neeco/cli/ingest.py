@@ -182,7 +182,8 @@ def recordings_of(args: Ingest) -> list[Recording]:
 def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json: bool) -> list[Assessment]:
     """Make the capture, print what was found and how good it is; the verdict on each tissue."""
     from neeco.capture import read_capture
-    from neeco.capture.check import Problem, errors_only, inspect_capture
+    from neeco.capture.checks import inspect_capture
+    from neeco.capture.documents import Problem, errors_only
     from neeco.cli._output import require_ending
     from neeco.errors import NeecoError
     from neeco.files import finite

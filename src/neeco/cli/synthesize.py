@@ -46,16 +46,19 @@ def run(arguments: Arguments) -> int:
     from neeco.cli._progress import counting, resumable
     from neeco.raster.devices import device_of
     from neeco.synthesis.dataset import synthesize
-    from neeco.training.run import load_run, open_run
+    from neeco.training.run import load_run, open_gaussian_run
 
     settings = arguments.settings
     settings.check()
     run_path, instrument_runs = _runs(arguments)
     device = device_of(arguments.device)
-    with open_run(run_path, device) as trained, counting("synthesize", settings.count) as advance:
+    with (
+        open_gaussian_run(run_path, "synthesize", device) as trained,
+        counting("synthesize", settings.count) as advance,
+    ):
         if trained.scene.recorded.still and settings.views in VIEWS_OF_STILL:
             print(f"the scope stood still: views are {VIEWS_OF_STILL[settings.views]}")
-        others = [load_run(path, device) for path in instrument_runs]
+        others = [load_run(path, device).gaussians("synthesize") for path in instrument_runs]
         with resumable("what was drawn is kept; run the same command again with --resume"):
             summary = synthesize(
                 trained,

@@ -9,8 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from neeco.capture.documents import Problem
-from neeco.capture.fromvideofile import UNKNOWN_DEG
-from neeco.capture.model import Capture
+from neeco.capture.model import UNKNOWN_DEG, Capture
 from neeco.ingest.result import IngestResult
 
 # Limits above which an ingest is doubted: conventions, not measurements.

@@ -23,14 +23,15 @@ from neeco.capture.model import (
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.chosen_images import ChosenImages
-from neeco.ingest.cameras.frame_selection import LEFT_OUT
-from neeco.ingest.cameras.sfm import SfmResult, StageProgress, StructureFromMotion
-from neeco.ingest.cameras.still import LOOKED_AT, find_background, moving_masks, reduced, stands_still
+from neeco.ingest.cameras.sfm import StructureFromMotion
+from neeco.ingest.cameras.still import LOOKED_AT, find_background, moving_masks, same_place, stands_still
 from neeco.ingest.cameras.still_scene import RightCamera, look_behind, read_right_camera, seen_by, still_cameras
 from neeco.ingest.convert import staged
 from neeco.ingest.foreground.motion import ResidualFlow, RoughShape, best_lag, carve_shape, observations_on
 from neeco.ingest.foreground.passing import passing_masks
+from neeco.ingest.frames.images import ChosenImages
+from neeco.ingest.frames.selection import LEFT_OUT
+from neeco.ingest.frames.views import SfmResult, StageProgress, reduced
 from neeco.ingest.posing.posed_capture import prepare
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.recording.model import STILL, Recording
@@ -49,8 +50,11 @@ from neeco.ingest.shaft.video_instruments import (
     uncertainties,
 )
 from neeco.ingest.splits import split_frames
-from neeco.ingest.timing.episodes import Episodes, separate
+from neeco.ingest.timing.episodes import NAME_TISSUES, Episodes, separate
 from neeco.ingest.timing.synchronized import States
+
+SAME_PLACE = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
+MOSTLY_ALIKE = 0.7  # less is worth a note
 
 
 def ingest(
@@ -99,7 +103,8 @@ class WorldIngest:
         self, recordings: Sequence[Recording], folder: Path, progress: StageProgress, tissue: str | None = None
     ) -> None:
         self.folder, self.progress = folder, progress
-        self.data = Episodes(recordings, progress, tissue)
+        progress("reading logs and video", 0, 0)
+        self.data = Episodes(recordings, tissue)
         self.recording = self.data.recording
         self.settings = self.recording.settings
         self.size = self.data.video.size
@@ -224,7 +229,20 @@ class WorldIngest:
             found = find_background(load, min(len(rows), LOOKED_AT))
             backgrounds.append(np.clip(found.colors, 0, 255).astype(np.uint8))
             episodes.append(int(self._episodes()[rows[0]]))
-        self.data.refuse_elsewhere(backgrounds, episodes)
+        for background, episode in zip(backgrounds[1:], episodes[1:], strict=True):
+            share = same_place(backgrounds[0], background)
+            first, part = self.data.names[episodes[0]], self.data.parts[episode]
+            if share is not None and share < SAME_PLACE:
+                raise NeecoError(
+                    f"{part.recording.path}: {self.data.names[episode]} shows another place than {first}: {share:.0%} "
+                    f"of the background is where it was; where that is another tissue, or the scope stands elsewhere, "
+                    f"{NAME_TISSUES}"
+                )
+            if share is not None and share < MOSTLY_ALIKE:
+                self.data.note(
+                    f"{1 - share:.0%} of the background is not where it was in {first}: what changed is blurred",
+                    episode,
+                )
 
     def _place_bases(self, cameras: SfmResult, pinhole: Lens) -> None:
         """Say of every instrument of a still scope how the frame of its log's poses stands to the camera, as far as

@@ -12,14 +12,7 @@ from neeco.ingest.foreground.motion import RoughShape
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.timing.clock_search import ClockOffset
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """A reason not to trust an ingest, one sentence. severe: the capture is likely to be wrong."""
-
-    sentence: str
-    severe: bool
+from neeco.ingest.timing.notes import Doubt
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neeco.errors import NeecoError
-from neeco.ingest.cameras.frame_selection import LEFT_OUT, assign_splits
+from neeco.ingest.frames.selection import LEFT_OUT, assign_splits
 from neeco.ingest.recording.model import Splits
 from neeco.ingest.timing.episodes import Episodes
 from neeco.ingest.timing.synchronized import States

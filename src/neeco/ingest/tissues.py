@@ -11,8 +11,8 @@ import numpy as np
 from neeco.capture.model import Capture, PointCloud, Tissue
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
-from neeco.ingest.cameras.sfm import StageProgress
 from neeco.ingest.convert import staged
+from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.pipeline import Placed, WorldIngest
 from neeco.ingest.recording.model import EACH, Recording, Splits
 from neeco.ingest.result import IngestResult

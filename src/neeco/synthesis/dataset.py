@@ -25,7 +25,6 @@ from neeco.labels.drawing import REACH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels
 from neeco.raster.native import threads
 from neeco.registry import plugins
-from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.camera_effects import read_effects
 from neeco.synthesis.card import write_card
 from neeco.synthesis.generator import (
@@ -33,7 +32,6 @@ from neeco.synthesis.generator import (
     ENTERS_TISSUE,
     LEAVES_IMAGE,
     UNOBSERVED_TISSUE,
-    VERB,
     GeneratorSpec,
     SampleGenerator,
     draw_to_folder,
@@ -56,8 +54,8 @@ from neeco.synthesis.writers.folder import (
 )
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
-    from neeco.training.run import Run
+    from neeco.scene import GaussianScene
+    from neeco.training.run import GaussianRun
 
 SCHEMA = "neeco-dataset/1"
 SAME_IMAGES = ("0.1.0",)  # versions that draw the same images and labels as this one, so that their sets are continued
@@ -84,14 +82,14 @@ class Synthesized:
 
 
 def synthesize(
-    run: Run,
+    run: GaussianRun,
     output: Path,
     settings: Settings,
     formats: Sequence[str] = DEFAULT_FORMATS,
     resume: bool = False,
     on_progress: Callable[[int], None] = lambda done: None,
     workers: int = 1,
-    instrument_runs: Sequence[Run] = (),
+    instrument_runs: Sequence[GaussianRun] = (),
 ) -> Synthesized:
     """Write a labelled data set of `settings.count` images of the run's scene to `output`; with `instrument_runs` of
     its tissue under the instruments of those runs.
@@ -110,7 +108,7 @@ def synthesize(
         cluster.require_ray()
     output = Path(output)
     runs = (run, *instrument_runs)
-    scene, *instrument_scenes = (gaussian_scene(given.scene, VERB) for given in runs)
+    scene, *instrument_scenes = (given.scene for given in runs)
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
     check_formats(formats, settings)
     recorded = scene.recorded.cameras[0]
@@ -162,7 +160,9 @@ def _draw_all(
     return (draw_to_folder(generator, output, index) for index in missing)
 
 
-def description(run: Run, settings: dict[str, Any], instrument_runs: Sequence[Run] = ()) -> dict[str, Any]:
+def description(
+    run: GaussianRun, settings: dict[str, Any], instrument_runs: Sequence[GaussianRun] = ()
+) -> dict[str, Any]:
     """How a data set of the run's scene, or of its tissue under the instruments of `instrument_runs`, is made: what
     dataset.json begins with. `settings` must stay the same for it to be continued."""
     info = {
@@ -180,7 +180,7 @@ def description(run: Run, settings: dict[str, Any], instrument_runs: Sequence[Ru
     return info
 
 
-def _digest(run: Run) -> str:
+def _digest(run: GaussianRun) -> str:
     content = read_bytes(Path(run.path) / SCENE_FILE, "a learned scene", "no such file; train the run first")
     return hashlib.sha256(content).hexdigest()
 
@@ -212,7 +212,7 @@ class DataSetFolder:
     count: int  # of records, once it is complete
     begun: bool
     info: dict[str, Any]
-    scene: Scene
+    scene: GaussianScene
     labeller: Labeller
     formats: Sequence[str]
 

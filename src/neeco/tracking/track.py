@@ -22,25 +22,24 @@ import torch
 
 import neeco
 from neeco.capture.model import Capture, Frame, InstrumentState, State
-from neeco.capture.reader import read_capture
+from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, own_folder, read_begun, read_bytes, read_json, require_like, require_same, write_json
 from neeco.scene import Recorded
-from neeco.scene.io import load_scene, save_scene
-from neeco.scene.scene import gaussian_scene, one_tissue
-from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.fitting import Fitter
+from neeco.scene.gaussian_scene import one_tissue
+from neeco.scene.io import load_gaussians, save_scene
 from neeco.tracking.follow import LOOK_EVERY, Follower, Step
 from neeco.tracking.footage_again import learned_again
 from neeco.tracking.footage_scene import adapted, over_tissue
 from neeco.tracking.footage_tissue import Report, learn_tissue
+from neeco.tracking.parameters import TrackedParameters, fitter_of
 from neeco.tracking.trust import Reference
-from neeco.training.run import load_run, stored_config, write_config
+from neeco.training.run import stored_config, write_config
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
-    from neeco.training.run import Run
+    from neeco.scene import GaussianScene
+    from neeco.training.run import GaussianRun
 
 SCHEMA = "neeco-track/1"
 INFO = "track.json"
@@ -68,7 +67,7 @@ class Tracked:
     records: list[dict[str, Any]]
     written: int
     min_trust: float
-    scene: Scene
+    scene: GaussianScene
 
     @property
     def verdict(self) -> str:
@@ -91,7 +90,7 @@ class Tracked:
 
 
 def track_footage(
-    run: Run,
+    run: GaussianRun,
     footage: Capture,
     output: Path,
     *,
@@ -115,11 +114,11 @@ def track_footage(
     """
     if not 0 <= min_trust <= 1:
         raise NeecoError(f"--min-trust: {min_trust} is not a share; give 0 to 1")
-    scene = gaussian_scene(run.scene, "track")
+    scene = run.scene
     one_tissue(scene, "track")
     if footage.tissues:
         raise NeecoError(f"{footage.root}: tissues: footage is of one; track each tissue's by itself")
-    coordinates = Coordinates.of(scene)
+    parameters = TrackedParameters.of(scene)
     frames = sorted(footage.frames, key=lambda frame: frame.state.time)
     given = _first_state(footage, frames[0], scene) if start == "first" else None
     trained_on = run.capture()
@@ -141,24 +140,24 @@ def track_footage(
         stored = read_json(output / INFO) if (output / INFO).exists() else {}
         if not stored.get("complete"):
             write_json(output / INFO, info | {"complete": False})
-            fitter = Fitter.of(scene)
+            fitter = fitter_of(scene)
             reference = Reference.of(fitter, trained_on.split("train"))
             if tissue == "run":
                 follower = Follower.of(frames, fitter, reference)
                 steps = _Work(output / STEPS, follower, on_progress).all_steps(given)
             else:
                 scene, info["light"] = _over_footage(scene, footage, output / STEPS, on_stage)
-                follower = Follower.of(frames, Fitter.of(scene), reference, OTHER_TISSUE)
+                follower = Follower.of(frames, fitter_of(scene), reference, OTHER_TISSUE)
                 steps = _Work(output / STEPS, follower, on_progress).all_steps(given)
                 scene = _learned_again(scene, frames, steps, output / STEPS, on_stage)
-                follower = Follower.of(frames, Fitter.of(scene), reference, OTHER_TISSUE)
+                follower = Follower.of(frames, fitter_of(scene), reference, OTHER_TISSUE)
                 steps = _Work(output / STEPS / SECOND, follower, on_progress).all_steps(given)
-            records = [_record(frames[k], step, coordinates) for k, step in enumerate(steps)]
+            records = [_record(frames[k], step, parameters) for k, step in enumerate(steps)]
             info |= {"complete": True, "reference": reference.to_json(), "frames": records}
         else:
             info = stored
             if tissue == "footage":
-                scene = gaussian_scene(load_run(output / RUN, scene.center.device).scene, "track")
+                scene = load_gaussians(output / RUN / "scene.safetensors", "track", scene.center.device)
         registered = trained_on.registered or tissue == "footage"
         written = _write(output, footage, scene, trained_on, frames, info["frames"], min_trust, registered)
         if tissue == "footage" and not stored.get("complete"):
@@ -169,15 +168,19 @@ def track_footage(
     return Tracked(output, footage, info["frames"], written, min_trust, scene)
 
 
-def _learned_again(scene: Scene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Report) -> Scene:
+def _learned_again(
+    scene: GaussianScene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Report
+) -> GaussianScene:
     """Tissue and light learned again from what was tracked; kept in `folder`."""
     file = folder / "scene-2.safetensors"
     if not file.exists():
         save_scene(learned_again(scene, frames, steps, report), file)
-    return gaussian_scene(load_scene(file).to(scene.center.device), "track")
+    return load_gaussians(file, "track", scene.center.device)
 
 
-def _over_footage(instruments: Scene, footage: Capture, folder: Path, report: Report) -> tuple[Scene, dict[str, Any]]:
+def _over_footage(
+    instruments: GaussianScene, footage: Capture, folder: Path, report: Report
+) -> tuple[GaussianScene, dict[str, Any]]:
     """The instruments over the footage's tissue, in its light; and what that light is. Kept in `folder`."""
     file, light = folder / "scene.safetensors", folder / "light.json"
     if not light.exists():
@@ -185,11 +188,10 @@ def _over_footage(instruments: Scene, footage: Capture, folder: Path, report: Re
         found = adapted(over_tissue(instruments, ground), footage.frames, report)
         save_scene(found.scene, file)
         write_json(light, found.to_json())
-    scene = load_scene(file).to(instruments.center.device)
-    return gaussian_scene(scene, "track"), read_json(light)
+    return load_gaussians(file, "track", instruments.center.device), read_json(light)
 
 
-def _write_run(output: Path, run: Run, scene: Scene) -> None:
+def _write_run(output: Path, run: GaussianRun, scene: GaussianScene) -> None:
     """The scene that was tracked by as a run of its own, trained on the capture at `output`, where there is one."""
     folder, digest = output / RUN, ""
     if (output / "transforms.json").exists():
@@ -288,16 +290,16 @@ STEP = {
 }
 
 
-def _record(frame: Frame, step: Step, coordinates: Coordinates) -> dict[str, Any]:
+def _record(frame: Frame, step: Step, parameters: TrackedParameters) -> dict[str, Any]:
     """What track.json says of a frame. `deviation`: of rotation (rad), place (mm) and every joint, one standard
     deviation."""
     instruments = {}
     variance = step.moving.covariance.diagonal()
-    for item, rows in zip(coordinates.instruments, coordinates.slices, strict=True):
-        state, own = step.moving.state.instruments[item.name], variance[rows].clamp_min(0)
-        deviation = {"rotation": float(own[:3].sum().sqrt()), "place": float(own[3:6].sum().sqrt())}
+    for item, (pose, rows) in zip(parameters.instruments, parameters.rows, strict=True):
+        state, own = step.moving.state.instruments[item.name], variance[pose].clamp_min(0)
+        deviation = {"rotation": float(own[:3].sum().sqrt()), "place": float(own[3:].sum().sqrt())}
         most = (item.high - item.low) / math.sqrt(12)  # of a joint that may be anywhere between its bounds
-        joints = torch.minimum(own[6:].sqrt(), most).tolist()
+        joints = torch.minimum(variance[rows].clamp_min(0).sqrt(), most).tolist()
         deviation |= {f"joint.{name}": value for name, value in zip(item.joints, joints, strict=True)}
         instruments[item.name] = {
             "pose": state.pose.tolist(),
@@ -328,7 +330,7 @@ def state_of(record: dict[str, Any]) -> State:
 def _write(
     output: Path,
     footage: Capture,
-    scene: Scene,
+    scene: GaussianScene,
     trained_on: Capture,
     frames: Sequence[Frame],
     records: Sequence[dict[str, Any]],
@@ -350,7 +352,7 @@ def _write(
     return len(chosen)
 
 
-def _first_state(footage: Capture, frame: Frame, scene: Scene) -> State:
+def _first_state(footage: Capture, frame: Frame, scene: GaussianScene) -> State:
     """What the footage says of its first frame. Raises NeecoError where it says nothing of an instrument or joint."""
     states = {}
     for item in scene.instruments:

@@ -19,10 +19,10 @@ from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.calibration.stereo import read_stereo
-from neeco.ingest.cameras.sfm import SfmResult, StageProgress
-from neeco.ingest.cameras.still import Background, find_background, moving_masks, reduced
+from neeco.ingest.cameras.still import Background, find_background, moving_masks
 from neeco.ingest.cameras.tissue_surface import TissueSurface, surface_behind, surface_from_stereo
 from neeco.ingest.foreground.motion import STEP, PosesAt, RoughShape, best_lag, carve_shape, project_mask
+from neeco.ingest.frames.views import SfmResult, StageProgress, reduced
 from neeco.ingest.recording.model import IngestSettings, StereoPartner
 
 Load = Callable[[int], np.ndarray]  # row of the chosen frames -> image uint8 [H, W, 3], undistorted

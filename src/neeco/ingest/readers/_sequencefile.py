@@ -263,67 +263,44 @@ def _pixels(sequence: FrameSequence, numbers: list[int]) -> Iterator[np.ndarray]
 
 
 def _unpacked(sequence: FrameSequence, numbers: list[int]) -> Iterator[bytes]:
-    """The bytes of frames in increasing order. Raises NeecoError where the data ends before them, is damaged, or does
-    not end with the last of the sequence."""
+    """Yield the bytes of frames in increasing order. Raises NeecoError where the data ends before them, is damaged, or
+    does not end with the last of the sequence."""
     file, start = sequence.data
     length = sequence.size[0] * sequence.size[1] * sequence.channels
     assert sequence.window is not None
     try:
         with file.open("rb") as stream:
             stream.seek(start)
-            source = _Unpacker(file, stream, sequence.window)
-            reached = 0
+            parts, held, first = _inflated(stream, sequence.window), bytearray(), 0  # first: the byte where held begins
             for number in numbers:
-                while reached < number * length:
-                    reached += len(source.take(min(number * length - reached, CHUNK_BYTES)))
-                content = source.take(length)
-                reached += length
-                yield content
-            if reached == sequence.count * length and not source.at_end():
+                while first + len(held) < (number + 1) * length:
+                    if (part := next(parts, None)) is None:
+                        raise NeecoError(f"{file}: its compressed images end early; copy or export the sequence again")
+                    held += part
+                    passed = min(number * length - first, len(held))
+                    first, held = first + passed, held[passed:]
+                yield bytes(held[number * length - first :][:length])
+            if (
+                numbers
+                and numbers[-1] == sequence.count - 1
+                and (first + len(held) > sequence.count * length or next(parts, b""))
+            ):
                 raise NeecoError(f"{file}: holds more images than its header says; export the sequence again")
+    except zlib.error:
+        raise NeecoError(f"{file}: its compressed images are damaged; copy or export the sequence again") from None
     except OSError as error:
         raise NeecoError(f"{file}: cannot read: {error.strerror or error}; correct the path") from None
 
 
-class _Unpacker:
-    """Takes bytes out of zlib's or gzip's streams, one after the other, never more than were asked for."""
-
-    def __init__(self, file: Path, stream: BinaryIO, window: int) -> None:
-        self.file, self.stream, self.window = file, stream, window
-        self.machine = zlib.decompressobj(window)
-        self.packed = b""
-
-    def take(self, length: int) -> bytes:
-        """Raises NeecoError where there are fewer, or they are damaged."""
-        parts: list[bytes] = []
-        missing = length
-        while missing:
-            part = self._more(missing)
-            if not part:
-                raise NeecoError(f"{self.file}: its compressed images end early; copy or export the sequence again")
-            parts.append(part)
-            missing -= len(part)
-        return b"".join(parts)
-
-    def at_end(self) -> bool:
-        return not self._more(1)
-
-    def _more(self, most: int) -> bytes:
-        while True:
-            if self.machine.eof:
-                self.packed = self.machine.unused_data or self.stream.read(CHUNK_BYTES)
-                if not self.packed or self.window == zlib.MAX_WBITS:
-                    return b""
-                self.machine = zlib.decompressobj(self.window)
-            elif not self.packed:
-                self.packed = self.stream.read(CHUNK_BYTES)
-            ended = not self.packed
-            try:
-                part = self.machine.decompress(self.packed, most)
-            except zlib.error:
-                raise NeecoError(
-                    f"{self.file}: its compressed images are damaged; copy or export the sequence again"
-                ) from None
-            self.packed = self.machine.unconsumed_tail
-            if part or ended:
-                return part
+def _inflated(stream: BinaryIO, window: int) -> Iterator[bytes]:
+    """Yield what zlib's stream, or gzip's streams one after the other, unpack to, at most CHUNK_BYTES at a time."""
+    machine, packed = zlib.decompressobj(window), b""
+    while packed := packed or stream.read(CHUNK_BYTES):
+        if part := machine.decompress(packed, CHUNK_BYTES):
+            yield part
+        packed = machine.unconsumed_tail
+        if machine.eof:
+            packed = machine.unused_data
+            if window == zlib.MAX_WBITS:
+                return
+            machine = zlib.decompressobj(window)

@@ -12,8 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
+from neeco.geometry.lines import distances_to_lines, nearest_point
+from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import POSES, Stream, format_of, numbers, read_table
 from neeco.ingest.readers.columns import (
     BASE,
@@ -99,11 +102,8 @@ def shaft_of(positions: np.ndarray, quats: np.ndarray) -> Shaft:
     best = None
     for axis in range(3):
         lines = axis_directions(quats, axis)
-        across = np.eye(3) - lines[:, :, None] * lines[:, None, :]  # [R, 3, 3] what is off a line
-        # lines that are nearly parallel meet nowhere in particular: the least point then
-        point = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, positions), rcond=1e-6)[0]
-        off = np.einsum("nij,nj->ni", across, positions - point)
-        rms = float(np.sqrt((off**2).sum(1).mean()))
+        point = nearest_point(positions, lines, ridge=1e-9)
+        rms = float(np.sqrt((distances_to_lines(point, positions, lines) ** 2).mean()))
         if best is None or rms < best.rms:
             best = Shaft(axis, point, rms)
     assert best is not None
@@ -112,19 +112,13 @@ def shaft_of(positions: np.ndarray, quats: np.ndarray) -> Shaft:
 
 def axis_directions(quats: np.ndarray, axis: int) -> np.ndarray:
     """Return the directions [R, 3] of an axis of bodies with rotations quats [R, 4] wxyz."""
-    w, x, y, z = quats.T
-    columns = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack(columns[axis], 1)
+    return np.asarray(Rotation.from_quat(quats, scalar_first=True).as_matrix()[:, :, axis])
 
 
 def largest_step(quats: np.ndarray) -> float:
     """Return the largest turn from one sample to the next, rad."""
-    cosines = np.abs((quats[1:] * quats[:-1]).sum(1)).clip(0, 1)
-    return float(2 * np.arccos(cosines).max(initial=0.0))
+    turns = Rotation.from_quat(quats, scalar_first=True)
+    return float((turns[1:] * turns[:-1].inv()).magnitude().max(initial=0.0)) if len(quats) > 1 else 0.0
 
 
 def _open(source: Path, stream: Stream) -> list[OpenPoses]:
@@ -199,5 +193,4 @@ def _ending(columns: Sequence[str], name: str) -> int:
 
 
 def _are_rotations(matrices: np.ndarray) -> bool:
-    off = np.einsum("nji,njk->nik", matrices, matrices) - np.eye(3)
-    return bool(np.abs(off).max() < UNIT_TOLERANCE and (np.linalg.det(matrices) > 0).all())
+    return bool(rotation_error(matrices).max() < UNIT_TOLERANCE and (np.linalg.det(matrices) > 0).all())

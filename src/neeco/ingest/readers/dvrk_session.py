@@ -7,7 +7,6 @@ A session is a folder with `index.json`, videos, beside each a JSON file with it
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,7 @@ from neeco.ingest.readers import (
 from neeco.ingest.readers.delimited import DelimitedText
 from neeco.ingest.readers.frame_names import meaning_of
 from neeco.ingest.readers.rosbag import DVRK_HINT, POSE_HEADER, RosBag, joint_column, wrist_joints
-from neeco.ingest.readers.video import open_video
+from neeco.ingest.readers.video import ChosenFrames, ImageFiles, open_video
 
 INDEX, TYPES = "index.json", ("dc_index_v1", "dc::index@", "dvrk_data:index@")
 TOPIC = "# Topic: /"  # begins a CSV file of `extract`
@@ -129,44 +128,17 @@ class DvrkSession(RecordingFormat):
         )
         if film.files[0].suffix.lower() != ".mp4":
             files = tuple(file for file, good in zip(film.files, keep, strict=True) if good)
-            return _Files(path, open_image(files[0]).size, tuple(notes), times[keep] - start, files)
+            return ImageFiles(path, open_image(files[0]).size, tuple(notes), times[keep] - start, files)
         video = open_video(film.files[0])
         count = len(video.times)
         notes += compare_counts(film.files[0], count, len(times), "times", UNLIKE)
         usable = np.flatnonzero(keep[:count])
         width, height = video.size
         size = (width if film.half is None else width // 2, height)
-        return _Timed(
+        return ChosenFrames(
             path, size, (*video.notes, *notes), times[usable] - start, video, tuple(usable.tolist()), film.half,
             pixel_aspect=video.pixel_aspect,
         )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Timed(VideoSource):
-    """Frames of a video, or halves of them, at times of their own."""
-
-    video: VideoSource
-    frames: tuple[int, ...]
-    half: int | None
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        wanted = {self.frames[int(index)]: int(index) for index in indices}
-        for frame, pixels in self.video.read(sorted(wanted)):
-            start = (self.half or 0) * self.size[0]
-            yield wanted[frame], np.ascontiguousarray(pixels[:, start : start + self.size[0]])
-
-
-@dataclass(frozen=True)
-class _Files(VideoSource):
-    files: tuple[Path, ...]
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        for index in sorted({int(index) for index in indices}):
-            pixels = np.array(open_image(self.files[index]).convert("RGB"))
-            if pixels.shape[:2] != self.size[::-1]:
-                raise NeecoError(f"{self.files[index]}: is of another size than the first; give images of one size")
-            yield index, pixels
 
 
 def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:

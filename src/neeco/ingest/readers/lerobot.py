@@ -100,7 +100,7 @@ class LeRobot(RecordingFormat):
         times, order, notes = _times(data, episode)
         if data.features[key].dtype == "image":
             return _open_stored(data, episode, key, times, order, notes)
-        from neeco.ingest.readers.video import open_video
+        from neeco.ingest.readers.video import ChosenFrames, open_video
 
         if key in episode.absent:
             raise NeecoError(episode.absent[key])
@@ -115,7 +115,7 @@ class LeRobot(RecordingFormat):
         remedy = "download the data set again, or name another episode"
         notes = (*notes, *compare_counts(film.file, shown, len(times), states, remedy=remedy))
         frames = tuple(np.flatnonzero(usable).tolist())
-        return _Episode(
+        return ChosenFrames(
             video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames,
             pixel_aspect=video.pixel_aspect,
         )  # fmt: skip
@@ -222,19 +222,6 @@ class LeRobot(RecordingFormat):
         if values.shape[1] != len(feature.names):
             return np.zeros((len(values), len(columns)))
         return values[:, [feature.names.index(column) for column in columns]]
-
-
-@dataclass(frozen=True)
-class _Episode(VideoSource):
-    """The frames of a video that have states. frames: which, of the video's."""
-
-    video: VideoSource
-    frames: tuple[int, ...]
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        back = {self.frames[int(index)]: int(index) for index in indices}
-        for number, pixels in self.video.read(list(back)):
-            yield back[number], pixels
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ import numpy as np
 from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.still import reduced
+from neeco.ingest.frames.views import reduced
 from neeco.ingest.readers.columns import CAMERA
+from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
 from neeco.ingest.registration.base import FEWEST, BaseRegistration, base_from_layers, find_base
@@ -21,7 +22,6 @@ from neeco.ingest.registration.base_layers import covered_by, evenly_lit, fit_la
 from neeco.ingest.registration.base_shape import SHIFTS
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, ClockOffset
 from neeco.ingest.timing.episodes import Episodes
-from neeco.ingest.timing.interpolate import poses_at, readings_at
 
 FRAMES = 140  # looked at, evenly spaced
 STRAIGHT_MM = 2.0  # from the root to the link that is logged: nearer, nothing bends there

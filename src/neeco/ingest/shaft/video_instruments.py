@@ -12,11 +12,10 @@ import numpy as np
 from neeco.capture.model import FromVideo, Instrument, Uncertainty
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.sfm import SfmResult
-from neeco.ingest.cameras.still import reduced
+from neeco.ingest.frames.views import SfmResult, reduced
 from neeco.ingest.recording.model import InstrumentLogs, Recording
-from neeco.ingest.shaft.axis import Scene
-from neeco.ingest.shaft.from_video import ENOUGH, FoundShaft, find_shaft
+from neeco.ingest.shaft.axis import ShaftVideo
+from neeco.ingest.shaft.from_video import MIN_SHARE, FoundShaft, find_shaft
 from neeco.ingest.timing.episodes import Episodes
 
 NOT_SEEN = "the shaft is not seen well enough"
@@ -51,9 +50,17 @@ def find_in_video(
     assert asked is not None
     images = np.stack([reduced(load(row)) for row in range(len(times))])
     radius = asked.shaft_diameter_mm / 2
-    scene = Scene(world_from_camera, times, episodes, radius, pinhole.intrinsics, True, scaled=tissue is None)
+    shared = ShaftVideo(
+        world_from_camera=world_from_camera,
+        times=times,
+        episodes=episodes,
+        radius=radius,
+        intrinsics=pinhole.intrinsics,
+        trocar=True,
+        scaled=tissue is None,
+    )
     try:
-        found = find_shaft(images, masks, scene, asked.working_length_mm, asked.fixed_trocar, tissue or np.inf)
+        found = find_shaft(images, masks, shared, asked.working_length_mm, asked.fixed_trocar, tissue or np.inf)
     except NeecoError as error:
         raise NeecoError(f"{data.recording.path}: instrument {item.name!r}, from video: {error}") from error
     data.place(item.name, times[found.known], found.poses[found.known])
@@ -77,7 +84,7 @@ def _in_words(name: str, found: FoundShaft) -> str:
         scale = f"; the cameras' scale is known to {found.axes.scale_sd:.0%}, from the trocar"
     return (
         f"instrument {name!r} was found in the video: {found.share:.0%} of the frames show two diameters of its shaft "
-        f"({ENOUGH:.0%} are needed); {left_out} of {len(found.known)} show too little of it and are left out; its "
+        f"({MIN_SHARE:.0%} are needed); {left_out} of {len(found.known)} show too little of it and are left out; its "
         f"direction is sure to {np.median(turns):.1f} degrees, its place to {np.median(shifts[:, :2]):.1f} mm across "
         f"the view and {np.median(shifts[:, 2]):.1f} mm in depth (standard deviations); from the end of the shaft to "
         f"the tip it is {found.working_length:.0f} mm{scale}"

@@ -16,8 +16,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from neeco.errors import NeecoError
-from neeco.ingest.cameras.sfm import StageProgress
-from neeco.ingest.cameras.still import same_place
 from neeco.ingest.readers import VideoSource, format_of
 from neeco.ingest.readers.logs import PoseLog, ReadingLog
 from neeco.ingest.recording.base import same_base
@@ -29,14 +27,12 @@ from neeco.ingest.recording.model import (
     Recording,
     VideoFile,
 )
-from neeco.ingest.result import Doubt
 from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
+from neeco.ingest.timing.notes import Doubt
 from neeco.ingest.timing.synchronized import States, SynchronizedRecording
 
 PAUSE_S = 2.0  # longer than anything that is smooth in time looks beyond an instant
-SAME_PLACE = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
 NAME_TISSUES = "say in every recording over which `tissue` it was taken"
-MOSTLY_ALIKE = 0.7  # less is worth a note
 Log = TypeVar("Log", PoseLog, ReadingLog)
 
 
@@ -46,9 +42,9 @@ class Episodes:
     Raises NeecoError for recordings that cannot be used, or that cannot be of one capture.
     """
 
-    def __init__(self, recordings: Sequence[Recording], progress: StageProgress, tissue: str | None = None) -> None:
+    def __init__(self, recordings: Sequence[Recording], tissue: str | None = None) -> None:
         self.tissue = tissue  # of several that one capture holds, the one that these were taken over
-        self.parts = [SynchronizedRecording(recording, progress) for recording in recordings]
+        self.parts = [SynchronizedRecording(recording) for recording in recordings]
         self.recording = recordings[0]  # what is said once for all: lens, links, frames, splits, settings
         self.names = episode_names(recordings)
         check_alike(self.parts)
@@ -134,24 +130,6 @@ class Episodes:
                     f"{part.recording.path}: {name} stands alone: {count} of its frames show enough of what the other "
                     f"recordings show to find their cameras together (at least {MIN_FRAMES} are needed); where it "
                     f"shows another tissue, {NAME_TISSUES}, else leave it out"
-                )
-
-    def refuse_elsewhere(self, backgrounds: Sequence[np.ndarray], episodes: Sequence[int]) -> None:
-        """Raise NeecoError for an episode in which a still scope looked at something else than in the first.
-        backgrounds: uint8 [H, W, 3] of `episodes`."""
-        for background, episode in zip(backgrounds[1:], episodes[1:], strict=True):
-            share = same_place(backgrounds[0], background)
-            first, part = self.names[episodes[0]], self.parts[episode]
-            if share is not None and share < SAME_PLACE:
-                raise NeecoError(
-                    f"{part.recording.path}: {self.names[episode]} shows another place than {first}: {share:.0%} of "
-                    f"the background is where it was; where that is another tissue, or the scope stands elsewhere, "
-                    f"{NAME_TISSUES}"
-                )
-            if share is not None and share < MOSTLY_ALIKE:
-                self.note(
-                    f"{1 - share:.0%} of the background is not where it was in {first}: what changed is blurred",
-                    episode,
                 )
 
     @property

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
-from neeco.ingest.cameras.sfm import StageProgress
 from neeco.ingest.readers import MAX_UNLIKE, compare_lengths
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
+from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording.model import Recording
-from neeco.ingest.shaft.from_video import with_roll
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, LONGEST, ClockOffset
-from neeco.ingest.timing.interpolate import poses_at, readings_at
 
 SLOWEST, FASTEST = 0.01, 10_000.0  # frames a second
 SAME_INSTANT = 1e-6  # s
@@ -28,9 +27,9 @@ class SynchronizedRecording:
     notes: what was lost or assumed, one sentence each. Raises NeecoError for logs and videos that cannot be used.
     """
 
-    def __init__(self, recording: Recording, progress: StageProgress) -> None:
+    def __init__(self, recording: Recording) -> None:
         self.recording = recording
-        progress("reading logs", 0, 0)  # quick, and wrong ones are found before the video is touched
+        # logs are quick to read: wrong ones are found before the video is touched
         self.poses = {item.name: read_pose_log(item.poses) for item in recording.instruments if item.poses is not None}
         self.joints = {
             item.name: {joint: read_reading_log(source) for joint, source in item.joints.items()}
@@ -42,7 +41,6 @@ class SynchronizedRecording:
         self.placed = tuple(item.name for item in recording.instruments if item.placed)
         self.scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
         self._check_bases()
-        progress("reading video", 0, 0)
         self.video = recording.source.open()
         self.times = self.video.times  # [V] s, every frame
         logs: list[PoseLog | ReadingLog] = [*self.poses.values(), *([self.scope] if self.scope else [])]
@@ -232,3 +230,10 @@ class SynchronizedRecording:
             degrees = np.degrees(excess)
             self.note(f"{log.path.name}: readings up to {degrees:.1f} deg beyond the limits are held at them")
         return held
+
+
+def with_roll(poses: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """Poses [F, 4, 4] turned about their own z by roll [F] rad."""
+    turned = np.tile(np.eye(4), (len(poses), 1, 1))
+    turned[:, :3, :3] = Rotation.from_rotvec(roll[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    return np.asarray(poses @ turned)

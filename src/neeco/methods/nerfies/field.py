@@ -34,7 +34,7 @@ from torch import Tensor, nn
 from neeco.capture.model import Camera, Instrument, State
 from neeco.errors import NeecoError
 from neeco.raster.devices import tf32_products
-from neeco.raster.optics import draw_through
+from neeco.raster.resampling import draw_through
 from neeco.raster.types import Rendering
 from neeco.scene.deformation import octave_angles, octave_weights
 from neeco.scene.drawable import Recorded
@@ -332,7 +332,7 @@ class RayRendering:
 
 
 class NerfScene(nn.Module):
-    """A `Drawable` without Gaussians. Inside, positions are (world - center) / scale: sparse points lie in [-1, 1].
+    """Radiance field; inside, positions are (world - center) / scale, so that sparse points lie in [-1, 1].
 
     `bounds` (near, far) are those of the samples' depth in mm. `opened` counts the warp's frequencies that are in use.
     """

@@ -16,7 +16,7 @@ from neeco.labels.labellers import Labeller, instruments_of
 from neeco.synthesis.writers.folder import Record
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import GaussianScene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class WrittenImages:
     part_names: tuple[tuple[str, str], ...]  # (instrument, part) of part id 1, 2, ...
     keypoint_names: tuple[str, ...]
     bones: Sequence[tuple[str, str]]  # pairs of keypoints that a line joins
-    scene: Scene  # that rendered the images and labels
+    scene: GaussianScene  # that rendered the images and labels
     labeller: Labeller
 
     @property

@@ -1,0 +1,179 @@
+"""Lamps that cast the instruments' shadows on the tissue: chosen among candidates around the lens, later learned."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from neeco.raster import rasterize
+from neeco.raster.shadow import GAMMA, Casting, blocked
+from neeco.raster.types import Gaussians
+from neeco.scene.gaussian_scene import LAMPS
+from neeco.training.session import GaussianSession
+
+RADII = (0.04, 0.08)  # of the tissue's distance: a lamp nearer the lens would explain any dark edge
+MAX_COVERAGE = 0.05  # share of a pixel that is solid instrument, where the tissue is compared
+LAMP_FRAMES = 12  # in which lamps are tried
+LAMP_DIRECTIONS = 8  # tried around the lens
+MIN_AGREEMENT = 0.75  # share of the frames that the first lamps found improve, at least
+MIN_FURTHER_AGREEMENT = 0.5  # of further lamps
+MIN_EXPLAINED = 0.005  # share of the squared error near the instruments that each lamp explains
+MARGIN = 3  # px of the images that searches take: nothing as near to a pixel may be covered more
+MAX_BRIGHTNESS = 0.8  # of white: errors at highlights exceed any shadow
+MIN_BRIGHTNESS = 0.05  # of white, to which rendered colours are clamped
+MAX_RESIDUAL = 0.1  # of white, to which residuals are clamped
+FAINT_OPACITY = 0.5  # of an instrument's Gaussian: up to here it may model the shadow
+FADED_OPACITY = 0.02  # to which faint Gaussians are reset
+MAX_STRENGTH = 0.9  # initially: a lamp that gives all the light has no gradient
+MAX_COSINE = 0.5  # between directions from the lens: lamps closer than 60 degrees would share one shadow
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Lamps chosen among the candidates, and their strengths."""
+
+    chosen: tuple[int, ...]
+    strengths: NDArray[np.float64]  # [L]
+    explained: float  # squared error that they remove
+
+
+@dataclass(frozen=True)
+class _NormalEquations:
+    """Normal equations, per frame, of a least-squares fit of the strengths of C candidate lamps to F frames."""
+
+    gram: NDArray[np.float64]  # [F, C, C]: products of the candidates' shadows
+    moment: NDArray[np.float64]  # [F, C]: products of the shadows and the residual, rendered minus recorded
+    total: float  # squared residual
+
+    def fit(self, chosen: tuple[int, ...]) -> _Fit:
+        """The non-negative strengths of these lamps that explain most."""
+        gram, moment = self.gram.sum(0)[np.ix_(chosen, chosen)], self.moment.sum(0)[list(chosen)]
+        root = np.linalg.cholesky(gram + 1e-6 * np.eye(len(chosen)))
+        strengths, _ = nnls(root.T, np.linalg.solve(root, moment))
+        return _Fit(chosen, strengths, float(2 * strengths @ moment - strengths @ gram @ strengths))
+
+    def agreement(self, fit: _Fit) -> float:
+        """Share of the frames whose error the lamps reduce."""
+        index = list(fit.chosen)
+        common = np.einsum("i,fij,j->f", fit.strengths, self.gram[:, index][:, :, index], fit.strengths)
+        return float((2 * self.moment[:, index] @ fit.strengths > common).mean())
+
+
+@torch.no_grad()
+def find_shadow(session: GaussianSession) -> None:
+    """Add to the scene's lamps those that best explain what the tissue, the solid part of the instruments and the
+    shadows of known lamps do not; none where none explains enough."""
+    scene = session.scene
+    free = [lamp for lamp in range(LAMPS) if float(scene.shadow_strengths[lamp]) <= 0]
+    if not scene.instruments or not free:
+        return
+    offsets = _candidates(2 * session.extent, LAMP_DIRECTIONS).to(scene.center)
+    equations = _normal_equations(session, offsets)
+    known = [scene.shadow_offsets[lamp] for lamp in range(LAMPS) if lamp not in free]
+    fit = _choose(equations, offsets, known, MIN_EXPLAINED)
+    agree = equations.agreement(fit)
+    searches = scene.diagnostics.setdefault("shadow", [])
+    searches.append(
+        {
+            "iteration": session.iteration,
+            "explains": round(fit.explained / max(equations.total, 1e-12), 4),
+            "agree": round(agree, 2),
+            "found_at_mm": [],
+        }
+    )
+    if not fit.chosen or agree < (MIN_FURTHER_AGREEMENT if known else MIN_AGREEMENT):
+        return
+    for lamp, candidate, strength in zip(free, fit.chosen, fit.strengths, strict=False):
+        scene.shadow_offsets[lamp] = offsets[candidate]
+        scene.shadow_strengths[lamp] = min(float(strength), MAX_STRENGTH)
+        searches[-1]["found_at_mm"].append([round(float(v), 2) for v in offsets[candidate]])
+    _fade_instruments(session)
+
+
+def _fade_instruments(session: GaussianSession) -> None:
+    """Make faint Gaussians of the instruments nearly transparent, to be learned again: they may have modelled the
+    shadow."""
+    canonical = session.scene.canonical
+    logits = canonical.opacity_logits
+    faint = canonical.of_instruments & (torch.sigmoid(logits) <= FAINT_OPACITY)
+    logits[faint] = logits[faint].clamp_max(math.log(FADED_OPACITY / (1 - FADED_OPACITY)))
+    session.adam.forget("opacity_logits")
+
+
+def _candidates(distance: float, directions: int) -> Tensor:
+    """Lamps [C, 3] mm around the lens, camera frame, for tissue at `distance` mm."""
+    angles = torch.arange(directions) * (2 * math.pi / directions)
+    around = torch.stack([angles.cos(), angles.sin(), torch.zeros(directions)], 1)
+    return torch.cat([radius * distance * around for radius in RADII])
+
+
+def _choose(equations: _NormalEquations, offsets: Tensor, known: list[Tensor], min_explained: float) -> _Fit:
+    """Greedy choice among the lamps at `offsets` [C, 3]: one after the other the one that explains most, as long as it
+    explains `min_explained` of the error and is far enough from those chosen and `known`; at most LAMPS with these."""
+    best = _Fit((), np.zeros(0), 0.0)
+    while len(known) + len(best.chosen) < LAMPS:
+        taken = [*known, *(offsets[k] for k in best.chosen)]
+        apart = [k for k in range(len(offsets)) if all(_cosine(offsets[k], other) < MAX_COSINE for other in taken)]
+        if not apart:
+            break
+        more = max((equations.fit((*best.chosen, k)) for k in apart), key=lambda fit: fit.explained)
+        if more.explained - best.explained < min_explained * equations.total or not (more.strengths > 0).all():
+            break
+        best = more
+    return best
+
+
+def _cosine(a: Tensor, b: Tensor) -> float:
+    return float(torch.nn.functional.cosine_similarity(a, b, dim=0))
+
+
+def _normal_equations(session: GaussianSession, offsets: Tensor) -> _NormalEquations:
+    """Of candidate lamps at `offsets` [C, 3] mm, from some of the training frames."""
+    gram, moment, total = [], [], 0.0
+    margin = max(1, round(MARGIN * session.scale / session.resolution.search_scale))
+    for index in session.frames_along_poses(LAMP_FRAMES):
+        color, shade, instrument = _render_candidates(session, index, offsets)
+        target, mask = session.views.target(index), session.views.mask(index)
+        counts = _clear_of_instruments(instrument, margin) & (torch.maximum(color, target).amax(-1) < MAX_BRIGHTNESS)
+        if mask is not None:
+            counts &= mask
+        color, target = color[counts].clamp(MIN_BRIGHTNESS, 1), target[counts]  # [P, 3]
+        # in linear light, where lamps add up, divided by the slope of the stored curve to weight errors as stored
+        residual = (color - target**GAMMA * color ** (1 - GAMMA)) / GAMMA
+        residual = residual.clamp(-MAX_RESIDUAL, MAX_RESIDUAL)
+        darkened = (color / GAMMA)[:, :, None] * shade[counts][:, None, :]  # [P, 3, C]
+        total += float(residual.square().sum())
+        flat = darkened.flatten(0, 1)  # [3 P, C]
+        gram.append((flat.T @ flat).double().cpu().numpy())
+        moment.append((flat.T @ residual.flatten()).double().cpu().numpy())
+    return _NormalEquations(np.stack(gram), np.stack(moment), total)
+
+
+def _render_candidates(session: GaussianSession, index: int, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Frame `index` without the instruments' faint Gaussians, which may model the shadow: colour [H, W, 3], the share
+    of each candidate's light [H, W, C] that is blocked there, and the share of each pixel that is instrument [H, W]."""
+    state, camera = session.corrected(index)
+    scene = session.scene
+    posed: Gaussians = scene.at(state)
+    instrument = scene.canonical.bodies > 0
+    casting = ~instrument | (posed.opacities > FAINT_OPACITY)
+    posed, instrument = posed.select(casting), instrument[casting]
+    among = Casting.of(posed, instrument, camera)
+    missed = blocked(among, scene.shadow_width, offsets, rasterize)  # [C, N]
+    channels = torch.stack([instrument.float(), *missed], 1)  # [N, 1 + C]
+    rendering = rasterize(posed, camera, channels=channels)
+    assert rendering.channels is not None
+    return rendering.color, rendering.channels[..., 1:], rendering.channels[..., 0]
+
+
+def _clear_of_instruments(instrument: Tensor, margin: int) -> Tensor:
+    """[H, W] bool: pixels without instrument within `margin` px; `instrument` [H, W]: the share of each pixel that is
+    one."""
+    return max_pool2d(instrument[None, None], 2 * margin + 1, 1, margin)[0, 0] < MAX_COVERAGE

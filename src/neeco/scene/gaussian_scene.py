@@ -1,0 +1,330 @@
+"""The learned model: canonical Gaussians, the deformation that poses them, and the light they are seen in."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from typing import Any, TypeGuard
+
+import torch
+from torch import Tensor, nn
+
+from neeco.capture.model import Camera, Instrument, InstrumentState, State
+from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid_from_vector
+from neeco.raster import rasterize
+from neeco.raster.devices import CachedPredicate
+from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
+from neeco.scene.canonical import SH_COEFFICIENTS, TISSUE, CanonicalGaussians
+from neeco.scene.deformation import UNPERTURBED, Deformation, Deltas, Perturbation
+from neeco.scene.drawable import ArticulatedMotion, DrawableScene, Recorded, Skeleton
+from neeco.scene.method import Stored
+from neeco.scene.visibility import VISIBILITY, measure_visibility, unobserved_share
+
+LAMPS = 3  # at most, as many as a laparoscope has light guides
+SHADOW_WIDTH = 0.01  # slope, at the start
+CANONICAL_SHAPES = {  # of one Gaussian
+    "means": (3,),
+    "quats": (4,),
+    "log_scales": (3,),
+    "opacity_logits": (),
+    "sh_dc": (1, 3),
+    "sh_rest": (SH_COEFFICIENTS - 1, 3),
+}
+
+
+class GaussianScene(nn.Module):
+    """A learned scene of Gaussians: `at` poses them in a state, for every method; `render` draws them.
+
+    `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
+    in mm, log scale about `center`), applied to every instrument pose; zero unless refined. Of several tissues each has
+    one, [T, 7], which is always refined: the instrument's shape takes on the constant error of one world, but not of
+    several. `falloff` (tissue, instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`,
+    `shadow_strengths` (0: no such lamp) and `shadow_width` the instruments' shadows on the tissue (see `Shadow`).
+    `background` in [0, 1] is the grey behind everything. `label_threshold` in (0, 1) is the share of a pixel from which
+    it is labelled an instrument; None: by what shadows the scene draws (see `neeco.labels.labellers`).
+    """
+
+    has_gaussians = True
+
+    center: Tensor
+    registration: Tensor
+
+    def __init__(
+        self,
+        method: str,
+        canonical: CanonicalGaussians,
+        deformation: Deformation,
+        instruments: tuple[Instrument, ...],
+        recorded: Recorded,
+        center: Tensor,
+    ) -> None:
+        super().__init__()
+        self.method = method
+        self.canonical = canonical
+        self.deformation = deformation
+        self.instruments = instruments
+        self.recorded = recorded
+        self.sh_degree = 0
+        self.background = 0.0
+        self.label_threshold: float | None = None
+        self.diagnostics: dict[str, Any] = {}
+        self.register_buffer("center", center.float())  # [3] mm, middle of the tissue; [T, 3] of several
+        self.registration = nn.Parameter(torch.zeros(*center.shape[:-1], 7))
+        self.falloff = nn.Parameter(torch.zeros(2))
+        self.vignette = nn.Parameter(torch.zeros(2))
+        self.shadow_offsets = nn.Parameter(torch.zeros(LAMPS, 3))
+        self.shadow_strengths = nn.Parameter(torch.zeros(LAMPS))
+        self.shadow_width = nn.Parameter(torch.full((), SHADOW_WIDTH))
+        self._shines = CachedPredicate(lambda strengths: (strengths > 0).any())
+        self._corrects = CachedPredicate(lambda registration: registration.any())
+
+    @property
+    def settings(self) -> Any:
+        """The method's own."""
+        return self.deformation.settings
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianScene:
+        """What `to` calls: the canonical Gaussians go with the modules."""
+        super()._apply(fn, recurse)
+        self.canonical = self.canonical.map(fn)
+        return self
+
+    def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """(tensors, JSON-able fields) that `load` makes the scene of, beside the state of its modules."""
+        canonical = self.canonical
+        return {f"canonical.{name}": tensor for name, tensor in canonical.tensors().items()}, {
+            "counts": list(canonical.counts),
+            "sh_degree": self.sh_degree,
+            "background": self.background,
+            "label_threshold": self.label_threshold,
+        }
+
+    @classmethod
+    def load(cls, deformation: Deformation, stored: Stored) -> GaussianScene:
+        """The inverse of `pack`. Raises ValueError or LookupError where what is stored does not fit."""
+        header = stored.header
+        prefix = "canonical."
+        canonical = _canonical(
+            {name.removeprefix(prefix): t for name, t in stored.tensors.items() if name.startswith(prefix)},
+            _counts(header["counts"], len(stored.instruments)),
+        )
+        tissues = len(stored.recorded.tissues)
+        if tissues > 1 and not bool(torch.isin(canonical.extras[TISSUE], torch.arange(float(tissues))).all()):
+            raise ValueError("its Gaussians are of tissues that it does not name")
+        center = canonical.means.new_zeros((tissues, 3) if tissues > 1 else 3)
+        scene = cls(header["method"], canonical, deformation, stored.instruments, stored.recorded, center)
+        scene.sh_degree = int(header["sh_degree"])
+        if scene.sh_degree < 0 or (scene.sh_degree + 1) ** 2 - 1 > canonical.sh_rest.shape[1]:
+            raise ValueError(f"sh_degree is {scene.sh_degree}, which does not fit its harmonics")
+        # older scenes call it backdrop, or have none
+        scene.background = float(header.get("background", header.get("backdrop", 0.0)))
+        if not 0 <= scene.background <= 1:
+            raise ValueError(f"its background is {scene.background}, not a grey in [0, 1]")
+        if (threshold := header.get("label_threshold")) is not None:  # older scenes have none
+            scene.label_threshold = float(threshold)
+            if not 0 < scene.label_threshold < 1:
+                raise ValueError(f"its label_threshold is {threshold}, not a share between 0 and 1")
+        return scene
+
+    def at(self, state: State, perturbation: Perturbation = UNPERTURBED) -> Gaussians:
+        """Gaussians posed in `state`, float32. Gradients reach instrument poses that require them.
+
+        Those of other tissues than the state's have opacity 0. Raises NeecoError when the state lacks an instrument or
+        joint that the scene has, or names no tissue of it where there are several.
+        """
+        canonical, shown = self.canonical, self._shown(state)
+        posed = self.deformation.pose(canonical, self.registered(state), perturbation)
+        opacities = torch.sigmoid(canonical.opacity_logits)
+        tissue, instruments = canonical.counts[0], len(canonical) - canonical.counts[0]
+        falloff = torch.cat([self.falloff[:1].expand(tissue), self.falloff[1:].expand(instruments)])
+        return Gaussians(
+            means=posed.means,
+            quats=posed.quats,
+            scales=posed.scales,
+            opacities=opacities if shown is None else opacities * shown,
+            sh=canonical.spherical_harmonics(self.sh_degree),
+            sh_frames=posed.sh_frames,
+            headlight=Headlight(falloff, self.vignette, self._shadow()),
+            background=canonical.means.new_full((3,), self.background) if self.background else None,
+        )
+
+    def _shown(self, state: State) -> Tensor | None:
+        """[N] float, 0 for the Gaussians of other tissues than the state's; None: there is one. Raises NeecoError."""
+        index, canonical = self._tissue_index(state), self.canonical
+        if index is None:
+            return None
+        return (canonical.of_tissue(index) | canonical.of_instruments).to(canonical.means.dtype)
+
+    def _tissue_index(self, state: State) -> int | None:
+        """Which of several tissues the state names; None: there is one. Raises NeecoError for one that there is not."""
+        names = self.recorded.tissues
+        if state.tissue not in (names or (None,)) and (len(names) > 1 or state.tissue is not None):
+            known = f"name one of {', '.join(names)}" if names else "it has one, without a name"
+            raise NeecoError(f"state: tissue: {state.tissue!r} is not in the scene; {known}")
+        return names.index(str(state.tissue)) if len(names) > 1 else None
+
+    def over(self, tissue: str) -> GaussianScene:
+        """The scene of one of several tissues alone, with what was recorded over it."""
+        index = self.recorded.tissues.index(tissue)
+        chosen = self.canonical.of_tissue(index) | self.canonical.of_instruments
+        counts = (int(self.canonical.of_tissue(index).sum()), *self.canonical.counts[1:])
+        alone = copy.copy(self)
+        alone._buffers, alone._parameters = dict(self._buffers), dict(self._parameters)
+        if self.center.dim() > 1:
+            alone.center = self.center[index]
+            alone.registration = nn.Parameter(self.registration[index].detach(), requires_grad=False)
+            alone._corrects = CachedPredicate(self._corrects.question)
+        canonical = self.canonical.map(lambda tensor: tensor[chosen], counts)
+        alone.canonical = replace(canonical, extras={name: t for name, t in canonical.extras.items() if name != TISSUE})
+        alone.recorded = replace(self.recorded.over(tissue), tissues=(tissue,))
+        return alone
+
+    def visibility(self) -> Tensor:
+        """[N, 12] how well the training frames observed each Gaussian (see `neeco.scene.visibility`). Measured at the
+        end of training; otherwise here, once."""
+        if VISIBILITY not in self.canonical.extras:
+            measured = measure_visibility(self.canonical, self.recorded, self.at)
+            self.canonical = self.canonical.with_extras(**{VISIBILITY: measured})
+        return self.canonical.extras[VISIBILITY]
+
+    def unobserved(self, posed: Gaussians, camera: Camera) -> Tensor:
+        """[N] in [0, 1] how far each posed Gaussian, as `camera` sees it, is unobserved: seen by no training frame, or
+        not from about there."""
+        return unobserved_share(self.visibility(), posed, camera)
+
+    @property
+    def casts_shadow(self) -> bool:
+        """Was a lamp beside the lens found, and is there anything that casts its shadow?"""
+        return self._shines(self.shadow_strengths) and len(self.canonical) > self.canonical.counts[0]
+
+    def _shadow(self) -> Shadow | None:
+        if not self.casts_shadow:
+            return None
+        strengths = self.shadow_strengths.clamp(0.0, 1.0)
+        return Shadow(self.canonical.of_instruments, self.shadow_offsets, strengths, self.shadow_width)
+
+    def registered(self, state: State) -> State:
+        """`state` with the learned tracker-to-world correction applied to its poses.
+
+        Raises NeecoError for poses that are not rigid and joints far beyond their limits (see `State.check`).
+        """
+        state.check(self.instruments, fitted=True)
+        registration = self.registration
+        # a tensor on the device "meta" holds no numbers to ask
+        corrects = registration.requires_grad or registration.is_meta or self._corrects(registration)
+        if not state.instruments or not corrects:
+            return state
+        index, center, moved = self._tissue_index(state), self.center, {}
+        if index is not None:
+            registration, center = registration[index], center[index]
+        correction = rigid_from_vector(registration[:6])
+        scale = registration[6].exp()
+        for name, given in state.instruments.items():
+            pose = given.pose.to(correction)
+            arm = (pose[:3, 3] - center) * scale
+            rotation = correction[:3, :3] @ pose[:3, :3]
+            translation = correction[:3, :3] @ arm + center + correction[:3, 3]
+            top = torch.cat([rotation, translation[:, None]], 1)
+            moved[name] = InstrumentState(torch.cat([top, pose[3:]]), given.joints)
+        return dataclasses.replace(state, instruments=moved)
+
+    def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
+        """`state` as the recorded `camera` sees it, differentiable; `labels`: with label channels, where it has any."""
+        channels = self.label_channels() if labels and self.label_names else None
+        return rasterize(self.at(state), camera, channels=channels)
+
+    def motion(self) -> ArticulatedMotion | None:
+        """How the Gaussians move, where joints say all of it; None otherwise."""
+        return self.deformation.motion(self.canonical)
+
+    def torch_threads(self) -> AbstractContextManager[None]:
+        """As many of torch's threads as pay where the scene is drawn."""
+        return self.deformation.torch_threads()
+
+    @property
+    def num_gaussians(self) -> int:
+        """How many Gaussians one drawing uses."""
+        return len(self.canonical)
+
+    @property
+    def label_names(self) -> tuple[tuple[str, str], ...]:
+        """(instrument, part) of each label column; mask id = index + 1, 0 is tissue."""
+        return self.deformation.label_names
+
+    def label_channels(self) -> Tensor:
+        """Soft membership [N, L] in [0, 1] of each Gaussian; what is left to 1 is tissue."""
+        return self.deformation.label_channels(self.canonical)
+
+    def deltas(self, state: State) -> Deltas:
+        """How each Gaussian changes from canonical to `state`."""
+        return self.deformation.deltas(self.canonical, self.registered(state))
+
+    def keypoints(self, state: State) -> dict[str, dict[str, Tensor]]:
+        """Named 3D points [3] mm, world frame, per instrument."""
+        return self.deformation.keypoints(self.registered(state))
+
+    def skeleton(self) -> Skeleton:
+        """Pairs of keypoints' names that a line joins."""
+        return self.deformation.skeleton()
+
+
+def is_gaussian(scene: DrawableScene) -> TypeGuard[GaussianScene]:
+    """Whether `scene` is made of Gaussians, which can be posed and labelled."""
+    return scene.has_gaussians
+
+
+def require_gaussians(scene: DrawableScene, asked_by: str) -> GaussianScene:
+    """Return `scene`, which must be made of Gaussians. Raises NeecoError, in the words of the option or verb
+    `asked_by`, for a radiance field."""
+    if not is_gaussian(scene):
+        raise NeecoError(
+            f"{asked_by}: method {scene.method} has no Gaussians to pose or label; use a run of another method, "
+            "such as kinematic"
+        )
+    return scene
+
+
+def over_one(scene: DrawableScene, tissue: str | None) -> DrawableScene:
+    """The scene over one tissue: that of this name, else the first; as it is where it has one. Raises NeecoError for a
+    name that is none of its."""
+    names = scene.recorded.tissues
+    if tissue is not None and tissue not in names:
+        known = f"its tissues are {', '.join(names)}" if names else "it has one tissue, without a name"
+        raise NeecoError(f"--tissue: {tissue!r} is not in the scene; {known}")
+    return scene.over(tissue or names[0]) if is_gaussian(scene) and len(names) > 1 else scene
+
+
+def one_tissue(scene: DrawableScene, asked_by: str) -> None:
+    """Raise NeecoError, in the words of the option or verb `asked_by`, for a scene of several tissues."""
+    if len(scene.recorded.tissues) > 1:
+        raise NeecoError(
+            f"{asked_by}: the scene has several tissues ({', '.join(scene.recorded.tissues)}), and this takes one; use "
+            "a run of a capture of one"
+        )
+
+
+def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:
+    """Of the Gaussians of the tissue and of each instrument; a scene that knows no instrument may have any bodies."""
+    fits = instruments == 0 or len(counts) in (1, 1 + instruments)
+    if not fits or not all(isinstance(count, int) and count >= 0 for count in counts):
+        raise ValueError(f"counts of {len(counts)} bodies do not fit {instruments} instruments")
+    return tuple(counts)
+
+
+def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
+    """The Gaussians. Raises ValueError for shapes, types and numbers that do not fit."""
+    if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
+        raise ValueError(f"{missing[0]} is missing")
+    for name, tensor in tensors.items():
+        found, wanted = tuple(tensor.shape), (sum(counts), *CANONICAL_SHAPES.get(name, tensor.shape[1:]))
+        if found != wanted:
+            raise ValueError(f"{name} has shape {list(found)}, not {list(wanted)}")
+        if tensor.dtype != torch.float32:
+            raise ValueError(f"{name} is {tensor.dtype}, not float32")
+        if not torch.isfinite(tensor).all():
+            raise ValueError(f"{name} contains NaN or infinity")
+    return CanonicalGaussians.from_tensors(tensors, counts)
