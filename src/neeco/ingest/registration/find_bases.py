@@ -16,10 +16,10 @@ from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
-from neeco.ingest.registration.base import FEWEST, BaseRegistration, base_from_layers, find_base
-from neeco.ingest.registration.base_fit import CLOCK_SD
-from neeco.ingest.registration.base_layers import covered_by, evenly_lit, fit_layers, line_through_trocar
-from neeco.ingest.registration.base_shape import SHIFTS
+from neeco.ingest.registration.base import MIN_FRAMES, BaseRegistration, base_from_layers, find_base
+from neeco.ingest.registration.layers import ArmImages, covered_by, evenly_lit, fit_layers, line_through_trocar
+from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, ClockOffset
 from neeco.ingest.timing.episodes import Episodes
 
@@ -234,7 +234,8 @@ def _find(arm: _Arm, seen: _Seen, *, alone: bool) -> BaseRegistration | None:
     try:
         return find_base(
             arm.item.name, seen.masks, seen.lens.intrinsics, np.linalg.inv(seen.cameras), arm.poses_at, seen.times,
-            arm.prior, readings=readings, hidden=seen.hidden, images=seen.images, clock_known=arm.clock.source in KNOWN,
+            prior=arm.prior, readings=readings, hidden=seen.hidden, images=seen.images,
+            clock_known=arm.clock.source in KNOWN,
         )  # fmt: skip
     except NeecoError as error:
         if alone and (found := _without_masks(arm, seen)) is not None:
@@ -250,28 +251,31 @@ def _without_masks(arm: _Arm, seen: _Seen) -> BaseRegistration | None:
     well."""
     if arm.prior is None or not seen.still:
         return None
-    poses = np.stack([arm.poses_at(float(shift)) for shift in SHIFTS])
+    poses = np.stack([arm.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
     known = np.flatnonzero(np.isfinite(poses).all((0, 2, 3)))
     if arm.clock.source in KNOWN:  # no other clock is tried
-        poses = np.tile(arm.poses_at(0.0), (len(SHIFTS), 1, 1, 1))
+        poses = np.tile(arm.poses_at(0.0), (len(CLOCK_SHIFTS_S), 1, 1, 1))
         known = np.flatnonzero(np.isfinite(poses[0]).all((1, 2)))
-    line = line_through_trocar(poses[len(SHIFTS) // 2, known]) if len(known) >= FEWEST else None
+    line = line_through_trocar(poses[len(CLOCK_SHIFTS_S) // 2, known]) if len(known) >= MIN_FRAMES else None
     if line is None:
         return None
     wrists = None if arm.wrists is None else arm.wrists[known]
     world_from_camera, (given, sd_mm, sd_deg) = seen.cameras[0], arm.prior
     prior = (np.linalg.inv(world_from_camera) @ given, sd_mm, sd_deg)
-    sd_clock = 0.0 if arm.clock.source in KNOWN else CLOCK_SD
-    found = fit_layers(
-        seen.lit[known], seen.lens.intrinsics, poses[:, known], line, prior, sd_clock, seen.usable[known],
-        np.random.default_rng(0), wrists,
-    )  # fmt: skip
+    sd_clock = 0.0 if arm.clock.source in KNOWN else CLOCK_SD_S
+    images = ArmImages(
+        images=seen.lit[known],
+        intrinsics=seen.lens.intrinsics,
+        poses=poses[:, known],
+        line=line,
+        usable=seen.usable[known],
+        wrists=wrists,
+    )
+    found = fit_layers(images, prior, sd_clock, np.random.default_rng(0))
     if not found.found:
         return None
-    seen.usable[known] &= ~covered_by(
-        found, seen.images.shape[1:3], seen.lens.intrinsics, poses[:, known], line, wrists
-    )
-    return base_from_layers(arm.prior, found, world_from_camera, poses[len(SHIFTS) // 2, known], line)
+    seen.usable[known] &= ~covered_by(found, images)
+    return base_from_layers(arm.prior, found, world_from_camera, poses[len(CLOCK_SHIFTS_S) // 2, known], line)
 
 
 def _in_world(stated: StatedBase, cameras: np.ndarray) -> np.ndarray:
@@ -290,7 +294,7 @@ def describe(name: str, found: BaseRegistration) -> str:
     if np.isfinite(found.moved_mm):
         words += f", {found.moved_mm:.1f} mm and {found.turned_deg:.1f} deg from what was given"
     words += f"; sure to {listed(found.sd_mm)} mm and {listed(found.sd_deg)} deg (right, down, forward of the camera); "
-    if found.fit is None:
+    if not found.from_masks:
         words += f"without outlines: its shaft explains {found.explained:.0%} of what changes in the images"
     else:
         words += f"its outline and what moves overlap by {found.overlap:.2f}"
