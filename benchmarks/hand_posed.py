@@ -26,8 +26,9 @@ from from_video import masks_of
 from scipy.ndimage import gaussian_filter1d
 
 from neeco.capture import Capture, Instrument, InstrumentState, State, read_capture, write_capture
-from neeco.capture.model import REFERENCE_PIXELS, FromVideo, Uncertainty, swap_camera_axes
+from neeco.capture.model import REFERENCE_PIXELS, FromVideo, Uncertainty
 from neeco.files import read_json
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
 from neeco.ingest.frames.views import reduced
 from neeco.ingest.posing.hand_posed import HandPose, write_answers

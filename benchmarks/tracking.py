@@ -42,9 +42,10 @@ from torch import Tensor
 
 from neeco.capture import read_capture, write_capture
 from neeco.capture.images import write_image
-from neeco.capture.model import Frame, InstrumentState, State, swap_camera_axes
+from neeco.capture.model import Frame, InstrumentState, State
 from neeco.evaluation.mask_folders import load_reference
 from neeco.geometry.camera import Camera
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 from neeco.labels.drawing import draw
@@ -279,7 +280,7 @@ def single(given: argparse.Namespace) -> None:
             began = time.process_time()
             step = follower.find(k)
             seconds += time.process_time() - began
-            state = next(iter(step.moving.state.instruments.values()))
+            state = next(iter(step.motion.state.instruments.values()))
             rows.append(compared(frame, state, step.trust.value, truth, (given.capture, given.capture)))
     print_tables(rows, truth)
     print(f"{seconds / len(rows):.2f} s of processor time a frame")

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.fromvideofile import UNKNOWN_DEG
-from neeco.capture.model import Uncertainty, evenly_spaced
+from neeco.capture.model import UNKNOWN_DEG, Uncertainty, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lines import distances_to_lines, unit
 from neeco.ingest.foreground.silhouettes import shaft_lines
