@@ -1,7 +1,8 @@
 """Result tables of every study: CSV by pandas, and one kind of table for the terminal, pages, Markdown and LaTeX.
 
 `csv_text` writes rows of numbers in full. `summary_table` makes a `ResultTable` of means and standard deviations,
-rounded, the best of each column marked; `markdown_document` and `latex_document` write several, `write_files` all of a study.
+rounded, the best of each column marked; `markdown_document` and `latex_document` write several, and `write_files` all
+tables of a study.
 """
 
 from __future__ import annotations
