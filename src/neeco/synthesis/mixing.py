@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 DEPTH_SCALE = 0.25  # of the image's size, at which the depth of tissue is looked up
 RECORDED_FRAMES = 24  # frames that the mixed scene has as if they had been recorded
 GAINS = (0.6, 1.6)  # range of the change of colours: beyond that, the shafts differ in make
-SOLID = 0.5  # least opacity of Gaussians that tell a shaft's colour
+SOLID = 0.5  # least opacity of Gaussians from which a shaft's colour is estimated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +205,7 @@ def tissue_depth(tissue: Gaussians, camera: Camera, point: np.ndarray) -> float:
 def _merged(
     tissue: GaussianScene, instrument_scenes: Sequence[GaussianScene], gains: Sequence[tuple[float, float, float]]
 ) -> GaussianScene:
-    """One scene of the tissue of `tissue` and the instruments of `instrument_scenes`."""
+    """Build one scene of the tissue of `tissue` and the instruments of `instrument_scenes`."""
     instruments = tuple(instrument for scene in instrument_scenes for instrument in scene.instruments)
     deformation = tissue.deformation.combined([scene.deformation for scene in instrument_scenes])
     bodies = [_body(tissue, 0, deformation)]
@@ -228,7 +228,7 @@ def _merged(
 
 
 def _body(scene: GaussianScene, index: int, deformation: Deformation) -> CanonicalGaussians:
-    """One body alone, with what the mixed scene's `deformation` knows of each Gaussian, and how well it was seen."""
+    """Return one body alone, with the extras of the mixed scene's `deformation` and its visibility."""
     canonical, rows = scene.canonical, scene.canonical.body(index)
     seen = scene.visibility()[rows]
     extras = deformation.fit_extras({name: tensor[rows] for name, tensor in canonical.extras.items()})
@@ -243,8 +243,8 @@ def _brightened(body: CanonicalGaussians, gain: tuple[float, float, float]) -> C
 
 
 def _gain(tissue: GaussianScene, instruments: GaussianScene) -> tuple[float, float, float]:
-    """By what the colours of `instruments` are multiplied to look as under the light of `tissue`'s capture, going by
-    the shafts, grey of a like kind in both. 1 where the tissue's run has no instrument to compare with, or it is the
+    """Estimate the colour gains that make `instruments` look as under the light of `tissue`'s capture, from the shafts,
+    which are of a similar grey in both. 1 where the tissue's run has no instrument to compare with, or it is the
     same run."""
     if tissue is instruments or not tissue.instruments:
         return 1.0, 1.0, 1.0

@@ -1,7 +1,7 @@
 """Samplers of instrument states.
 
 A sampler turns (index, random generator) into a state. The generator is seeded by (seed, index) alone, so any image of
-a data set can be drawn without the others, in any order, and comes out the same.
+a data set can be rendered without the others, in any order, with the same result.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ JITTER = 0.02  # of the recorded spread: keeps a sample off the exact line betwe
 
 @dataclass(frozen=True)
 class JointRange:
-    """Where a joint may go, in rad."""
+    """The range of a joint, rad."""
 
     lower: float
     upper: float
@@ -160,7 +160,7 @@ class ExtrapolatedStates(InterpolatedStates):
     """States from the recorded range widened by `margin`.
 
     Joints are uniform over their range widened by that fraction at either end, within the limits the capture states;
-    poses are drawn as `InterpolatedStates` does and then moved away from the mean recorded pose by a factor in
+    poses are sampled as `InterpolatedStates` does and then moved away from the mean recorded pose by a factor in
     [1, 1 + 2 margin], as the half range either side of the mean grows by that much; all instruments of a state by the
     same factor.
     """
@@ -235,7 +235,7 @@ class PathStates:
 
 
 class ListedStates:
-    """The given states in order; from the start again when more images are asked for than states are given."""
+    """The given states in order; from the start again when more images than states are requested."""
 
     prescribed = True
 
