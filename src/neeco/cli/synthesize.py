@@ -12,7 +12,7 @@ from neeco.errors import NeecoError
 from neeco.settings import Device
 from neeco.synthesis.settings import DEFAULT_FORMATS, Settings, formats_help
 
-# what is drawn of a scene that was seen from one place
+# views of a scene that was recorded by a still scope
 VIEWS_OF_STILL = {
     "recorded": "the recorded ones",
     "perturbed": "within about a degree and a millimetre of the recorded ones",
@@ -21,13 +21,13 @@ VIEWS_OF_STILL = {
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Draw a labelled data set of states that nobody recorded: of one run, or of one run's tissue under the instruments
-    of others (--tissue, --instruments)."""
+    """Render a labelled data set of states that nobody recorded: of one run, or of one run's tissue under the
+    instruments of others (--tissue, --instruments)."""
 
     run: Annotated[Path | None, tyro.conf.arg(metavar="RUN"), tyro.conf.Positional] = None
     """Run folder that `neeco train` wrote."""
     tissue: Path | None = None
-    """Instead of RUN: the run whose tissue and light are drawn."""
+    """Instead of RUN: the run whose tissue and light are rendered."""
     instruments: tuple[Path, ...] = ()
     """With --tissue: the runs whose instruments stand before it."""
     output: Path
@@ -59,7 +59,7 @@ def run(arguments: Arguments) -> int:
         if trained.scene.recorded.still and settings.views in VIEWS_OF_STILL:
             print(f"the scope stood still: views are {VIEWS_OF_STILL[settings.views]}")
         others = [load_run(path, device).gaussians("synthesize") for path in instrument_runs]
-        with resumable("what was drawn is kept; run the same command again with --resume"):
+        with resumable("what was rendered is kept; run the same command again with --resume"):
             summary = synthesize(
                 trained,
                 arguments.output,
@@ -70,7 +70,7 @@ def run(arguments: Arguments) -> int:
                 workers=arguments.workers,
                 instrument_runs=others,
             )
-    print(f"{summary.images} images in {summary.output} ({summary.made_now} drawn now); look at preview.png")
+    print(f"{summary.images} images in {summary.output} ({summary.made_now} rendered now); look at preview.png")
     for reason, times in summary.refused.items():
         print(f"refused {times} states: instrument {reason}")
     if summary.skipped:
@@ -79,7 +79,7 @@ def run(arguments: Arguments) -> int:
 
 
 def _runs(arguments: Arguments) -> tuple[Path, tuple[Path, ...]]:
-    """The run that is drawn, and those whose instruments are drawn over its tissue."""
+    """Return the run that is rendered, and those whose instruments are rendered over its tissue."""
     if (arguments.run is None) == (arguments.tissue is None):
         raise NeecoError("synthesize: give a RUN, or --tissue RUN with --instruments RUN ...; one of the two")
     if (arguments.tissue is None) != (not arguments.instruments):
