@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from neeco.scene import GaussianScene
     from neeco.training.run import GaussianRun
 
-REFERENCE_FRAMES = 16  # training frames from which the usual errors are estimated
+N_REFERENCE_FRAMES = 16  # training frames from which the usual errors are estimated
 FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # the start is near: no coarse search
 NOT_TRUSTED = "not trusted"
-NOT_RECORDED = 0.01  # of a pixel: more than this outside the recorded image, and it is ignored
+MAX_UNRECORDED_SHARE = 0.01  # of a pixel: more than this outside the recorded image, and it is ignored
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class _Annotator:
         shown = resampled(torch.ones(field.height, field.width, 1), field, fine, wanted)[..., 0]
         known = torch.cat([image, torch.ones_like(image[..., :1])], -1)
         found = resampled(known, recorded, fine, wanted)
-        missing = found[..., 3] < shown - NOT_RECORDED
+        missing = found[..., 3] < shown - MAX_UNRECORDED_SHARE
         drawing = replace(
             drawing,
             image=found[..., :3],
@@ -217,8 +217,8 @@ def typical_errors(scene: GaussianScene, labeller: CompositedLabels, trained_on:
     """The scene's errors on the frames that it was trained on."""
     frames = trained_on.split("train")
     drawings = []
-    for k in range(min(REFERENCE_FRAMES, len(frames))):
-        frame = frames[round(k * (len(frames) - 1) / (REFERENCE_FRAMES - 1))]
+    for k in range(min(N_REFERENCE_FRAMES, len(frames))):
+        frame = frames[round(k * (len(frames) - 1) / (N_REFERENCE_FRAMES - 1))]
         image = frame.load_image()
         drawings.append((fitted(scene, labeller, frame, image, None)[1], image, frame.load_mask()))
     return typical_errors_of(drawings)

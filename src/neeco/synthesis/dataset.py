@@ -37,7 +37,7 @@ from neeco.synthesis.generator import (
 )
 from neeco.synthesis.parallel import draw_in_workers
 from neeco.synthesis.preview import write_preview
-from neeco.synthesis.samplers import SIMILAR, states_fingerprint
+from neeco.synthesis.samplers import N_SIMILAR, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import (
@@ -111,7 +111,7 @@ def synthesize(
     identity = settings.identity() | {
         **settings.image_identity(recorded.width, recorded.height),
         "states_sha256": states_fingerprint(settings.states),
-        "similar_views": SIMILAR,
+        "similar_views": N_SIMILAR,
         "camera_effects": effects,
     }
     info = description(run, identity, instrument_runs)

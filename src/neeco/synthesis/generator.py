@@ -46,11 +46,11 @@ if TYPE_CHECKING:
 VERB = "synthesize"
 EFFECTS_STREAM = 1  # of an image's random numbers: camera effects do not change which state and view are sampled
 BURIED_SHARE = 0.05  # of an instrument's pixels that may lie deeper than the tolerance: edges are uncertain
-TOLERANCE_MM = (2.0, 5.0)  # range of tolerances found from the recording
-TOLERANCE_STATES = 12  # recorded states from which the tolerance is found
-APART_MM = 6.0  # surfaces of two instruments nearer than about a shaft's thickness: the instruments intersect
-CROSSING = 5  # px nearer than that: instruments are taken to intersect
-MAX_UNOBSERVED_IMAGE = 0.25  # of an image's pixels
+TOLERANCE_RANGE_MM = (2.0, 5.0)  # range of tolerances found from the recording
+N_TOLERANCE_STATES = 12  # recorded states from which the tolerance is found
+MIN_GAP_MM = 6.0  # surfaces of two instruments nearer than about a shaft's thickness: the instruments intersect
+MIN_CROSSING_PX = 5  # px nearer than that: instruments are taken to intersect
+MAX_UNOBSERVED_SHARE = 0.25  # of an image's pixels
 LEAVES_IMAGE, ENTERS_TISSUE, ENTERS_ANOTHER = "leaves the image", "enters the tissue", "enters another"
 UNOBSERVED_TISSUE = "stands before tissue that no frame saw"
 UNOBSERVED_SIDE = "shows sides that no frame saw"
@@ -104,7 +104,7 @@ class Acceptance:
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
         unobserved = drawing.unobserved > MOSTLY
-        if float(unobserved.float().mean()) > MAX_UNOBSERVED_IMAGE:
+        if float(unobserved.float().mean()) > MAX_UNOBSERVED_SHARE:
             return UNOBSERVED_TISSUE
         if float(unobserved[drawing.parts > 0].float().mean()) > self.max_unobserved:
             return UNOBSERVED_SIDE
@@ -279,9 +279,9 @@ def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
     recorded = scene.recorded
     depths = [
         buried_depth(scene, draw_layers(scene, labeller, recorded.states[k], recorded.cameras[k], min_component=0.0))
-        for k in evenly_spaced(len(recorded.states), TOLERANCE_STATES, floor=True)
+        for k in evenly_spaced(len(recorded.states), N_TOLERANCE_STATES, floor=True)
     ]
-    return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *TOLERANCE_MM)) / 100)
+    return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *TOLERANCE_RANGE_MM)) / 100)
 
 
 def buried_depth(scene: GaussianScene, drawing: LayeredDrawing) -> float:
@@ -316,7 +316,7 @@ def _intersect(drawing: LayeredDrawing, some: frozenset[str], others: frozenset[
     for a, b in product(sorted(some & drawing.layers.keys()), sorted(others & drawing.layers.keys())):
         first, second = drawing.layers[a], drawing.layers[b]
         both = first.mask & second.mask & (first.depth > 0) & (second.depth > 0)
-        if int((np.abs(first.depth - second.depth)[both] < APART_MM).sum()) >= CROSSING:
+        if int((np.abs(first.depth - second.depth)[both] < MIN_GAP_MM).sum()) >= MIN_CROSSING_PX:
             return True
     return False
 

@@ -19,8 +19,8 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.labels.drawing import to_numpy
 
-AT_ZERO = 0.05  # of a joint's range: what lies past 0 by less is noise of its sensor
-JITTER = 0.02  # of the recorded spread: keeps a sample off the exact line between two recorded states
+ZERO_SHARE = 0.05  # of a joint's range: what lies past 0 by less is noise of its sensor
+JITTER_SHARE = 0.02  # of the recorded spread: keeps a sample off the exact line between two recorded states
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class JointRange:
         states none, a range on one side of 0 stays there: an angle of 0 is a closed jaw."""
         length = self.upper - self.lower
         reach = margin * length
-        if limits is None and self.lower >= -AT_ZERO * length:
+        if limits is None and self.lower >= -ZERO_SHARE * length:
             limits = 0.0, math.inf
-        elif limits is None and self.upper <= AT_ZERO * length:
+        elif limits is None and self.upper <= ZERO_SHARE * length:
             limits = -math.inf, 0.0
         lower, upper = self.lower - reach, self.upper + reach
         if limits is not None:
@@ -133,8 +133,8 @@ class InterpolatedStates:
             self.bounds[name] = positions.min(0), positions.max(0)
             turns.append(float((Rotation.from_matrix(mean).inv() * rotations).magnitude().max()))
         spans = [upper - lower for lower, upper in self.bounds.values()]
-        self.jitter_mm = JITTER * float(np.linalg.norm(np.mean(spans, axis=0)))
-        self.jitter_rad = JITTER * float(np.mean(turns))
+        self.jitter_mm = JITTER_SHARE * float(np.linalg.norm(np.mean(spans, axis=0)))
+        self.jitter_rad = JITTER_SHARE * float(np.mean(turns))
 
     def __call__(self, index: int, rng: Generator) -> State:
         first, second = (self.states[k] for k in rng.integers(len(self.states), size=2))

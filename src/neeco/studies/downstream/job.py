@@ -42,9 +42,7 @@ EDGES: tuple[Edges, ...] = ("hard", "soft", "ignore")
 DEFAULT_EDGES: Edges = "hard"
 RESERVED = (REAL, AUGMENT, *EDGES)
 PARTS_STEPS = 2.5  # times as many steps to learn parts as one class: more of them do not help
-PAIR_DISTANCE = (
-    4.0  # px about a pair (jaws) in which `iou_jaws` is taken: thin, and small compared with the shaft
-)
+PAIR_DISTANCE = 4.0  # px about a pair (jaws) in which `iou_jaws` is taken: thin, and small compared with the shaft
 HELD_OUT = ("validation_every", "min_validated")  # settings that job.json has only where they are not the default
 PYTHON_ONLY = ("finetune_share", "finetune_epochs", *HELD_OUT)
 MIN_STORED_SCORE = 0.05  # boxes of a lower confidence are not stored
