@@ -297,13 +297,13 @@ class StoredImages(Dataset[Sample]):
         image = require_inside(self.folder / record["image"], self.folder)
         depth = np.asarray(open_image(files["depth"], size), np.float32) * np.float32(self._mm_per_count)
         labelled = LabelledImage.of(
-            read_image(image, size),
-            torch.from_numpy(depth),
-            read_labels(files["parts"], size),
-            read_labels(files["ignore"], size) == self._ignored,
-            record["labels"],
-            self.part_names,
-            self.keypoint_names,
+            image=read_image(image, size),
+            depth=torch.from_numpy(depth),
+            parts=read_labels(files["parts"], size),
+            ignore=read_labels(files["ignore"], size) == self._ignored,
+            labels=record["labels"],
+            part_names=self.part_names,
+            keypoint_names=self.keypoint_names,
         )
         state = State(
             {i["name"]: InstrumentState(i["pose"], i["joints"]) for i in record["instruments"]},
