@@ -24,7 +24,7 @@ Pixels = TypeVar("Pixels", Tensor, np.ndarray)
 
 
 def iou(mask: Pixels, truth: Pixels, counted: Pixels | None = None) -> float:
-    """Return the intersection over union of bool masks [H, W], over pixels that are `counted`; NaN when both are empty."""
+    """Return the intersection over union of bool masks [H, W] over `counted` pixels; NaN when both are empty."""
     both, either = _overlap(mask, truth, counted)
     return both / either if either else math.nan
 
