@@ -25,8 +25,8 @@ from neeco.studies.masks import check_masks, score_folder, score_runs, splits_wi
 from neeco.studies.study import JobEvent, Result, check_output, check_workers, run_and_record, spread
 from neeco.studies.tables import (
     Column,
+    ResultTable,
     SummaryRow,
-    Table,
     csv_text,
     latex_document,
     markdown_document,
@@ -85,7 +85,7 @@ ABSENT = {  # why nobody has a number
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ComparisonSpec:
     """What to compare. `seeds`: how many, from 0. `splits` None: all but `train`. `masks`: folders of masks by name.
     `assignments`: NAME=VALUE, fields of the training config that are changed for every method."""
@@ -121,7 +121,7 @@ class ComparisonPlan:
         return list(dict.fromkeys([*self.spec.methods, *self.spec.masks]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ComparisonResult:
     """What comparison.json holds, valid at every moment."""
 
@@ -171,15 +171,15 @@ def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
     _check_output(spec)
     jobs = tuple(
         TrainingJob(
-            name,
-            seed,
-            spec.capture,
-            job_folder(spec.output, name, seed),
-            config,
-            spec.budget,
-            spec.splits,
-            spec.lpips_weights,
-            spec.device,
+            name=name,
+            seed=seed,
+            capture=spec.capture,
+            folder=job_folder(spec.output, name, seed),
+            config=config,
+            budget=spec.budget,
+            splits=spec.splits,
+            lpips_weights=spec.lpips_weights,
+            device=spec.device,
         )
         for seed in range(spec.seeds)  # every method's first seed comes first: half of the runs show them all
         for name, config in configs.items()
@@ -381,7 +381,7 @@ def summarise(
     return rows
 
 
-def tables_of(comparison: ComparisonResult) -> list[Table]:
+def tables_of(comparison: ComparisonResult) -> list[ResultTable]:
     """One table per split, then the methods' own. Columns that nobody has a number for are left out."""
     finished = {job["name"] for job in comparison.jobs if "error" not in job}
     reasons: dict[str, str] = {}  # of methods of which no seed finished
@@ -389,7 +389,7 @@ def tables_of(comparison: ComparisonResult) -> list[Table]:
         if "error" in job and job["name"] not in finished:
             reasons.setdefault(job["name"], job["error"])
 
-    def table(title: str, columns: Sequence[Column], rows: Sequence[Mapping[str, Any]]) -> Table:
+    def table(title: str, columns: Sequence[Column], rows: Sequence[Mapping[str, Any]]) -> ResultTable:
         entries = [SummaryRow((row["name"],), row, reasons.get(row["name"])) for row in rows]
         return summary_table(title, ("method",), columns, entries)
 
