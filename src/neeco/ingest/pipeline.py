@@ -438,7 +438,7 @@ class WorldIngest:
         assert self.images.lens is not None
         lens = replace(self.images.lens, size=self.size, border=self.images.border)
         capture = Capture(
-            self.folder, capture_frames, instruments, cloud, registered, lens=lens, still=tissue is not None
+            self.folder, capture_frames, instruments, cloud, registered=registered, lens=lens, still=tissue is not None
         )
         if len(capture_frames) == len(chosen):  # of a second camera no masks are known
             self.shown = self.masks[chosen] if self.in_video is not None else self.masks

@@ -88,7 +88,7 @@ class _Scene:
         return max(self.spread, self.distance)
 
 
-def check_geometry(parsed: Parsed) -> dict[str, MotionVerdict]:
+def check_placement(parsed: Parsed) -> dict[str, MotionVerdict]:
     """Check points, cameras against points, then instruments against both (not against cameras that are wrong). Returns
     what the images say of instruments that are out of view, by name."""
     report = parsed.places[0].report

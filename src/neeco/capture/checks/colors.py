@@ -10,7 +10,7 @@ correlate less, the known causes are applied; one is named only if the correlati
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -54,12 +54,12 @@ BEHIND = 1e-3  # mm; what is less deep is not in front of a camera
 Place = tuple[np.ndarray, np.ndarray]  # columns and rows, px
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Cause:
     """A mistake, what to do about it, and what the cameras and the pixels are without it."""
 
-    message: str = ""
-    remedy: str = ""
+    message: str = field(default="", kw_only=False)
+    remedy: str = field(default="", kw_only=False)
     poses: np.ndarray | None = None  # [N, 4, 4] of all frames
     intrinsics: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None  # of intrinsics [F, 4], sizes [F, 2]
     pixels: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Place] | None = None  # u, v, width, height

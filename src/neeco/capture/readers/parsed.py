@@ -30,7 +30,7 @@ class ParsedTissue:
     place: Node  # of the points
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Parsed:
     """A capture as far as it could be read.
 
@@ -39,7 +39,7 @@ class Parsed:
     images (whose cameras say how) and absent ones (listed as `absent`) are no errors.
     """
 
-    root: Path
+    root: Path = field(kw_only=False)
     frames: list[Frame] = field(default_factory=list)
     places: list[Node] = field(default_factory=list)  # where each frame is described
     instruments: tuple[Instrument, ...] = ()
