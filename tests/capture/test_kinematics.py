@@ -16,7 +16,7 @@ from kinematic_trees import at_rest, kinematic_trees, turned
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.readers import kinematics_of, read_dvrk_tool
 from neeco.errors import NeecoError
-from neeco.raster.posing import ArticulatedBody, pose_bodies
+from neeco.raster.articulated import ArticulatedBody, pose_bodies
 
 WRISTED = {
     "pose_of": "tip",

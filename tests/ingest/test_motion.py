@@ -89,8 +89,9 @@ def test_what_moves_is_told_alike_in_small_and_large_images(times: int) -> None:
     seen = [[frame, point, 0, 0, point] for frame in range(4) for point in range(len(points))]
     count = np.zeros(len(points))
     sfm = SfmResult(
-        np.arange(4), np.tile(np.eye(4), (4, 1, 1)), points, count[:, None], count, count, np.array(seen), None, 0.0
-    )
+        indices=np.arange(4), world_from_camera=np.tile(np.eye(4), (4, 1, 1)), points=points, colors=count[:, None],
+        errors=count, lengths=count, observations=np.array(seen), lens=None, reprojection_px=0.0,
+    )  # fmt: skip
     visible = np.ones((times * height, times * width), bool)
     visible[:, : 40 * times] = False
     lens = Lens(

@@ -24,7 +24,7 @@ from neeco.geometry.distortion import field_pinhole
 from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
-from neeco.raster.optics import resampled, supersampled
+from neeco.raster.resampling import resampled, supersampled
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings

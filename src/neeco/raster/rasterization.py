@@ -13,7 +13,7 @@ from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.raster.devices import cuda_backend
 from neeco.raster.native import runs_native
-from neeco.raster.optics import draw_through, of_learned_size, widened
+from neeco.raster.resampling import draw_through, of_learned_size, widened
 from neeco.raster.shadow import shadowed
 from neeco.raster.triton.ready import require_triton
 from neeco.raster.types import Gaussians, Rendering
@@ -71,18 +71,18 @@ def rasterize(
 
         return rasterize_reference(gaussians, camera, channels, background)
     if backend == "cpu":
-        from neeco.raster.native import rasterize_cpu
+        from neeco.raster.cpu_backend import rasterize_cpu
 
         return rasterize_cpu(gaussians, camera, channels, background)
     if backend == "cuda":
         if not torch.cuda.is_available() or importlib.util.find_spec("gsplat") is None:
             raise NeecoError("backend: cuda: needs a CUDA device and gsplat; install neeco[cuda] or use backend='cpu'")
-        from neeco.raster.cuda import rasterize_cuda
+        from neeco.raster.gsplat_backend import rasterize_cuda
 
         return rasterize_cuda(gaussians, camera, channels, background)
     if backend == "triton":
         require_triton(gaussians.means.device)
-        from neeco.raster.triton.backend import rasterize_triton
+        from neeco.raster.triton_backend import rasterize_triton
 
         return rasterize_triton(gaussians, camera, channels, background)
     raise NeecoError(f"backend: {backend!r}: unknown; use one of {', '.join(BACKENDS)}")

@@ -165,7 +165,7 @@ def _kernel(given: Sequence[Tensor]) -> Any:
     if all_run_native(*given):
         return native().Posing
     if all(runs_triton(t) for t in given):
-        from neeco.raster.triton.posing import Posing
+        from neeco.raster.triton.articulated import Posing
 
         return Posing
     return None

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from itertools import combinations
 
 import torch
 from torch import Tensor, nn
 
-from neeco.methods.carving.evidence import (
+from neeco.capture.model import Instrument
+from neeco.methods.kinematic.stated_links import StatedLinks
+from neeco.methods.space_carving import (
     POSSIBLE,
     CarvedShape,
     Evidence,
@@ -18,7 +23,6 @@ from neeco.methods.carving.evidence import (
     posed_views,
     score_points,
 )
-from neeco.methods.kinematic.articulation.stated import StatedLinks
 from neeco.training.session import GaussianSession
 
 LINK_LOGIT = 2.0  # initial logit of a seed for the link that it was carved on
@@ -224,3 +228,83 @@ def _on_link(
     jitter = 0.1 * radius * torch.randn(len(again), 3, generator=generator, device=generator.device).to(points)
     order = torch.randperm(len(best), generator=generator, device=generator.device).to(device)[:count]
     return torch.cat([points[best[order]], points[best[again.to(device)]] + jitter])
+
+
+POINTS = 1500  # about each link
+CHECK_REACH_RADII, CHECK_BESIDE_RADII = 4.0, 2.0  # how far about the pivots they lie
+FRAMES = 80  # of the evidence
+DOUBT = 1.15  # times the volume on evidence, from which other readings are believed
+CHECK_MIN_SEEN = 0.1  # share of the frames that must see a point
+
+Readings = dict[str, float]
+
+
+@torch.no_grad()
+def doubt_readings(
+    session: GaussianSession, links: StatedLinks, evidence: Evidence, instrument: Instrument, readings: list[Readings]
+) -> None:
+    """Warn, and note in `scene.diagnostics["doubted_readings"]`, where the links keep more of their volume on evidence
+    with two readings exchanged or one's sign reversed. `readings`: those of every frame of the evidence."""
+    volumes = _Volumes(links, evidence, instrument.name, readings, session.config.seed)
+    named = volumes.with_readings(dict)
+    recorded = [name for name in links.reading_names if name not in instrument.unrecorded]
+    better: dict[float, tuple[tuple[str, ...], str]] = {}
+    for one, other in combinations(recorded, 2):
+        if instrument.slides(one) == instrument.slides(other):
+            better[volumes.with_readings(partial(_exchanged, one, other))] = (
+                (one, other),
+                f"with the readings of {one} and {other} exchanged: which log is which?",
+            )
+    for name in recorded:
+        better[volumes.with_readings(partial(_reversed, name))] = (
+            (name,),
+            f"with the sign of {name} reversed: is its axis, or its gain, the wrong way round?",
+        )
+    most = max(better, default=0.0)
+    if most <= DOUBT * named:
+        return
+    names, words = better[most]
+    session.report(
+        f"warning: {instrument.name}: its links fit the images {most / max(named, 1):.1f} times as well {words}"
+    )
+    doubts = session.scene.diagnostics.setdefault("doubted_readings", {})
+    doubts |= {f"{instrument.name}.{name}": f"the links fit the images better {words}" for name in names}
+
+
+def _exchanged(one: str, other: str, given: Readings) -> Readings:
+    return {**given, one: given[other], other: given[one]}
+
+
+def _reversed(name: str, given: Readings) -> Readings:
+    return {**given, name: -given[name]}
+
+
+class _Volumes:
+    """Of what stays on evidence, points of all links together."""
+
+    def __init__(self, links: StatedLinks, evidence: Evidence, name: str, readings: list[Readings], seed: int) -> None:
+        step = max(1, len(readings) // FRAMES)
+        self.links, self.readings = links, readings[::step]
+        self.evidence = evidence.subset(torch.arange(0, len(readings), step))
+        self.camera_from_instrument = camera_from_instrument(self.evidence, name)  # [F, 4, 4]
+        generator = torch.Generator().manual_seed(seed)
+        self.points = [self._about(link, generator) for link in range(1, links.link_count)]
+
+    def _about(self, link: int, generator: torch.Generator) -> Tensor:
+        """[POINTS, 3] mm at rest."""
+        radius = float(self.links.radius)
+        centers, half = (
+            part.cpu() for part in self.links.where(link, CHECK_REACH_RADII * radius, CHECK_BESIDE_RADII * radius)
+        )
+        which = torch.randint(len(centers), (POINTS,), generator=generator)
+        away = 2 * torch.rand(POINTS, 3, generator=generator) - 1
+        return (centers[which] + away * half[which, None]).to(self.evidence.device)
+
+    def with_readings(self, change: Callable[[Readings], Readings]) -> float:
+        """In points."""
+        moved = link_motions(self.links, [change(given) for given in self.readings])  # [F, L, 4, 4]
+        total = 0.0
+        for link, points in enumerate(self.points, 1):
+            score, seen = score_points(self.evidence, self.camera_from_instrument @ moved[:, link], points)
+            total += float((((score - POSSIBLE) / (1 - POSSIBLE)).clamp(0, 1) * (seen > CHECK_MIN_SEEN)).sum())
+        return total

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.geometry.rotations import rotate_about
-from neeco.methods.kinematic.articulation.base import Articulation
+from neeco.methods.kinematic.articulation import Articulation
 from neeco.scene.drawable import JointMotion, Skeleton
 
 JAWS_BEYOND = 0.75  # radii beyond the hinge, where nothing but jaws is

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +15,7 @@ from neeco.raster.triton.binning import Lists, Tiles, list_per_tile
 from neeco.raster.triton.composite import Images, composite, composite_backward
 from neeco.raster.triton.project import Inputs, Projected, project
 from neeco.raster.triton.project_backward import project_backward
+from neeco.raster.triton.ready import working_on
 from neeco.raster.types import Gaussians, Rendering, differentiable
 
 TILE = 16  # px
@@ -50,14 +50,9 @@ def rasterize_triton(
             raise NeecoError(f"backend: triton: tensors are on {device} and {tensor.device}; move them to one device")
     wanted = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     offsets = torch.zeros(len(gaussians), 2, device=device, requires_grad=wanted)
-    with _working_on(device):
+    with working_on(device):
         color, alpha, depth, composited, radii = _Rasterize.apply(offsets, camera, wanted, *tensors)
     return Rendering(color, alpha, depth, composited, radii, offsets)
-
-
-def _working_on(device: torch.device) -> AbstractContextManager[Any]:
-    """Triton launches on the current CUDA device."""
-    return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
 
 
 class _Rasterize(torch.autograd.Function):
@@ -92,7 +87,7 @@ class _Rasterize(torch.autograd.Function):
         )
         wanted = ctx.needs_input_grad[3:]
         images = Images(depth, alpha, depth, None, drawing.left, drawing.full_at)
-        with _working_on(alpha.device):
+        with working_on(alpha.device):
             sums = composite_backward(
                 drawing.projected.records, inputs.channels, drawing.lists, inputs.background, drawing.tiles, images,
                 (to_color, to_alpha, to_depth, to_channels),

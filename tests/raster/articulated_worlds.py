@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from neeco.geometry.rotations import rigid_from_vector
-from neeco.raster.posing import ArticulatedBody, pose_bodies
+from neeco.raster.articulated import ArticulatedBody, pose_bodies
 
 GAUSSIANS = ("means", "quats", "log_scales", "logits")
 LEARNED = ("world_from_body", "origins", "axes", "values", "shaft_origin", "shaft_direction")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,10 +24,12 @@ from neeco.geometry.projection import project
 from neeco.raster import rasterize
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
+from neeco.training.session import GaussianSession
 
 SOLID = (0.85, 0.75, 0.65)  # mean evidence of a point surely inside: the strictest level that enough points reach
 MIN_SOLID = 8  # solid points without which nothing is carved
 FEW_SOLID = 24  # solid points: with fewer, the finer grid is tried
+SEED_SPREAD = 0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame
 POSSIBLE = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
 
 
@@ -233,6 +235,54 @@ def _rolled(poses: Tensor, number: int, count: int, worlds: Sequence[Tensor]) ->
         shift = round(len(rows) * (number + 0.1 * (number % 2)) / (count + 1))
         rolled[rows] = poses[rows].roll(shift, 0)
     return rolled
+
+
+def carved_shape(session: GaussianSession, evidence: Evidence, name: str, generator: torch.Generator) -> CarvedShape:
+    """The carved shape, or what of it is around the instrument's frame where the rest may be static parts of the scene.
+    Raises NeecoError when there is nothing."""
+    search = session.config.deformation.carving
+    shape = carve(evidence, name, generator, search)
+    if shape is None:
+        raise NeecoError(
+            f"instrument {name!r}: nothing in the images moves with its recorded pose; check that its poses are in the "
+            "cameras' world frame and in mm (`neeco check`), or train with --method neeco as published"
+        )
+    if moves_with_pose(session, evidence, name, shape):
+        return shape
+    return shape_around_frame(shape, evidence.distance, search.seeds, generator)
+
+
+def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, shape: CarvedShape) -> bool:
+    """Whether the evidence moves with the instrument: with poses exchanged among frames it must be weaker.
+
+    Where it is not (an instrument that hardly moves, say), carving cannot separate the instrument from static parts of
+    the scene.
+    """
+    search = session.config.deformation.carving
+    views = posed_views(evidence, name, search)
+    own, _ = score_points(evidence, views.own, shape.seeds)
+    other = views.exchanged_scores(shape.seeds)
+    moves = float(own.mean()) > search.motion_ratio * float(other.mean())
+    session.scene.diagnostics.setdefault("instruments", {})[name] = {
+        "evidence": round(float(own.mean()), 4),
+        "evidence_of_other_poses": round(float(other.mean()), 4),
+        "moves_with_its_pose": moves,
+    }
+    if not moves:
+        session.report(
+            f"warning: {name}: the images hardly depend on its recorded pose; its shape is searched around the "
+            "tracked frame, and its labels may be wrong (record more motion, or check that poses are registered)"
+        )
+    return moves
+
+
+def shape_around_frame(shape: CarvedShape, distance: float, count: int, generator: torch.Generator) -> CarvedShape:
+    """The initial shape where carving cannot be trusted: `count` seeds around the tracked frame, which is on the
+    body."""
+    spread = SEED_SPREAD * distance
+    seeds = (torch.randn(count, 3, generator=generator, device=generator.device) * spread).to(shape.seeds)
+    frame = torch.eye(4, device=seeds.device)
+    return replace(shape, instrument_from_shaft=frame, near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds)
 
 
 def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: CarvingSettings) -> CarvedShape | None:

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from neeco.capture.kinematics import PRISMATIC, KinematicTree, Link
 from neeco.geometry.rotations import rotate_about
-from neeco.methods.kinematic.articulation.base import Articulation
-from neeco.methods.kinematic.articulation.hinges import MIN_PART_SHARE, farthest
+from neeco.methods.kinematic.articulation import Articulation
+from neeco.methods.kinematic.hinges import MIN_PART_SHARE, farthest
 from neeco.scene.drawable import JointMotion
 
 # standard deviations of what is stated against what is so

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
+from articulated_worlds import Tree, assert_same_as_definition, hinges, make_world, posed, trees
 from hypothesis import given, settings
-from posing_worlds import Tree, assert_same_as_definition, hinges, make_world, posed, trees
 
-from neeco.raster import posing
+from neeco.raster import articulated as posing
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's, of the interpreter
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's, of
 @pytest.fixture(autouse=True)
 def by_triton(monkeypatch: pytest.MonkeyPatch) -> None:
     """float32 on the CPU is posed by the kernels, as float32 on a CUDA device is elsewhere."""
-    from neeco.raster.triton.posing import Posing
+    from neeco.raster.triton.articulated import Posing
 
     monkeypatch.setattr(posing, "_kernel", lambda given: Posing if given[0].dtype == torch.float32 else None)
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
+from torch import Tensor
+
 from neeco.fitting.refinement import RefineConfig
 from neeco.methods.breathing import Breathing
-from neeco.methods.carving.evidence import Evidence, gather_evidence
+from neeco.methods.space_carving import Evidence, carved_shape, gather_evidence
 from neeco.methods.static import Static
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig, method_defaults
-from neeco.training.session import new_session
+from neeco.training.session import GaussianSession, new_session
 
 DENSITY_START = 200  # steps of a longer fit of the tissue before it adds Gaussians
 
@@ -69,3 +72,14 @@ def fit_tissue(
         session.step()
     tissue.requires_grad_(False)
     return tissue
+
+
+def carve_seeds(session: GaussianSession) -> list[tuple[Tensor, float]]:
+    """Points [P, 3] mm on every instrument in its own frame, and its shaft's radius, mm. Raises NeecoError as
+    `find_instruments` does."""
+    session.report("looking for the instruments, on which Gaussians begin")
+    evidence = tissue_evidence(session.scene, session.views, session.config)
+    generator = torch.Generator().manual_seed(session.config.seed)
+    names = [instrument.name for instrument in session.scene.instruments]
+    shapes = [carved_shape(session, evidence, name, generator) for name in names]
+    return [(shape.seeds, shape.radius) for shape in shapes]

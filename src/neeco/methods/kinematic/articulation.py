@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from neeco.raster.posing import ArticulatedBody, link_weights
+from neeco.raster.articulated import ArticulatedBody, link_weights
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import JointMotion, Skeleton
 

@@ -1,4 +1,4 @@
-"""Posing bodies of links that joints move, as `neeco.raster.posing` defines it: a Gaussian per lane."""
+"""Posing bodies of links that joints move, as `neeco.raster.articulated` defines it: a Gaussian per lane."""
 
 from collections.abc import Sequence
 

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).parent))
-from posing_worlds import Tree, assert_same_as_definition, hinges, make_world, posed, trees
+from articulated_worlds import Tree, assert_same_as_definition, hinges, make_world, posed, trees
 
 from neeco.errors import NeecoError
 from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import kernels
+from neeco.raster.articulated import MOST_JOINTS, ArticulatedBody, pose_bodies
 from neeco.raster.native import set_threads
-from neeco.raster.posing import MOST_JOINTS, ArticulatedBody, pose_bodies
 
 
 @pytest.mark.parametrize("roll", [0.0, 2.1])
