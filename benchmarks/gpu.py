@@ -46,7 +46,7 @@ from neeco.raster.losses import photometric_loss
 from neeco.raster.native import synchronise
 from neeco.raster.optimizer import adam_step
 from neeco.raster.triton import ready
-from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.studies.machine import machine
 from neeco.studies.training_job import Budget, TrainingJob
@@ -113,7 +113,7 @@ def backends_on(device: torch.device) -> list[Backend]:
     return found
 
 
-def surface_scene(gaussians: Gaussians, camera: Camera) -> Scene:
+def surface_scene(gaussians: Gaussians, camera: Camera) -> GaussianScene:
     """`kinematic`'s scene of these Gaussians; the last fifth is a grasper's, whose frame is the world's."""
     count = len(gaussians)
     held = count // 5
@@ -130,7 +130,7 @@ def surface_scene(gaussians: Gaussians, camera: Camera) -> Scene:
     )
     deformation = make_deformation("kinematic", (GRASPER,), method_settings("kinematic", {}))
     recorded = Recorded(("000000",), ("train",), (STATE,), (camera,))
-    scene = Scene("kinematic", canonical, deformation, (GRASPER,), recorded, torch.zeros(3))
+    scene = GaussianScene("kinematic", canonical, deformation, (GRASPER,), recorded, torch.zeros(3))
     scene.sh_degree = 3
     return scene
 

@@ -34,7 +34,7 @@ from neeco.labels.labellers import (
     find_thresholds,
 )
 from neeco.raster.types import Gaussians
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.scene.deformation import Deltas, LabelledByMotion
 from neeco.training.run import open_run
 
@@ -69,7 +69,7 @@ class View:
 
     def iou(self, origin: str, thresholds: DeltaThresholds) -> float:
         """Overlap of what exceeds the thresholds, as the paper draws it, with the true mask."""
-        labeller = ThresholdLabels(cast("Scene", self.moved[origin]), thresholds)
+        labeller = ThresholdLabels(cast("GaussianScene", self.moved[origin]), thresholds)
         owners = labeller.owners(self.state, self.gaussians)
         parts = labeller.draw(self.gaussians, self.camera, owners)[1]
         return iou(parts.cpu() > 0, self.truth, self.counted)
@@ -79,14 +79,14 @@ def mean_iou(views: Sequence[View], origin: str, thresholds: DeltaThresholds) ->
     return mean_of([view.iou(origin, thresholds) for view in views])
 
 
-def mean_deltas(scene: Scene) -> Deltas:
+def mean_deltas(scene: GaussianScene) -> Deltas:
     """Each Gaussian's mean change from canonical over recorded states."""
     states = scene.recorded.states
     found = [scene.deltas(states[k]) for k in evenly_spaced(len(states), THRESHOLD_STATES, floor=True)]
     return Deltas(*(torch.stack([getattr(deltas, kind) for deltas in found]).mean(0) for kind in DELTAS))
 
 
-def make_views(scene: Scene, capture: Capture, split: str) -> list[View]:
+def make_views(scene: GaussianScene, capture: Capture, split: str) -> list[View]:
     """The frames of `split` that have a true mask. Raises NeecoError when there are none."""
     mean, views = mean_deltas(scene), []
     for frame in capture.split(split):
@@ -115,7 +115,7 @@ def candidates(magnitudes: Tensor) -> list[float]:
 def scan(views: Sequence[View], origin: str) -> dict[str, Any]:
     """The mean IoU at every threshold of each kind of delta alone, and of the best of each together:
     {"kinds": {kind: {"thresholds", "iou"}}, "together": IoU, "best": which, "thresholds": of the best, "iou": its}."""
-    scene_of = [(cast("Scene", view.moved[origin]), view.state) for view in views]
+    scene_of = [(cast("GaussianScene", view.moved[origin]), view.state) for view in views]
     magnitudes = [delta_magnitudes(*given) for given in scene_of]
     kinds: dict[str, dict[str, list[float]]] = {}
     alone: dict[str, tuple[float, DeltaThresholds]] = {}
@@ -151,7 +151,11 @@ def label_scan(folder: Path) -> dict[str, Any] | None:
         return read_scan(folder)
     with open_run(folder) as run:
         scene = run.scene
-        if not isinstance(scene, Scene) or not isinstance(scene.deformation, LabelledByMotion) or not scene.instruments:
+        if (
+            not isinstance(scene, GaussianScene)
+            or not isinstance(scene.deformation, LabelledByMotion)
+            or not scene.instruments
+        ):
             return None
         capture, evaluation = run.capture(), read_evaluation(folder)["given"]
         views = {split: make_views(scene, capture, split) for split in evaluation if split != "train"}

@@ -27,8 +27,8 @@ from neeco.capture.model import State
 from neeco.evaluation.image_metrics import psnr
 from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize
-from neeco.scene.scene import Scene, gaussian_scene
-from neeco.training.run import open_run
+from neeco.scene.gaussian_scene import GaussianScene
+from neeco.training.run import open_gaussian_run
 from neeco.viewer.export import export_page
 
 OPENINGS = 5
@@ -67,7 +67,7 @@ def shown(page: Any, frame: int, reading: float | None) -> tuple[np.ndarray, np.
     return raw[0].reshape(height, width, 4)[..., :3] / 255, raw[1].reshape(height, width), raw[2].reshape(height, width)
 
 
-def states(scene: Scene, frame: int) -> Iterator[tuple[float | None, State]]:
+def states(scene: GaussianScene, frame: int) -> Iterator[tuple[float | None, State]]:
     """The recorded state, and the same with the reading of the frame half the recording away."""
     recorded = scene.recorded.states
     yield None, recorded[frame]
@@ -80,7 +80,7 @@ def states(scene: Scene, frame: int) -> Iterator[tuple[float | None, State]]:
 
 
 @torch.no_grad()
-def compare(page: Any, scene: Scene, frame: int) -> None:
+def compare(page: Any, scene: GaussianScene, frame: int) -> None:
     """A row of the table for every state of a frame."""
     for reading, state in states(scene, frame):
         truth = scene.render(state, scene.recorded.cameras[frame], labels=True)
@@ -97,7 +97,7 @@ def compare(page: Any, scene: Scene, frame: int) -> None:
 
 
 @torch.no_grad()
-def native_rate(scene: Scene, seconds: float) -> float:
+def native_rate(scene: GaussianScene, seconds: float) -> float:
     """Posed drawings a second, by the native kernels."""
     recorded, drawn, began = scene.recorded, 0, time.monotonic()
     while time.monotonic() - began < seconds:
@@ -126,8 +126,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=5.0)
     arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder, open_run(arguments.run) as trained, sync_playwright() as driver:
-        scene = gaussian_scene(trained.scene, "page")
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        open_gaussian_run(arguments.run, "page") as trained,
+        sync_playwright() as driver,
+    ):
+        scene = trained.scene
         path = Path(folder) / "page.html"
         print(export_page(arguments.run, path, 3, torch.device("cpu")), end="\n\n")
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])

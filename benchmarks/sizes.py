@@ -24,8 +24,7 @@ from neeco.evaluation.mask_folders import load_reference
 from neeco.labels.drawing import draw
 from neeco.raster import Camera, Gaussians, rasterize
 from neeco.raster.reference import LOW_PASS, camera_from_world, project
-from neeco.scene.scene import gaussian_scene
-from neeco.training.run import open_run
+from neeco.training.run import open_gaussian_run
 
 
 def compensated(gaussians: Gaussians, camera: Camera, scale: float) -> Gaussians:
@@ -46,8 +45,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=12, help="of split test")
     parser.add_argument("--scales", type=float, nargs="+", default=[1.0, 0.9, 0.75, 0.5, 0.25])
     given = parser.parse_args()
-    with open_run(given.run) as trained:
-        scene = gaussian_scene(trained.scene, "sizes")
+    with open_gaussian_run(given.run, "sizes") as trained:
+        scene = trained.scene
         learned = scene.recorded.cameras[0]
         capture = trained.capture() if given.truth is None else read_capture(given.truth)
         frames = capture.split("test")[: given.frames]

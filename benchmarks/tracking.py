@@ -48,13 +48,12 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 from neeco.labels.drawing import draw
-from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.camera_effects import SMOKE_MM, apply_effects
 from neeco.tracking.fitting import Fitter
 from neeco.tracking.follow import Follower
 from neeco.tracking.track import state_of
 from neeco.tracking.trust import Reference
-from neeco.training.run import load_run, open_run
+from neeco.training.run import load_run, open_gaussian_run, open_run
 
 DEG = math.pi / 180
 TIP_BEYOND = 15.0  # mm beyond the hinge along the shaft: a point near the tips
@@ -272,8 +271,8 @@ def single(given: argparse.Namespace) -> None:
     """Find the state in each of some frames, nothing known before, and print errors."""
     capture, truth, rows, seconds = read_capture(given.capture), Truth.read(given.capture), [], 0.0
     chosen = [frame for frame in capture.frames if not given.splits or frame.split in given.splits][:: given.every]
-    with open_run(given.run) as opened, torch.no_grad():
-        scene = gaussian_scene(opened.scene, "track")
+    with open_gaussian_run(given.run, "track") as opened, torch.no_grad():
+        scene = opened.scene
         fitter = Fitter.of(scene)
         follower = Follower.of(chosen, fitter, Reference.of(fitter, opened.capture().split("train")))
         for k, frame in enumerate(chosen):

@@ -11,7 +11,7 @@ from rod_world import CAMERA, WALL_MM, FakeRun
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.kinematic.deformation import Kinematic
-from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.io import save_scene
 
 RADIUS = 6.0  # mm, of a ball
@@ -33,7 +33,7 @@ def ball_scene(
     places: list[tuple[float, float, float]],
     wall: float = WALL_MM,
     color: float = 0.5,
-) -> Scene:
+) -> GaussianScene:
     """A grey ball recorded at `places` before a red wall."""
     tissue = [(x, y, wall) for x in np.linspace(-110, 110, 45) for y in np.linspace(-90, 90, 37)]
     rng = np.random.default_rng(0)
@@ -57,11 +57,13 @@ def ball_scene(
     names = tuple(f"{k:06d}" for k in range(len(states)))
     recorded = Recorded(names, ("train",) * len(states), states, (CAMERA,) * len(states))
     instruments = (Instrument(name, {}),)
-    scene = Scene("kinematic", canonical, Kinematic(instruments), instruments, recorded, torch.tensor([0.0, 0, wall]))
+    scene = GaussianScene(
+        "kinematic", canonical, Kinematic(instruments), instruments, recorded, torch.tensor([0.0, 0, wall])
+    )
     return scene.requires_grad_(False)  # as a scene is that was read
 
 
-def run_of(scene: Scene, path: Path) -> FakeRun:
+def run_of(scene: GaussianScene, path: Path) -> FakeRun:
     path.mkdir()
     save_scene(scene, path / "scene.safetensors")
     return FakeRun(path, scene)

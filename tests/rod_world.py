@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.geometry.camera import Camera
-from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.deformation import UNPERTURBED, Deformation, Deltas, Perturbation, Posed
 
 WALL_MM = 100.0
@@ -75,7 +75,7 @@ def rod_state(x: float = 0.0, y: float = 0.0, z: float = 70.0, roll: float = 0.0
     return State({"rod": InstrumentState(torch.from_numpy(pose), {"jaw_angle": jaw})}, time=0.0)
 
 
-def make_scene() -> Scene:
+def make_scene() -> GaussianScene:
     """640 tissue Gaussians in a wall at 100 mm; 60 of the shaft and 30 of the jaw."""
     wall = [(x, y, WALL_MM) for x in np.linspace(-80, 80, 32) for y in np.linspace(-60, 60, 20)]
     shaft = [(0.0, y, 0.0) for y in np.linspace(-40, 0, 60)]
@@ -101,7 +101,7 @@ def make_scene() -> Scene:
     names = tuple(f"{k:06d}" for k in range(len(states)))
     recorded = Recorded(names, ("train",) * len(states), states, (CAMERA,) * len(states))
     instruments = (Instrument("rod", {"jaw_angle": (0.0, 0.9)}),)
-    return Scene("rod", canonical, Rod(len(jaw)), instruments, recorded, torch.tensor([0.0, 0, WALL_MM]))
+    return GaussianScene("rod", canonical, Rod(len(jaw)), instruments, recorded, torch.tensor([0.0, 0, WALL_MM]))
 
 
 @dataclass(frozen=True)
@@ -109,17 +109,17 @@ class FakeRun:
     """As much of a run as synthesis uses."""
 
     path: Path
-    scene: Scene
+    scene: GaussianScene
 
 
 @pytest.fixture(scope="session")
-def scene() -> Scene:
+def scene() -> GaussianScene:
     torch.set_num_threads(1)
     return make_scene()
 
 
 @pytest.fixture(scope="session")
-def run(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> FakeRun:
+def run(scene: GaussianScene, tmp_path_factory: pytest.TempPathFactory) -> FakeRun:
     path = tmp_path_factory.mktemp("run")
     (path / "scene.safetensors").write_bytes(b"the scene's bits")
     return FakeRun(path, scene)

@@ -10,7 +10,7 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid_from_vector
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.nerfies.field import NerfiesSettings, NerfScene
-from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.method_registry import make_deformation, method_settings
 
 TISSUE, INSTRUMENT = 20, 40
@@ -52,7 +52,7 @@ def random_canonical(generator: torch.Generator, counts: tuple[int, ...] = (TISS
     )
 
 
-def make_scene(method: str) -> Scene:
+def make_scene(method: str) -> GaussianScene:
     """A scene of `method` with everything that is learned at random, and eight recorded states."""
     generator = torch.Generator().manual_seed(3)
     canonical = random_canonical(generator)
@@ -70,7 +70,7 @@ def make_scene(method: str) -> Scene:
     torch.manual_seed(0)
     deformation = make_deformation(method, instruments, method_settings(method, SMALL.get(method, {})))
     canonical = canonical.with_extras(**deformation.initial_extras(canonical) | dict(canonical.extras))
-    scene = Scene(method, canonical, deformation, instruments, recorded, torch.tensor([1.0, 2.0, 80.0]))
+    scene = GaussianScene(method, canonical, deformation, instruments, recorded, torch.tensor([1.0, 2.0, 80.0]))
     scene.sh_degree = 2
     if method == "kinematic":
         hinges = scene.deformation.articulations[0]

@@ -16,8 +16,8 @@ from neeco.capture.writer import write_capture
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.methods.kinematic.articulation import LINK_LOGITS
-from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.drawable import Learned
+from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
+from neeco.scene.drawable import DrawableScene
 from neeco.scene.io import save_scene
 from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.training.config import TrainConfig
@@ -35,7 +35,7 @@ def camera(turn: float = 0.0) -> Camera:
     return Camera(pose, fx=60.0, fy=60.0, cx=WIDTH / 2, cy=HEIGHT / 2, width=WIDTH, height=HEIGHT)
 
 
-def grasper_scene(name: str = "grasper", joint: str = "jaw_angle", frame_name: str = "{:06d}") -> Scene:
+def grasper_scene(name: str = "grasper", joint: str = "jaw_angle", frame_name: str = "{:06d}") -> GaussianScene:
     """A shaft along z of its frame with two jaws beyond z = 0, before a red wall 100 mm away; the camera turns."""
     wall = [(x, y, 100.0) for x in np.linspace(-90, 90, 30) for y in np.linspace(-70, 70, 24)]
     shaft = [(math.cos(a) * 2, math.sin(a) * 2, z) for z in np.linspace(-40, 0, 30) for a in (0.0, 2.1, 4.2)]
@@ -74,11 +74,11 @@ def grasper_scene(name: str = "grasper", joint: str = "jaw_angle", frame_name: s
         states,
         tuple(camera(0.01 * k) for k in range(FRAMES)),
     )
-    scene = Scene("kinematic", canonical, deformation, instruments, recorded, torch.tensor([0.0, 0.0, 100.0]))
+    scene = GaussianScene("kinematic", canonical, deformation, instruments, recorded, torch.tensor([0.0, 0.0, 100.0]))
     return scene.requires_grad_(False)
 
 
-def write_recorded_images(scene: Learned, root: Path, masks: bool = True) -> Path:
+def write_recorded_images(scene: DrawableScene, root: Path, masks: bool = True) -> Path:
     """The capture whose recorded images the scene draws, with true masks where it has labels. Times are the frames'."""
     frames = []
     for name, split, state, taken_by in zip(
@@ -96,7 +96,7 @@ def write_recorded_images(scene: Learned, root: Path, masks: bool = True) -> Pat
     return root
 
 
-def write_run(scene: Learned, path: Path, capture: Path, finished: bool = True) -> Path:
+def write_run(scene: DrawableScene, path: Path, capture: Path, finished: bool = True) -> Path:
     """A run folder of `scene`; `finished`: with the scene in it."""
     path.mkdir(parents=True, exist_ok=True)
     write_config(path, capture, TrainConfig(method=scene.method), "0" * 64)
@@ -113,7 +113,7 @@ def write_run(scene: Learned, path: Path, capture: Path, finished: bool = True) 
     return path
 
 
-def brighter(scene: Scene) -> Scene:
+def brighter(scene: GaussianScene) -> GaussianScene:
     """The same, after more training."""
     other = grasper_scene(scene.instruments[0].name)
     other.canonical = replace(other.canonical, sh_dc=other.canonical.sh_dc + 0.5)

@@ -9,7 +9,7 @@ from scene_worlds import CAMERA, TISSUE, pose_of, random_canonical
 from neeco.capture.kinematics import PRISMATIC, REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.methods.kinematic.articulation import LINK_LOGITS
-from neeco.scene import Recorded, Scene
+from neeco.scene import GaussianScene, Recorded
 from neeco.scene.method_registry import make_deformation, method_settings
 
 X, Y = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
@@ -44,7 +44,7 @@ def driver_state(pose: torch.Tensor, readings: dict[str, float], time: float = 0
     return State({"driver": InstrumentState(pose, readings)}, time)
 
 
-def make_driver(frames: int = 8) -> Scene:
+def make_driver(frames: int = 8) -> GaussianScene:
     """Random Gaussians of the links, axes a little off those stated, and recorded states in which all joints move."""
     generator = torch.Generator().manual_seed(1)
     canonical = random_canonical(generator)
@@ -60,7 +60,7 @@ def make_driver(frames: int = 8) -> Scene:
         states.append(driver_state(pose_of(0.3 * k - 1, 0.2 * k, 0.1, 2 * k - 6, 3 - k, 70 - k), readings, 0.04 * k))
     names = tuple(f"{k:06d}" for k in range(frames))
     recorded = Recorded(names, ("train",) * frames, tuple(states), (CAMERA,) * frames)
-    scene = Scene("kinematic", canonical, deformation, (instrument,), recorded, torch.zeros(3))
+    scene = GaussianScene("kinematic", canonical, deformation, (instrument,), recorded, torch.zeros(3))
     links = scene.deformation.articulations[0]
     links.radius.fill_(3.0)
     links.extent.copy_(torch.tensor([-20.0, 2.0]))

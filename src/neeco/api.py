@@ -22,7 +22,7 @@ from neeco.geometry.rotations import rigid_fault
 from neeco.labels.annotation import LabelledImage, RGBDImage, draw_labelled
 from neeco.plausible import Fault, focal_fault
 from neeco.raster.devices import device_of
-from neeco.scene.drawable import Learned
+from neeco.scene.drawable import DrawableScene
 from neeco.scene.io import load_scene
 from neeco.training import run as runs
 from neeco.training.config import training_config
@@ -43,13 +43,13 @@ class Scene:
     file is no scene, or the device cannot be used.
     """
 
-    learned: Learned  # the scene as training makes it: a torch module
+    learned: DrawableScene  # the scene as training makes it: a torch module
 
     def __init__(self, file: PathLike, device: str = "auto") -> None:
         self.learned = load_scene(Path(file)).to(device_of(device))
 
     @classmethod
-    def of(cls, learned: Learned) -> Scene:
+    def of(cls, learned: DrawableScene) -> Scene:
         """The public face of a scene that is in memory."""
         scene = cls.__new__(cls)
         scene.learned = learned
@@ -132,8 +132,8 @@ class Run:
         return self._run.capture()
 
     @property
-    def _run(self) -> runs.Run:
-        return runs.Run(self.path, self.scene.learned, dict(self.config))
+    def _run(self) -> runs.TrainedRun:
+        return runs.TrainedRun(self.path, self.scene.learned, dict(self.config))
 
     def evaluate(
         self,

@@ -13,24 +13,25 @@ from neeco.errors import NeecoError
 T = TypeVar("T")
 
 
-def plugins(base: type[T], attribute: str, package: str) -> dict[str, type[T]]:
-    """Every class of `base` with its own `attribute`, by the name under it: those of the public modules and packages in
-    `package`, and those of entry points in the group `package`. Sorted by name.
+def plugins(base: type[T], attribute: str, package: str, group: str | None = None) -> dict[str, type[T]]:
+    """Return every class of `base` with its own `attribute`, by the name under it: those of the public modules and
+    packages in `package`, and those of entry points in `group` (None: the package's name). Sorted by name.
 
     Raises NeecoError when two share a name, or an entry point cannot be loaded.
     """
     found = named_classes(base, attribute, importlib.import_module(package))
-    for point in entry_points(group=package):
+    group = group or package
+    for point in entry_points(group=group):
         try:
             kind = point.load()
         except Exception as error:  # another's code: whatever it raises, the user has to know whose it is
             raise NeecoError(
-                f"{point.value}: entry point of {_owner(point.dist)} in {package} cannot be loaded "
+                f"{point.value}: entry point of {_owner(point.dist)} in {group} cannot be loaded "
                 f"({type(error).__name__}: {error}); update or uninstall it"
             ) from None
         if not (isinstance(kind, type) and issubclass(kind, base) and attribute in vars(kind)):
             raise NeecoError(
-                f"{point.value}: entry point of {_owner(point.dist)} in {package} is no {base.__name__} with a "
+                f"{point.value}: entry point of {_owner(point.dist)} in {group} is no {base.__name__} with a "
                 f"`{attribute}`; update or uninstall it"
             )
         _add(found, getattr(kind, attribute), kind, attribute)

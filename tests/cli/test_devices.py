@@ -14,7 +14,7 @@ from neeco.cli import main
 from neeco.cli._progress import resumable
 from neeco.errors import NeecoError
 from neeco.raster import devices
-from neeco.scene.scene import Scene
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_session import StepResult
 from neeco.scene.training_views import TrainingViews
 from neeco.studies import training_job
@@ -169,10 +169,10 @@ class TestADeviceThatFails:
 
     @pytest.mark.parametrize("verb", ["evaluate", "render"])
     def test_drawing_verbs_end_in_a_line(self, verb: str, made, monkeypatch, capsys) -> None:
-        def lost(scene: Scene, *args: object, **named: object) -> None:
+        def lost(scene: GaussianScene, *args: object, **named: object) -> None:
             raise RuntimeError("CUDA error: unspecified launch failure\nCUDA kernel errors might be reported")
 
-        monkeypatch.setattr(Scene, "at", lost)
+        monkeypatch.setattr(GaussianScene, "at", lost)
         assert main(command(verb, made, "cpu")) == 1
         line = capsys.readouterr().err.strip().splitlines()[-1]
         assert line.startswith("neeco: error: --device: the GPU gave up (CUDA error: unspecified launch failure): ")

@@ -20,8 +20,8 @@ from neeco.evaluation.evaluate import evaluate_run
 from neeco.methods.nerfies.field import Rays
 from neeco.raster import rasterize
 from neeco.raster.losses import photometric_loss
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.method_registry import methods
-from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig, training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
@@ -63,7 +63,7 @@ def close(there: Tensor, here: Tensor, tolerance: float = 1e-3) -> bool:
     return bool((there.detach().cpu().double() - here.double()).norm() <= tolerance * here.double().norm() + 1e-6)
 
 
-def all_of(scene: Scene) -> dict[str, Tensor]:
+def all_of(scene: GaussianScene) -> dict[str, Tensor]:
     """What the scene is posed, drawn and labelled as in one state, and the gradients of its loss."""
     scene.requires_grad_(True)
     canonical, device = scene.canonical, scene.center.device

@@ -16,7 +16,7 @@ from viewer_world import grasper_scene, write_recorded_images, write_run
 
 from neeco.cli import main
 from neeco.errors import NeecoError
-from neeco.scene.scene import Scene
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.viewer.controls import Controls
 from neeco.viewer.runs import ViewedRuns
 from neeco.viewer.views import IMAGE, render_run, scored, views_of
@@ -156,7 +156,7 @@ def test_the_viewer_says_that_a_gpu_failed_and_goes_on(run: str, monkeypatch: py
     runs = ViewedRuns([Path(run)])
     camera, controls = runs.loaded[0].recorded.cameras[2], Controls(2.0)
     with monkeypatch.context() as patch:
-        patch.setattr(Scene, "at", full)
+        patch.setattr(GaussianScene, "at", full)
         with pytest.raises(NeecoError, match=r"2\.50 GiB more were asked for"):
             render_run(runs, 0, controls, camera, 2, IMAGE)
     assert render_run(runs, 0, controls, camera, 2, IMAGE).picture.pixels.any()

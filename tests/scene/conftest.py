@@ -4,7 +4,7 @@ import pytest
 import torch
 from scene_worlds import make_scene
 
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 
 
 @pytest.fixture(autouse=True)
@@ -13,15 +13,15 @@ def one_thread() -> None:
 
 
 @pytest.fixture
-def kinematic() -> Scene:
+def kinematic() -> GaussianScene:
     return make_scene("kinematic")
 
 
 @pytest.fixture
-def neeco() -> Scene:
+def neeco() -> GaussianScene:
     return make_scene("neeco")
 
 
 @pytest.fixture(params=["kinematic", "neeco", "3dgs", "deformable-3dgs", "4dgs"])
-def any_scene(request: pytest.FixtureRequest) -> Scene:
+def any_scene(request: pytest.FixtureRequest) -> GaussianScene:
     return make_scene(request.param)

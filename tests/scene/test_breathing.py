@@ -14,7 +14,7 @@ from scene_worlds import TISSUE, grasper_state, make_scene, pose_of
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.methods.breathing import HARMONICS, Breathing
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.scene.io import load_scene, save_scene
 
 CAMERAS = [
@@ -31,7 +31,7 @@ def breathing(points: torch.Tensor) -> Breathing:
     return made
 
 
-def breathing_scene() -> Scene:
+def breathing_scene() -> GaussianScene:
     scene = make_scene("kinematic")
     scene.deformation.start_breathing(breathing(scene.canonical.means[:TISSUE]))
     scene.diagnostics["breathing"] = {"explained": 0.8}
@@ -75,7 +75,7 @@ def test_only_the_tissue_breathes_and_what_was_stored_does_so_again(tmp_path: Pa
     assert (posed[0][TISSUE:] == still.at(states[0]).means[TISSUE:]).all()
     save_scene(scene, tmp_path / "breathing.safetensors")
     loaded = load_scene(tmp_path / "breathing.safetensors")
-    assert isinstance(loaded, Scene)
+    assert isinstance(loaded, GaussianScene)
     assert all((loaded.at(state).means == means).all() for state, means in zip(states, posed, strict=True))
 
 

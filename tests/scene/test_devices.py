@@ -21,8 +21,8 @@ from neeco.methods.nerfies.session import elastic_loss, geman_mcclure
 from neeco.raster import rasterize
 from neeco.raster.losses import photometric_loss
 from neeco.scene.deformation import UNPERTURBED, Perturbation
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.method_registry import methods
-from neeco.scene.scene import Scene
 
 META = torch.device("meta")
 OF_GAUSSIANS = [name for name, kind in methods().items() if kind.has_gaussians]
@@ -33,13 +33,13 @@ def all_meta(*tensors: Tensor | None) -> bool:
 
 
 @pytest.fixture(params=OF_GAUSSIANS)
-def scene(request: pytest.FixtureRequest) -> Scene:
+def scene(request: pytest.FixtureRequest) -> GaussianScene:
     scene = make_scene(request.param).to(META)
     scene.background = 0.5
     return scene
 
 
-def test_a_scene_moves_with_all_it_has(scene: Scene) -> None:
+def test_a_scene_moves_with_all_it_has(scene: GaussianScene) -> None:
     assert all_meta(*scene.state_dict().values(), *scene.canonical.tensors().values(), scene.canonical.bodies)
 
 
@@ -50,7 +50,7 @@ def test_a_moved_scene_is_the_same_scene() -> None:
         assert torch.equal(there.canonical.tensors()[name], tensor), name
 
 
-def test_posing_labels_and_deltas_stay_on_the_device(scene: Scene) -> None:
+def test_posing_labels_and_deltas_stay_on_the_device(scene: GaussianScene) -> None:
     state = scene.recorded.states[3]
     disturbed = [
         scene.deformation.perturb(Perturbation(0.3), 5_000, 0.1, np.random.default_rng(seed)) for seed in range(8)
@@ -65,7 +65,7 @@ def test_posing_labels_and_deltas_stay_on_the_device(scene: Scene) -> None:
     assert all_meta(*(point for points in scene.keypoints(state).values() for point in points.values()))
 
 
-def test_losses_and_regularisers_stay_on_the_device_with_their_gradients(scene: Scene) -> None:
+def test_losses_and_regularisers_stay_on_the_device_with_their_gradients(scene: GaussianScene) -> None:
     scene.requires_grad_(True)
     for tensor in scene.canonical.tensors().values():
         tensor.requires_grad_(True)
@@ -110,7 +110,7 @@ class TestProducts:
             monkeypatch.setattr(module, "tf32_products", note)
         return asked
 
-    def test_a_network_that_moves_gaussians(self, scene: Scene, asked: list[torch.device]) -> None:
+    def test_a_network_that_moves_gaussians(self, scene: GaussianScene, asked: list[torch.device]) -> None:
         scene.at(scene.recorded.states[3])
         assert asked == ([META] if scene.deformation.large_operations else [])
 

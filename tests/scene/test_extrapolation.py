@@ -11,8 +11,8 @@ from neeco.capture.model import State
 from neeco.geometry.camera import Camera
 from neeco.scene.canonical import SH_C0, CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.method_registry import make_deformation, method_settings
-from neeco.scene.scene import Scene
 from neeco.scene.visibility import EXTRAPOLATED, count_views, extrapolate_tissue, outside_all_views
 
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=80.0, fy=80.0, cx=40.0, cy=32.0, width=80, height=64)
@@ -33,9 +33,9 @@ def wall() -> CanonicalGaussians:
                           opacity=0.95)  # fmt: skip
 
 
-def scene_of(canonical: CanonicalGaussians) -> Scene:
+def scene_of(canonical: CanonicalGaussians) -> GaussianScene:
     deformation = make_deformation("3dgs", (), method_settings("3dgs", {}))
-    return Scene("3dgs", canonical, deformation, (), Recorded(), torch.tensor([0.0, 0.0, DEPTH]))
+    return GaussianScene("3dgs", canonical, deformation, (), Recorded(), torch.tensor([0.0, 0.0, DEPTH]))
 
 
 def test_a_view_beyond_the_border_shows_the_extrapolated_wall() -> None:

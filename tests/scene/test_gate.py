@@ -14,7 +14,7 @@ from scene_worlds import GRASPER, grasper_state, make_scene, pose_of, random_can
 from neeco.errors import NeecoError
 from neeco.methods.nps import NPS, NPSSettings
 from neeco.methods.swept_volume import SweptVolume
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.scene.deformation import mark_moving
 from neeco.scene.io import load_scene, save_scene
 
@@ -27,16 +27,16 @@ def path_points() -> torch.Tensor:
     return torch.stack([12 * t, 6 * t**2, 3 * t], 1)
 
 
-def gated(scene: Scene) -> Scene:
+def gated(scene: GaussianScene) -> GaussianScene:
     """The same scene, network included, with its gate about `path_points`."""
     network = NPS(scene.instruments, NPSSettings(gate_mm=MARGIN_MM))
     network.load_state_dict(scene.deformation.state_dict(), strict=False)
     network.gate.cover(path_points())
-    return Scene("neeco", scene.canonical, network, scene.instruments, scene.recorded, scene.center)
+    return GaussianScene("neeco", scene.canonical, network, scene.instruments, scene.recorded, scene.center)
 
 
 @pytest.fixture
-def neeco() -> Scene:
+def neeco() -> GaussianScene:
     """A scene whose network moves every Gaussian."""
     scene = make_scene("neeco")
     torch.manual_seed(1)
@@ -57,7 +57,7 @@ def test_a_swept_volume_is_what_lies_within_the_margin_of_the_path() -> None:
     assert 0.01 < inside.float().mean() < 0.5
 
 
-def test_the_gate_changes_nothing_inside_and_moves_nothing_outside(neeco: Scene) -> None:
+def test_the_gate_changes_nothing_inside_and_moves_nothing_outside(neeco: GaussianScene) -> None:
     other = gated(neeco)
     inside = other.deformation.gate.contains(neeco.canonical.means)
     assert 5 < int(inside.sum()) < len(inside) - 5
@@ -74,13 +74,13 @@ def test_the_gate_changes_nothing_inside_and_moves_nothing_outside(neeco: Scene)
     assert not bound.scales[~inside].any()
 
 
-def test_gradients_pass_the_gate(neeco: Scene) -> None:
+def test_gradients_pass_the_gate(neeco: GaussianScene) -> None:
     other = gated(neeco)
     other.at(neeco.recorded.states[0]).means.square().sum().backward()
     assert other.deformation.head.weight.grad[:3].abs().max() > 0
 
 
-def test_a_gated_scene_comes_back_exactly(neeco: Scene, tmp_path: Path) -> None:
+def test_a_gated_scene_comes_back_exactly(neeco: GaussianScene, tmp_path: Path) -> None:
     other = gated(neeco)
     save_scene(other, tmp_path / "scene.safetensors")
     loaded = load_scene(tmp_path / "scene.safetensors")
@@ -90,7 +90,7 @@ def test_a_gated_scene_comes_back_exactly(neeco: Scene, tmp_path: Path) -> None:
     assert loaded.deformation.gate.bounded
 
 
-def test_the_published_network_has_no_gate(neeco: Scene) -> None:
+def test_the_published_network_has_no_gate(neeco: GaussianScene) -> None:
     assert neeco.deformation.gate is None
     assert not any("gate" in name for name in neeco.state_dict())
 

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.scene.io import load_scene, pack_scene, save_scene, save_tensors
 
 
-def test_a_scene_comes_back_exactly(any_scene: Scene, tmp_path: Path) -> None:
+def test_a_scene_comes_back_exactly(any_scene: GaussianScene, tmp_path: Path) -> None:
     any_scene.background = 0.75
     any_scene.diagnostics = {"joints": {"grasper.jaw_angle": {"found": True}}}
     with torch.no_grad():
@@ -45,7 +45,7 @@ def test_a_scene_comes_back_exactly(any_scene: Scene, tmp_path: Path) -> None:
             assert torch.equal(a.headlight.falloff, b.headlight.falloff)
 
 
-def test_a_scene_knows_the_lens_of_its_recording(kinematic: Scene, tmp_path: Path) -> None:
+def test_a_scene_knows_the_lens_of_its_recording(kinematic: GaussianScene, tmp_path: Path) -> None:
     lens = Lens(60.0, 61.0, 32.0, 24.0, (-0.3, 0.1, 0.0, 0.0, 0.01), (64, 48), (31.0, 25.0, 28.0))
     assert load_scene(_saved(kinematic, tmp_path)).recorded.lens is None
     kinematic.recorded = dataclasses.replace(kinematic.recorded, lens=lens)
@@ -56,25 +56,25 @@ def test_a_scene_knows_the_lens_of_its_recording(kinematic: Scene, tmp_path: Pat
         load_scene(_saved(kinematic, tmp_path))
 
 
-def _saved(scene: Scene, folder: Path) -> Path:
+def _saved(scene: GaussianScene, folder: Path) -> Path:
     save_scene(scene, folder / "scene.safetensors")
     return folder / "scene.safetensors"
 
 
-def test_saving_again_gives_the_same_bytes(any_scene: Scene, tmp_path: Path) -> None:
+def test_saving_again_gives_the_same_bytes(any_scene: GaussianScene, tmp_path: Path) -> None:
     first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
     save_scene(any_scene, first)
     save_scene(load_scene(first), second)
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_a_loaded_scene_wants_no_gradients(kinematic: Scene, tmp_path: Path) -> None:
+def test_a_loaded_scene_wants_no_gradients(kinematic: GaussianScene, tmp_path: Path) -> None:
     save_scene(kinematic, tmp_path / "scene.safetensors")
     loaded = load_scene(tmp_path / "scene.safetensors")
     assert not loaded.at(loaded.recorded.states[0]).means.requires_grad
 
 
-def test_the_file_is_tensors_and_json_alone(kinematic: Scene, tmp_path: Path) -> None:
+def test_the_file_is_tensors_and_json_alone(kinematic: GaussianScene, tmp_path: Path) -> None:
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)
     content = path.read_bytes()
@@ -86,7 +86,7 @@ def test_the_file_is_tensors_and_json_alone(kinematic: Scene, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("kept", [0, 5, 200, -10])
-def test_a_cut_file_is_refused(kinematic: Scene, tmp_path: Path, kept: int) -> None:
+def test_a_cut_file_is_refused(kinematic: GaussianScene, tmp_path: Path, kept: int) -> None:
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)
     path.write_bytes(path.read_bytes()[:kept])
@@ -103,7 +103,7 @@ def rewrite(path: Path, header_change, *drop: str) -> None:
     save_file(tensors, path, {"neeco": json.dumps(header)})
 
 
-def test_another_schema_is_refused_by_name(kinematic: Scene, tmp_path: Path) -> None:
+def test_another_schema_is_refused_by_name(kinematic: GaussianScene, tmp_path: Path) -> None:
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)
     rewrite(path, lambda header: header.update(schema="neeco-scene/9"))
@@ -112,7 +112,7 @@ def test_another_schema_is_refused_by_name(kinematic: Scene, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("grey", [1e300, -0.5, float("nan")])
-def test_a_background_that_is_not_grey_is_refused(kinematic: Scene, tmp_path: Path, grey: float) -> None:
+def test_a_background_that_is_not_grey_is_refused(kinematic: GaussianScene, tmp_path: Path, grey: float) -> None:
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)
     rewrite(path, lambda header: header.update(background=grey))
@@ -121,7 +121,9 @@ def test_a_background_that_is_not_grey_is_refused(kinematic: Scene, tmp_path: Pa
 
 
 @pytest.mark.parametrize(("old", "new"), [("rim", "extrapolate_tissue"), ("wrist_again", "refine_wrists")])
-def test_a_scene_whose_settings_had_other_names_is_read(kinematic: Scene, tmp_path: Path, old: str, new: str) -> None:
+def test_a_scene_whose_settings_had_other_names_is_read(
+    kinematic: GaussianScene, tmp_path: Path, old: str, new: str
+) -> None:
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)
 
@@ -135,7 +137,7 @@ def test_a_scene_whose_settings_had_other_names_is_read(kinematic: Scene, tmp_pa
     assert settings.hinge_start == 600
 
 
-def test_a_scene_from_before_shadows_casts_none(kinematic: Scene, tmp_path: Path) -> None:
+def test_a_scene_from_before_shadows_casts_none(kinematic: GaussianScene, tmp_path: Path) -> None:
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)
     shadow = [f"module.shadow_{part}" for part in ("offsets", "strengths", "width")]
@@ -147,7 +149,7 @@ def test_a_scene_from_before_shadows_casts_none(kinematic: Scene, tmp_path: Path
 
 
 @pytest.mark.parametrize("drop", ["canonical.means", "module.falloff", "recorded.poses"])
-def test_a_missing_tensor_is_refused(kinematic: Scene, tmp_path: Path, drop: str) -> None:
+def test_a_missing_tensor_is_refused(kinematic: GaussianScene, tmp_path: Path, drop: str) -> None:
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)
     rewrite(path, lambda header: None, drop)
@@ -167,7 +169,7 @@ def test_a_missing_tensor_is_refused(kinematic: Scene, tmp_path: Path, drop: str
     ],
 )
 def test_a_tensor_that_does_not_fit_is_refused(
-    kinematic: Scene, tmp_path: Path, name: str, change: Callable[[Tensor], Tensor], told: str
+    kinematic: GaussianScene, tmp_path: Path, name: str, change: Callable[[Tensor], Tensor], told: str
 ) -> None:
     tensors, header = pack_scene(kinematic)
     path = tmp_path / "scene.safetensors"
@@ -197,7 +199,7 @@ def test_no_file_is_no_scene(tmp_path: Path) -> None:
     ],
 )
 def test_recorded_poses_that_are_none_are_refused(
-    tensor: str, value: float, told: str, any_scene: Scene, tmp_path: Path
+    tensor: str, value: float, told: str, any_scene: GaussianScene, tmp_path: Path
 ) -> None:
     tensors, header = pack_scene(any_scene)
     if tensor not in tensors:
@@ -209,14 +211,16 @@ def test_recorded_poses_that_are_none_are_refused(
 
 
 @pytest.mark.parametrize("change", [{"recorded": 3}, {"instruments": [{"name": 1}]}, {"deformation": []}])
-def test_a_header_built_otherwise_is_refused(change: dict[str, object], any_scene: Scene, tmp_path: Path) -> None:
+def test_a_header_built_otherwise_is_refused(
+    change: dict[str, object], any_scene: GaussianScene, tmp_path: Path
+) -> None:
     tensors, header = pack_scene(any_scene)
     save_tensors(tensors, {"neeco": json.dumps(header | change)}, tmp_path / "scene.safetensors")
     with pytest.raises(NeecoError, match=r"scene.safetensors: header: .*; it is damaged; train again"):
         load_scene(tmp_path / "scene.safetensors")
 
 
-def test_an_unpaired_surrogate_is_refused(kinematic: Scene, tmp_path: Path) -> None:
+def test_an_unpaired_surrogate_is_refused(kinematic: GaussianScene, tmp_path: Path) -> None:
     tensors, header = pack_scene(kinematic)
     header["diagnostics"] = {"note": "\ud800"}
     save_tensors(tensors, {"neeco": json.dumps(header)}, tmp_path / "scene.safetensors")
@@ -224,7 +228,7 @@ def test_an_unpaired_surrogate_is_refused(kinematic: Scene, tmp_path: Path) -> N
         load_scene(tmp_path / "scene.safetensors")
 
 
-def test_both_cameras_of_a_still_scope_have_the_lamps_of_the_first(any_scene: Scene, tmp_path: Path) -> None:
+def test_both_cameras_of_a_still_scope_have_the_lamps_of_the_first(any_scene: GaussianScene, tmp_path: Path) -> None:
     recorded, right = any_scene.recorded, torch.eye(4)
     right[0, 3] = 5.0
     poses = [torch.eye(4) if index % 2 == 0 else right for index in range(len(recorded.cameras))]
@@ -240,7 +244,7 @@ def test_both_cameras_of_a_still_scope_have_the_lamps_of_the_first(any_scene: Sc
     assert torch.equal(second.world_from_lamps, torch.eye(4))
 
 
-def test_infinite_numbers_are_no_json(kinematic: Scene, tmp_path: Path) -> None:
+def test_infinite_numbers_are_no_json(kinematic: GaussianScene, tmp_path: Path) -> None:
     (item, *others) = kinematic.instruments
     open_ended = {**item.joints, next(iter(item.joints)): (-math.inf, 1.5)}
     kinematic.instruments = (dataclasses.replace(item, joints=open_ended), *others)
@@ -254,7 +258,7 @@ def test_infinite_numbers_are_no_json(kinematic: Scene, tmp_path: Path) -> None:
     assert again.diagnostics["found"] == {"depth_mm": [None, 2.0], "share": None}
 
 
-def test_a_scene_remembers_that_its_scope_stood_still(any_scene: Scene, tmp_path: Path) -> None:
+def test_a_scene_remembers_that_its_scope_stood_still(any_scene: GaussianScene, tmp_path: Path) -> None:
     any_scene.recorded = dataclasses.replace(any_scene.recorded, still=True)
     save_scene(any_scene, tmp_path / "scene.safetensors")
     assert load_scene(tmp_path / "scene.safetensors").recorded.still

@@ -16,20 +16,20 @@ from neeco.errors import NeecoError
 from neeco.geometry.rotations import quat_to_matrix, rotate_about
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.kinematic.deformation import Kinematic, Spin
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 
 POSE = pose_of(0.5, -0.2, 0.9, 10, -4, 70)
 UNIT = torch.nn.functional.normalize
 
 
-def assign(scene: Scene, part: int) -> None:
+def assign(scene: GaussianScene, part: int) -> None:
     """Give every Gaussian of the instrument to one part."""
     logits = torch.zeros(len(scene.canonical), 3)
     logits[:, part] = SURE
     scene.canonical = scene.canonical.with_extras(**{LINK_LOGITS: logits})
 
 
-def test_an_instruments_gaussians_move_with_its_pose(kinematic: Scene) -> None:
+def test_an_instruments_gaussians_move_with_its_pose(kinematic: GaussianScene) -> None:
     before, after = kinematic.at(grasper_state(pose_of(0, 0, 0, 0, 0, 0))), kinematic.at(grasper_state(POSE))
     rotation, translation = POSE[:3, :3].float(), POSE[:3, 3].float()
     expected = before.means[TISSUE:] @ rotation.T + translation
@@ -38,7 +38,7 @@ def test_an_instruments_gaussians_move_with_its_pose(kinematic: Scene) -> None:
     assert torch.allclose(quat_to_matrix(UNIT(after.quats[TISSUE:], dim=-1)), turned, atol=1e-5)
 
 
-def test_tissue_never_moves(kinematic: Scene) -> None:
+def test_tissue_never_moves(kinematic: GaussianScene) -> None:
     posed = kinematic.at(grasper_state(POSE, 1.2))
     assert torch.equal(posed.means[:TISSUE], kinematic.canonical.means[:TISSUE])
     deltas = kinematic.deltas(grasper_state(POSE, 1.2))
@@ -46,14 +46,14 @@ def test_tissue_never_moves(kinematic: Scene) -> None:
     assert deltas.means[TISSUE:].norm(dim=1).min() > 0
 
 
-def test_a_joint_leaves_the_shaft_alone(kinematic: Scene) -> None:
+def test_a_joint_leaves_the_shaft_alone(kinematic: GaussianScene) -> None:
     assign(kinematic, 0)
     shut, open_ = kinematic.at(grasper_state(POSE, 0.0)), kinematic.at(grasper_state(POSE, 1.5))
     assert torch.allclose(shut.means, open_.means, atol=1e-5)
 
 
 @pytest.mark.parametrize("part", [1, 2])
-def test_a_joint_turns_its_parts_by_gain_times_reading_about_the_hinge(kinematic: Scene, part: int) -> None:
+def test_a_joint_turns_its_parts_by_gain_times_reading_about_the_hinge(kinematic: GaussianScene, part: int) -> None:
     assign(kinematic, part)
     identity = pose_of(0, 0, 0, 0, 0, 0)
     shut, open_ = (kinematic.at(grasper_state(identity, jaw)).means[TISSUE:] for jaw in (0.0, 0.7))
@@ -65,7 +65,7 @@ def test_a_joint_turns_its_parts_by_gain_times_reading_about_the_hinge(kinematic
     assert (open_ - shut).norm(dim=1).max() > 1
 
 
-def test_at_the_middle_reading_a_change_of_gains_moves_nothing(kinematic: Scene) -> None:
+def test_at_the_middle_reading_a_change_of_gains_moves_nothing(kinematic: GaussianScene) -> None:
     hinges = kinematic.deformation.articulations[0]
     hinges.middle.fill_(0.6)
     before = [kinematic.at(grasper_state(POSE, jaw)).means for jaw in (0.6, 1.1)]
@@ -76,7 +76,7 @@ def test_at_the_middle_reading_a_change_of_gains_moves_nothing(kinematic: Scene)
     assert not torch.allclose(before[1], after[1], atol=0.1)
 
 
-def test_tips_meet_where_the_joint_is_closed(kinematic: Scene) -> None:
+def test_tips_meet_where_the_joint_is_closed(kinematic: GaussianScene) -> None:
     hinges = kinematic.deformation.articulations[0]
     hinges.middle.fill_(0.6)
     hinges.closed.fill_(0.1)
@@ -85,7 +85,7 @@ def test_tips_meet_where_the_joint_is_closed(kinematic: Scene) -> None:
     assert (open_["tip_left"] - open_["tip_right"]).norm().item() > 1
 
 
-def test_tips_turn_with_their_parts_wherever_they_were_measured(kinematic: Scene) -> None:
+def test_tips_turn_with_their_parts_wherever_they_were_measured(kinematic: GaussianScene) -> None:
     hinges = kinematic.deformation.articulations[0]
     pivot, axis = hinges.hinge(0)
     _, direction = hinges.shaft()
@@ -102,7 +102,7 @@ def test_tips_turn_with_their_parts_wherever_they_were_measured(kinematic: Scene
             assert torch.allclose(told, drawn, atol=1e-3)
 
 
-def test_what_lies_far_behind_the_hinge_never_turns(kinematic: Scene) -> None:
+def test_what_lies_far_behind_the_hinge_never_turns(kinematic: GaussianScene) -> None:
     assign(kinematic, 1)
     hinges = kinematic.deformation.articulations[0]
     hinges.radius.fill_(2.0)
@@ -117,7 +117,7 @@ def test_what_lies_far_behind_the_hinge_never_turns(kinematic: Scene) -> None:
     assert moved[places > depth].min() > 1
 
 
-def test_what_turns_is_no_longer_than_the_shaft_is_thick(kinematic: Scene) -> None:
+def test_what_turns_is_no_longer_than_the_shaft_is_thick(kinematic: GaussianScene) -> None:
     hinges = kinematic.deformation.articulations[0]
     hinges.radius.fill_(2.0)
     with torch.no_grad():
@@ -129,7 +129,7 @@ def test_what_turns_is_no_longer_than_the_shaft_is_thick(kinematic: Scene) -> No
     assert kinematic.at(grasper_state(POSE)).scales[TISSUE:].max() > 50
 
 
-def test_a_jaw_that_stands_still_is_a_jaw(kinematic: Scene) -> None:
+def test_a_jaw_that_stands_still_is_a_jaw(kinematic: GaussianScene) -> None:
     """It is learned as body, since it moves like it."""
     assign(kinematic, 0)
     hinges = kinematic.deformation.articulations[0]
@@ -152,7 +152,7 @@ def test_a_jaw_that_stands_still_is_a_jaw(kinematic: Scene) -> None:
             assert bool((labels[beyond, still] > 0.5).all())
 
 
-def test_points_on_the_hinge_line_stay(kinematic: Scene) -> None:
+def test_points_on_the_hinge_line_stay(kinematic: GaussianScene) -> None:
     assign(kinematic, 1)
     pivot, axis = kinematic.deformation.articulations[0].hinge(0)
     with torch.no_grad():
@@ -162,14 +162,14 @@ def test_points_on_the_hinge_line_stay(kinematic: Scene) -> None:
     assert torch.allclose(shut.means, open_.means, atol=1e-4)
 
 
-def test_the_hinge_crosses_the_shaft_at_a_right_angle(kinematic: Scene) -> None:
+def test_the_hinge_crosses_the_shaft_at_a_right_angle(kinematic: GaussianScene) -> None:
     hinges = kinematic.deformation.articulations[0]
     (origin, direction), (pivot, axis) = hinges.shaft(), hinges.hinge(0)
     assert float((axis @ direction).detach().abs()) < 1e-6
     assert torch.allclose(torch.linalg.cross(pivot - origin, direction), torch.zeros(3), atol=1e-5)
 
 
-def test_spinning_the_shaft_leaves_the_wrist_and_the_axis_alone(kinematic: Scene) -> None:
+def test_spinning_the_shaft_leaves_the_wrist_and_the_axis_alone(kinematic: GaussianScene) -> None:
     state, hinges = grasper_state(POSE), kinematic.deformation.articulations[0]
     still, spun = kinematic.at(state).means, kinematic.at(state, Spin(shaft_roll=1.0)).means
     beyond = hinges.along_shaft(kinematic.canonical.means[TISSUE:]) >= hinges.wrist_start
@@ -180,7 +180,7 @@ def test_spinning_the_shaft_leaves_the_wrist_and_the_axis_alone(kinematic: Scene
     assert 5 < int(beyond.sum()) < 35
 
 
-def test_spinning_keeps_the_distance_from_the_shaft(kinematic: Scene) -> None:
+def test_spinning_keeps_the_distance_from_the_shaft(kinematic: GaussianScene) -> None:
     hinges, state = kinematic.deformation.articulations[0], grasper_state(pose_of(0, 0, 0, 0, 0, 0))
     assign(kinematic, 0)
     origin, direction = hinges.shaft()
@@ -190,7 +190,7 @@ def test_spinning_keeps_the_distance_from_the_shaft(kinematic: Scene) -> None:
     assert torch.allclose(hinges.along_shaft(spun), hinges.along_shaft(points), atol=1e-4)
 
 
-def test_a_method_made_of_it_says_for_itself_how_it_moves(kinematic: Scene) -> None:
+def test_a_method_made_of_it_says_for_itself_how_it_moves(kinematic: GaussianScene) -> None:
     class Sways(Kinematic):
         method = "sways"
 
@@ -198,7 +198,7 @@ def test_a_method_made_of_it_says_for_itself_how_it_moves(kinematic: Scene) -> N
     assert Sways(kinematic.instruments).motion(kinematic.canonical) is None
 
 
-def test_labels_share_out_the_instrument_and_leave_tissue_free(kinematic: Scene) -> None:
+def test_labels_share_out_the_instrument_and_leave_tissue_free(kinematic: GaussianScene) -> None:
     labels = kinematic.label_channels()
     assert labels.shape[1] == len(kinematic.label_names) == 4
     assert not labels[:TISSUE].any()
@@ -207,7 +207,7 @@ def test_labels_share_out_the_instrument_and_leave_tissue_free(kinematic: Scene)
     assert labels.sum(1).max() <= 1 + 1e-6
 
 
-def test_shaft_and_wrist_meet_at_wrist_start(kinematic: Scene) -> None:
+def test_shaft_and_wrist_meet_at_wrist_start(kinematic: GaussianScene) -> None:
     assign(kinematic, 0)
     labels, hinges = kinematic.label_channels()[TISSUE:], kinematic.deformation.articulations[0]
     beyond = hinges.along_shaft(kinematic.canonical.means[TISSUE:]) >= hinges.wrist_start
@@ -216,7 +216,7 @@ def test_shaft_and_wrist_meet_at_wrist_start(kinematic: Scene) -> None:
     assert torch.equal(labels[:, 0] > 0.5, ~beyond)
 
 
-def test_gradients_reach_the_pose(kinematic: Scene) -> None:
+def test_gradients_reach_the_pose(kinematic: GaussianScene) -> None:
     pose = POSE.clone().requires_grad_()
     kinematic.at(grasper_state(pose)).means.sum().backward()
     assert pose.grad is not None
@@ -224,7 +224,7 @@ def test_gradients_reach_the_pose(kinematic: Scene) -> None:
     assert pose.grad[:3, :3].abs().min() > 0
 
 
-def test_keypoints_ride_along(kinematic: Scene) -> None:
+def test_keypoints_ride_along(kinematic: GaussianScene) -> None:
     at_home = kinematic.keypoints(grasper_state(pose_of(0, 0, 0, 0, 0, 0)))["grasper"]
     moved = kinematic.keypoints(grasper_state(POSE))["grasper"]
     assert set(at_home) == {"hinge", "tip_left", "tip_right", "shaft_near", "shaft_far"}
@@ -232,7 +232,7 @@ def test_keypoints_ride_along(kinematic: Scene) -> None:
         assert torch.allclose(moved[name], POSE[:3, :3].float() @ point + POSE[:3, 3].float(), atol=1e-4), name
 
 
-def test_a_registration_moves_all_instruments_and_no_tissue(kinematic: Scene) -> None:
+def test_a_registration_moves_all_instruments_and_no_tissue(kinematic: GaussianScene) -> None:
     before = kinematic.at(grasper_state(POSE)).means
     with torch.no_grad():
         kinematic.registration.copy_(torch.tensor([0, 0, 0, 1.0, -2.0, 3.0, 0]))
@@ -249,6 +249,6 @@ def test_a_registration_moves_all_instruments_and_no_tissue(kinematic: Scene) ->
         (State({"scissors": InstrumentState(POSE, {"jaw_angle": 0.1})}), "'grasper'"),
     ],
 )
-def test_a_state_that_lacks_something_is_refused(kinematic: Scene, state: State, named: str) -> None:
+def test_a_state_that_lacks_something_is_refused(kinematic: GaussianScene, state: State, named: str) -> None:
     with pytest.raises(NeecoError, match=named):
         kinematic.at(state)

@@ -27,7 +27,7 @@ from neeco.methods.nerfies.field import (
 )
 from neeco.methods.nerfies.session import elastic_loss, geman_mcclure
 from neeco.scene.drawable import Recorded
-from neeco.scene.scene import gaussian_scene
+from neeco.scene.gaussian_scene import require_gaussians
 
 
 def screw_matrix(rotation: Tensor, velocity: Tensor) -> Tensor:
@@ -173,7 +173,7 @@ def test_drawing_in_chunks_changes_nothing_and_says_where_things_are() -> None:
 
 def test_what_needs_gaussians_is_refused_in_one_line() -> None:
     with pytest.raises(NeecoError, match="synthesize: method nerfies has no Gaussians"):
-        gaussian_scene(make_nerf(), "synthesize")
+        require_gaussians(make_nerf(), "synthesize")
 
 
 @pytest.mark.parametrize(

@@ -16,13 +16,13 @@ from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.methods.nps import NPS, NPSSettings
 from neeco.raster.devices import fast_bfloat16, processor_has
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.scene.deformation import encode, mark_moving, otsu
 from neeco.scene.method_registry import make_deformation, method_class, method_settings
 from neeco.training.config import method_defaults
 
 
-def test_an_untrained_scene_is_its_canonical_one_in_every_state(neeco: Scene) -> None:
+def test_an_untrained_scene_is_its_canonical_one_in_every_state(neeco: GaussianScene) -> None:
     for state in neeco.recorded.states:
         posed = neeco.at(state)
         assert torch.equal(posed.means, neeco.canonical.means)
@@ -30,13 +30,13 @@ def test_an_untrained_scene_is_its_canonical_one_in_every_state(neeco: Scene) ->
         assert torch.allclose(posed.quats, torch.nn.functional.normalize(neeco.canonical.quats, dim=-1))
 
 
-def test_the_head_starts_at_zero_and_still_learns(neeco: Scene) -> None:
+def test_the_head_starts_at_zero_and_still_learns(neeco: GaussianScene) -> None:
     neeco.at(neeco.recorded.states[0]).means.square().sum().backward()
     assert not neeco.deformation.head.weight.any()
     assert neeco.deformation.head.weight.grad[:3].abs().max() > 0
 
 
-def test_a_network_is_not_evaluated_in_its_warm_up(neeco: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_network_is_not_evaluated_in_its_warm_up(neeco: GaussianScene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(NPS, "network", lambda *_: pytest.fail("evaluated"))
     neeco.deformation.warming_up = True
     posed = neeco.at(neeco.recorded.states[0])
@@ -74,7 +74,7 @@ def test_the_network_has_the_papers_size() -> None:
     assert network.state_in.in_features == 20 * (3 + 4 + 1)
 
 
-def test_recorded_states_span_minus_one_to_one(neeco: Scene) -> None:
+def test_recorded_states_span_minus_one_to_one(neeco: GaussianScene) -> None:
     vectors = torch.stack([neeco.deformation.state_vector(state) for state in neeco.recorded.states])
     assert vectors.abs().max() <= 1 + 1e-5
     spans = (vectors.max(0).values - vectors.min(0).values)[[0, 1, 2, 7]]  # position and jaw, which surely vary
@@ -90,7 +90,7 @@ def test_the_quaternion_does_not_jump_where_its_sign_is_a_convention() -> None:
     assert (quats[1:] - quats[:-1]).norm(dim=1).max() < 0.02
 
 
-def test_noise_perturbs_the_encoded_state_only_when_asked(neeco: Scene) -> None:
+def test_noise_perturbs_the_encoded_state_only_when_asked(neeco: GaussianScene) -> None:
     network, state = neeco.deformation, neeco.recorded.states[2]
     clean = network._encoded_state(state, 0.0)
     noisy = torch.stack([network._encoded_state(state, 0.3) for _ in range(200)])
@@ -98,7 +98,7 @@ def test_noise_perturbs_the_encoded_state_only_when_asked(neeco: Scene) -> None:
     assert abs(float((noisy - clean).std()) - 0.3) < 0.01
 
 
-def test_evaluation_in_chunks_changes_nothing(neeco: Scene) -> None:
+def test_evaluation_in_chunks_changes_nothing(neeco: GaussianScene) -> None:
     torch.manual_seed(1)
     torch.nn.init.normal_(neeco.deformation.head.weight)
     with torch.no_grad():
@@ -150,7 +150,7 @@ def test_an_unknown_method_is_refused() -> None:
     "state",
     [State(), State({"grasper": InstrumentState(torch.eye(4, dtype=torch.float64))})],
 )
-def test_a_state_that_lacks_something_is_refused(neeco: Scene, state: State) -> None:
+def test_a_state_that_lacks_something_is_refused(neeco: GaussianScene, state: State) -> None:
     with pytest.raises(NeecoError, match="is missing"):
         neeco.at(state)
 

@@ -19,7 +19,7 @@ from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.methods.hexplane import HexPlane, HexPlaneSettings
 from neeco.methods.time_mlp import NoisyTime, TimeMLP, TimeMLPSettings, octaves
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.scene.deformation import UNPERTURBED, Deformation, Perturbation, mark_moving
 from neeco.scene.method_registry import make_deformation, method_settings
 
@@ -27,7 +27,7 @@ METHODS = ("deformable-3dgs", "4dgs")
 
 
 @pytest.fixture(params=METHODS)
-def scene(request: pytest.FixtureRequest) -> Scene:
+def scene(request: pytest.FixtureRequest) -> GaussianScene:
     return make_scene(request.param)
 
 
@@ -40,7 +40,7 @@ def woken(deformation: Deformation) -> Deformation:
     return deformation
 
 
-def test_an_untrained_scene_is_its_canonical_one_at_every_time(scene: Scene) -> None:
+def test_an_untrained_scene_is_its_canonical_one_at_every_time(scene: GaussianScene) -> None:
     for state in scene.recorded.states:
         posed = scene.at(state)
         assert torch.equal(posed.means, scene.canonical.means)
@@ -49,7 +49,7 @@ def test_an_untrained_scene_is_its_canonical_one_at_every_time(scene: Scene) -> 
         assert torch.allclose(directions, torch.nn.functional.normalize(scene.canonical.quats, dim=-1))
 
 
-def test_the_gradient_reaches_every_parameter(scene: Scene) -> None:
+def test_the_gradient_reaches_every_parameter(scene: GaussianScene) -> None:
     woken(scene.deformation)
     posed = scene.at(scene.recorded.states[3])
     loss = posed.means.square().sum() + posed.quats[:, 0].sum() + posed.scales.sum()
@@ -61,20 +61,20 @@ def test_the_gradient_reaches_every_parameter(scene: Scene) -> None:
     assert set(scene.deformation.learning_rates(0.0)) == {name for name, _ in scene.deformation.named_parameters()}
 
 
-def test_a_deformation_changes_nothing_in_its_warm_up(scene: Scene) -> None:
+def test_a_deformation_changes_nothing_in_its_warm_up(scene: GaussianScene) -> None:
     woken(scene.deformation).warming_up = True
     assert torch.equal(scene.at(scene.recorded.states[1]).means, scene.canonical.means)
 
 
 @torch.no_grad()
-def test_the_state_of_the_instrument_plays_no_part_but_its_time_does(scene: Scene) -> None:
+def test_the_state_of_the_instrument_plays_no_part_but_its_time_does(scene: GaussianScene) -> None:
     woken(scene.deformation)
     first, later = scene.recorded.states[1], scene.recorded.states[5]
     assert torch.equal(scene.at(State(time=first.time)).means, scene.at(first).means)
     assert not torch.allclose(scene.at(State(later.instruments, first.time)).means, scene.at(later).means)
 
 
-def test_noise_on_the_state_comes_from_torchs_generator_and_only_when_asked_for(scene: Scene) -> None:
+def test_noise_on_the_state_comes_from_torchs_generator_and_only_when_asked_for(scene: GaussianScene) -> None:
     assert_noise_is_drawn(scene, Perturbation(state_noise=0.3))
 
 
@@ -83,7 +83,7 @@ def test_noise_on_the_time_comes_from_torchs_generator_and_only_when_asked_for()
 
 
 @torch.no_grad()
-def assert_noise_is_drawn(scene: Scene, noise: Perturbation) -> None:
+def assert_noise_is_drawn(scene: GaussianScene, noise: Perturbation) -> None:
     woken(scene.deformation)
     state = scene.recorded.states[2]
     untouched = torch.get_rng_state()

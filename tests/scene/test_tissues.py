@@ -15,17 +15,17 @@ from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians, Rendering
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.scene.canonical import TISSUE as OF
+from neeco.scene.gaussian_scene import one_tissue, over_one
 from neeco.scene.io import load_scene, save_scene
-from neeco.scene.scene import one_tissue, over_one
 
 
 def draw(gaussians: Gaussians) -> Rendering:
     return rasterize(gaussians, CAMERA, backend="reference")
 
 
-def two_tissues(method: str = "kinematic") -> Scene:
+def two_tissues(method: str = "kinematic") -> GaussianScene:
     """The scene's tissue, every other Gaussian of it of a second one."""
     scene = make_scene(method)
     index = torch.zeros(len(scene.canonical))

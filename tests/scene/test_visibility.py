@@ -14,8 +14,8 @@ from neeco.geometry.camera import Camera
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.method_registry import make_deformation, method_settings
-from neeco.scene.scene import Scene
 from neeco.scene.visibility import DIRECTIONS, EXTRAPOLATED, measure_visibility
 
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=80.0, fy=80.0, cx=32.0, cy=24.0, width=64, height=48)
@@ -37,15 +37,15 @@ def ball(radius: float = 8.0, depth: float = 50.0) -> CanonicalGaussians:
     return body(radius * unit + torch.tensor([0.0, 0.0, depth]))
 
 
-def still(canonical: CanonicalGaussians, cameras: tuple[Camera, ...] = (CAMERA,)) -> Scene:
+def still(canonical: CanonicalGaussians, cameras: tuple[Camera, ...] = (CAMERA,)) -> GaussianScene:
     recorded = Recorded(
         tuple(map(str, range(len(cameras)))), ("train",) * len(cameras), (State(),) * len(cameras), cameras
     )
     deformation = make_deformation("3dgs", (), method_settings("3dgs", {}))
-    return Scene("3dgs", canonical, deformation, (), recorded, torch.tensor([0.0, 0.0, 50.0]))
+    return GaussianScene("3dgs", canonical, deformation, (), recorded, torch.tensor([0.0, 0.0, 50.0]))
 
 
-def unobserved(scene: Scene, state: State, camera: Camera) -> Tensor:
+def unobserved(scene: GaussianScene, state: State, camera: Camera) -> Tensor:
     posed = scene.at(state)
     channels = scene.unobserved(posed, camera)[:, None]
     rendering = rasterize(posed, camera, channels=channels)
@@ -94,7 +94,7 @@ def test_sides_of_an_instrument_turn_with_it() -> None:
     deformation = make_deformation("kinematic", (GRASPER,), method_settings("kinematic", {}))
     canonical = canonical.with_extras(**dict(deformation.initial_extras(canonical)) | {"part_logits": logits})
     recorded = Recorded(("0",), ("train",), (grasper_state(FRONT),), (CAMERA,))
-    scene = Scene("kinematic", canonical, deformation, (GRASPER,), recorded, torch.zeros(3))
+    scene = GaussianScene("kinematic", canonical, deformation, (GRASPER,), recorded, torch.zeros(3))
     assert float(unobserved(scene, grasper_state(FRONT), CAMERA).mean()) < 0.2
     assert float(unobserved(scene, grasper_state(BACK), CAMERA).mean()) > 0.9
 

@@ -24,7 +24,7 @@ from neeco.geometry.rotations import rigid_from_vector
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.report.run_page import write_annotated_page
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.synthesis.annotated import annotate_capture
 from neeco.synthesis.settings import ImageSettings
 
@@ -50,7 +50,7 @@ def tracked(state: State, index: int) -> State:
 
 
 @pytest.fixture(scope="module")
-def recorded(run, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
+def recorded(run, scene: GaussianScene, tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     """Eight images of the scene, one of them with a board held before the instrument."""
     root = tmp_path_factory.mktemp("recorded")
     frames = []
@@ -76,7 +76,7 @@ def made(recorded: RecordedRun, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return output
 
 
-def layers(scene: Scene, state: State) -> LayeredDrawing:
+def layers(scene: GaussianScene, state: State) -> LayeredDrawing:
     return draw_layers(scene, CompositedLabels(scene), state, CAMERA, 0.01, tissue_image=True)
 
 
@@ -84,7 +84,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_an_image_supports_a_right_label_and_not_a_wrong_one(scene: Scene) -> None:
+def test_an_image_supports_a_right_label_and_not_a_wrong_one(scene: GaussianScene) -> None:
     right, wrong = layers(scene, rod_state()), layers(scene, rod_state(x=12.0))
     assert estimate_trust(right, right.image, None, USUAL).value == 1.0
     judged = estimate_trust(wrong, right.image, None, USUAL)
@@ -92,7 +92,7 @@ def test_an_image_supports_a_right_label_and_not_a_wrong_one(scene: Scene) -> No
     assert judged.against > 0.7
 
 
-def test_what_something_hides_is_no_label(scene: Scene) -> None:
+def test_what_something_hides_is_no_label(scene: GaussianScene) -> None:
     drawing = layers(scene, rod_state())
     image, label = drawing.image.clone(), drawing.parts > 0
     image[:20] = torch.tensor([0.1, 0.3, 0.9])
@@ -102,7 +102,7 @@ def test_what_something_hides_is_no_label(scene: Scene) -> None:
     assert judged.value < 1 - hidden + 0.1
 
 
-def test_a_label_too_small_misses_what_looks_like_no_tissue(scene: Scene) -> None:
+def test_a_label_too_small_misses_what_looks_like_no_tissue(scene: GaussianScene) -> None:
     drawing = layers(scene, rod_state())
     label = drawing.parts.clone()
     half = torch.nonzero(label.sum(0))[:, 0].float().mean().round().long()
@@ -113,7 +113,7 @@ def test_a_label_too_small_misses_what_looks_like_no_tissue(scene: Scene) -> Non
     assert judged.value < 0.9
 
 
-def test_pixels_that_the_loss_leaves_out_do_not_vote(scene: Scene) -> None:
+def test_pixels_that_the_loss_leaves_out_do_not_vote(scene: GaussianScene) -> None:
     drawing = layers(scene, rod_state())
     image = drawing.image.clone()
     image[:20] = torch.tensor([0.1, 0.3, 0.9])
@@ -122,13 +122,13 @@ def test_pixels_that_the_loss_leaves_out_do_not_vote(scene: Scene) -> None:
     assert estimate_trust(drawing, image, mask, USUAL).value == 1.0
 
 
-def test_without_a_label_there_is_nothing_to_trust(scene: Scene) -> None:
+def test_without_a_label_there_is_nothing_to_trust(scene: GaussianScene) -> None:
     drawing = layers(scene, rod_state())
     empty = replace(drawing, parts=torch.zeros_like(drawing.parts))
     assert estimate_trust(empty, drawing.image, None, USUAL).value == 0.0
 
 
-def test_usual_errors_are_those_of_all_but_a_hundredth_of_the_pixels(scene: Scene) -> None:
+def test_usual_errors_are_those_of_all_but_a_hundredth_of_the_pixels(scene: GaussianScene) -> None:
     drawing = layers(scene, rod_state())
     off = 0.04 * torch.rand(drawing.parts.shape, generator=torch.Generator().manual_seed(0))
     brighter = (drawing.image + off[..., None]).clamp(0, 1)

@@ -18,7 +18,8 @@ from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import Acceptance, SampleGenerator, draw_to_folder
 from neeco.synthesis.rendered_views import render, split_views, state_views
 from neeco.synthesis.settings import Settings
-from neeco.synthesis.writers.coco import write_coco
+from neeco.synthesis.writers import WrittenImages
+from neeco.synthesis.writers.coco import Coco
 from neeco.synthesis.writers.folder import load_record
 
 COUNT = 6
@@ -132,7 +133,9 @@ def test_ids_of_parts_do_not_depend_on_which_are_seen(made, tmp_path):
     records = [load_record(made, 0)]
     records[0]["labels"][0]["parts"].pop("shaft")
     shutil.copytree(made / "images", tmp_path / "images")
-    write_coco(tmp_path, records, (("rod", "shaft"), ("rod", "jaw")), (), ())
+    names = (("rod", "shaft"), ("rod", "jaw"))
+    nothing = {"keypoint_names": (), "bones": (), "scene": None, "labeller": None}
+    Coco().write(WrittenImages(root=tmp_path, records=records, part_names=names, **nothing))
     for file in (made / "coco/parts.json", made / "coco/annotations/parts_val.json", tmp_path / "coco/parts.json"):
         assert {number: category["name"] for number, category in COCO(str(file)).cats.items()} == ids
     (annotation,) = COCO(str(tmp_path / "coco/parts.json")).anns.values()

@@ -18,7 +18,7 @@ from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.synthesis.camera_effects import (
     EFFECTS,
     MAX_SUBFRAMES,
@@ -59,11 +59,11 @@ def through_effects(image: np.ndarray, depth: float = 100.0, seed: int = 0, **va
 
 
 @pytest.fixture(scope="module")
-def moving(scene: Scene) -> Scene:
+def moving(scene: GaussianScene) -> GaussianScene:
     """The rod recorded at 25 frames a second, sliding sideways by 30 mm/s, its jaw opening."""
     states = tuple(replace(rod_state(x=1.2 * k - 6, jaw=0.02 * k), time=k / 25) for k in range(12))
     recorded = replace(scene.recorded, states=states)
-    copied = Scene("rod", scene.canonical, scene.deformation, scene.instruments, recorded, scene.center)
+    copied = GaussianScene("rod", scene.canonical, scene.deformation, scene.instruments, recorded, scene.center)
     copied.load_state_dict(scene.state_dict())
     return copied
 
@@ -219,7 +219,7 @@ def test_another_range_is_another_data_set(run: FakeRun, tmp_path: Path) -> None
         synthesize(run, tmp_path / "set", settings, resume=True)  # type: ignore[arg-type]
 
 
-def test_motion_goes_on_as_recorded(moving: Scene) -> None:
+def test_motion_goes_on_as_recorded(moving: GaussianScene) -> None:
     motion = RecordedMotion(moving.recorded)(rod_state(), np.random.default_rng(0))
     assert motion.instruments["rod"][3:] == pytest.approx([30.0, 0, 0], abs=1e-6)
     assert motion.joints["rod"]["jaw_angle"] == pytest.approx(0.5)
@@ -235,7 +235,7 @@ def test_a_recording_without_times_tells_of_no_motion(run: FakeRun, tmp_path: Pa
         SampleGenerator.of(run.scene, replace(SETTINGS, camera_effects=path))
 
 
-def test_mixed_instruments_and_camera_move_each_as_recorded(moving: Scene) -> None:
+def test_mixed_instruments_and_camera_move_each_as_recorded(moving: GaussianScene) -> None:
     other = replace(
         moving.recorded,
         cameras=tuple(moved_camera(CAMERA, rigid(np.eye(3), np.array([0, 2.0 * k, 0]))) for k in range(12)),
@@ -249,7 +249,7 @@ def test_mixed_instruments_and_camera_move_each_as_recorded(moving: Scene) -> No
     assert not MixedMotion(other, [replace(moving.recorded, states=moving.recorded.states[:1])]).known
 
 
-def test_an_exposure_is_drawn_as_often_as_its_motion_needs(moving: Scene) -> None:
+def test_an_exposure_is_drawn_as_often_as_its_motion_needs(moving: GaussianScene) -> None:
     drawing = draw_layers(moving, CompositedLabels(moving), rod_state(), CAMERA, 0.0)
     still = Motion({"rod": np.zeros(6)}, {"rod": {"jaw_angle": 0.0}}, np.zeros(6))
     fast = Motion({"rod": np.array([0, 0, 0, 5e5, 0, 0.0])}, {"rod": {"jaw_angle": 0.0}}, np.zeros(6))
@@ -260,7 +260,7 @@ def test_an_exposure_is_drawn_as_often_as_its_motion_needs(moving: Scene) -> Non
     assert counts[2] <= MAX_SUBFRAMES
 
 
-def blurred(scene: Scene, state: State, motion: Motion, shutter_s: float, count: int) -> torch.Tensor:
+def blurred(scene: GaussianScene, state: State, motion: Motion, shutter_s: float, count: int) -> torch.Tensor:
     """The exposure drawn `count` times."""
     labeller = CompositedLabels(scene)
     times = ((np.arange(count) + 0.5) / count - 0.5) * shutter_s
@@ -270,7 +270,7 @@ def blurred(scene: Scene, state: State, motion: Motion, shutter_s: float, count:
 
 @pytest.mark.parametrize(("speed", "seen"), [(60.0, 0.06), (250.0, 0.2)])
 def test_motion_blur_is_the_integral_over_the_exposure(
-    speed: float, seen: float, moving: Scene, tmp_path: Path
+    speed: float, seen: float, moving: GaussianScene, tmp_path: Path
 ) -> None:
     path = effects_file(tmp_path, "shutter_s: 0.05\nsoft_masks: mean\n")
     generator = SampleGenerator.of(moving, replace(SETTINGS, camera_effects=path))

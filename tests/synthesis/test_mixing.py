@@ -20,7 +20,7 @@ from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.raster.native import torch_threads
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import ENTERS_ANOTHER, Acceptance
 from neeco.synthesis.mixing import Mixture, tissue_depth, tissue_gaussians
@@ -44,16 +44,16 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def near() -> Scene:
+def near() -> GaussianScene:
     return ball_scene("near", [(-8, 0, 55), (-4, 2, 60), (-9, 4, 58)])
 
 
 @pytest.fixture(scope="module")
-def far() -> Scene:
+def far() -> GaussianScene:
     return ball_scene("far", [(8, 0, 75), (10, -2, 78), (6, 3, 72)])
 
 
-def test_labels_and_occlusion_of_two_balls_are_those_of_geometry(near: Scene, far: Scene) -> None:
+def test_labels_and_occlusion_of_two_balls_are_those_of_geometry(near: GaussianScene, far: GaussianScene) -> None:
     mixed = Mixture.of(ball_scene("own", [(0, 0, 50)]), [near, far]).scene
     labeller = CompositedLabels(mixed)
     assert labeller.names == (("near", "instrument"), ("far", "instrument"))
@@ -67,7 +67,7 @@ def test_labels_and_occlusion_of_two_balls_are_those_of_geometry(near: Scene, fa
     assert overlap(drawing.layers["far"].mask, behind) > 0.93
 
 
-def test_an_instrument_stands_as_far_before_the_tissue_as_before_its_own(near: Scene) -> None:
+def test_an_instrument_stands_as_far_before_the_tissue_as_before_its_own(near: GaussianScene) -> None:
     camera = Camera(at(500, 40, -30), 60.0, 60.0, 32.0, 24.0, 64, 48)
     tissue = ball_scene("own", [(0, 0, 50)], wall=130.0)
     mixture = Mixture.of(tissue, [near])
@@ -83,7 +83,7 @@ def test_an_instrument_stands_as_far_before_the_tissue_as_before_its_own(near: S
     assert local[0, 3].item() / local[2, 3].item() == pytest.approx(-8 / 60)
 
 
-def test_the_light_is_that_of_the_tissue_and_shafts_are_matched(near: Scene) -> None:
+def test_the_light_is_that_of_the_tissue_and_shafts_are_matched(near: GaussianScene) -> None:
     tissue = ball_scene("own", [(0, 0, 50)], color=0.6)
     with torch.no_grad():
         tissue.falloff.copy_(torch.tensor([1.0, 2.0]))
@@ -100,7 +100,9 @@ def test_the_light_is_that_of_the_tissue_and_shafts_are_matched(near: Scene) -> 
     assert Mixture.of(tissue, [tissue]).gains == ((1.0, 1.0, 1.0),)
 
 
-def test_instruments_in_each_other_are_refused_but_not_those_recorded_so(near: Scene, far: Scene) -> None:
+def test_instruments_in_each_other_are_refused_but_not_those_recorded_so(
+    near: GaussianScene, far: GaussianScene
+) -> None:
     mixed = Mixture.of(near, [near, far]).scene
     labeller = CompositedLabels(mixed)
     groups = (frozenset({"near"}), frozenset({"far"}))
@@ -112,7 +114,7 @@ def test_instruments_in_each_other_are_refused_but_not_those_recorded_so(near: S
 
 
 def test_a_mixed_data_set_is_made_by_any_number_of_workers_with_the_same_bytes(
-    near: Scene, far: Scene, tmp_path: Path
+    near: GaussianScene, far: GaussianScene, tmp_path: Path
 ) -> None:
     tissue, first, second = (
         run_of(scene, tmp_path / name)
@@ -134,7 +136,7 @@ def test_a_mixed_data_set_is_made_by_any_number_of_workers_with_the_same_bytes(
         synthesize(tissue, alone, SETTINGS, instrument_runs=(second,), resume=True)  # type: ignore[arg-type]
 
 
-def test_what_cannot_be_mixed_is_told(near: Scene, scene: Scene) -> None:
+def test_what_cannot_be_mixed_is_told(near: GaussianScene, scene: GaussianScene) -> None:
     with pytest.raises(NeecoError, match=r"--instruments: method rod does not keep tissue and instruments apart"):
         Mixture.of(near, [scene])
     with pytest.raises(NeecoError, match=r"--instruments: 'near' is in two of the runs"):

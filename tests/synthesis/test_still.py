@@ -9,18 +9,18 @@ import pytest
 from rod_world import make_scene
 
 from neeco.errors import NeecoError
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.synthesis.samplers import make_sampler
 
 
 @pytest.fixture
-def still() -> Scene:
+def still() -> GaussianScene:
     scene = make_scene()
     scene.recorded = replace(scene.recorded, still=True)
     return scene
 
 
-def test_perturbed_views_stay_within_millimetres_of_a_still_scope(still: Scene) -> None:
+def test_perturbed_views_stay_within_millimetres_of_a_still_scope(still: GaussianScene) -> None:
     sampler = make_sampler(still, "interpolate", 0.2, "perturbed", 1)
     rng = np.random.default_rng(0)
     places = np.stack([camera.world_from_camera[:3, 3].numpy() for camera in still.recorded.cameras])
@@ -29,6 +29,6 @@ def test_perturbed_views_stay_within_millimetres_of_a_still_scope(still: Scene) 
         assert np.linalg.norm(places - place, axis=1).min() < 5
 
 
-def test_no_orbit_about_what_was_seen_from_one_place(still: Scene) -> None:
+def test_no_orbit_about_what_was_seen_from_one_place(still: GaussianScene) -> None:
     with pytest.raises(NeecoError, match="--views orbit: the scope stood still"):
         make_sampler(still, "interpolate", 0.2, "orbit", 1)

@@ -9,7 +9,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import LABEL_THRESHOLD, CompositedLabels, ThresholdLabels
-from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.deformation import UNPERTURBED, Deformation, Posed
 from neeco.synthesis.states import InterpolatedStates
 
@@ -42,7 +42,7 @@ def at(upright_z: float, level_z: float) -> State:
 
 
 @pytest.fixture(scope="module")
-def bars(request) -> Scene:
+def bars(request) -> GaussianScene:
     wall = [(x, y, 100.0) for x in np.linspace(-70, 70, 20) for y in np.linspace(-50, 50, 15)]
     upright = [(0.0, y, 0.0) for y in np.linspace(-15, 15, BAR)]
     level = [(x, 0.0, 0.0) for x in np.linspace(-15, 15, BAR)]
@@ -60,7 +60,7 @@ def bars(request) -> Scene:
     states = (at(60, 70), at(70, 60))
     recorded = Recorded(("0", "1"), ("train",) * 2, states, (CAMERA,) * 2)
     instruments = (Instrument("upright"), Instrument("level"))
-    return Scene("bars", canonical, TwoBars(), instruments, recorded, torch.zeros(3))
+    return GaussianScene("bars", canonical, TwoBars(), instruments, recorded, torch.zeros(3))
 
 
 @pytest.mark.parametrize(("front", "state"), [("upright", at(60, 70)), ("level", at(70, 60))])

@@ -15,7 +15,7 @@ from neeco.capture.images import write_image
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.geometry.camera import Camera
 from neeco.methods.kinematic.articulation import LINK_LOGITS
-from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.training.config import config_to_dict, method_defaults
 
@@ -43,7 +43,7 @@ def moving(k: float) -> State:
     return replace(state, time=k / RATE)
 
 
-def make_scene() -> Scene:
+def make_scene() -> GaussianScene:
     """A wall, a shaft whose colour changes along and around it, and jaws that the hinge turns apart."""
     rng = np.random.default_rng(3)
     wall = [(x, y, WALL_MM) for x in np.linspace(-90, 90, 30) for y in np.linspace(-60, 60, 20)]
@@ -73,7 +73,7 @@ def make_scene() -> Scene:
     names = tuple(f"{k:06d}" for k in range(len(states)))
     recorded = Recorded(names, ("train",) * len(states), states, (CAMERA,) * len(states))
     deformation = make_deformation("kinematic", (GRASPER,), method_settings("kinematic", {}))
-    scene = Scene("kinematic", canonical, deformation, (GRASPER,), recorded, torch.tensor([0.0, 0.0, WALL_MM]))
+    scene = GaussianScene("kinematic", canonical, deformation, (GRASPER,), recorded, torch.tensor([0.0, 0.0, WALL_MM]))
     articulation = deformation.articulations[0]
     articulation.extent.copy_(torch.tensor([-40.0, 14.0]))
     articulation.radius.fill_(3.0)
@@ -85,7 +85,7 @@ class RecordedRun:
     """As much of a run as tracking uses."""
 
     path: Path
-    scene: Scene
+    scene: GaussianScene
     recording: Capture
     config: dict[str, Any] = field(default_factory=lambda: config_to_dict(method_defaults("kinematic")))
 
@@ -93,7 +93,7 @@ class RecordedRun:
         return self.recording
 
 
-def record(scene: Scene, root: Path, states: list[State], split: str) -> Capture:
+def record(scene: GaussianScene, root: Path, states: list[State], split: str) -> Capture:
     """Images of the scene in `states`, as a capture that says them."""
     frames = []
     for k, state in enumerate(states):

@@ -18,7 +18,7 @@ from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.ingest.footage_video import read_footage
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.tracking import footage_again, footage_scene, footage_tissue
 from neeco.tracking.coordinates import DEG, Coordinates
 from neeco.tracking.drawing import InstrumentDrawer, Tissue
@@ -33,7 +33,7 @@ from neeco.training.run import load_run
 COUNT = 6
 
 
-def other_wall() -> Scene:
+def other_wall() -> GaussianScene:
     """The grasper before a wall of other colours, 8 mm nearer."""
     scene = make_scene()
     tissue = scene.canonical.counts[0]

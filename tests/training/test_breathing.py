@@ -14,7 +14,7 @@ from neeco.methods.carving.tissue_fit import fit_tissue
 from neeco.methods.kinematic.breathing_search import find_breathing, find_period
 from neeco.methods.static import Static
 from neeco.raster import Camera, rasterize
-from neeco.scene import Recorded, Scene
+from neeco.scene import GaussianScene, Recorded
 from neeco.scene.canonical import seed_gaussians
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
@@ -55,7 +55,7 @@ def test_no_period_is_found_where_there_is_none(kind: str) -> None:
     assert find_period(times, shifts) is None
 
 
-def wall(moving: bool) -> tuple[Scene, TrainingViews]:
+def wall(moving: bool) -> tuple[GaussianScene, TrainingViews]:
     """A textured wall at rest, and 40 images of it at irregular times over three breaths, some in other light."""
     generator = torch.Generator().manual_seed(2)
     places = torch.rand(500, 3, generator=generator) * torch.tensor([130.0, 100.0, 10.0]) + torch.tensor(
@@ -63,14 +63,16 @@ def wall(moving: bool) -> tuple[Scene, TrainingViews]:
     )
     colors = 0.2 + 0.6 * torch.rand(500, 3, generator=generator)
     tissue = seed_gaussians(places, colors, torch.full((500,), 3.0), opacity=0.8)
-    scene = Scene("3dgs", tissue, Static(), (), Recorded(), places.mean(0))
+    scene = GaussianScene("3dgs", tissue, Static(), (), Recorded(), places.mean(0))
     times = np.sort(np.random.default_rng(3).uniform(0, 3 * PERIOD, 40))
     shifts = torch.from_numpy(breath(times) * moving).float()
     frames, images = [], []
     for k, time in enumerate(times):
         tissue = scene.canonical.map(lambda tensor: tensor.clone())
         tissue.means.add_(shifts[k])
-        drawn = rasterize(Scene("3dgs", tissue, Static(), (), Recorded(), places.mean(0)).at(State()), CAMERA).color
+        drawn = rasterize(
+            GaussianScene("3dgs", tissue, Static(), (), Recorded(), places.mean(0)).at(State()), CAMERA
+        ).color
         drawn = drawn.detach() * (1.05 if k % 3 else 0.95)
         images.append((drawn.clamp(0, 1) * 255).round().to(torch.uint8))
         frames.append(Frame(Path(f"{k:06d}.png"), CAMERA, State(time=float(time)), "train"))
@@ -86,7 +88,7 @@ def test_breathing_is_found_in_images_and_learned() -> None:
     config = training_config("kinematic", {})
 
     @torch.no_grad()
-    def error(tissue: Scene) -> float:
+    def error(tissue: GaussianScene) -> float:
         drawn = [rasterize(tissue.at(frame.state), CAMERA).color for frame in views.frames]
         return sum(float((color - views.target(k)).square().mean()) for k, color in enumerate(drawn))
 

@@ -19,8 +19,8 @@ from neeco.methods.kinematic.wrist import color_boundary, measure_radius, place_
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.method_registry import make_deformation
-from neeco.scene.scene import Scene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
 from neeco.training.session import GaussianSession, new_session
@@ -45,7 +45,9 @@ def session(tmp_path: Path) -> GaussianSession:
     states, cameras = tuple(f.state for f in frames), tuple(f.camera for f in frames)
     recorded = Recorded(tuple(f.name for f in frames), ("train",) * len(frames), states, cameras)
     deformation = make_deformation("kinematic", capture.instruments)
-    scene = Scene("kinematic", canonical, deformation, capture.instruments, recorded, torch.tensor([0.0, 0.0, 100.0]))
+    scene = GaussianScene(
+        "kinematic", canonical, deformation, capture.instruments, recorded, torch.tensor([0.0, 0.0, 100.0])
+    )
     hinges = deformation.articulations[0]
     with torch.no_grad():
         hinges.hinge_depth.fill_(PIVOT_MM)

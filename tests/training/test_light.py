@@ -12,7 +12,7 @@ from rod_world import CAMERA, make_scene
 from neeco.capture.model import Frame
 from neeco.methods.kinematic.shadow import find_shadow
 from neeco.raster import rasterize
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
 from neeco.training.session import GaussianSession, new_session
@@ -21,7 +21,7 @@ OFFSET, STRENGTH = (9.0, -6.0, 0.0), 0.5  # mm, of the lamp of the recorded imag
 OTHER = (-7.0, -7.0, 0.0)
 
 
-def lit(scene: Scene, offsets: Sequence[tuple[float, float, float]], strength: float) -> Scene:
+def lit(scene: GaussianScene, offsets: Sequence[tuple[float, float, float]], strength: float) -> GaussianScene:
     with torch.no_grad():
         for lamp, offset in enumerate(offsets):
             scene.shadow_offsets[lamp] = torch.tensor(offset)
@@ -48,7 +48,7 @@ def session(
     return new_session(lit(make_scene(), (), 0.0), views, config)
 
 
-def lamps(scene: Scene) -> list[torch.Tensor]:
+def lamps(scene: GaussianScene) -> list[torch.Tensor]:
     """Offsets [3] mm of those found."""
     found = scene.shadow_strengths.detach() > 0
     return list(scene.shadow_offsets.detach()[found])

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import importlib
 import json
-import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from capture_files import write_grasper
+from plugin_site import install_plugin
 
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.scene.method_registry import methods
 from neeco.training.run import load_run
 from neeco.viewer.views import picture, views_of
-
-PLUGIN = Path(__file__).parents[2] / "examples" / "plugin"
 
 
 @pytest.fixture
@@ -34,10 +31,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def test_an_installed_method_trains_evaluates_renders_synthesizes_and_is_viewed(site: Path, tmp_path: Path) -> None:
-    source = shutil.copytree(PLUGIN, tmp_path / "plugin")
-    options = ("--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--target", str(site))
-    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(source)], check=True)
-    importlib.invalidate_caches()
+    install_plugin(site, tmp_path)
     capture, run = write_grasper(tmp_path / "capture", frames=12, sizes=((64, 48),)), tmp_path / "run"
     settings = ["--set", "deformation.carving.tissue_steps=60", "--set", "deformation.carving.seeds=200"]
     assert (

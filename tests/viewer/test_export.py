@@ -17,7 +17,7 @@ from scene_worlds import make_scene
 
 from neeco.errors import NeecoError
 from neeco.scene.canonical import SH_C0
-from neeco.scene.scene import Scene
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.viewer.export import export_page, pack, page_of
 
 CPU = torch.device("cpu")
@@ -115,7 +115,7 @@ def test_a_network_for_every_state_is_refused_in_one_line(method: str) -> None:
     assert "\n" not in str(refusal.value)
 
 
-def renamed(scene: Scene, name: str) -> Scene:
+def renamed(scene: GaussianScene, name: str) -> GaussianScene:
     (instrument,) = scene.instruments
     recorded = scene.recorded
     states = tuple(replace(state, instruments={name: state.instruments["grasper"]}) for state in recorded.states)

@@ -22,7 +22,7 @@ from neeco.geometry.camera import Camera
 from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
-from neeco.scene.scene import Scene
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.viewer.controls import Controls, InstrumentControls, controlled_state, shafts_of
 from neeco.viewer.export import pack, page_of
 
@@ -49,7 +49,7 @@ def wall(generator: torch.Generator) -> CanonicalGaussians:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> GaussianScene:
     """A grasper of random Gaussians over a wall, under two lamps beside the lens."""
     generator = torch.Generator().manual_seed(1)
     scene = make_scene("kinematic")
@@ -114,7 +114,7 @@ class Page:
 
 
 @pytest.fixture(scope="module")
-def exported(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def exported(scene: GaussianScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "grasper.html"
     path.write_text(page_of(*pack(scene, 3), "grasper", [("method", "kinematic")]))
     return path
@@ -133,7 +133,7 @@ def decibels(image: np.ndarray, truth: np.ndarray, where: np.ndarray | None = No
 
 
 @torch.no_grad()
-def agree(page: Page, scene: Scene, state: State, camera: Camera, frame: float | None) -> None:
+def agree(page: Page, scene: GaussianScene, state: State, camera: Camera, frame: float | None) -> None:
     """What the page shows is what the scene draws: 50 dB, label ids in 99.9 % of pixels, depth within quantisation."""
     truth = scene.render(state, camera, labels=True)
     parts = composited_parts(truth, threshold_of(scene)).numpy()
@@ -148,13 +148,13 @@ def agree(page: Page, scene: Scene, state: State, camera: Camera, frame: float |
     assert np.quantile(np.abs(depths - truth.depth.numpy())[solid], 0.99) < 0.5
 
 
-def test_recorded_frames_look_as_the_scene_draws_them(page: Page, scene: Scene) -> None:
+def test_recorded_frames_look_as_the_scene_draws_them(page: Page, scene: GaussianScene) -> None:
     for k in (0, 3, FRAMES - 1):
         agree(page, scene, scene.recorded.states[k], scene.recorded.cameras[k], k)
     assert page.errors == []
 
 
-def test_without_its_shadows_it_would_not(page: Page, scene: Scene) -> None:
+def test_without_its_shadows_it_would_not(page: Page, scene: GaussianScene) -> None:
     strengths = scene.shadow_strengths.clone()
     scene.shadow_strengths.zero_()
     try:
@@ -169,7 +169,7 @@ def test_without_its_shadows_it_would_not(page: Page, scene: Scene) -> None:
     ("name", "value"), [("jaw_angle", 0.31), ("slide", 6.0), ("roll", 0.8), ("yaw", 0.25), ("pitch", -0.3)]
 )
 def test_every_slider_moves_the_instrument_as_the_server_does(
-    page: Page, scene: Scene, name: str, value: float
+    page: Page, scene: GaussianScene, name: str, value: float
 ) -> None:
     page.page.evaluate("window.neeco.toFrame(2)")
     before = page.drawn()[0]
@@ -186,7 +186,7 @@ def test_every_slider_moves_the_instrument_as_the_server_does(
 
 
 @pytest.fixture(scope="module")
-def driver(scene: Scene) -> Scene:
+def driver(scene: GaussianScene) -> GaussianScene:
     """A driver with a wrist and a blade that slides, over the same wall."""
     driver = make_driver(FRAMES)
     own = driver.canonical.map(lambda tensor: tensor[driver.canonical.body(1)], (driver.canonical.counts[1],))
@@ -203,7 +203,7 @@ def driver(scene: Scene) -> Scene:
     ("name", "value"), [("pitch", -0.5), ("yaw", 0.6), ("jaw", 1.1), ("blade_mm", 0.8), (None, None)]
 )
 def test_sliders_move_every_joint_of_a_wrist_as_the_server_does(
-    chromium: Any, driver: Scene, tmp_path: Path, name: str | None, value: float | None
+    chromium: Any, driver: GaussianScene, tmp_path: Path, name: str | None, value: float | None
 ) -> None:
     path = tmp_path / "driver.html"
     path.write_text(page_of(*pack(driver, 3), "driver", [("method", "kinematic")]))
@@ -219,7 +219,7 @@ def test_sliders_move_every_joint_of_a_wrist_as_the_server_does(
     opened.page.close()
 
 
-def test_between_frames_it_interpolates_as_the_server_does(page: Page, scene: Scene) -> None:
+def test_between_frames_it_interpolates_as_the_server_does(page: Page, scene: GaussianScene) -> None:
     page.slide("frame", 2.5)
     state = controlled_state(scene.recorded.states, {}, Controls(2.5))
     matrix = page.page.evaluate("window.neeco.eye.matrix")
@@ -257,7 +257,7 @@ def test_views_keys_and_play(page: Page) -> None:
     assert page.value("frame") != 1.0
 
 
-def test_saved_image_and_mask_are_of_the_recorded_size(page: Page, scene: Scene, tmp_path: Path) -> None:
+def test_saved_image_and_mask_are_of_the_recorded_size(page: Page, scene: GaussianScene, tmp_path: Path) -> None:
     from PIL import Image
 
     for name in ("image", "mask"):
@@ -329,7 +329,7 @@ def test_a_damaged_file_says_so(chromium: Any, exported: Path, tmp_path: Path) -
     ],
 )
 def test_a_hostile_file_neither_hangs_nor_shows_anything(
-    chromium: Any, scene: Scene, tmp_path: Path, change: dict[str, Any]
+    chromium: Any, scene: GaussianScene, tmp_path: Path, change: dict[str, Any]
 ) -> None:
     header, planes = pack(scene, 1)
     path = tmp_path / "hostile.html"

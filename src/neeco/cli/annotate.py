@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
 from neeco.settings import Device
-from neeco.synthesis.settings import AS_RECORDED, MIN_TRUST, Format, ImageSettings
+from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, formats_help
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,7 @@ class Arguments:
     """Another recording of the same instruments over the same tissue; the run's own when not given."""
     min_trust: float = MIN_TRUST
     """Frames trusted less are listed, not written: 0 to 1, about the overlap (IoU) that the image speaks for."""
-    formats: tuple[Format, ...] = ("coco", "yolo")
-    """Index files beside the plain images, masks, parts and depth."""
+    formats: Annotated[tuple[str, ...], tyro.conf.arg(help=formats_help())] = DEFAULT_FORMATS
     images: tyro.conf.OmitArgPrefixes[ImageSettings] = AS_RECORDED
     resume: bool = False
     """Continue a data set begun with the same settings."""
@@ -39,10 +39,10 @@ def run(arguments: Arguments) -> int:
     from neeco.raster.devices import device_of
     from neeco.report.run_page import write_annotated_page
     from neeco.synthesis.annotated import annotate_capture
-    from neeco.training.run import open_run
+    from neeco.training.run import open_gaussian_run
 
     arguments.images.check()
-    with open_run(arguments.run, device_of(arguments.device)) as trained:
+    with open_gaussian_run(arguments.run, "annotate", device_of(arguments.device)) as trained:
         capture = None if arguments.capture is None else read_checked(arguments.capture)
         with (
             counting("annotate") as advance,

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import torch
 
     from neeco.evaluation.image_metrics import Lpips
-    from neeco.training.run import Run
+    from neeco.training.run import TrainedRun
 
 SAMPLE = "liver-mini"
 IMAGES = 24
@@ -104,17 +104,17 @@ def _train(capture: Path, output: Path, minutes: float, device: torch.device) ->
     return train_with_progress(capture, output, config, device)
 
 
-def _synthesize(trained: Run, output: Path) -> None:
+def _synthesize(trained: TrainedRun, output: Path) -> None:
     from neeco.cli._progress import counting
     from neeco.synthesis.dataset import synthesize
     from neeco.synthesis.settings import Settings
 
     print(f"3/4 synthesize {IMAGES} labelled images of states that were not recorded")
     with counting("synthesize", IMAGES) as advance:
-        synthesize(trained, output, Settings(count=IMAGES), ("coco", "yolo"), False, advance)
+        synthesize(trained.gaussians("synthesize"), output, Settings(count=IMAGES), ("coco", "yolo"), False, advance)
 
 
-def _evaluate(trained: Run, dataset: Path, networks: dict[str, Lpips]) -> Path:
+def _evaluate(trained: TrainedRun, dataset: Path, networks: dict[str, Lpips]) -> Path:
     from neeco.evaluation.evaluate import evaluate_run
     from neeco.report import write_report
     from neeco.viewer.export import embedded_page

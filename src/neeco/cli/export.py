@@ -37,8 +37,7 @@ def run(arguments: Arguments) -> int:
     """Write the file and say what it holds."""
     from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
-    from neeco.scene.scene import gaussian_scene
-    from neeco.training.run import open_run
+    from neeco.training.run import open_gaussian_run
     from neeco.viewer.splats import exported_state, splats_of, write_splats
 
     format = arguments.format or "ply"
@@ -47,8 +46,8 @@ def run(arguments: Arguments) -> int:
         require_ending("--output", arguments.output, *(f".{ending}" for ending in endings))
         if arguments.format is None and arguments.output.suffix:
             format = cast(Format, arguments.output.suffix[1:].lower())
-    with open_run(arguments.run, device_of(arguments.device)) as trained:
-        scene = gaussian_scene(trained.scene, "export")
+    with open_gaussian_run(arguments.run, "export", device_of(arguments.device)) as trained:
+        scene = trained.scene
         frames = len(scene.recorded.states)
         if not 0 <= arguments.frame < frames:
             raise NeecoError(f"--frame: {arguments.frame}: the scene was trained on frames 0 to {frames - 1}")

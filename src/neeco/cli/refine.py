@@ -32,13 +32,13 @@ def run(arguments: Arguments) -> int:
     from neeco.errors import NeecoError
     from neeco.raster.devices import device_of
     from neeco.tracking.refine import refine_run
-    from neeco.training.run import open_run
+    from neeco.training.run import open_gaussian_run
 
     if not arguments.tracked:
         raise NeecoError("refine: give the captures that `neeco track` made, after the run")
     device = device_of(arguments.device)
     with (
-        open_run(arguments.run, device) as opened,
+        open_gaussian_run(arguments.run, "refine", device) as opened,
         Bars() as bars,
         resumable("run the same command again with --resume"),
     ):

@@ -10,7 +10,7 @@ import tyro
 
 from neeco.errors import NeecoError
 from neeco.settings import Device
-from neeco.synthesis.settings import Format, Settings
+from neeco.synthesis.settings import DEFAULT_FORMATS, Settings, formats_help
 
 # what is drawn of a scene that was seen from one place
 VIEWS_OF_STILL = {
@@ -33,8 +33,7 @@ class Arguments:
     output: Path
     """Data set folder to write; must be empty or absent unless --resume."""
     settings: tyro.conf.OmitArgPrefixes[Settings]
-    formats: tuple[Format, ...] = ("coco", "yolo")
-    """Index files beside the plain images, masks, parts and depth."""
+    formats: Annotated[tuple[str, ...], tyro.conf.arg(help=formats_help())] = DEFAULT_FORMATS
     resume: bool = False
     """Continue a data set begun with the same settings, or make it larger."""
     workers: int = 1
@@ -47,16 +46,19 @@ def run(arguments: Arguments) -> int:
     from neeco.cli._progress import counting, resumable
     from neeco.raster.devices import device_of
     from neeco.synthesis.dataset import synthesize
-    from neeco.training.run import load_run, open_run
+    from neeco.training.run import load_run, open_gaussian_run
 
     settings = arguments.settings
     settings.check()
     run_path, instrument_runs = _runs(arguments)
     device = device_of(arguments.device)
-    with open_run(run_path, device) as trained, counting("synthesize", settings.count) as advance:
+    with (
+        open_gaussian_run(run_path, "synthesize", device) as trained,
+        counting("synthesize", settings.count) as advance,
+    ):
         if trained.scene.recorded.still and settings.views in VIEWS_OF_STILL:
             print(f"the scope stood still: views are {VIEWS_OF_STILL[settings.views]}")
-        others = [load_run(path, device) for path in instrument_runs]
+        others = [load_run(path, device).gaussians("synthesize") for path in instrument_runs]
         with resumable("what was drawn is kept; run the same command again with --resume"):
             summary = synthesize(
                 trained,

@@ -43,22 +43,20 @@ def run(arguments: Arguments) -> int:
     from neeco.ingest.footage_video import read_footage
     from neeco.raster.devices import device_of
     from neeco.report.track_page import write_track_page
-    from neeco.scene.scene import gaussian_scene
     from neeco.tracking.track import track_footage
-    from neeco.training.run import open_run
+    from neeco.training.run import open_gaussian_run
 
     is_video = arguments.footage.is_file()
     if is_video and arguments.tissue == "run":
         raise NeecoError(
             f"--tissue: run: {arguments.footage} is a video, whose cameras are in no run's world; leave it out"
         )
-    with open_run(arguments.run, device_of(arguments.device)) as trained:
+    with open_gaussian_run(arguments.run, "track", device_of(arguments.device)) as trained:
         with (
             Bars() as bars,
             resumable("what was done is kept; run the same command again with --resume"),
         ):
-            scene = gaussian_scene(trained.scene, "track")
-            footage = read_footage(arguments.footage, arguments.output, scene, arguments.resume, bars.stage)
+            footage = read_footage(arguments.footage, arguments.output, trained.scene, arguments.resume, bars.stage)
             tracked = track_footage(
                 trained,
                 footage,

@@ -26,7 +26,7 @@ from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import GaussianScene
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class _Problem:
     """What is fitted: one increment of 6 numbers per instrument, in the instrument's frame, then of every reading in
     stated kinematics, then one of 6 for the camera."""
 
-    scene: Scene
+    scene: GaussianScene
     state: State
     names: tuple[str, ...]
     joints: tuple[_Joint, ...]
@@ -149,7 +149,7 @@ class _Problem:
 
 @torch.no_grad()
 def fit_frame(
-    scene: Scene, frame: Frame, image: Tensor, start: Tensor | None = None, config: AlignConfig | None = None
+    scene: GaussianScene, frame: Frame, image: Tensor, start: Tensor | None = None, config: AlignConfig | None = None
 ) -> Fit:
     """Fit the state of `frame` to its recorded `image` [H, W, 3], by about 7 * (6 * instruments + joints + 8) small
     renderings.
@@ -177,7 +177,7 @@ def fit_frame(
     return Fit(problem.moved_state(increments), problem.moved_camera(frame.camera, increments), increments)
 
 
-def _stated_joints(scene: Scene, names: tuple[str, ...]) -> tuple[_Joint, ...]:
+def _stated_joints(scene: GaussianScene, names: tuple[str, ...]) -> tuple[_Joint, ...]:
     """Every reading in stated kinematics; of those that nobody recorded a quarter of their limits is their spread."""
     found = []
     for item in scene.instruments:

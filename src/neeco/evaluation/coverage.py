@@ -18,7 +18,7 @@ from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster.types import Rendering
 
 if TYPE_CHECKING:
-    from neeco.scene import Drawable
+    from neeco.scene import DrawableScene
 
 MAX_VIEWS = 96  # training views compared with, evenly spaced over the recording: neighbours see the same tissue
 FACTOR = 0.25  # of the image's resolution
@@ -69,7 +69,7 @@ class Coverage:
 
 
 @torch.no_grad()
-def observed_depths(scene: Drawable, frames: Sequence[Frame]) -> Coverage:
+def observed_depths(scene: DrawableScene, frames: Sequence[Frame]) -> Coverage:
     """Render the depth maps of (at most MAX_VIEWS of) the training `frames`, small, instrument included."""
     chosen = [frames[index] for index in evenly_spaced(len(frames), MAX_VIEWS)]
     cameras = [_small(frame.camera) for frame in chosen]
@@ -88,7 +88,7 @@ def observed_depths(scene: Drawable, frames: Sequence[Frame]) -> Coverage:
 
 
 @torch.no_grad()
-def unobserved_tissue(coverage: Coverage, scene: Drawable, frame: Frame) -> tuple[Tensor, Tensor]:
+def unobserved_tissue(coverage: Coverage, scene: DrawableScene, frame: Frame) -> tuple[Tensor, Tensor]:
     """Tissue in `frame` that no training view saw, and all its tissue: two bool masks [H, W].
 
     The surface is the scene's own expected depth at the frame's state and camera; where nothing is drawn, that of the

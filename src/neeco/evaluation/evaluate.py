@@ -33,11 +33,11 @@ from neeco.files import finite, write_json
 from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
 from neeco.raster.native import synchronise
-from neeco.scene.scene import gaussian_scene
+from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 
 if TYPE_CHECKING:
-    from neeco.scene import Drawable
-    from neeco.training.run import Run
+    from neeco.scene import DrawableScene
+    from neeco.training.run import TrainedRun
 
 EVALUATION_FILE = "evaluation.json"
 TIMED_DRAWS = 7
@@ -59,7 +59,8 @@ class _Tally:
 class _Context:
     """What is the same for every frame."""
 
-    scene: Drawable
+    scene: DrawableScene
+    posed: GaussianScene | None  # `scene`, where its poses are fitted to the frames
     capture: Capture
     networks: Mapping[str, Lpips]
     coverage: Mapping[str | None, Coverage]  # by tissue; None: there is one
@@ -78,7 +79,7 @@ class _Recorded:
 
 
 def evaluate_run(
-    run: Run,
+    run: TrainedRun,
     capture: Capture,
     splits: Sequence[str] | None = None,
     *,
@@ -98,11 +99,10 @@ def evaluate_run(
     scene = run.scene
     capture = scene.recorded.completed(capture, scene.instruments)
     splits = held_out_splits(capture, splits)
-    if align:
-        gaussian_scene(scene, "--align")
+    posed = require_gaussians(scene, "--align") if align else None
     report = progress or (lambda what, done, total: None)
     report("training views", 0, 1)
-    context = _Context(scene, capture, networks, _coverage(scene, capture.split("train")))
+    context = _Context(scene, posed, capture, networks, _coverage(scene, capture.split("train")))
     report("training views", 1, 1)
     kinds = ("given", "aligned") if align else ("given",)
     names = truth_names(capture.root)
@@ -138,7 +138,7 @@ def evaluate_run(
     return evaluation
 
 
-def _coverage(scene: Drawable, frames: Sequence[Frame]) -> dict[str | None, Coverage]:
+def _coverage(scene: DrawableScene, frames: Sequence[Frame]) -> dict[str | None, Coverage]:
     """What the training frames saw of each tissue."""
     tissues: tuple[str | None, ...] = scene.recorded.tissues or (None,)
     return {
@@ -175,7 +175,8 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
         row: dict[str, Any] = {"frame": frame.name}
         state, camera = frame.state, frame.camera
         if kind == "aligned":
-            fit = fit_frame(gaussian_scene(scene, "--align"), frame, image)
+            assert context.posed is not None
+            fit = fit_frame(context.posed, frame, image)
             state, camera = fit.state, fit.camera
             row["moved"] = pose_changes(frame, state, camera)
             row["world_from_camera"] = camera.world_from_camera.tolist()
@@ -215,7 +216,7 @@ def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]
     }
 
 
-def _summary(scene: Drawable, tally: _Tally) -> tuple[dict[str, Any], dict[str, str]]:
+def _summary(scene: DrawableScene, tally: _Tally) -> tuple[dict[str, Any], dict[str, str]]:
     """Means over the frames that have the number, and which way the scene's pairs of parts were matched."""
     numbers: dict[str, Any] = {key: mean_of([row[key] for row in tally.scores]) for key in tally.scores[0]}
     numbers["mask_frames"] = sum(row["psnr_instrument"] is not None for row in tally.scores)
@@ -255,7 +256,7 @@ def _tissue_note(split: str, tissue: str, numbers: Mapping[str, Any]) -> str:
 
 
 @torch.no_grad()
-def _speed(scene: Drawable, frames: Sequence[Frame]) -> tuple[float, int | None]:
+def _speed(scene: DrawableScene, frames: Sequence[Frame]) -> tuple[float, int | None]:
     """Posed renderings per second (median of TIMED_DRAWS after two that do not count; of fewer where those take long)
     and Gaussians drawn."""
     seconds: list[float] = []
@@ -269,7 +270,7 @@ def _speed(scene: Drawable, frames: Sequence[Frame]) -> tuple[float, int | None]
     return 1.0 / statistics.median(seconds[2:] or seconds[1:]), scene.num_gaussians
 
 
-def _scene_notes(scene: Drawable, networks: Mapping[str, Lpips], names: Mapping[int, str]) -> list[str]:
+def _scene_notes(scene: DrawableScene, networks: Mapping[str, Lpips], names: Mapping[int, str]) -> list[str]:
     notes = []
     missing = [key for name, key in LPIPS_KEYS.items() if name not in networks]
     if missing:

@@ -15,7 +15,7 @@ from neeco.files import is_vacant, read_json, require_content, write_json
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.file import recording_from_flags
 from neeco.ingest.result import IngestResult
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.tracking.footage_tissue import Report
 from neeco.tracking.track import FOOTAGE
 
@@ -23,7 +23,7 @@ SOURCE = "source.json"  # in it: which video that is
 FARTHEST = 0.5  # quantile of the tissue's distances that is what ingest takes for the whole
 
 
-def read_footage(path: Path, output: Path, scene: Scene, resume: bool, report: Report) -> Capture:
+def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, report: Report) -> Capture:
     """The footage at `path`: a capture, or a video file, which becomes the capture `FOOTAGE` in the folder `output`.
 
     No video tells lengths: those of a moving scope are such that the tissue lies as far from it as from the cameras
@@ -63,7 +63,7 @@ def read_footage(path: Path, output: Path, scene: Scene, resume: bool, report: R
     return read_capture(capture_folder)
 
 
-def _distance(scene: Scene) -> float:
+def _distance(scene: GaussianScene) -> float:
     """mm, of the tissue from the recorded cameras."""
     tissue = scene.canonical.means[: scene.canonical.counts[0]].cpu()
     places = torch.stack([camera.world_from_camera[:3, 3].float().cpu() for camera in scene.recorded.cameras])

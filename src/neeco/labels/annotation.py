@@ -19,10 +19,10 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_seen
 from neeco.labels.drawing import LayeredDrawing, draw_layers, surface_depth, to_numpy
 from neeco.labels.labellers import CompositedLabels, instruments_of
-from neeco.scene.scene import gaussian_scene
+from neeco.scene.gaussian_scene import require_gaussians
 
 if TYPE_CHECKING:
-    from neeco.scene import Drawable, Scene
+    from neeco.scene import DrawableScene, GaussianScene
 
 SHAFT_ENDS = ("shaft_far", "shaft_near")  # keypoints; all others are of the working end
 OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2  # OUTSIDE: of the image, or the scene has nothing of the instrument
@@ -75,7 +75,9 @@ class InstrumentLabel:
 
 
 @torch.no_grad()
-def annotate(scene: Scene, drawing: LayeredDrawing, names: tuple[tuple[str, str], ...]) -> list[InstrumentLabel]:
+def annotate(
+    scene: GaussianScene, drawing: LayeredDrawing, names: tuple[tuple[str, str], ...]
+) -> list[InstrumentLabel]:
     """Labels of every instrument of the drawn state; `names` are the (instrument, part) of the drawing's part ids."""
     keypoints = scene.keypoints(drawing.state)
     drawn_at = scene.registered(drawing.state)  # the pose that agrees with the pixels
@@ -146,7 +148,7 @@ def project_keypoints(points: dict[str, Tensor], drawing: LayeredDrawing, instru
 
 
 @torch.no_grad()
-def keypoint_names(scene: Scene) -> tuple[str, ...]:
+def keypoint_names(scene: GaussianScene) -> tuple[str, ...]:
     """Every keypoint that some instrument of the scene has."""
     if not scene.recorded.states:
         return ()
@@ -155,7 +157,7 @@ def keypoint_names(scene: Scene) -> tuple[str, ...]:
 
 
 @torch.no_grad()
-def working_ends(scene: Scene, state: State) -> dict[str, list[np.ndarray]]:
+def working_ends(scene: GaussianScene, state: State) -> dict[str, list[np.ndarray]]:
     """Pivots and tips [3] mm of every instrument for which the scene knows any."""
     ends = {
         instrument: [to_numpy(point) for name, point in points.items() if name not in SHAFT_ENDS]
@@ -164,7 +166,7 @@ def working_ends(scene: Scene, state: State) -> dict[str, list[np.ndarray]]:
     return {instrument: points for instrument, points in ends.items() if points}
 
 
-def working_ends_or_origins(scene: Scene, state: State) -> dict[str, list[np.ndarray]]:
+def working_ends_or_origins(scene: GaussianScene, state: State) -> dict[str, list[np.ndarray]]:
     """The `working_ends`; where none is known, every instrument's origin [3] mm."""
     return working_ends(scene, state) or {
         name: [to_numpy(item.pose[:3, 3])] for name, item in scene.registered(state).instruments.items()
@@ -354,11 +356,13 @@ class LabelledImage(RGBDImage):
 
 
 @overload
-def draw_labelled(scene: Drawable, state: State, camera: Camera, labels: Literal[True] = True) -> LabelledImage: ...
+def draw_labelled(
+    scene: DrawableScene, state: State, camera: Camera, labels: Literal[True] = True
+) -> LabelledImage: ...
 @overload
-def draw_labelled(scene: Drawable, state: State, camera: Camera, labels: bool) -> RGBDImage: ...
+def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bool) -> RGBDImage: ...
 @torch.no_grad()
-def draw_labelled(scene: Drawable, state: State, camera: Camera, labels: bool = True) -> RGBDImage:
+def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bool = True) -> RGBDImage:
     """Draw `state` as `camera` sees it; with `labels` the result is a `LabelledImage`, without an `RGBDImage`.
 
     Poses may be NumPy arrays or tensors: world_from_instrument and world_from_camera [4, 4], mm, OpenCV axes.
@@ -375,7 +379,7 @@ def draw_labelled(scene: Drawable, state: State, camera: Camera, labels: bool = 
         rendering = scene.render(state, scene.recorded.as_learned(camera))
         depth = torch.from_numpy(surface_depth(rendering)).float()
         return RGBDImage(rendering.color.clamp(0, 1).cpu(), depth)
-    known = gaussian_scene(scene, "draw labels")
+    known = require_gaussians(scene, "draw labels")
     labeller = CompositedLabels(known)
     drawing = draw_layers(known, labeller, state, camera, MIN_COMPONENT)
     found = annotate(known, drawing, labeller.names)

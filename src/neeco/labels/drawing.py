@@ -24,7 +24,7 @@ from neeco.raster import rasterize
 from neeco.raster.types import Rendering
 
 if TYPE_CHECKING:
-    from neeco.scene import Drawable, Scene
+    from neeco.scene import DrawableScene, GaussianScene
 
 MOSTLY = 0.5  # of a pixel
 SURFACE_ALPHA = 0.5  # a pixel less opaque than this shows no surface
@@ -73,7 +73,7 @@ class LayeredDrawing(Drawing):
 
 
 @torch.no_grad()
-def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
+def draw(scene: DrawableScene, state: State, camera: Camera) -> Drawing:
     """Draw `state` as `camera`, of any size and lens, sees it, with the scene's own labels where it has any."""
     rendering = scene.render(state, scene.recorded.as_learned(camera), labels=True)
     parts = None if rendering.channels is None else composited_parts(rendering, threshold_of(scene)).cpu()
@@ -82,7 +82,12 @@ def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
 
 @torch.no_grad()
 def draw_layers(
-    scene: Scene, labeller: Labeller, state: State, camera: Camera, min_component: float, tissue_image: bool = False
+    scene: GaussianScene,
+    labeller: Labeller,
+    state: State,
+    camera: Camera,
+    min_component: float,
+    tissue_image: bool = False,
 ) -> LayeredDrawing:
     """Draw `state` as `camera`, of any size and lens, sees it, labelled by `labeller`; tissue and instruments also
     alone, for their depth, and with `tissue_image` for what the tissue looks like.
@@ -118,7 +123,9 @@ def draw_layers(
 
 
 @torch.no_grad()
-def extended_silhouettes(scene: Scene, labeller: Labeller, state: State, camera: Camera) -> dict[str, np.ndarray]:
+def extended_silhouettes(
+    scene: GaussianScene, labeller: Labeller, state: State, camera: Camera
+) -> dict[str, np.ndarray]:
     """Silhouette (bool [3 H, 3 W]) of every instrument drawn alone, by name, in the image of a pinhole `camera` and
     beyond its border: the image is the middle ninth."""
     width, height = camera.width, camera.height

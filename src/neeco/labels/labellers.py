@@ -22,7 +22,7 @@ from neeco.raster.types import Gaussians, Rendering
 from neeco.scene.deformation import otsu
 
 if TYPE_CHECKING:
-    from neeco.scene import Drawable, Scene
+    from neeco.scene import DrawableScene, GaussianScene
 
 # Of scenes without a threshold of their own: the instrument's moving shadow is learned with labels of .3 to .5, so
 # half is too low; .65 to .7 is best.
@@ -37,7 +37,7 @@ THRESHOLD_STATES = 24  # recorded states that Otsu's method looks at
 DELTAS = ("means", "quats", "scales")
 
 
-def threshold_of(scene: Drawable) -> float:
+def threshold_of(scene: DrawableScene) -> float:
     """The share of a pixel from which the scene's labels count it as instrument, unless a user says otherwise."""
     if scene.label_threshold is not None:
         return scene.label_threshold
@@ -79,7 +79,7 @@ class CompositedLabels:
     names: (instrument, part) of part id 1, 2, ...
     """
 
-    def __init__(self, scene: Scene, threshold: float | None = None) -> None:
+    def __init__(self, scene: GaussianScene, threshold: float | None = None) -> None:
         self.names = tuple(scene.label_names)
         if not self.names:
             raise NeecoError(
@@ -133,7 +133,7 @@ class ThresholdLabels:
     """The paper's labeller: Gaussians whose deltas exceed thresholds are drawn alone on black; what is not black is the
     mask. The paper knows one instrument; of several, the nearest owns a moved Gaussian."""
 
-    def __init__(self, scene: Scene, thresholds: DeltaThresholds | None = None) -> None:
+    def __init__(self, scene: GaussianScene, thresholds: DeltaThresholds | None = None) -> None:
         instruments = tuple(instrument.name for instrument in scene.instruments)
         if not instruments:
             raise NeecoError("scene: --labels threshold needs a scene with instruments; this one was trained without")
@@ -173,13 +173,13 @@ Labeller = CompositedLabels | ThresholdLabels
 
 
 @torch.no_grad()
-def delta_magnitudes(scene: Scene, state: State) -> dict[str, Tensor]:
+def delta_magnitudes(scene: GaussianScene, state: State) -> dict[str, Tensor]:
     """How far `state` moves each Gaussian from canonical: norms [N] of the deltas of "means", "quats", "scales"."""
     deltas = scene.deltas(state)
     return {kind: getattr(deltas, kind).norm(dim=1) for kind in DELTAS}
 
 
-def find_thresholds(scene: Scene) -> DeltaThresholds:
+def find_thresholds(scene: GaussianScene) -> DeltaThresholds:
     """Thresholds by Otsu's method on the deltas' log-magnitude over recorded states (the paper leaves them open).
 
     Raises NeecoError when no kind of delta tells Gaussians apart, as in a scene in which nothing moves.

@@ -23,7 +23,7 @@ from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.report.charts import SMALL, Series, line_chart, short
 from neeco.report.page import REPORT_FILE, difference, jpeg, preview_uri, split_counts, to_bytes, write_page
-from neeco.scene import Drawable
+from neeco.scene import DrawableScene
 
 MAX_POINTS = 300  # of a training curve
 
@@ -61,7 +61,7 @@ def write_report(
     run_path: Path,
     evaluation: dict[str, Any],
     capture: Capture,
-    scene: Drawable,
+    scene: DrawableScene,
     *,
     synthesis_preview: Path | None = None,
     playable: str | None = None,
@@ -108,7 +108,9 @@ def write_report(
     )
 
 
-def frame_figures(evaluation: dict[str, Any], capture: Capture, scene: Drawable, kind: str) -> list[dict[str, Any]]:
+def frame_figures(
+    evaluation: dict[str, Any], capture: Capture, scene: DrawableScene, kind: str
+) -> list[dict[str, Any]]:
     """For every evaluated split the best, the median and the worst frame by PSNR, drawn at the poses of `kind`.
 
     Each has `split`, `name`, `why` (best, median, worst), `scores` (words) and `pictures`: (what it is, data URI).
@@ -134,7 +136,7 @@ def chosen_rows(rows: Sequence[dict[str, Any]]) -> list[tuple[str, dict[str, Any
 
 
 def _figure(
-    capture: Capture, scene: Drawable, split: str, frame: Frame, why: str, row: dict[str, Any]
+    capture: Capture, scene: DrawableScene, split: str, frame: Frame, why: str, row: dict[str, Any]
 ) -> dict[str, Any]:
     drawing = draw(scene, *_poses(frame, row))
     recorded, image = frame.load_image().numpy(), drawing.image.numpy()
@@ -220,7 +222,7 @@ def _parts(evaluation: dict[str, Any]) -> dict[str, Any]:
     return {"part_head": head, "parts": rows, "pairs": [pair.replace("_", " ") for pair in pairs]}
 
 
-def _tints(scene: Drawable) -> list[tuple[str, str]]:
+def _tints(scene: DrawableScene) -> list[tuple[str, str]]:
     """Which tint is which part."""
     several = len({instrument for instrument, _ in scene.label_names}) > 1
     tints = []
@@ -256,7 +258,7 @@ def _plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _facts(capture: Capture, scene: Drawable, rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
+def _facts(capture: Capture, scene: DrawableScene, rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
     facts = [("capture", str(capture.root)), ("frames", split_counts(capture)), ("method", scene.method)]
     if rows:
         last = rows[-1]

@@ -160,8 +160,10 @@ class ArticulatedMotion:
     axes: tuple[tuple[JointMotion, ...], ...]  # of every moving instrument, in the order in which they move
 
 
-class Drawable(Protocol):
-    """A learned scene that can be drawn. `Scene` (Gaussians) and `NerfScene` (a field) both are."""
+class DrawableScene(Protocol):
+    """A learned scene that can be rendered: a `GaussianScene` or a radiance field, always a torch module.
+
+    Code that poses or labels Gaussians takes a `GaussianScene` (see `require_gaussians`)."""
 
     method: str
     instruments: tuple[Instrument, ...]
@@ -193,10 +195,6 @@ class Drawable(Protocol):
 
     def torch_threads(self) -> AbstractContextManager[None]:
         """Use as many of torch's threads as pay where the scene is drawn."""
-
-
-class Learned(Drawable, Protocol):
-    """A `Drawable` as training makes it and files hold it: a torch module with its method's settings."""
 
     @property
     def settings(self) -> Any:

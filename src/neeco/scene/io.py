@@ -22,10 +22,10 @@ from neeco.errors import NeecoError
 from neeco.files import HALVES, finite, require_content, require_like, write_atomically
 from neeco.geometry.rotations import rigid_fault
 from neeco.scene.deformation import Deformation
-from neeco.scene.drawable import Learned, Recorded
+from neeco.scene.drawable import DrawableScene, Recorded
+from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.method import Stored
 from neeco.scene.method_registry import method_class, method_settings
-from neeco.scene.scene import Scene
 from neeco.settings import plain
 
 SCHEMA = "neeco-scene/2"
@@ -46,7 +46,7 @@ HEADER = {  # what every scene's header holds, whatever its method
 }
 
 
-def save_scene(scene: Learned, path: Path) -> None:
+def save_scene(scene: DrawableScene, path: Path) -> None:
     """Write `scene` atomically. The same scene gives the same bytes."""
     tensors, header = pack_scene(scene)
     save_tensors(tensors, {"neeco": json.dumps(header, sort_keys=True, allow_nan=False)}, path)
@@ -64,7 +64,7 @@ def save_tensors(tensors: dict[str, Tensor], metadata: dict[str, str], path: Pat
     write_atomically(path, write)
 
 
-def load_scene(path: Path) -> Learned:
+def load_scene(path: Path) -> DrawableScene:
     """Read what `save_scene` wrote. Raises NeecoError when absent, damaged or of another schema."""
     path = Path(path)
     require_content(path)
@@ -90,7 +90,14 @@ def load_scene(path: Path) -> Learned:
         raise NeecoError(f"{path}: damaged scene ({reason}); train again") from None
 
 
-def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def load_gaussians(path: Path, asked_by: str, device: torch.device | None = None) -> GaussianScene:
+    """Read a scene of Gaussians onto `device` (None: the CPU). Raises NeecoError as `load_scene` does and, in the words
+    of the option or verb `asked_by`, for a radiance field."""
+    scene = require_gaussians(load_scene(path), asked_by)
+    return scene if device is None else scene.to(device)
+
+
+def pack_scene(scene: DrawableScene) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """(tensors, JSON-able header) from which `unpack_scene` makes the scene again."""
     recorded = scene.recorded
     tensors = {f"module.{name}": tensor for name, tensor in scene.state_dict().items()}
@@ -135,7 +142,7 @@ def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, header
 
 
-def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Learned:
+def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> DrawableScene:
     """The inverse of `pack_scene`; which kind of scene, the header's method says."""
     require_like(header, HEADER, "header", "it is damaged")
     if HALVES.search(json.dumps(header, ensure_ascii=False)):
@@ -145,8 +152,8 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Learned:
     settings = method_settings(method, header["deformation"])
     kind = method_class(method)
     stored = Stored(settings, instruments, recorded, tensors, header)
-    scene: Learned = (
-        Scene.load(kind(instruments, settings), stored) if issubclass(kind, Deformation) else kind.load(stored)
+    scene: DrawableScene = (
+        GaussianScene.load(kind(instruments, settings), stored) if issubclass(kind, Deformation) else kind.load(stored)
     )
     scene.diagnostics = header["diagnostics"]
     module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame, Instrument
 from neeco.raster.native import torch_threads
-from neeco.scene.drawable import Learned, Recorded
+from neeco.scene.drawable import DrawableScene, Recorded
 from neeco.scene.training_session import Report, RunLength, Session
 from neeco.scene.training_views import TrainingViews
 
@@ -99,7 +99,7 @@ class Method:
         raise NotImplementedError
 
     @classmethod
-    def load(cls, stored: Stored) -> Learned:
+    def load(cls, stored: Stored) -> DrawableScene:
         """The scene of a method without Gaussians that a file holds, but for the state of its modules, which the reader
         of files loads into it.
 

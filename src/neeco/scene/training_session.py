@@ -17,7 +17,7 @@ from torch import Tensor
 from neeco.errors import NeecoError
 from neeco.raster.optimizer import Adam
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.drawable import Learned
+from neeco.scene.drawable import DrawableScene
 from neeco.scene.training_views import TrainingViews
 
 Report = Callable[[str], None]  # shows the user one line
@@ -81,7 +81,7 @@ def members(tensors: Mapping[str, Tensor], group: str) -> dict[str, Tensor]:
 class Session:
     """One training run in memory, of any method."""
 
-    scene: Learned
+    scene: DrawableScene
     length: RunLength
     generator: torch.Generator
     adam: Adam = field(init=False)
@@ -122,8 +122,8 @@ class Session:
         """Compute what is derived from the learned scene after the last step."""
 
 
-class GaussianScene(Learned, Protocol):
-    """`neeco.scene.scene.Scene` as far as a deformation's hooks use it."""
+class CanonicalScene(DrawableScene, Protocol):
+    """The part of `GaussianScene` that a deformation's hooks use."""
 
     canonical: CanonicalGaussians
 
@@ -132,7 +132,7 @@ class GaussianScene(Learned, Protocol):
 class GaussianTraining(Session):
     """A training session as a deformation's hooks see it."""
 
-    scene: GaussianScene
+    scene: CanonicalScene
     views: TrainingViews
     report: Report
     batch_size: int  # frames per step

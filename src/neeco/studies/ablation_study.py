@@ -56,7 +56,7 @@ from neeco.studies.training_job import (
     settings_for,
 )
 from neeco.training.config import TISSUE_GAUSSIANS, TrainConfig, training_config
-from neeco.training.run import open_run
+from neeco.training.run import open_gaussian_run
 from neeco.training.schedule import MIN_RESET_INTERVAL
 
 SCHEMA = "neeco-ablation/1"
@@ -285,7 +285,7 @@ def _label_scores(
         stored = read_json(file) if file.exists() else None
         if stored is None or stored["splits"] != list(splits):
             try:
-                with open_run(folders[name], device) as run:
+                with open_gaussian_run(folders[name], "label ways", device) as run:
                     scored = score_label_ways(run, capture, splits)
             except NeecoError as error:
                 failures.append({"run": name, "error": f"label ways: {error}"})

@@ -19,7 +19,7 @@ import torch
 from neeco.capture.model import Capture, Frame
 from neeco.raster.devices import cuda_backend
 from neeco.raster.native import simd, synchronise, threads
-from neeco.training.run import Run
+from neeco.training.run import TrainedRun
 
 STATUS = Path("/proc/self/status")
 CLEAR = Path("/proc/self/clear_refs")
@@ -108,7 +108,7 @@ def peak_memory_mb() -> float | None:
 
 @torch.no_grad()
 def measure_speed(
-    runs: Sequence[tuple[str, int, Run]],
+    runs: Sequence[tuple[str, int, TrainedRun]],
     capture: Capture,
     device: torch.device,
     progress: Callable[[int, int], None] | None = None,
@@ -146,7 +146,7 @@ def measure_speed(
     }
 
 
-def _timed(run: Run, frames: Sequence[Frame], device: torch.device) -> list[float]:
+def _timed(run: TrainedRun, frames: Sequence[Frame], device: torch.device) -> list[float]:
     """Seconds of each timed image."""
     seconds: list[float] = []
     scene = run.scene.to(device)

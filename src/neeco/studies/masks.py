@@ -18,9 +18,8 @@ from neeco.evaluation.mask_scores import score_masks
 from neeco.files import write_json
 from neeco.labels.drawing import draw, draw_layers
 from neeco.labels.labellers import CompositedLabels, Labeller, ThresholdLabels
-from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.settings import Settings
-from neeco.training.run import Run, open_run
+from neeco.training.run import GaussianRun, TrainedRun, open_run
 
 NAMED_SCORES = ("iou", "challenge_iou", "dice", "boundary_f", "box_ap")  # of the whole instrument
 Row = dict[str, Any]
@@ -69,7 +68,7 @@ def score_folder(
 
 
 @torch.no_grad()
-def draw_masks(run: Run, folder: Path, frames: Sequence[Frame]) -> bool:
+def draw_masks(run: TrainedRun, folder: Path, frames: Sequence[Frame]) -> bool:
     """Write the run's part ids of `frames` as `folder`/<stem>_parts.png, and parts.json, which names them; False, and
     nothing written, when its scene carries no labels. Threads of torch: the caller's to set."""
     scene = run.scene
@@ -106,13 +105,13 @@ def score_runs(
     return rows
 
 
-def score_label_ways(run: Run, capture: Capture, splits: Sequence[str]) -> LabelScores:
+def score_label_ways(run: GaussianRun, capture: Capture, splits: Sequence[str]) -> LabelScores:
     """Mean mask IoU of a run by label way ("composited", "threshold") and split, each as `synthesize` makes its labels.
 
     None where no frame has a true or reference mask, or where a way cannot label the scene (nothing moves in it).
     Threads of torch: the caller's to set. Raises NeecoError for an unreadable mask.
     """
-    scene = gaussian_scene(run.scene, "label ways")
+    scene = run.scene
     capture = scene.recorded.completed(capture, scene.instruments)
     min_component = Settings(count=1).min_component
     scores: LabelScores = {}

@@ -33,7 +33,7 @@ from neeco.training.run import open_run, read_config, require_same_capture, stor
 from neeco.training.train import ProgressRow, train
 
 if TYPE_CHECKING:
-    from neeco.scene import Drawable
+    from neeco.scene import DrawableScene
     from neeco.scene.training_session import Session
 
 JOB_SCHEMA = "neeco-job/1"
@@ -298,7 +298,7 @@ class HeldOutFrames:
             self.frames[split] = [(frame, frame.load_image(), frame.load_mask()) for frame in chosen]
 
     @torch.no_grad()
-    def score(self, scene: Drawable) -> dict[str, float | None]:
+    def score(self, scene: DrawableScene) -> dict[str, float | None]:
         """Mean PSNR of each split, dB; None when it is no number. Random states are left as they were."""
         scores: dict[str, float | None] = {}
         with torch.random.fork_rng(devices=[]):
@@ -340,7 +340,7 @@ class TrainingRecorder:
             self.add_row(session.scene, session.progress)
         self.times = _read_clocks()
 
-    def add_row(self, scene: Drawable, progress: float) -> None:
+    def add_row(self, scene: DrawableScene, progress: float) -> None:
         """Score the held-out frames, and write curve and totals."""
         for split, value in self.held_out.score(scene).items():
             row = {key: self.totals[key] for key in ("iteration", "seconds", "processor_seconds")}

@@ -6,7 +6,7 @@ What trust is: `neeco.evaluation.trust`.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,15 +25,14 @@ from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.raster.optics import resampled, supersampled
-from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
-from neeco.synthesis.settings import AS_RECORDED, MIN_TRUST, Format, ImageSettings, Settings
+from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings
 from neeco.synthesis.writers.folder import Record, write_sample, write_skipped
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
-    from neeco.training.run import Run
+    from neeco.scene import GaussianScene
+    from neeco.training.run import GaussianRun
 
 REFERENCE_FRAMES = 16  # training frames that tell how well pixels are usually explained
 FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # the start is near: no coarse search
@@ -56,12 +55,12 @@ class Annotated:
 
 
 def annotate_capture(
-    run: Run,
+    run: GaussianRun,
     output: Path,
     *,
     capture: Capture | None = None,
     min_trust: float = MIN_TRUST,
-    formats: tuple[Format, ...] = ("coco", "yolo"),
+    formats: Sequence[str] = DEFAULT_FORMATS,
     images: ImageSettings = AS_RECORDED,
     resume: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
@@ -78,7 +77,7 @@ def annotate_capture(
     """
     if not 0 <= min_trust <= 1:
         raise NeecoError(f"--min-trust: {min_trust} is not a share; give 0 to 1")
-    scene = gaussian_scene(run.scene, "annotate")
+    scene = run.scene
     labeller = CompositedLabels(scene)
     trained_on = run.capture()
     capture = trained_on if capture is None else scene.recorded.completed(capture, scene.instruments)
@@ -116,7 +115,7 @@ def annotate_capture(
 class _Annotator:
     """Fits, draws, judges and writes frames."""
 
-    scene: Scene
+    scene: GaussianScene
     labeller: CompositedLabels
     typical: TypicalErrors
     min_trust: float
@@ -190,7 +189,7 @@ def _without_keypoints_in(missing: Tensor, label: InstrumentLabel) -> Instrument
 
 
 def fitted(
-    scene: Scene, labeller: CompositedLabels, frame: Frame, image: Tensor, start: Tensor | None
+    scene: GaussianScene, labeller: CompositedLabels, frame: Frame, image: Tensor, start: Tensor | None
 ) -> tuple[Fit, LayeredDrawing]:
     """The poses of `frame` fitted to its image [H, W, 3], and what the scene draws there; `start`: a neighbour's
     increments, without which the search starts coarse."""
@@ -198,7 +197,7 @@ def fitted(
     return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.min_component, tissue_image=True)
 
 
-def typical_errors(scene: Scene, labeller: CompositedLabels, trained_on: Capture) -> TypicalErrors:
+def typical_errors(scene: GaussianScene, labeller: CompositedLabels, trained_on: Capture) -> TypicalErrors:
     """The scene's errors on the frames that it was trained on."""
     frames = trained_on.split("train")
     drawings = []
@@ -209,7 +208,7 @@ def typical_errors(scene: Scene, labeller: CompositedLabels, trained_on: Capture
     return typical_errors_of(drawings)
 
 
-def _check_instruments(scene: Scene, capture: Capture) -> None:
+def _check_instruments(scene: GaussianScene, capture: Capture) -> None:
     """Raises NeecoError unless every frame states the poses and joints of the scene's instruments."""
     known = {item.name: set(item.joints) for item in capture.instruments}
     for instrument in scene.instruments:

@@ -29,7 +29,7 @@ from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
 from neeco.synthesis.states import rigid
 
 if TYPE_CHECKING:
-    from neeco.scene import Recorded, Scene
+    from neeco.scene import GaussianScene, Recorded
 
 SoftMasks = Literal["mid", "mean"]
 SOFT_MASKS = "soft_masks"
@@ -296,7 +296,9 @@ class MixedMotion:
         )
 
 
-def subframes(scene: Scene, drawing: LayeredDrawing, motion: Motion, shutter_s: float) -> list[tuple[State, Camera]]:
+def subframes(
+    scene: GaussianScene, drawing: LayeredDrawing, motion: Motion, shutter_s: float
+) -> list[tuple[State, Camera]]:
     """States and cameras spread evenly over an exposure of which `drawing` is the middle: so many that nothing moves
     by more than SUBFRAME_PX from one to the next (MAX_SUBFRAMES at most), and an odd number, so that the middle is
     one of them."""

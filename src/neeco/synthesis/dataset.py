@@ -12,6 +12,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,16 +22,16 @@ from neeco.errors import NeecoError
 from neeco.files import own_folder, read_begun, read_bytes, require_same, write_json
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.drawing import REACH
-from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels, instruments_of
+from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels
 from neeco.raster.native import threads
-from neeco.scene.scene import gaussian_scene
+from neeco.registry import plugins
 from neeco.synthesis.camera_effects import read_effects
+from neeco.synthesis.card import write_card
 from neeco.synthesis.generator import (
     ENTERS_ANOTHER,
     ENTERS_TISSUE,
     LEAVES_IMAGE,
     UNOBSERVED_TISSUE,
-    VERB,
     GeneratorSpec,
     SampleGenerator,
     draw_to_folder,
@@ -38,10 +39,9 @@ from neeco.synthesis.generator import (
 )
 from neeco.synthesis.preview import write_preview
 from neeco.synthesis.samplers import SIMILAR, states_fingerprint
-from neeco.synthesis.settings import Format, ImageSettings, Settings
+from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names
 from neeco.synthesis.workers import draw_in_processes, draw_on_cluster
-from neeco.synthesis.writers.bop import write_bop
-from neeco.synthesis.writers.coco import write_coco
+from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import (
     DEPTH_MM_PER_COUNT,
     FOLDERS,
@@ -52,12 +52,10 @@ from neeco.synthesis.writers.folder import (
     record_path,
     write_states,
 )
-from neeco.synthesis.writers.hub import write_card, write_imagefolder, write_webdataset
-from neeco.synthesis.writers.yolo import write_yolo
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
-    from neeco.training.run import Run
+    from neeco.scene import GaussianScene
+    from neeco.training.run import GaussianRun
 
 SCHEMA = "neeco-dataset/1"
 SAME_IMAGES = ("0.1.0",)  # versions that draw the same images and labels as this one, so that their sets are continued
@@ -84,14 +82,14 @@ class Synthesized:
 
 
 def synthesize(
-    run: Run,
+    run: GaussianRun,
     output: Path,
     settings: Settings,
-    formats: tuple[Format, ...] = ("coco", "yolo"),
+    formats: Sequence[str] = DEFAULT_FORMATS,
     resume: bool = False,
     on_progress: Callable[[int], None] = lambda done: None,
     workers: int = 1,
-    instrument_runs: Sequence[Run] = (),
+    instrument_runs: Sequence[GaussianRun] = (),
 ) -> Synthesized:
     """Write a labelled data set of `settings.count` images of the run's scene to `output`; with `instrument_runs` of
     its tissue under the instruments of those runs.
@@ -110,7 +108,7 @@ def synthesize(
         cluster.require_ray()
     output = Path(output)
     runs = (run, *instrument_runs)
-    scene, *instrument_scenes = (gaussian_scene(given.scene, VERB) for given in runs)
+    scene, *instrument_scenes = (given.scene for given in runs)
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
     check_formats(formats, settings)
     recorded = scene.recorded.cameras[0]
@@ -162,7 +160,9 @@ def _draw_all(
     return (draw_to_folder(generator, output, index) for index in missing)
 
 
-def description(run: Run, settings: dict[str, Any], instrument_runs: Sequence[Run] = ()) -> dict[str, Any]:
+def description(
+    run: GaussianRun, settings: dict[str, Any], instrument_runs: Sequence[GaussianRun] = ()
+) -> dict[str, Any]:
     """How a data set of the run's scene, or of its tissue under the instruments of `instrument_runs`, is made: what
     dataset.json begins with. `settings` must stay the same for it to be continued."""
     info = {
@@ -180,7 +180,7 @@ def description(run: Run, settings: dict[str, Any], instrument_runs: Sequence[Ru
     return info
 
 
-def _digest(run: Run) -> str:
+def _digest(run: GaussianRun) -> str:
     content = read_bytes(Path(run.path) / SCENE_FILE, "a learned scene", "no such file; train the run first")
     return hashlib.sha256(content).hexdigest()
 
@@ -212,9 +212,9 @@ class DataSetFolder:
     count: int  # of records, once it is complete
     begun: bool
     info: dict[str, Any]
-    scene: Scene
+    scene: GaussianScene
     labeller: Labeller
-    formats: tuple[Format, ...]
+    formats: Sequence[str]
 
     @contextlib.contextmanager
     def being_written(self) -> Iterator[dict[int, Record]]:
@@ -246,19 +246,22 @@ class DataSetFolder:
     def _write_indexes(self, records: list[Record], complete: bool) -> None:
         """(Re)write everything that is about the whole data set, from the records."""
         output, names, images = self.output, self.labeller.names, with_image(records)
-        instruments, keypoints = instruments_of(names), keypoint_names(self.scene)
+        keypoints = keypoint_names(self.scene)
         write_states(output, images)
-        writers: dict[Format, Callable[[], None]] = {
-            "coco": lambda: write_coco(output, images, names, keypoints, self.scene.skeleton()),
-            "yolo": lambda: write_yolo(output, images, instruments, keypoints),
-            "webdataset": lambda: write_webdataset(output, images),
-            "bop": lambda: write_bop(output, images, self.scene, self.labeller),
-            "imagefolder": lambda: write_imagefolder(output, images, instruments),
-        }
         # formats of earlier starts, too: their index files would else lack the images made now
-        formats = [*self.formats, *(name for name in writers if name not in self.formats and (output / name).is_dir())]
+        formats = [*self.formats, *(name for name in format_names() if name not in self.formats)]
+        formats = [name for name in formats if name in self.formats or (output / name).is_dir()]
+        written = WrittenImages(
+            root=output,
+            records=images,
+            part_names=names,
+            keypoint_names=keypoints,
+            bones=self.scene.skeleton(),
+            scene=self.scene,
+            labeller=self.labeller,
+        )
         for name in formats:
-            writers[name]()
+            writer(name)().write(written)
         if images:
             write_preview(output, images, names, self.scene.skeleton())
         thresholds = self.labeller.thresholds if isinstance(self.labeller, ThresholdLabels) else None
@@ -274,14 +277,32 @@ class DataSetFolder:
             "refused": refusals(records),
             "skipped": skipped(records),
         }
-        write_card(output, info)
+        write_card(output, info, {name: writer(name).description for name in formats})
         write_json(output / INFO, info)
 
 
-def check_formats(formats: Sequence[Format], settings: ImageSettings) -> None:
-    """Raises NeecoError for a format that cannot say what the images are."""
-    if settings.lens and "bop" in formats:
-        raise NeecoError("--formats: bop knows no distortion; leave out bop, or --lens")
+@cache
+def writers() -> dict[str, type[Writer]]:
+    """Return every data set format by name: those of `neeco.synthesis.writers` and of entry points in `neeco.writers`.
+    Raises NeecoError when two share a name, or one cannot be loaded."""
+    return plugins(Writer, "format", "neeco.synthesis.writers", WRITERS)  # type: ignore[type-abstract]
+
+
+def writer(name: str) -> type[Writer]:
+    """Return the writer of the format `name`. Raises NeecoError when there is none."""
+    if name not in writers():
+        raise NeecoError(
+            f"--formats: {name!r} is unknown; choose of {', '.join(writers())}, or install the package that has it"
+        )
+    return writers()[name]
+
+
+def check_formats(formats: Sequence[str], settings: ImageSettings) -> None:
+    """Raises NeecoError for a format that is unknown, or that cannot describe the images."""
+    for name in formats:
+        if settings.lens and not writer(name).accepts_distortion:
+            raise NeecoError(f"--formats: {name} knows no distortion; leave out {name}, or --lens")
+        writer(name)
 
 
 def part_ids(names: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:

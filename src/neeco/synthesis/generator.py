@@ -23,8 +23,7 @@ from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, pla
 from neeco.labels.drawing import MOSTLY, LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.raster.native import keep_freed_memory, set_threads
-from neeco.scene.io import load_scene
-from neeco.scene.scene import gaussian_scene
+from neeco.scene.io import load_gaussians
 from neeco.synthesis.camera_effects import (
     CameraEffects,
     MixedMotion,
@@ -42,7 +41,7 @@ from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers.folder import Record, write_sample, write_skipped
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import GaussianScene
 
 VERB = "synthesize"
 EFFECTS_STREAM = 1  # of an image's random numbers: camera effects do not change which state and view are drawn
@@ -92,7 +91,7 @@ class Acceptance:
     max_unobserved: float = 1.0
     recorded_together: tuple[frozenset[str], ...] = ()
 
-    def refusal(self, scene: Scene, drawing: LayeredDrawing) -> str | None:
+    def refusal(self, scene: GaussianScene, drawing: LayeredDrawing) -> str | None:
         """The reason to refuse the drawing, or None."""
         keypoints = working_ends(scene, drawing.state)
         # first: an instrument wholly behind the tissue shows no pixels either
@@ -116,7 +115,7 @@ class Acceptance:
 class SampleGenerator:
     """Draws the samples of one data set; writes nothing."""
 
-    scene: Scene
+    scene: GaussianScene
     labeller: Labeller
     sampler: Sampler | TissueSampler | MixedSampler
     acceptance: Acceptance
@@ -127,7 +126,9 @@ class SampleGenerator:
     cameras: DrawnCameras = RECORDED_CAMERAS
 
     @classmethod
-    def of(cls, scene: Scene, settings: Settings, instrument_scenes: Sequence[Scene] = ()) -> SampleGenerator:
+    def of(
+        cls, scene: GaussianScene, settings: Settings, instrument_scenes: Sequence[GaussianScene] = ()
+    ) -> SampleGenerator:
         """What `settings` ask for: images of `scene`, or of its tissue under the instruments of `instrument_scenes`.
         Raises NeecoError where the scenes cannot give it."""
         cameras = DrawnCameras.of(settings, scene.recorded, scene.recorded.cameras)
@@ -231,7 +232,7 @@ class GeneratorSpec:
         """The generator. Raises NeecoError where a file cannot be read or does not fit."""
         device = torch.device(self.device)
         paths = (self.scene, *self.instrument_scenes)
-        scene, *others = (gaussian_scene(load_scene(path).to(device), VERB) for path in paths)
+        scene, *others = (load_gaussians(path, VERB, device) for path in paths)
         return SampleGenerator.of(scene, self.settings, others)
 
 
@@ -256,7 +257,7 @@ def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Reco
     return write_sample(output, index, sample.drawing, sample.labels, sample.refused, sample.facts, quality)
 
 
-def find_tolerance(scene: Scene, labeller: Labeller) -> float:
+def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
     """The tolerance, in mm, under which nine of ten recorded states are acceptable, between 2 and 5 mm.
 
     No recorded instrument was in the tissue: where the model says so, that is the model's error. More than 5 mm is no
@@ -270,7 +271,7 @@ def find_tolerance(scene: Scene, labeller: Labeller) -> float:
     return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *TOLERANCE_MM)) / 100)
 
 
-def buried_depth(scene: Scene, drawing: LayeredDrawing) -> float:
+def buried_depth(scene: GaussianScene, drawing: LayeredDrawing) -> float:
     """How far, in mm, the worst instrument lies behind the tissue surface that this camera sees; 0 for none.
 
     All but the deepest BURIED_SHARE of an instrument's pixels are above this depth, and all keypoints of its working
@@ -307,7 +308,9 @@ def _intersect(drawing: LayeredDrawing, some: frozenset[str], others: frozenset[
     return False
 
 
-def _motion(scene: Scene, instrument_scenes: Sequence[Scene], settings: Settings) -> RecordedMotion | MixedMotion:
+def _motion(
+    scene: GaussianScene, instrument_scenes: Sequence[GaussianScene], settings: Settings
+) -> RecordedMotion | MixedMotion:
     """How everything moves while a shutter is open. Raises NeecoError where the recordings do not tell."""
     motion: RecordedMotion | MixedMotion = RecordedMotion(scene.recorded)
     if instrument_scenes:

@@ -28,7 +28,7 @@ from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies
 from neeco.scene.deformation import Deformation
 from neeco.scene.drawable import Recorded
-from neeco.scene.scene import Scene, one_tissue
+from neeco.scene.gaussian_scene import GaussianScene, one_tissue
 from neeco.scene.visibility import VISIBILITY
 from neeco.synthesis.samplers import Sampler, TissueSampler, make_sampler
 
@@ -45,16 +45,16 @@ SOLID = 0.5  # least opacity of Gaussians that tell a shaft's colour
 class Mixture:
     """A scene of one run's tissue and other runs' instruments, with a way to place them."""
 
-    scene: Scene
-    tissue: Scene
-    instrument_scenes: tuple[Scene, ...]
+    scene: GaussianScene
+    tissue: GaussianScene
+    instrument_scenes: tuple[GaussianScene, ...]
     gains: tuple[tuple[float, float, float], ...]  # by which each instrument scene's colours were multiplied
     min_depth: Mapping[str, float]  # mm from the lens, by instrument: working ends were recorded no nearer
     tissue_alone: Gaussians  # of `tissue`
     own_tissue_alone: tuple[Gaussians, ...]  # of every instrument scene
 
     @classmethod
-    def of(cls, tissue: Scene, instrument_scenes: Sequence[Scene]) -> Mixture:
+    def of(cls, tissue: GaussianScene, instrument_scenes: Sequence[GaussianScene]) -> Mixture:
         """Instruments recorded over several tissues are placed as over the first. Raises NeecoError where a scene's
         instruments cannot be taken out of it, or two have the same name."""
         one_tissue(tissue, "--tissue")
@@ -104,7 +104,7 @@ class Mixture:
         ]
         return MixedSampler(self, tuple(samplers))
 
-    def place(self, scene: Scene, state: State, seen_by: Camera, camera: Camera) -> dict[str, InstrumentState]:
+    def place(self, scene: GaussianScene, state: State, seen_by: Camera, camera: Camera) -> dict[str, InstrumentState]:
         """The instruments of instrument scene `scene`, in `state` before `seen_by`, as placed before `camera` of the
         tissue's run.
 
@@ -168,14 +168,14 @@ class MixedSampler:
         return State(placed, 0.0), camera
 
 
-def _working_end(scene: Scene, state: State, camera: Camera) -> np.ndarray:
+def _working_end(scene: GaussianScene, state: State, camera: Camera) -> np.ndarray:
     """The mean [3] mm of the instruments' working ends in the camera's frame; of their origins where none is known."""
     ends = [point for points in working_ends_or_origins(scene, state).values() for point in points]
     camera_from_world = np.linalg.inv(to_numpy(camera.world_from_camera))
     return camera_from_world[:3, :3] @ np.mean(ends, axis=0) + camera_from_world[:3, 3]
 
 
-def _min_depth(scene: Scene) -> float:
+def _min_depth(scene: GaussianScene) -> float:
     """Depth mm of the working ends in the recorded frame where they were nearest to the lens."""
     recorded = scene.recorded
     pairs = zip(recorded.states, recorded.cameras, strict=True)
@@ -183,7 +183,7 @@ def _min_depth(scene: Scene) -> float:
 
 
 @torch.no_grad()
-def tissue_gaussians(scene: Scene) -> Gaussians:
+def tissue_gaussians(scene: GaussianScene) -> Gaussians:
     """The scene's tissue alone, which stands still; for its depth, so without its light."""
     gaussians = scene.at(scene.recorded.states[0])
     return dataclasses.replace(gaussians, sh=gaussians.sh[:, :1], headlight=None).select(scene.canonical.bodies == 0)
@@ -202,14 +202,16 @@ def tissue_depth(tissue: Gaussians, camera: Camera, point: np.ndarray) -> float:
     return float(surface_depth(rendering)[row, column])
 
 
-def _merged(tissue: Scene, instrument_scenes: Sequence[Scene], gains: Sequence[tuple[float, float, float]]) -> Scene:
+def _merged(
+    tissue: GaussianScene, instrument_scenes: Sequence[GaussianScene], gains: Sequence[tuple[float, float, float]]
+) -> GaussianScene:
     """One scene of the tissue of `tissue` and the instruments of `instrument_scenes`."""
     instruments = tuple(instrument for scene in instrument_scenes for instrument in scene.instruments)
     deformation = tissue.deformation.combined([scene.deformation for scene in instrument_scenes])
     bodies = [_body(tissue, 0, deformation)]
     for scene, gain in zip(instrument_scenes, gains, strict=True):
         bodies += [_brightened(_body(scene, k + 1, deformation), gain) for k in range(len(scene.instruments))]
-    mixed = Scene(
+    mixed = GaussianScene(
         tissue.method, join_bodies(bodies), deformation, instruments, tissue.recorded, tissue.center.detach().clone()
     ).to(tissue.center.device)
     with torch.no_grad():
@@ -225,7 +227,7 @@ def _merged(tissue: Scene, instrument_scenes: Sequence[Scene], gains: Sequence[t
     return mixed.requires_grad_(False)
 
 
-def _body(scene: Scene, index: int, deformation: Deformation) -> CanonicalGaussians:
+def _body(scene: GaussianScene, index: int, deformation: Deformation) -> CanonicalGaussians:
     """One body alone, with what the mixed scene's `deformation` knows of each Gaussian, and how well it was seen."""
     canonical, rows = scene.canonical, scene.canonical.body(index)
     seen = scene.visibility()[rows]
@@ -240,7 +242,7 @@ def _brightened(body: CanonicalGaussians, gain: tuple[float, float, float]) -> C
     return dataclasses.replace(body, sh_dc=brightened(body.sh_dc, factor), sh_rest=body.sh_rest * factor)
 
 
-def _gain(tissue: Scene, instruments: Scene) -> tuple[float, float, float]:
+def _gain(tissue: GaussianScene, instruments: GaussianScene) -> tuple[float, float, float]:
     """By what the colours of `instruments` are multiplied to look as under the light of `tissue`'s capture, going by
     the shafts, grey of a like kind in both. 1 where the tissue's run has no instrument to compare with, or it is the
     same run."""
@@ -251,7 +253,7 @@ def _gain(tissue: Scene, instruments: Scene) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _shaft_color(scene: Scene) -> Tensor:
+def _shaft_color(scene: GaussianScene) -> Tensor:
     """[3] the mean colour, at 100 mm, of what is solid of the instruments' shafts."""
     labels = scene.label_channels()
     shaft = [k for k, (_, part) in enumerate(scene.label_names) if part in ("shaft", "instrument")]

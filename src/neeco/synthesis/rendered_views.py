@@ -25,8 +25,8 @@ from neeco.synthesis.samplers import moved_camera, states_file
 from neeco.synthesis.settings import AS_RECORDED, ImageSettings
 
 if TYPE_CHECKING:
-    from neeco.scene import Drawable
-    from neeco.training.run import Run
+    from neeco.scene import DrawableScene
+    from neeco.training.run import TrainedRun
 
 STATES_FOLDER = "states"
 
@@ -48,7 +48,7 @@ class View(NamedTuple):
     camera: Camera
 
 
-def split_views(run: Run, split: str, capture_path: Path | None = None) -> list[View]:
+def split_views(run: TrainedRun, split: str, capture_path: Path | None = None) -> list[View]:
     """The frames of one split of a capture (the run's own unless given), named by their files' stems.
 
     Stems that several frames share are made unique by the names of the folders above them. Raises NeecoError.
@@ -70,7 +70,7 @@ def split_views(run: Run, split: str, capture_path: Path | None = None) -> list[
     return views
 
 
-def state_views(scene: Drawable, path: Path) -> list[View]:
+def state_views(scene: DrawableScene, path: Path) -> list[View]:
     """The states of a JSON-lines file, each from its own camera, or the first recorded one where it has none."""
     first = scene.recorded.cameras[0]
     views = []
@@ -82,7 +82,7 @@ def state_views(scene: Drawable, path: Path) -> list[View]:
 
 
 def render(
-    scene: Drawable,
+    scene: DrawableScene,
     views: Sequence[View],
     folder: Path,
     on_progress: Callable[[int], None] = lambda done: None,

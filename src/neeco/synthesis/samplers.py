@@ -38,7 +38,7 @@ from neeco.synthesis.states import (
 )
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import GaussianScene
 
 SIMILAR = 10  # recorded frames whose cameras may see a drawn state
 VIEW_ATTEMPTS = 50  # views drawn until one has the instrument in the image
@@ -131,7 +131,7 @@ class OrbitViews:
 class Sampler:
     """Draws (state, camera) of image `index`."""
 
-    scene: Scene
+    scene: GaussianScene
     states: StateSampler
     views: ViewSampler
     cameras: tuple[Camera | None, ...] = (None,)  # given with the states, in turn; None: the view sampler decides
@@ -195,7 +195,7 @@ class TissueViews:
         return self.by_tissue[state.tissue](state, rng)
 
 
-def make_sampler(scene: Scene, states: str, margin: float, views: Views, count: int) -> Sampler | TissueSampler:
+def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views, count: int) -> Sampler | TissueSampler:
     """The sampler named by `states` (interpolate, extrapolate, grid, path:FILE or FILE) and `views`, over each of the
     scene's tissues. Raises NeecoError."""
     tissues = scene.recorded.tissues
@@ -208,7 +208,7 @@ def make_sampler(scene: Scene, states: str, margin: float, views: Views, count: 
     return TissueSampler(tuple(_sampler(own, states, margin, seen[tissue], count) for tissue, own in alone.items()))
 
 
-def _view_sampler(scene: Scene, views: Views) -> ViewSampler:
+def _view_sampler(scene: GaussianScene, views: Views) -> ViewSampler:
     recorded = RecordedViews(scene.recorded.cameras, scene.recorded.states)
     view_sampler: ViewSampler = recorded
     still = scene.recorded.still
@@ -223,7 +223,7 @@ def _view_sampler(scene: Scene, views: Views) -> ViewSampler:
     return view_sampler
 
 
-def _sampler(scene: Scene, states: str, margin: float, view_sampler: ViewSampler, count: int) -> Sampler:
+def _sampler(scene: GaussianScene, states: str, margin: float, view_sampler: ViewSampler, count: int) -> Sampler:
     if states == "interpolate":
         return Sampler(scene, InterpolatedStates(scene.recorded.states), view_sampler)
     if states == "extrapolate":
@@ -257,7 +257,7 @@ def states_fingerprint(states: str) -> str | None:
 
 
 @torch.no_grad()
-def instrument_axes(scene: Scene) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def instrument_axes(scene: GaussianScene) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Axis of each instrument in its own frame: a point [3] mm and a unit direction [3].
 
     The learned shaft where the scene knows one, else the frame's z axis.
@@ -295,7 +295,7 @@ def surface_points(depth: np.ndarray, camera: Camera, step: int = 4) -> np.ndarr
 
 
 @torch.no_grad()
-def surface_centre(scene: Scene) -> np.ndarray:
+def surface_centre(scene: GaussianScene) -> np.ndarray:
     """The median [3] mm of the surface points that recorded cameras see."""
     recorded = scene.recorded
     points = []

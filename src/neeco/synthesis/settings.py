@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import asdict, dataclass, fields
+from importlib.metadata import entry_points
 from typing import Any, Literal, get_args
 
 from neeco.errors import NeecoError
 
 LabelWay = Literal["composited", "threshold"]
-Format = Literal["coco", "yolo", "webdataset", "bop", "imagefolder"]
 Views = Literal["recorded", "perturbed", "orbit"]
+FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")  # of our own writers
+DEFAULT_FORMATS = ("coco", "yolo")
+WRITERS = "neeco.writers"  # the group of entry points of others'
 PATH_PREFIX = "path:"
 SIZE = re.compile(r"[1-9]\d{0,5}[xX][1-9]\d{0,5}")
 SAMPLERS = ("interpolate", "extrapolate", "grid")  # what `states` may be beside a file
@@ -98,6 +101,16 @@ class ImageSettings(SizeSettings):
             "lens": self.lens or None,
             "quality": self.jpeg_quality,
         }
+
+
+def format_names() -> tuple[str, ...]:
+    """Return the names that `--formats` takes: ours, then those of installed packages. Loads none of them."""
+    return tuple(dict.fromkeys((*FORMATS, *sorted(point.name for point in entry_points(group=WRITERS)))))
+
+
+def formats_help() -> str:
+    """Return the help of `--formats`."""
+    return f"Index files beside the plain images, masks, parts and depth: {', '.join(format_names())}."
 
 
 RECORDED_SIZE, AS_RECORDED = SizeSettings(), ImageSettings()

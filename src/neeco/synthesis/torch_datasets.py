@@ -49,8 +49,8 @@ from neeco.geometry.camera import Camera
 from neeco.labels.annotation import LabelledImage, keypoint_names
 from neeco.labels.labellers import instruments_of
 from neeco.raster.native import torch_threads
-from neeco.scene.io import load_scene, save_scene
-from neeco.scene.scene import Scene, gaussian_scene
+from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
+from neeco.scene.io import load_gaussians, save_scene
 from neeco.settings import with_fields
 from neeco.synthesis.dataset import INFO, SCENE_FILE
 from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, StatesRefused, limit_threads
@@ -58,11 +58,11 @@ from neeco.synthesis.samplers import make_sampler
 from neeco.synthesis.settings import PATH_PREFIX, LabelWay, Settings, Views
 from neeco.synthesis.workers import PackedSpec
 from neeco.synthesis.writers.folder import read_public_records, stem
-from neeco.training.run import Run, load_run
+from neeco.training.run import TrainedRun, load_run
 
 Sample = dict[str, Any]
 Transform = Callable[[Sample], Sample]
-SceneLike = Run | Scene | Path | str
+SceneLike = TrainedRun | GaussianScene | Path | str
 STACKED = ("image", "parts", "depth", "ignore")  # of one shape in a batch; the rest are lists
 RANDOM = ("interpolate", "extrapolate")  # samplers that draw anew what is refused
 MAX_REFUSED = 1000  # given states refused in a row, before a stream ends with an error
@@ -320,16 +320,16 @@ class StoredImages(Dataset[Sample]):
         return found if self.transform is None else self.transform(found)
 
 
-def _opened(given: SceneLike) -> tuple[Scene, Path | None]:
+def _opened(given: SceneLike) -> tuple[GaussianScene, Path | None]:
     """The scene, and the file that holds it where there is one. Raises NeecoError."""
     if isinstance(given, str | Path):
         path = Path(given)
         if not path.is_dir():
-            return gaussian_scene(load_scene(path), ASKED_BY), path
+            return load_gaussians(path, ASKED_BY), path
         given = load_run(path)
     folder = getattr(given, "path", None)  # a run has one
     drawable: Any = getattr(given, "scene", given)
-    scene = gaussian_scene(getattr(drawable, "learned", drawable), ASKED_BY)  # neeco.Scene holds what was learned
+    scene = require_gaussians(getattr(drawable, "learned", drawable), ASKED_BY)  # neeco.Scene holds what was learned
     return scene, None if folder is None else Path(folder) / SCENE_FILE
 
 
@@ -339,7 +339,7 @@ def _settings(count: int, seed: int, camera_effects: str | Path | None, **given:
     return with_fields(Settings(count, seed), {"camera_effects": effects} | given)
 
 
-def _spec(opened: Sequence[tuple[Scene, Path | None]], settings: Settings) -> GeneratorSpec | PackedSpec:
+def _spec(opened: Sequence[tuple[GaussianScene, Path | None]], settings: Settings) -> GeneratorSpec | PackedSpec:
     """The generator of these scenes, for another process."""
     device = str(opened[0][0].center.device)
     paths = [path for _, path in opened if path is not None]

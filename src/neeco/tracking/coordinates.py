@@ -14,7 +14,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 
 DEG = math.pi / 180
 BELOW, ABOVE = 0.1, 0.5  # of a joint's recorded range: how far below and above it a joint is looked for
@@ -42,7 +42,7 @@ class Coordinates:
     instruments: tuple[TrackedInstrument, ...]
 
     @classmethod
-    def of(cls, scene: Scene) -> Coordinates:
+    def of(cls, scene: GaussianScene) -> Coordinates:
         """Raises NeecoError for a scene that does not keep tissue and instruments apart, or knows no instrument."""
         deformation = scene.deformation
         if not (deformation.separates_instruments and isinstance(deformation, ArticulatedInstruments)):

@@ -16,7 +16,7 @@ from neeco.labels.labellers import CompositedLabels, composited_labels
 from neeco.raster import rasterize
 from neeco.raster.shadow import GAMMA, shadowed
 from neeco.raster.types import Gaussians
-from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 
 BLOCK = 8  # px to multiples of which images are trimmed and crops rounded, so that they are halved three times exactly
 MAX_PIXELS = 160_000  # of images worked on, to which larger ones are reduced
@@ -118,7 +118,7 @@ def reduced(image: Tensor, size: float) -> Tensor:
 class InstrumentDrawer:
     """Draws a scene's instruments without its tissue, on the CPU whatever device draws."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: GaussianScene) -> None:
         self.scene = scene
         self.alone = _without_tissue(scene)
         tissue = scene.canonical.counts[0]
@@ -201,7 +201,7 @@ class LabelledView:
 class Tissue:
     """Draws the tissue of a learned scene, with the shadow that its instruments cast."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: GaussianScene) -> None:
         self.scene = scene
         self._rows = slice(0, scene.canonical.counts[0])
 
@@ -221,13 +221,13 @@ class Tissue:
         return rasterize(gaussians.select(self._rows), camera).color.clamp(0, 1).cpu()
 
 
-def _without_tissue(scene: Scene) -> Scene:
+def _without_tissue(scene: GaussianScene) -> GaussianScene:
     """The scene's instruments: the same modules, Gaussians of their own."""
     scene.visibility()  # measured on the whole, where training did not store it
     tissue, *others = scene.canonical.counts
     tensors = {name: tensor[tissue:].contiguous() for name, tensor in scene.canonical.tensors().items()}
     own = CanonicalGaussians.from_tensors(tensors, (0, *others))
-    alone = Scene(scene.method, own, scene.deformation, scene.instruments, scene.recorded, scene.center)
+    alone = GaussianScene(scene.method, own, scene.deformation, scene.instruments, scene.recorded, scene.center)
     alone.load_state_dict(scene.state_dict())
     alone.sh_degree = scene.sh_degree
     return alone.to(scene.center.device).requires_grad_(False)

@@ -14,7 +14,7 @@ from torch import Tensor
 from neeco.capture.model import Frame, State
 from neeco.evaluation.photometric_fit import Minimum, Observed, minimise
 from neeco.raster.types import Gaussians
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.tracking.coordinates import Coordinates
 from neeco.tracking.drawing import (
     InstrumentDrawer,
@@ -62,7 +62,7 @@ class Fitter:
     tissue: Tissue
 
     @classmethod
-    def of(cls, scene: Scene) -> Fitter:
+    def of(cls, scene: GaussianScene) -> Fitter:
         """Of all instruments of a scene, over its tissue."""
         return cls(InstrumentDrawer(scene), Coordinates.of(scene), Tissue(scene))
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Frame, State, evenly_spaced
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 from neeco.settings import with_fields
 from neeco.tracking.follow import Step
@@ -45,7 +45,9 @@ def usable(steps: Sequence[Step]) -> list[Step]:
     return [chosen[k] for k in evenly_spaced(len(chosen), FRAMES)] if chosen else []
 
 
-def learned_again(scene: Scene, frames: Sequence[Frame], steps: Sequence[Step], report: Report) -> Scene:
+def learned_again(
+    scene: GaussianScene, frames: Sequence[Frame], steps: Sequence[Step], report: Report
+) -> GaussianScene:
     """`scene`, changed in place: its tissue and light from the frames that `steps` found the instruments in."""
     chosen = usable(steps)
     if len(chosen) < FEWEST:

@@ -22,7 +22,7 @@ from torch import Tensor
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.methods.kinematic.shadow import find_shadow
 from neeco.raster.reference import SH_C0
-from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.canonical import join_bodies
 from neeco.scene.training_views import TrainingViews
 from neeco.tracking.coordinates import Coordinates
@@ -62,7 +62,7 @@ class Colors:
         """Whether instruments could not be found in their recorded colours."""
         return any(abs(math.log(value)) > ALIKE for value in (*self.gain, self.gamma))
 
-    def of(self, scene: Scene) -> Scene:
+    def of(self, scene: GaussianScene) -> GaussianScene:
         """The scene, its instruments' Gaussians recoloured: what they show head on exactly, what changes with the
         direction to first order, and dimming with the distance as far as it is a power of it."""
         canonical, rows = scene.canonical, scene.canonical.of_instruments
@@ -99,7 +99,7 @@ class Colors:
         return cls((red, green, blue), gamma)
 
 
-def over_tissue(instruments: Scene, tissue: Scene) -> Scene:
+def over_tissue(instruments: GaussianScene, tissue: GaussianScene) -> GaussianScene:
     """The instruments of one scene over the tissue of another, in its light. Recorded are the states and cameras of the
     first, as corrected by its registration, which is taken out."""
     for scene in (instruments, tissue):
@@ -118,7 +118,9 @@ def over_tissue(instruments: Scene, tissue: Scene) -> Scene:
     deformation = instruments.deformation.combined([instruments.deformation])
     recorded = instruments.recorded
     recorded = replace(recorded, states=tuple(instruments.registered(state) for state in recorded.states))
-    made = Scene(instruments.method, joined, deformation, instruments.instruments, recorded, tissue.center.clone())
+    made = GaussianScene(
+        instruments.method, joined, deformation, instruments.instruments, recorded, tissue.center.clone()
+    )
     with torch.no_grad():
         made.falloff.copy_(torch.stack([tissue.falloff[0], instruments.falloff[1]]))
         made.vignette.copy_(tissue.vignette)
@@ -128,9 +130,9 @@ def over_tissue(instruments: Scene, tissue: Scene) -> Scene:
     return made.to(own.means.device).requires_grad_(False)
 
 
-def _like(scene: Scene, canonical: CanonicalGaussians, recorded: Recorded | None = None) -> Scene:
+def _like(scene: GaussianScene, canonical: CanonicalGaussians, recorded: Recorded | None = None) -> GaussianScene:
     """The scene with other Gaussians, or with other frames as recorded; tensors are not shared."""
-    made = Scene(
+    made = GaussianScene(
         scene.method,
         canonical.map(torch.clone),
         scene.deformation.combined([scene.deformation]),
@@ -148,7 +150,7 @@ def _like(scene: Scene, canonical: CanonicalGaussians, recorded: Recorded | None
 class Adapted:
     """A scene in the light of footage, and what was found of it."""
 
-    scene: Scene
+    scene: GaussianScene
     colors: Colors
 
     def to_json(self) -> dict[str, Any]:
@@ -165,7 +167,7 @@ class Adapted:
         }
 
 
-def adapted(scene: Scene, frames: Sequence[Frame], report: Report) -> Adapted:
+def adapted(scene: GaussianScene, frames: Sequence[Frame], report: Report) -> Adapted:
     """`scene`, of instruments over the tissue of `frames` (`over_tissue`), in their light."""
     plain, coordinates = Fitter.of(scene), Coordinates.of(scene)
     chosen = [frames[k] for k in evenly_spaced(len(frames), FRAMES)]
@@ -190,7 +192,7 @@ def adapted(scene: Scene, frames: Sequence[Frame], report: Report) -> Adapted:
     return Adapted(with_lamps(lit, found), colors)
 
 
-def with_lamps(scene: Scene, found: Sequence[tuple[Frame, Fit]]) -> Scene:
+def with_lamps(scene: GaussianScene, found: Sequence[tuple[Frame, Fit]]) -> GaussianScene:
     """The scene with the lamps whose shadow its instruments cast on the tissue, as training finds them; with none where
     these explain too little."""
     made = _like(scene, scene.canonical)
@@ -206,7 +208,7 @@ def with_lamps(scene: Scene, found: Sequence[tuple[Frame, Fit]]) -> Scene:
     return made.requires_grad_(False)
 
 
-def _found(scene: Scene, frames: Sequence[Frame], report: Report) -> list[tuple[Frame, Fit]]:
+def _found(scene: GaussianScene, frames: Sequence[Frame], report: Report) -> list[tuple[Frame, Fit]]:
     """Where the instruments of `scene` are in some frames, nothing known."""
     fitter, found = Fitter.of(scene), []
     search = Search.of(fitter)

@@ -17,7 +17,7 @@ from scipy.ndimage import binary_dilation, binary_opening, uniform_filter
 from neeco.capture.images import area_averaged, write_labels
 from neeco.capture.model import REFERENCE_PIXELS, Capture, Frame, State, evenly_spaced
 from neeco.errors import NeecoError
-from neeco.scene import Scene
+from neeco.scene import GaussianScene
 from neeco.tracking.drawing import Tissue
 from neeco.training.config import training_config
 from neeco.training.run import load_run
@@ -36,7 +36,7 @@ MOST_MASKED = 0.7  # of an image: more, and the masks say nothing
 Report = Callable[[str, int, int], None]  # what is under way, how much of how much is done
 
 
-def learn_tissue(footage: Capture, folder: Path, device: torch.device, report: Report) -> Scene:
+def learn_tissue(footage: Capture, folder: Path, device: torch.device, report: Report) -> GaussianScene:
     """The tissue behind all that moves in `footage`, whose states are not looked at. `folder` keeps runs and masks;
     what was broken off there goes on to the same bits. Raises NeecoError for unreadable images, and for one frame."""
     frames = tuple(
@@ -48,7 +48,7 @@ def learn_tissue(footage: Capture, folder: Path, device: torch.device, report: R
             f"{footage.root}: {len(frames)} frame does not tell tissue from what passes before it; give more of them, "
             "or --tissue run"
         )
-    scene: Scene | None = None
+    scene: GaussianScene | None = None
     for number, iterations in enumerate(ROUNDS, 1):
         if scene is not None:
             frames = _masked(frames, scene, folder / f"masks-{number}")
@@ -58,7 +58,7 @@ def learn_tissue(footage: Capture, folder: Path, device: torch.device, report: R
     return scene
 
 
-def _learned(capture: Capture, run: Path, iterations: int, device: torch.device, report: Report) -> Scene:
+def _learned(capture: Capture, run: Path, iterations: int, device: torch.device, report: Report) -> GaussianScene:
     what = f"learning the tissue, {run.name}"
 
     def tell(row: ProgressRow) -> None:
@@ -67,9 +67,7 @@ def _learned(capture: Capture, run: Path, iterations: int, device: torch.device,
     config = training_config(METHOD, {"iterations": iterations})
     config = replace(config, max_tissue_gaussians=min(GAUSSIANS, config.gaussian_limits(_pixels(capture))[0]))
     train(capture.root, run, config, capture=capture, device=device, resume=run.exists(), progress=tell)
-    learned = load_run(run, device).scene
-    assert isinstance(learned, Scene)
-    return learned
+    return load_run(run, device).gaussians("track").scene
 
 
 def _pixels(capture: Capture) -> float:
@@ -77,7 +75,7 @@ def _pixels(capture: Capture) -> float:
     return float(camera.width * camera.height)
 
 
-def _masked(frames: Sequence[Frame], scene: Scene, folder: Path) -> tuple[Frame, ...]:
+def _masked(frames: Sequence[Frame], scene: GaussianScene, folder: Path) -> tuple[Frame, ...]:
     """The frames, what passes before the tissue left out of their masks."""
     folder.mkdir(parents=True, exist_ok=True)
     tissue, masked = Tissue(scene), []

@@ -20,8 +20,8 @@ from neeco.capture.reader import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_begun, read_bytes, read_json, require_same, write_json
-from neeco.scene import Scene
-from neeco.scene.scene import gaussian_scene, one_tissue
+from neeco.scene import GaussianScene
+from neeco.scene.gaussian_scene import one_tissue
 from neeco.settings import with_fields
 from neeco.tracking.fitting import Fitter, wide
 from neeco.tracking.track import INFO
@@ -29,7 +29,7 @@ from neeco.training.run import stored_config
 from neeco.training.train import ShowRow, train
 
 if TYPE_CHECKING:
-    from neeco.training.run import Run
+    from neeco.training.run import GaussianRun
 
 SCHEMA = "neeco-refined/1"
 CAPTURE, RUN = "capture", "run"  # folders of the output
@@ -39,7 +39,7 @@ STAGING = "images"
 
 
 def refine_run(
-    run: Run,
+    run: GaussianRun,
     tracked: Sequence[Path],
     output: Path,
     *,
@@ -64,7 +64,7 @@ def refine_run(
     if (begun := read_begun(output, BEGUN, resume, "a refinement")) is not None:
         require_same(str(output / BEGUN), ((key, begun.get(key), value) for key, value in info.items()))
     if not (folder / "transforms.json").exists():
-        scene, own = gaussian_scene(run.scene, "refine"), run.capture()
+        scene, own = run.scene, run.capture()
         one_tissue(scene, "refine")
         frames = [frame for path in tracked for frame in _tracked_frames(path, scene)]
         with own_folder(output):
@@ -81,7 +81,7 @@ def refine_run(
     return train(folder, output / RUN, config, device=device, resume=(output / RUN).exists(), progress=on_row)
 
 
-def _tracked_frames(path: Path, scene: Scene) -> list[Frame]:
+def _tracked_frames(path: Path, scene: GaussianScene) -> list[Frame]:
     """The frames of a tracked capture, to train on. Raises NeecoError where they do not belong to the scene."""
     capture = read_capture(path)
     info = read_json(path / INFO) if (path / INFO).exists() else {}
@@ -124,7 +124,7 @@ def _named_apart(frames: Sequence[Frame], folder: Path) -> list[Frame]:
     return named
 
 
-def fitted(scene: Scene, capture: Capture, on_progress: Callable[[int, int], None]) -> list[Frame]:
+def fitted(scene: GaussianScene, capture: Capture, on_progress: Callable[[int, int], None]) -> list[Frame]:
     """The frames of a capture; those trained on with states as the scene explains their images best, near the recorded
     ones."""
     fitter = Fitter.of(scene)

@@ -27,8 +27,8 @@ from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, own_folder, read_begun, read_bytes, read_json, require_like, require_same, write_json
 from neeco.scene import Recorded
-from neeco.scene.io import load_scene, save_scene
-from neeco.scene.scene import gaussian_scene, one_tissue
+from neeco.scene.gaussian_scene import one_tissue
+from neeco.scene.io import load_gaussians, save_scene
 from neeco.tracking.coordinates import Coordinates
 from neeco.tracking.fitting import Fitter
 from neeco.tracking.follow import LOOK_EVERY, Follower, Step
@@ -36,11 +36,11 @@ from neeco.tracking.footage_again import learned_again
 from neeco.tracking.footage_scene import adapted, over_tissue
 from neeco.tracking.footage_tissue import Report, learn_tissue
 from neeco.tracking.trust import Reference
-from neeco.training.run import load_run, stored_config, write_config
+from neeco.training.run import stored_config, write_config
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
-    from neeco.training.run import Run
+    from neeco.scene import GaussianScene
+    from neeco.training.run import GaussianRun
 
 SCHEMA = "neeco-track/1"
 INFO = "track.json"
@@ -68,7 +68,7 @@ class Tracked:
     records: list[dict[str, Any]]
     written: int
     min_trust: float
-    scene: Scene
+    scene: GaussianScene
 
     @property
     def verdict(self) -> str:
@@ -91,7 +91,7 @@ class Tracked:
 
 
 def track_footage(
-    run: Run,
+    run: GaussianRun,
     footage: Capture,
     output: Path,
     *,
@@ -115,7 +115,7 @@ def track_footage(
     """
     if not 0 <= min_trust <= 1:
         raise NeecoError(f"--min-trust: {min_trust} is not a share; give 0 to 1")
-    scene = gaussian_scene(run.scene, "track")
+    scene = run.scene
     one_tissue(scene, "track")
     if footage.tissues:
         raise NeecoError(f"{footage.root}: tissues: footage is of one; track each tissue's by itself")
@@ -158,7 +158,7 @@ def track_footage(
         else:
             info = stored
             if tissue == "footage":
-                scene = gaussian_scene(load_run(output / RUN, scene.center.device).scene, "track")
+                scene = load_gaussians(output / RUN / "scene.safetensors", "track", scene.center.device)
         registered = trained_on.registered or tissue == "footage"
         written = _write(output, footage, scene, trained_on, frames, info["frames"], min_trust, registered)
         if tissue == "footage" and not stored.get("complete"):
@@ -169,15 +169,19 @@ def track_footage(
     return Tracked(output, footage, info["frames"], written, min_trust, scene)
 
 
-def _learned_again(scene: Scene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Report) -> Scene:
+def _learned_again(
+    scene: GaussianScene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Report
+) -> GaussianScene:
     """Tissue and light learned again from what was tracked; kept in `folder`."""
     file = folder / "scene-2.safetensors"
     if not file.exists():
         save_scene(learned_again(scene, frames, steps, report), file)
-    return gaussian_scene(load_scene(file).to(scene.center.device), "track")
+    return load_gaussians(file, "track", scene.center.device)
 
 
-def _over_footage(instruments: Scene, footage: Capture, folder: Path, report: Report) -> tuple[Scene, dict[str, Any]]:
+def _over_footage(
+    instruments: GaussianScene, footage: Capture, folder: Path, report: Report
+) -> tuple[GaussianScene, dict[str, Any]]:
     """The instruments over the footage's tissue, in its light; and what that light is. Kept in `folder`."""
     file, light = folder / "scene.safetensors", folder / "light.json"
     if not light.exists():
@@ -185,11 +189,10 @@ def _over_footage(instruments: Scene, footage: Capture, folder: Path, report: Re
         found = adapted(over_tissue(instruments, ground), footage.frames, report)
         save_scene(found.scene, file)
         write_json(light, found.to_json())
-    scene = load_scene(file).to(instruments.center.device)
-    return gaussian_scene(scene, "track"), read_json(light)
+    return load_gaussians(file, "track", instruments.center.device), read_json(light)
 
 
-def _write_run(output: Path, run: Run, scene: Scene) -> None:
+def _write_run(output: Path, run: GaussianRun, scene: GaussianScene) -> None:
     """The scene that was tracked by as a run of its own, trained on the capture at `output`, where there is one."""
     folder, digest = output / RUN, ""
     if (output / "transforms.json").exists():
@@ -328,7 +331,7 @@ def state_of(record: dict[str, Any]) -> State:
 def _write(
     output: Path,
     footage: Capture,
-    scene: Scene,
+    scene: GaussianScene,
     trained_on: Capture,
     frames: Sequence[Frame],
     records: Sequence[dict[str, Any]],
@@ -350,7 +353,7 @@ def _write(
     return len(chosen)
 
 
-def _first_state(footage: Capture, frame: Frame, scene: Scene) -> State:
+def _first_state(footage: Capture, frame: Frame, scene: GaussianScene) -> State:
     """What the footage says of its first frame. Raises NeecoError where it says nothing of an instrument or joint."""
     states = {}
     for item in scene.instruments:

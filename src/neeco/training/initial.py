@@ -12,9 +12,9 @@ from neeco.capture.images import has_alpha
 from neeco.capture.model import Capture, Frame, Instrument, PointCloud
 from neeco.errors import NeecoError
 from neeco.scene.canonical import TISSUE, CanonicalGaussians, neighbour_spacing, seed_gaussians
-from neeco.scene.drawable import Learned, Recorded
+from neeco.scene.drawable import DrawableScene, Recorded
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.method_registry import make_deformation, method_class
-from neeco.scene.scene import Scene
 from neeco.scene.training_session import Report, Session
 from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig
@@ -24,7 +24,7 @@ MAX_POSE_EXPLAINED = 0.98  # share of a joint's variance that its instrument's p
 
 
 def begin_session(
-    capture: Capture, views: TrainingViews, config: TrainConfig, report: Report, scene: Learned | None = None
+    capture: Capture, views: TrainingViews, config: TrainConfig, report: Report, scene: DrawableScene | None = None
 ) -> Session:
     """A session at iteration 0, of any method, on the device of the views: around `scene`, which a checkpoint held, or
     around a new one, for which the method's `begin` is called."""
@@ -34,7 +34,7 @@ def begin_session(
     is_new = scene is None
     if scene is None:
         scene = initial_scene(capture, views.frames, config, report)
-    assert isinstance(scene, Scene)
+    assert isinstance(scene, GaussianScene)
     session = new_session(scene.to(views.device), views, config, report)
     session.timed = capture.timed
     if is_new:
@@ -43,7 +43,7 @@ def begin_session(
     return session
 
 
-def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig, report: Report) -> Scene:
+def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig, report: Report) -> GaussianScene:
     """Seed the tissue's Gaussians and the deformation of the method from the sparse points and the training frames
     alone. Raises NeecoError when `config.joints` has an unknown one, or an image cannot be read."""
     # first, as files may be deleted once training has begun: the grey behind transparent images, which need not be
@@ -62,7 +62,7 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
     centers = torch.from_numpy(np.stack([np.median(positions, 0) for positions, _ in clouds]))
     center = centers if len(centers) > 1 else centers[0]
     tissue = tissue.with_extras(**deformation.initial_extras(tissue))
-    scene = Scene(config.method, tissue, deformation, instruments, recorded, center)
+    scene = GaussianScene(config.method, tissue, deformation, instruments, recorded, center)
     scene.background = background
     return scene
 

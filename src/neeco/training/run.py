@@ -29,7 +29,8 @@ from neeco.files import (
     require_utf8,
     write_text,
 )
-from neeco.scene.drawable import Learned
+from neeco.scene.drawable import DrawableScene
+from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import DAMAGED, load_scene, pack_scene, save_tensors, unpack_scene
 from neeco.scene.training_session import Session, StepResult, members
 from neeco.training.config import TrainConfig, check_ranges, config_from_dict, config_to_dict
@@ -41,11 +42,11 @@ CHECKPOINT_HEADER = {"schema": str, "scene": {}, "iteration": int, "seconds": fl
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainedRun:
     """A finished training run. `config` is config.yaml as a dict (keys schema, version, capture, and TrainConfig's)."""
 
     path: Path
-    scene: Learned
+    scene: DrawableScene
     config: dict[str, Any]
 
     def capture(self) -> Capture:
@@ -57,8 +58,20 @@ class Run:
             raise NeecoError(f"{config}: capture: {root} no longer exists; put it back, or write there where it is")
         return self.scene.recorded.completed(read_capture(root, self.config["transforms"]), self.scene.instruments)
 
+    def gaussians(self, asked_by: str) -> GaussianRun:
+        """Return the run as one whose scene is made of Gaussians. Raises NeecoError, in the words of the option or verb
+        `asked_by`, for a radiance field."""
+        return GaussianRun(self.path, require_gaussians(self.scene, asked_by), self.config)
 
-def load_run(path: Path, device: torch.device | None = None) -> Run:
+
+@dataclass(frozen=True)
+class GaussianRun(TrainedRun):
+    """A finished training run whose scene is made of Gaussians, which can be posed and labelled."""
+
+    scene: GaussianScene
+
+
+def load_run(path: Path, device: torch.device | None = None) -> TrainedRun:
     """Open a run folder, its scene on `device` (None: the CPU). Raises NeecoError when it is not one, is unfinished or
     comes from another version's format."""
     path = Path(path)
@@ -66,15 +79,23 @@ def load_run(path: Path, device: torch.device | None = None) -> Run:
     if not (path / "scene.safetensors").is_file():
         raise NeecoError(f"{path}: training has not finished here; continue it with `neeco train … --resume`")
     scene = load_scene(path / "scene.safetensors")
-    return Run(path, scene if device is None else scene.to(device), config)
+    return TrainedRun(path, scene if device is None else scene.to(device), config)
 
 
 @contextmanager
-def open_run(path: Path, device: torch.device | None = None) -> Iterator[Run]:
+def open_run(path: Path, device: torch.device | None = None) -> Iterator[TrainedRun]:
     """`load_run` for a block that draws: until its end torch uses as many threads as pay for the run's method."""
     run = load_run(path, device)
     with run.scene.torch_threads():
         yield run
+
+
+@contextmanager
+def open_gaussian_run(path: Path, asked_by: str, device: torch.device | None = None) -> Iterator[GaussianRun]:
+    """`open_run` for a verb that poses or labels Gaussians. Raises NeecoError, in the words of the option or verb
+    `asked_by`, for a run of a radiance field."""
+    with open_run(path, device) as run:
+        yield run.gaussians(asked_by)
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -164,7 +185,7 @@ def save_checkpoint(session: Session, run: Path) -> None:
     )
 
 
-def read_checkpoint(run: Path) -> tuple[Learned, dict[str, Any], dict[str, Tensor]]:
+def read_checkpoint(run: Path) -> tuple[DrawableScene, dict[str, Any], dict[str, Tensor]]:
     """(scene, header, other tensors) of a run's checkpoint. Raises NeecoError when damaged or of another version."""
     path = checkpoint_path(run)
     require_file(path, "a checkpoint of `neeco train`")

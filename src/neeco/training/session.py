@@ -20,7 +20,7 @@ from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformation import FINAL_RATE, Perturbation, floored_decay, log_linear
-from neeco.scene.scene import Scene
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_session import GaussianTraining, Report, StepResult, check_finite, members, numbers
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
@@ -34,7 +34,7 @@ from neeco.training.schedule import Schedule, due, order_by_pose
 class GaussianSession(GaussianTraining):
     """One training run in memory, of any method that deforms Gaussians. Its hooks are `Deformation`'s."""
 
-    scene: Scene
+    scene: GaussianScene
     config: TrainConfig
     extent: float  # mm; positions' learning rates and the dense size scale with it
     pose_order: np.ndarray = field(init=False)
@@ -330,7 +330,7 @@ def gaussian_session(training: GaussianTraining) -> GaussianSession:
 
 
 def new_session(
-    scene: Scene, views: TrainingViews, config: TrainConfig, report: Report = lambda text: None
+    scene: GaussianScene, views: TrainingViews, config: TrainConfig, report: Report = lambda text: None
 ) -> GaussianSession:
     """A session at iteration 0, on the device of the views; `start` it before the first step."""
     generator = torch.Generator(views.device).manual_seed(config.seed)

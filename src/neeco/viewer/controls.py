@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.labels.drawing import to_numpy
-from neeco.scene.scene import gaussian_scene
+from neeco.scene.gaussian_scene import is_gaussian
 from neeco.synthesis.samplers import instrument_axes
 from neeco.synthesis.states import JointRange, interpolate_pose, joint_ranges, rigid, turn_about
 
 if TYPE_CHECKING:
-    from neeco.scene import Drawable
+    from neeco.scene import DrawableScene
 
 MARGIN = 0.2  # of the recorded range, by which a slider goes further where the capture states no limits
 STILL = math.radians(1.0)  # half of the range of a joint that never moved
@@ -100,16 +100,15 @@ def corresponding_frame(frame: float, frames: int, others: int) -> float:
     return float(round(there)) if frame == int(frame) else there
 
 
-def shafts_of(scene: Drawable) -> dict[str, Shaft]:
+def shafts_of(scene: DrawableScene) -> dict[str, Shaft]:
     """Every instrument's shaft: as learned, where the method learns one."""
-    if not scene.has_gaussians or not scene.recorded.states:
+    if not is_gaussian(scene) or not scene.recorded.states:
         return {item.name: Shaft(np.zeros(3), np.array([0.0, 0.0, 1.0]), False) for item in scene.instruments}
-    posed = gaussian_scene(scene, "view")
     with torch.no_grad():
-        known = posed.keypoints(scene.recorded.states[0])
+        known = scene.keypoints(scene.recorded.states[0])
     return {
         name: Shaft(end, along, {"shaft_far", "shaft_near"} <= set(known.get(name, ())))
-        for name, (end, along) in instrument_axes(posed).items()
+        for name, (end, along) in instrument_axes(scene).items()
     }
 
 

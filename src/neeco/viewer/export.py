@@ -30,10 +30,10 @@ from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.files import read_json, write_text
 from neeco.labels.labellers import threshold_of
 from neeco.raster.reference import SH_C0
-from neeco.scene import Drawable, Scene
+from neeco.scene import DrawableScene, GaussianScene
 from neeco.scene.drawable import ArticulatedMotion
-from neeco.scene.scene import gaussian_scene, over_one
-from neeco.training.run import Run, load_run
+from neeco.scene.gaussian_scene import over_one, require_gaussians
+from neeco.training.run import TrainedRun, load_run
 from neeco.viewer.controls import perpendicular_axes, shafts_of, slider_ranges
 
 SCHEMA = "neeco-page/1"
@@ -70,17 +70,17 @@ def export_page(run: Path, output: Path, sh_degree: int, device: torch.device, t
     return f"{output}: {len(page) / 1e6:.2f} MB, {shown.num_gaussians:,} Gaussians{over}; open it in any browser"
 
 
-def embedded_page(run: Run) -> str | None:
+def embedded_page(run: TrainedRun) -> str | None:
     """The page of a run for a frame in its report; None where a page cannot hold it."""
     return None if why_not(run.scene) else page_of_run(run, EMBEDDED_DEGREE)
 
 
-def page_of_run(run: Run, sh_degree: int, tissue: str | None = None) -> str:
+def page_of_run(run: TrainedRun, sh_degree: int, tissue: str | None = None) -> str:
     """The page of a run over one tissue (None: the first), harmonics up to `sh_degree`. Raises NeecoError where
     a page cannot hold it (`why_not`)."""
     if refusal := why_not(run.scene):
         raise NeecoError(f"--export: {refusal}")
-    scene = gaussian_scene(over_one(run.scene, tissue), "--export")
+    scene = require_gaussians(over_one(run.scene, tissue), "--export")
     facts = [
         ("capture", Path(run.config["capture"]).name),
         ("method", scene.method),
@@ -153,7 +153,7 @@ def _templates() -> Environment:
     return Environment(loader=PackageLoader("neeco.viewer", "page"), autoescape=True, undefined=StrictUndefined)
 
 
-def why_not(scene: Drawable) -> str | None:
+def why_not(scene: DrawableScene) -> str | None:
     """Why a page cannot hold `scene`, in a line that says what can show it; None where it can."""
     motion = scene.motion()
     if motion is None:
@@ -173,7 +173,7 @@ def why_not(scene: Drawable) -> str | None:
 
 
 @torch.no_grad()
-def pack(scene: Scene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
+def pack(scene: GaussianScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
     """(header, planes) of a scene, harmonics up to `sh_degree`. Raises NeecoError where its method cannot be packed, or
     there are more instruments, joints or labels than the page has room for."""
     canonical, motion = scene.canonical, scene.motion()
@@ -254,7 +254,7 @@ def _rounded(values: Tensor) -> np.ndarray:
     return np.rint(values.double().cpu().numpy()).astype(np.int64)
 
 
-def _light(scene: Scene) -> dict[str, Any]:
+def _light(scene: GaussianScene) -> dict[str, Any]:
     lamps = zip(scene.shadow_offsets.tolist(), scene.shadow_strengths.clamp(0, 1).tolist(), strict=True)
     return {
         "falloff": scene.falloff.tolist(),
@@ -265,7 +265,7 @@ def _light(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _instruments(scene: Scene, motion: ArticulatedMotion) -> list[dict[str, Any]]:
+def _instruments(scene: GaussianScene, motion: ArticulatedMotion) -> list[dict[str, Any]]:
     """Name, shaft, joints and their axes of every instrument that moves, in its own frame, mm and rad."""
     if not motion.axes:
         return []
@@ -299,7 +299,7 @@ def _instruments(scene: Scene, motion: ArticulatedMotion) -> list[dict[str, Any]
     return found
 
 
-def _recorded(scene: Scene, motion: ArticulatedMotion) -> dict[str, Any]:
+def _recorded(scene: GaussianScene, motion: ArticulatedMotion) -> dict[str, Any]:
     """Names, cameras and states of the frames trained on; matrices are the first three rows, 12 numbers."""
     moving = scene.instruments[: len(motion.axes)]
     states = [scene.registered(state) for state in scene.recorded.states]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -24,14 +24,14 @@ from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
-from neeco.scene.drawable import Learned, Recorded
+from neeco.scene.drawable import DrawableScene, Recorded
+from neeco.scene.gaussian_scene import is_gaussian, over_one
 from neeco.scene.io import load_scene
-from neeco.scene.scene import over_one
 from neeco.training.run import checkpoint_path, read_checkpoint, read_config
 from neeco.viewer.controls import Shaft, shafts_of
 
 if TYPE_CHECKING:
-    from neeco.scene import Drawable, Scene
+    from neeco.scene import DrawableScene
 
 SCENE_FILE = "scene.safetensors"
 ASSUMED_MM = 100.0  # from a camera to what it looks at, where no camera looks at the scene's centre
@@ -51,7 +51,7 @@ class LoadedRun:
 
     name: str
     world: str  # the capture's folder: runs of one capture share their world frame
-    scene: Drawable
+    scene: DrawableScene
     recorded: Recorded
     frames: tuple[Frame, ...]  # those of `recorded`, with their images; empty: the capture is not at hand
     capture: Capture | None
@@ -63,11 +63,10 @@ class LoadedRun:
     @cached_property
     def labels(self) -> Tensor | None:
         """The scene's label channels [N, L], computed once; None where it has none."""
-        if not self.scene.label_names:
+        if not (is_gaussian(self.scene) and self.scene.label_names):
             return None
-        scene: Scene = self.scene  # type: ignore[assignment]
         with torch.no_grad():
-            return scene.label_channels()
+            return self.scene.label_channels()
 
     @cached_property
     def distance(self) -> float:
@@ -143,7 +142,7 @@ class WatchedRun:
         capture, trouble = _read_capture_of(config)
         if capture is not None:
             capture = scene.recorded.completed(capture, scene.instruments)
-        tissues, scene = scene.recorded.tissues, cast(Learned, over_one(scene, self.tissue))
+        tissues, scene = scene.recorded.tissues, over_one(scene, self.tissue)
         if capture is not None and len(tissues) > 1:
             capture = capture.over(scene.recorded.tissues[0])
         if not scene.recorded.states and capture is None:

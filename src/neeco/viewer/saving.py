@@ -16,7 +16,7 @@ from neeco.files import own_folder, write_text
 from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers, to_numpy
 from neeco.labels.labellers import CompositedLabels
-from neeco.scene.scene import gaussian_scene
+from neeco.scene.gaussian_scene import require_gaussians
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.settings import RECORDED_SIZE, Settings, SizeSettings
@@ -63,7 +63,7 @@ class SavedStates:
     def save_image(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> Path:
         """Write one labelled image as `synthesize` does, of the recorded cameras' intrinsics, as large as was asked;
         returns the image's path. Raises NeecoError for a scene without labels, and where it cannot be written."""
-        scene = gaussian_scene(loaded.scene, "save labelled image")
+        scene = require_gaussians(loaded.scene, "save labelled image")
         labeller = CompositedLabels(scene)
         camera = DrawnCameras(self.size)(moved_camera(loaded.recorded.cameras[0], world_from_camera))
         with scene.torch_threads(), torch.no_grad():

@@ -28,7 +28,7 @@ from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import GaussianScene
 
 Format = Literal["ply", "spz"]
 DIRECTIONS = 64  # by which harmonics are rotated: four times as many as there are harmonics
@@ -49,7 +49,7 @@ class Splats:
     sh: np.ndarray  # [N, K, 3], world frame
 
 
-def exported_state(scene: Scene, frame: int, states: Path | None) -> tuple[State, Camera]:
+def exported_state(scene: GaussianScene, frame: int, states: Path | None) -> tuple[State, Camera]:
     """State and camera of a frame trained on; of the first line of a file of states where that is given, whose camera
     is the frame's unless it names one. Raises NeecoError for a file that does not fit."""
     state, camera = scene.recorded.states[frame], scene.recorded.cameras[frame]
@@ -62,7 +62,7 @@ def exported_state(scene: Scene, frame: int, states: Path | None) -> tuple[State
 
 
 @torch.no_grad()
-def splats_of(scene: Scene, state: State, camera: Camera) -> Splats:
+def splats_of(scene: GaussianScene, state: State, camera: Camera) -> Splats:
     """The scene in `state`, over its tissue, lit as `camera` has it."""
     if state.tissue is not None and len(scene.recorded.tissues) > 1:
         scene = scene.over(state.tissue)

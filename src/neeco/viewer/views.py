@@ -17,13 +17,13 @@ from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize
 from neeco.raster.devices import readable_failures
 from neeco.raster.types import Rendering
-from neeco.scene.scene import gaussian_scene
+from neeco.scene.gaussian_scene import is_gaussian
 from neeco.viewer.controls import Controls, controlled_state, corresponding_frame
 from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRuns, score_frame
 from neeco.viewer.viser_scene import carried_over, stands_at
 
 if TYPE_CHECKING:
-    from neeco.scene import Drawable
+    from neeco.scene import DrawableScene
 
 IMAGE, OVERLAY, PARTS = "image", "labels over image", "parts"
 DEPTH, UNOBSERVED, DIFFERENCE = "depth", "unobserved", "difference to the recorded image"
@@ -59,7 +59,7 @@ class RunPicture:
     score: FrameScore | None = None
 
 
-def views_of(scene: Drawable, has_images: bool) -> tuple[str, ...]:
+def views_of(scene: DrawableScene, has_images: bool) -> tuple[str, ...]:
     """Which of VIEWS there are of a scene; has_images: the capture is at hand."""
     absent = set()
     if not scene.label_names:
@@ -72,7 +72,7 @@ def views_of(scene: Drawable, has_images: bool) -> tuple[str, ...]:
 
 
 @torch.no_grad()
-def picture(scene: Drawable, state: State, camera: Camera, view: str, labels: Tensor | None = None) -> Picture:
+def picture(scene: DrawableScene, state: State, camera: Camera, view: str, labels: Tensor | None = None) -> Picture:
     """One of VIEWS but DIFFERENCE of `state` as `camera` sees it. labels [N, L]: the scene's label channels, where
     they are at hand; they take time."""
     rendering = _rendering(scene, state, camera, view, labels)
@@ -93,7 +93,7 @@ def picture(scene: Drawable, state: State, camera: Camera, view: str, labels: Te
 
 
 @torch.no_grad()
-def difference(scene: Drawable, state: State, recorded_by: Camera, image: np.ndarray, window: Camera) -> Picture:
+def difference(scene: DrawableScene, state: State, recorded_by: Camera, image: np.ndarray, window: Camera) -> Picture:
     """How far what the camera that recorded `image` [H, W, 3] in [0, 1] would see is from it, as `window` shows it: a
     camera at the same place with the same vertical field of view. What it shows beside the image is black."""
     rendering = scene.render(state, recorded_by)
@@ -185,17 +185,16 @@ def scored(shown: RunPicture) -> RunPicture:
         return replace(shown, score=score_frame(shown.loaded, int(shown.frame)))
 
 
-def _rendering(scene: Drawable, state: State, camera: Camera, view: str, labels: Tensor | None) -> Rendering:
+def _rendering(scene: DrawableScene, state: State, camera: Camera, view: str, labels: Tensor | None) -> Rendering:
     learned = scene.recorded.as_learned(camera)
     if learned.learned_fx is not None and camera.fx > learned.learned_fx:  # averaging smaller ones would take too long
         camera = learned
     if view in LABELLED and labels is None:
         return scene.render(state, camera, labels=True)
-    if view not in (*LABELLED, UNOBSERVED):
+    if view not in (*LABELLED, UNOBSERVED) or not is_gaussian(scene):
         return scene.render(state, camera)
-    posing = gaussian_scene(scene, f"view: {view}")
-    gaussians = posing.at(state)
-    channels = labels if view in LABELLED else posing.unobserved(gaussians, camera)[:, None]
+    gaussians = scene.at(state)
+    channels = labels if view in LABELLED else scene.unobserved(gaussians, camera)[:, None]
     return rasterize(gaussians, camera, channels=channels)
 
 

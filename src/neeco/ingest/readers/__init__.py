@@ -9,7 +9,6 @@ table's columns mean is the same for all formats (`columns.py`, `logs.py`).
 from __future__ import annotations
 
 import importlib.util
-import sys
 from abc import ABC
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +22,7 @@ from neeco.capture.documents import printable
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.readers.frame_names import NamedFrame
-from neeco.registry import named_classes
+from neeco.registry import plugins
 
 MISSING = {"", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"}
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
@@ -31,6 +30,7 @@ HUGE = 1e20
 MAX_LISTED = 3  # lines named in a message
 MAX_UNLIKE = 0.1  # share by which a video may be longer or shorter than the states of its images
 DELIMITED = (".csv", ".tsv", ".txt")
+ENTRY_POINTS = "neeco.readers"  # the group in which installed packages name their formats
 
 
 @dataclass(frozen=True)
@@ -136,49 +136,51 @@ class VideoSource:
 
 
 class RecordingFormat(ABC):
-    """A format of what was recorded. Subclasses set `format`, `holds` and, unless they look into the files, `suffixes`,
-    and have a constructor without arguments.
+    """A format of what was recorded: the protocol of a reader, in a file of this folder or in a package that names its
+    class as an entry point in the group `neeco.readers`.
 
-    Every method raises NeecoError naming the file, the place and the remedy.
+    Subclasses set `format`, `holds` and, unless they look into the files, `suffixes`; they have a constructor without
+    arguments, and override `read`, `open_images` or both. Every method raises NeecoError naming the file, the place and
+    the remedy.
     """
 
-    format: ClassVar[str]  # what the format is called
-    holds: ClassVar[str]  # what is read of it, in one line
-    suffixes: ClassVar[tuple[str, ...]] = ()  # of its files, in small letters
+    format: ClassVar[str]  # its name
+    holds: ClassVar[str]  # what is read from it, in one line
+    suffixes: ClassVar[tuple[str, ...]] = ()  # of its files, in lower case
     package: ClassVar[str | None] = None  # a module that it needs
-    extra: ClassVar[str | None] = None  # of neeco, that installs this module
+    extra: ClassVar[str | None] = None  # the extra of neeco that installs this module
 
     def claims(self, path: Path) -> bool:
-        """Is the file or folder in this format? Looks at little of it, and raises nothing."""
+        """Return whether the file or folder is in this format. Looks at little of it, and raises nothing."""
         return path.suffix.lower() in self.suffixes
 
     def require_package(self, path: Path) -> None:
-        """Raise NeecoError saying what to install when the module it needs is absent; imports nothing."""
+        """Raise NeecoError stating what to install when the module it needs is absent; imports nothing."""
         if self.package is not None and importlib.util.find_spec(self.package) is None:
             raise NeecoError(f"{path}: {self.format}: needs {self.package}; pip install 'neeco[{self.extra}]'")
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        """What the file holds; () where it is one table."""
+        """Return what the file holds; () where it is one table."""
         return ()
 
     def read(self, path: Path, stream: str | None = None) -> Table:
-        """Poses or readings as a table. stream: which, where there are several."""
+        """Return poses or readings as a table. stream: the name of one, where there are several."""
         raise NeecoError(f"{path}: {self.format} holds no poses and no readings; name a log")
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
-        """Its images, with times on the clock that its tables share."""
+        """Return the images, with times on the clock that the tables share."""
         raise NeecoError(f"{path}: {self.format} holds no images; name a video or a folder of images")
 
     def clock(self, path: Path, stream: str | None) -> str:
-        """What the times of a stream count from: streams of the same share a clock."""
+        """Return the origin of a stream's times, by name: streams with the same one share a clock."""
         return ""
 
     def of_episode(self, stream: str, episode: int) -> str | None:
-        """The same stream in another episode; None: the format's files hold one."""
+        """Return the name of the same stream in another episode; None: the format's files hold one."""
         return None
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
-        """The lens that the images of `stream` were taken through, where the file says it."""
+        """Return the lens of the images of `stream`; None where the file does not state it."""
         return None
 
 
@@ -188,7 +190,7 @@ POSES, READINGS, IMAGES, OTHER = "poses", "readings", "images", "other"  # kinds
 @cache
 def recording_formats() -> tuple[RecordingFormat, ...]:
     """All formats; delimited text, which claims by its suffix what others know by what it holds, last."""
-    kinds = named_classes(RecordingFormat, "format", sys.modules[__name__])
+    kinds = plugins(RecordingFormat, "format", __name__, ENTRY_POINTS)
     return tuple(sorted((kind() for kind in kinds.values()), key=lambda kind: kind.suffixes == DELIMITED))
 
 

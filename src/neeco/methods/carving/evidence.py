@@ -22,7 +22,7 @@ from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.geometry.projection import project
 from neeco.raster import rasterize
-from neeco.scene.scene import Scene
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 
 SOLID = (0.85, 0.75, 0.65)  # mean evidence of a point surely inside: the strictest level that enough points reach
@@ -120,7 +120,7 @@ class Evidence:
 
 
 @torch.no_grad()
-def gather_evidence(scene: Scene, views: TrainingViews, settings: CarvingSettings) -> Evidence:
+def gather_evidence(scene: GaussianScene, views: TrainingViews, settings: CarvingSettings) -> Evidence:
     """Residuals of a tissue-only `scene` against every n-th training image, at most `settings.evidence_frames`, on its
     device. Where a mask is False there is no evidence."""
     frames = views.frames

@@ -8,7 +8,7 @@ from neeco.methods.breathing import Breathing
 from neeco.methods.carving.evidence import Evidence, gather_evidence
 from neeco.methods.static import Static
 from neeco.scene.drawable import Recorded
-from neeco.scene.scene import Scene
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import RefineConfig, TrainConfig, method_defaults
 from neeco.training.session import new_session
@@ -16,7 +16,9 @@ from neeco.training.session import new_session
 DENSITY_START = 200  # steps of a longer fit of the tissue before it adds Gaussians
 
 
-def tissue_evidence(scene: Scene, views: TrainingViews, config: TrainConfig, tissue: Scene | None = None) -> Evidence:
+def tissue_evidence(
+    scene: GaussianScene, views: TrainingViews, config: TrainConfig, tissue: GaussianScene | None = None
+) -> Evidence:
     """Fit a copy of the tissue without motion but that of breathing; the residual is the evidence. `tissue`: that fit,
     where it was made before.
 
@@ -34,13 +36,13 @@ def tissue_evidence(scene: Scene, views: TrainingViews, config: TrainConfig, tis
 
 
 def fit_tissue(
-    scene: Scene,
+    scene: GaussianScene,
     views: TrainingViews,
     config: TrainConfig,
     steps: int | None = None,
     density_start: int = 10**9,
     breathing: Breathing | None = None,
-) -> Scene:
+) -> GaussianScene:
     """A copy of the tissue of `scene`, which holds it alone, after `steps` steps (None: `tissue_steps`), with density
     control from `density_start` on; still, or breathing as it begins to with `breathing`."""
     steps = config.deformation.carving.tissue_steps if steps is None else steps
@@ -49,7 +51,7 @@ def fit_tissue(
     if breathing is not None:
         deformation.start_breathing(breathing)
     recorded = Recorded(tissues=scene.recorded.tissues)
-    tissue = Scene(Static.method, canonical, deformation, (), recorded, scene.center)
+    tissue = GaussianScene(Static.method, canonical, deformation, (), recorded, scene.center)
     tissue.background = scene.background  # or the background of transparent images would be evidence
     short = replace(
         config,

@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from neeco.capture.images import area_averaged
 from neeco.methods.breathing import HARMONICS, Breathing
 from neeco.raster import rasterize
-from neeco.scene.scene import Scene
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 
 FRAMES = 240  # at most, that displacements are measured in
@@ -84,7 +84,7 @@ def _explained(times: Array, shifts: Array, frequency: float, harmonics: int) ->
 
 
 @torch.no_grad()
-def find_breathing(tissue: Scene, views: TrainingViews) -> tuple[Breathing, Found] | None:
+def find_breathing(tissue: GaussianScene, views: TrainingViews) -> tuple[Breathing, Found] | None:
     """How the tissue breathes, as far as one displacement of all of it tells, or None; `tissue`: a scene of still
     tissue alone, learned from these views."""
     picked = range(0, len(views), max(1, -(-len(views) // FRAMES)))
@@ -99,7 +99,7 @@ def find_breathing(tissue: Scene, views: TrainingViews) -> tuple[Breathing, Foun
     return Breathing.of(tissue.canonical.means, found.period, swing, found.origin), found
 
 
-def tissue_shift(tissue: Scene, views: TrainingViews, index: int) -> Tensor:
+def tissue_shift(tissue: GaussianScene, views: TrainingViews, index: int) -> Tensor:
     """[3] mm, world frame: the displacement of all the tissue that best explains frame `index`, to first order, beside
     a change of each colour's gain; pixels that neither explains count little."""
     frame, target, mask = views.frames[index], views.target(index), views.mask(index)

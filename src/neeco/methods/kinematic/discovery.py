@@ -15,7 +15,7 @@ from neeco.methods.kinematic.hinge_search import start_hinges
 from neeco.methods.kinematic.link_seeds import along_links, readings_of, start_links
 from neeco.methods.kinematic.reading_doubts import doubt_readings
 from neeco.scene.canonical import join_bodies, seed_instrument
-from neeco.scene.scene import Scene
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.training.session import GaussianSession
 
 
@@ -55,7 +55,7 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
     scene.canonical = join_bodies(bodies)
 
 
-def _learn_breathing(session: GaussianSession, breathes: BreathingTissue, tissue: Scene) -> Scene:
+def _learn_breathing(session: GaussianSession, breathes: BreathingTissue, tissue: GaussianScene) -> GaussianScene:
     """`tissue`, a fit of still tissue, or where that breathes one that was fitted anew with its breathing, with which
     `breathes` begins then."""
     scene, views, config = session.scene, session.views, session.config

@@ -16,7 +16,7 @@ from neeco.methods.kinematic.wrist import MIN_SOLID, SOLID_OPACITY, color_bounda
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Recorded
-from neeco.scene.scene import Scene
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.visibility import visible_pixels
 from neeco.training.session import GaussianSession
 
@@ -142,7 +142,7 @@ def _with_reading(state: State, instrument: str, joint: str, reading: float) -> 
     return replace(state, instruments={**state.instruments, instrument: changed})
 
 
-def drop_occluded(scene: Scene) -> CanonicalGaussians:
+def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
     """The canonical Gaussians without those of instruments that other bodies occlude in nearly every frame.
 
     No image constrained them: they lie inside another instrument of the same arm, or in the tissue. Rendered alone,

@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool2d
 from neeco.raster import rasterize
 from neeco.raster.shadow import GAMMA, Casting, blocked
 from neeco.raster.types import Gaussians
-from neeco.scene.scene import LAMPS
+from neeco.scene.gaussian_scene import LAMPS
 from neeco.training.session import GaussianSession
 
 RADII = (0.04, 0.08)  # of the tissue's distance: a lamp nearer the lens would explain any dark edge

@@ -332,7 +332,7 @@ class RayRendering:
 
 
 class NerfScene(nn.Module):
-    """A `Drawable` without Gaussians. Inside, positions are (world - center) / scale: sparse points lie in [-1, 1].
+    """Radiance field; inside, positions are (world - center) / scale, so that sparse points lie in [-1, 1].
 
     `bounds` (near, far) are those of the samples' depth in mm. `opened` counts the warp's frequencies that are in use.
     """

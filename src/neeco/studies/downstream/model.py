@@ -21,8 +21,7 @@ from torch import Tensor, nn
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.files import placeholder, write_atomically
-from neeco.registry import named_classes
-from neeco.studies.downstream import models
+from neeco.registry import plugins
 from neeco.studies.downstream.samples import BatchSampler, Example, Sample
 from neeco.studies.downstream.scores import Prediction, validation_score
 
@@ -96,15 +95,18 @@ def missing_packages(*packages: str) -> str | None:
 
 @cache
 def find_models() -> dict[str, type[Model]]:
-    """Every class with a `model` name of its own in a public module of `models/`, by that name."""
-    return named_classes(Model, "model", models)  # type: ignore[type-abstract]
+    """Return every class with a `model` name of its own, by that name: those of `models/`, and those of entry points in
+    `neeco.models`. Raises NeecoError when two share a name, or one cannot be loaded."""
+    return plugins(Model, "model", "neeco.studies.downstream.models", "neeco.models")  # type: ignore[type-abstract]
 
 
 def model_class(name: str) -> type[Model]:
     """The model of that name. Raises NeecoError when there is none."""
     known = find_models()
     if name not in known:
-        raise NeecoError(f"--models: {name!r} is unknown; choose of {', '.join(known)}")
+        raise NeecoError(
+            f"--models: {name!r} is unknown; choose of {', '.join(known)}, or install the package that has it"
+        )
     return known[name]
 
 

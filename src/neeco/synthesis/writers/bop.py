@@ -12,9 +12,8 @@ column and row and the distance to the last ones, and -1 where no pixel is visib
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,35 +26,39 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.lens import INTRINSICS
 from neeco.labels.annotation import bounding_box
 from neeco.labels.drawing import extended_silhouettes
-from neeco.labels.labellers import Labeller, instruments_of
+from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import DEPTH_MM_PER_COUNT, Record, link, stem
 
-if TYPE_CHECKING:
-    from neeco.scene import Scene
-
-FOLDER, SCENE = "bop", "000000"
+SCENE = "000000"
 NOWHERE = [-1, -1, -1, -1]
 
 
-def write_bop(root: Path, records: Sequence[Record], scene: Scene, labeller: Labeller) -> None:
-    """(Re)write everything; `scene` and `labeller` are those that the images were drawn with. Raises NeecoError."""
-    instruments = instruments_of(labeller.names)
-    write_json(root / FOLDER / "objects.json", {str(k): name for k, name in enumerate(instruments, 1)})
-    for split in sorted({record["split"] for record in records}):
-        folder = root / FOLDER / split / SCENE
-        cameras, poses, infos = {}, {}, {}
-        for record in records:
-            if record["split"] != split:
-                continue
-            name, key = stem(record["index"]), str(record["index"])
-            link(root / record["image"], folder / "rgb" / Path(record["image"]).name)
-            link(root / "depth" / f"{name}.png", folder / "depth" / f"{name}.png")
-            cameras[key] = _camera(record)
-            poses[key] = [_pose(label, instruments.index(label["name"]) + 1) for label in record["labels"]]
-            infos[key] = _masks(root, folder, record, scene, labeller)
-        write_json(folder / "scene_camera.json", cameras)
-        write_json(folder / "scene_gt.json", poses)
-        write_json(folder / "scene_gt_info.json", infos)
+class Bop(Writer):
+    """Poses, masks and depth of every instrument, in images without distortion."""
+
+    format = "bop"
+    description = "`bop/{train,val}/`, for 6-DoF pose"
+    accepts_distortion = False
+
+    def write(self, images: WrittenImages) -> None:
+        """(Re)write everything. Raises NeecoError."""
+        root, instruments = images.root, images.instruments
+        write_json(root / self.format / "objects.json", {str(k): name for k, name in enumerate(instruments, 1)})
+        for split in sorted({record["split"] for record in images.records}):
+            folder = root / self.format / split / SCENE
+            cameras, poses, infos = {}, {}, {}
+            for record in images.records:
+                if record["split"] != split:
+                    continue
+                name, key = stem(record["index"]), str(record["index"])
+                link(root / record["image"], folder / "rgb" / Path(record["image"]).name)
+                link(root / "depth" / f"{name}.png", folder / "depth" / f"{name}.png")
+                cameras[key] = _camera(record)
+                poses[key] = [_pose(label, instruments.index(label["name"]) + 1) for label in record["labels"]]
+                infos[key] = _masks(images, folder, record)
+            write_json(folder / "scene_camera.json", cameras)
+            write_json(folder / "scene_gt.json", poses)
+            write_json(folder / "scene_gt_info.json", infos)
 
 
 def _camera(record: Record) -> dict[str, Any]:
@@ -76,8 +79,9 @@ def _pose(label: dict[str, Any], number: int) -> dict[str, Any]:
     return {"cam_R_m2c": pose[:3, :3].ravel().tolist(), "cam_t_m2c": pose[:3, 3].tolist(), "obj_id": number}
 
 
-def _masks(root: Path, folder: Path, record: Record, scene: Scene, labeller: Labeller) -> list[dict[str, Any]]:
+def _masks(images: WrittenImages, folder: Path, record: Record) -> list[dict[str, Any]]:
     """Write whole and visible mask of every instrument; returns their scene_gt_info entries."""
+    root, labeller = images.root, images.labeller
     name, width, height = stem(record["index"]), record["width"], record["height"]
     parts = read_labels(root / "parts" / f"{name}.png").numpy()
     bits = read_labels(root / "silhouettes" / f"{name}.png").numpy()
@@ -86,7 +90,7 @@ def _masks(root: Path, folder: Path, record: Record, scene: Scene, labeller: Lab
     given = {item["name"]: InstrumentState(item["pose"], item["joints"]) for item in record["instruments"]}
     fx, fy, cx, cy = (record["intrinsics"][key] for key in INTRINSICS)
     camera = Camera(swap_camera_axes(np.array(record["camera"])), fx, fy, cx, cy, width, height)
-    extended = extended_silhouettes(scene, labeller, State(given, record["time"], record.get("tissue")), camera)
+    extended = extended_silhouettes(images.scene, labeller, State(given, record["time"], record.get("tissue")), camera)
     infos = []
     for place, label in enumerate(record["labels"]):
         ids = [k for k, (owner, _) in enumerate(labeller.names, 1) if owner == label["name"]]

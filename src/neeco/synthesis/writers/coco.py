@@ -16,53 +16,54 @@ from typing import Any
 import numpy as np
 
 from neeco.files import write_json
-from neeco.labels.labellers import instruments_of
+from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import Record, link
 
-FOLDER = "coco"
 
+class Coco(Writer):
+    """Boxes, polygons, keypoints and poses of instruments and their parts.
 
-def write_coco(
-    root: Path,
-    records: Sequence[Record],
-    names: tuple[tuple[str, str], ...],
-    keypoints: Sequence[str],
-    bones: Sequence[tuple[str, str]],
-) -> None:
-    """(Re)write all COCO files. names: (instrument, part) of part id 1, 2, ...; bones: pairs of keypoints that a line
-    joins.
-
-    Instruments have keypoints in the order of `keypoints` (all of them, absent ones as 0 0 0) and, beyond COCO's own
-    fields, `visibility`, `rectangle` (minimum-area, 4 corners) and `camera_from_instrument` (4x4, mm, OpenCV axes).
-    Raises NeecoError.
+    Instruments have all keypoints, absent ones as 0 0 0, and, beyond COCO's own fields, `visibility`, `rectangle`
+    (minimum-area, 4 corners) and `camera_from_instrument` (4x4, mm, OpenCV axes).
     """
-    skeleton = [[keypoints.index(a) + 1, keypoints.index(b) + 1] for a, b in bones if {a, b} <= set(keypoints)]
-    instruments: list[dict[str, Any]] = [
-        {"id": k, "name": name, "supercategory": "instrument"} for k, name in enumerate(instruments_of(names), 1)
-    ]
-    for category in instruments if keypoints else []:
-        category |= {"keypoints": list(keypoints), "skeleton": skeleton}
-    parts = [
-        {"id": k, "name": f"{instrument}/{part}", "supercategory": instrument}
-        for k, (instrument, part) in enumerate(names, 1)
-    ]
-    numbers = {category["name"]: category["id"] for category in instruments}
-    part_numbers = {name: k for k, name in enumerate(names, 1)}
-    folder = root / FOLDER
-    for record in records:
-        link(root / record["image"], folder / "images" / Path(record["image"]).name)
-    for split in (None, *sorted({record["split"] for record in records})):
-        chosen = [record for record in records if split in (None, record["split"])]
-        found = [(record, label) for record in chosen for label in record["labels"] if label["area"] > 0]
-        by_instrument = (_instrument(record, label, numbers, keypoints) for record, label in found)
-        by_part = (
-            _annotation(record, shape, part_numbers[label["name"], part])
-            for record, label in found
-            for part, shape in label["parts"].items()
-        )
-        for kind, categories, made in (("instances", instruments, by_instrument), ("parts", parts, by_part)):
-            path = folder / (f"{kind}.json" if split is None else f"annotations/{kind}_{split}.json")
-            write_json(path, _document(chosen, categories, made))
+
+    format = "coco"
+    description = (
+        "`coco/instances.json` (boxes, polygons, keypoints, 6-DoF poses) and `coco/parts.json`; each split in "
+        "`coco/annotations/`, images in `coco/images/`"
+    )
+
+    def write(self, images: WrittenImages) -> None:
+        """(Re)write all COCO files. Raises NeecoError."""
+        keypoints, records = images.keypoint_names, images.records
+        bones = [pair for pair in images.bones if set(pair) <= set(keypoints)]
+        skeleton = [[keypoints.index(a) + 1, keypoints.index(b) + 1] for a, b in bones]
+        instruments: list[dict[str, Any]] = [
+            {"id": k, "name": name, "supercategory": "instrument"} for k, name in enumerate(images.instruments, 1)
+        ]
+        for category in instruments if keypoints else []:
+            category |= {"keypoints": list(keypoints), "skeleton": skeleton}
+        parts = [
+            {"id": k, "name": f"{instrument}/{part}", "supercategory": instrument}
+            for k, (instrument, part) in enumerate(images.part_names, 1)
+        ]
+        numbers = {category["name"]: category["id"] for category in instruments}
+        part_numbers = {name: k for k, name in enumerate(images.part_names, 1)}
+        folder = images.root / self.format
+        for record in records:
+            link(images.root / record["image"], folder / "images" / Path(record["image"]).name)
+        for split in (None, *sorted({record["split"] for record in records})):
+            chosen = [record for record in records if split in (None, record["split"])]
+            found = [(record, label) for record in chosen for label in record["labels"] if label["area"] > 0]
+            by_instrument = (_instrument(record, label, numbers, keypoints) for record, label in found)
+            by_part = (
+                _annotation(record, shape, part_numbers[label["name"], part])
+                for record, label in found
+                for part, shape in label["parts"].items()
+            )
+            for kind, categories, made in (("instances", instruments, by_instrument), ("parts", parts, by_part)):
+                path = folder / (f"{kind}.json" if split is None else f"annotations/{kind}_{split}.json")
+                write_json(path, _document(chosen, categories, made))
 
 
 def _document(

@@ -18,24 +18,32 @@ import numpy as np
 import yaml
 
 from neeco.files import write_text
-from neeco.synthesis.writers.folder import Record, link, stem
+from neeco.synthesis.writers import Writer, WrittenImages
+from neeco.synthesis.writers.folder import link, stem
 
-FOLDER = "yolo"
 Row = Callable[[dict[str, Any], np.ndarray], list[float]]  # (label, image size [2]) -> numbers after the class
 
 
-def write_yolo(root: Path, records: Sequence[Record], instruments: Sequence[str], keypoints: Sequence[str]) -> None:
-    """Write every variant; classes are `instruments`, coordinates are shares of the image's width and height."""
-    _write_variant(root, root / FOLDER, records, instruments, detect_row, {})
-    _write_variant(root, root / FOLDER / "segment", records, instruments, segment_row, {})
-    _write_variant(root, root / FOLDER / "obb", records, instruments, oriented_row, {})
-    if keypoints:
-        mirrored = [name.replace("left", "\0").replace("right", "left").replace("\0", "right") for name in keypoints]
-        flip = [keypoints.index(name) if name in keypoints else k for k, name in enumerate(mirrored)]
-        extra: dict[str, Any] = {"kpt_shape": [len(keypoints), 3], "flip_idx": flip}
-        extra["kpt_names"] = {k: list(keypoints) for k in range(len(instruments))}
-        row = _pose_row(keypoints)
-        _write_variant(root, root / FOLDER / "pose", records, instruments, row, extra)
+class Yolo(Writer):
+    """Boxes, polygons, keypoints and oriented boxes; coordinates are shares of the image's width and height."""
+
+    format = "yolo"
+    description = "`yolo/` to detect, `yolo/segment/`, `yolo/pose/` and `yolo/obb/`"
+
+    def write(self, images: WrittenImages) -> None:
+        """(Re)write every variant. Raises NeecoError."""
+        keypoints, folder = images.keypoint_names, images.root / self.format
+        _write_variant(images, folder, detect_row, {})
+        _write_variant(images, folder / "segment", segment_row, {})
+        _write_variant(images, folder / "obb", oriented_row, {})
+        if keypoints:
+            mirrored = [
+                name.replace("left", "\0").replace("right", "left").replace("\0", "right") for name in keypoints
+            ]
+            flip = [keypoints.index(name) if name in keypoints else k for k, name in enumerate(mirrored)]
+            extra: dict[str, Any] = {"kpt_shape": [len(keypoints), 3], "flip_idx": flip}
+            extra["kpt_names"] = {k: list(keypoints) for k in range(len(images.instruments))}
+            _write_variant(images, folder / "pose", _pose_row(keypoints), extra)
 
 
 def detect_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
@@ -80,9 +88,8 @@ def _shares(points: np.ndarray, size: np.ndarray) -> list[float]:
     return np.clip(points / size, 0, 1).ravel().tolist()
 
 
-def _write_variant(
-    root: Path, folder: Path, records: Sequence[Record], instruments: Sequence[str], row: Row, extra: dict[str, Any]
-) -> None:
+def _write_variant(images: WrittenImages, folder: Path, row: Row, extra: dict[str, Any]) -> None:
+    records, instruments = images.records, images.instruments
     for record in records:
         name, split = stem(record["index"]), record["split"]
         size = np.array([record["width"], record["height"]], dtype=float)
@@ -92,7 +99,7 @@ def _write_variant(
             if label["area"] > 0
         ]
         write_text(folder / "labels" / split / f"{name}.txt", "".join(f"{line}\n" for line in lines))
-        link(root / record["image"], folder / "images" / split / Path(record["image"]).name)
+        link(images.root / record["image"], folder / "images" / split / Path(record["image"]).name)
     has_validation = any(record["split"] == "val" for record in records)
     # without "path", tools take the folder of data.yaml itself, wherever the data set is moved
     data = {

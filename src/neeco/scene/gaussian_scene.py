@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +20,7 @@ from neeco.raster.devices import CachedPredicate
 from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
 from neeco.scene.canonical import SH_COEFFICIENTS, TISSUE, CanonicalGaussians
 from neeco.scene.deformation import UNPERTURBED, Deformation, Deltas, Perturbation
-from neeco.scene.drawable import ArticulatedMotion, Drawable, Recorded, Skeleton
+from neeco.scene.drawable import ArticulatedMotion, DrawableScene, Recorded, Skeleton
 from neeco.scene.method import Stored
 from neeco.scene.visibility import VISIBILITY, measure_visibility, unobserved_share
 
@@ -36,7 +36,7 @@ CANONICAL_SHAPES = {  # of one Gaussian
 }
 
 
-class Scene(nn.Module):
+class GaussianScene(nn.Module):
     """A learned scene of Gaussians: `at` poses them in a state, for every method; `render` draws them.
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
@@ -87,7 +87,7 @@ class Scene(nn.Module):
         """The method's own."""
         return self.deformation.settings
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Scene:
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianScene:
         """What `to` calls: the canonical Gaussians go with the modules."""
         super()._apply(fn, recurse)
         self.canonical = self.canonical.map(fn)
@@ -104,7 +104,7 @@ class Scene(nn.Module):
         }
 
     @classmethod
-    def load(cls, deformation: Deformation, stored: Stored) -> Scene:
+    def load(cls, deformation: Deformation, stored: Stored) -> GaussianScene:
         """The inverse of `pack`. Raises ValueError or LookupError where what is stored does not fit."""
         header = stored.header
         prefix = "canonical."
@@ -167,7 +167,7 @@ class Scene(nn.Module):
             raise NeecoError(f"state: tissue: {state.tissue!r} is not in the scene; {known}")
         return names.index(str(state.tissue)) if len(names) > 1 else None
 
-    def over(self, tissue: str) -> Scene:
+    def over(self, tissue: str) -> GaussianScene:
         """The scene of one of several tissues alone, with what was recorded over it."""
         index = self.recorded.tissues.index(tissue)
         chosen = self.canonical.of_tissue(index) | self.canonical.of_instruments
@@ -272,17 +272,33 @@ class Scene(nn.Module):
         return self.deformation.skeleton()
 
 
-def over_one(scene: Drawable, tissue: str | None) -> Drawable:
+def is_gaussian(scene: DrawableScene) -> TypeGuard[GaussianScene]:
+    """Whether `scene` is made of Gaussians, which can be posed and labelled."""
+    return scene.has_gaussians
+
+
+def require_gaussians(scene: DrawableScene, asked_by: str) -> GaussianScene:
+    """Return `scene`, which must be made of Gaussians. Raises NeecoError, in the words of the option or verb
+    `asked_by`, for a radiance field."""
+    if not is_gaussian(scene):
+        raise NeecoError(
+            f"{asked_by}: method {scene.method} has no Gaussians to pose or label; use a run of another method, "
+            "such as kinematic"
+        )
+    return scene
+
+
+def over_one(scene: DrawableScene, tissue: str | None) -> DrawableScene:
     """The scene over one tissue: that of this name, else the first; as it is where it has one. Raises NeecoError for a
     name that is none of its."""
     names = scene.recorded.tissues
     if tissue is not None and tissue not in names:
         known = f"its tissues are {', '.join(names)}" if names else "it has one tissue, without a name"
         raise NeecoError(f"--tissue: {tissue!r} is not in the scene; {known}")
-    return cast(Scene, scene).over(tissue or names[0]) if len(names) > 1 else scene
+    return scene.over(tissue or names[0]) if is_gaussian(scene) and len(names) > 1 else scene
 
 
-def one_tissue(scene: Drawable, asked_by: str) -> None:
+def one_tissue(scene: DrawableScene, asked_by: str) -> None:
     """Raise NeecoError, in the words of the option or verb `asked_by`, for a scene of several tissues."""
     if len(scene.recorded.tissues) > 1:
         raise NeecoError(
@@ -312,14 +328,3 @@ def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> Canonical
         if not torch.isfinite(tensor).all():
             raise ValueError(f"{name} contains NaN or infinity")
     return CanonicalGaussians.from_tensors(tensors, counts)
-
-
-def gaussian_scene(scene: Drawable, asked_by: str) -> Scene:
-    """`scene` where it is made of Gaussians. Raises NeecoError, in the words of the option or verb `asked_by`, for a
-    field, which has nothing to pose."""
-    if not scene.has_gaussians:
-        raise NeecoError(
-            f"{asked_by}: method {scene.method} has no Gaussians to pose or label; use a run of another method, "
-            "such as kinematic"
-        )
-    return cast(Scene, scene)
