@@ -13,11 +13,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from neeco.ingest.assessment import Assessment
     from neeco.ingest.recording.model import Recording
     from neeco.ingest.result import IngestResult
+    from neeco.report.ingest_page import Ingested
 
-PAGE = "ingest.html"
 RECORDING = "recording.yaml"
 CHOICES = "recording_choices.png"
 
@@ -94,8 +93,8 @@ def run(args: Ingest) -> int:
                 raise NeecoError(f"{source}: is a folder; of several recordings give each recording.yaml")
             _refuse_beside(args, f"{source}: a folder in another format", keep=("output",))
             return _convert(source, output)
-    verdicts = _ingest(recordings_of(args), output, args.rrd, args.json)
-    return 1 if args.strict and any(verdict.level == "bad" for verdict in verdicts) else 0
+    made = _ingest(recordings_of(args), output, args.rrd, args.json)
+    return 1 if args.strict and made.verdict == "doubtful" else 0
 
 
 def _refuse_beside(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
@@ -179,22 +178,15 @@ def recordings_of(args: Ingest) -> list[Recording]:
     return [recording]
 
 
-def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json: bool) -> list[Assessment]:
-    """Make the capture, print what was found and how good it is; the verdict on each tissue."""
-    from neeco.capture import read_capture
-    from neeco.capture.check import Problem, errors_only, inspect_capture
+def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json: bool) -> Ingested:
+    """Make the capture, print what was found and how good it is."""
+    from neeco.capture.check import errors_only
     from neeco.cli._output import require_ending
-    from neeco.errors import NeecoError
     from neeco.files import finite
-    from neeco.ingest.assessment import assess_ingest
-    from neeco.ingest.pipeline import ingest
-    from neeco.ingest.tissues import ingest_tissues
-    from neeco.report.ingest_page import write_ingest_page
-    from neeco.report.rerun_log import require_rerun, write_rrd
+    from neeco.report.ingest_page import ingest_with_page
 
     if rrd is not None:
         require_ending("--rrd", rrd, ".rrd")
-        require_rerun()
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
@@ -207,59 +199,29 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
                 tasks[what] = bar.add_task(what, total=total or None)
             bar.update(tasks[what], completed=done, total=total or None)
 
-        problems: list[Problem] = []
-        verdicts: dict[str, Assessment] = {}
-
-        def complete(result: IngestResult, folder: Path) -> None:
-            complete_tissues({"": result}, folder)
-
-        def complete_tissues(results: dict[str, IngestResult], folder: Path) -> None:
-            report("writing the page", 0, 0)
-            checked = inspect_capture(folder)
-            problems.extend(checked.problems)
-            capture = checked.capture or read_capture(folder)
-            for tissue, result in results.items():
-                own = capture.over(tissue) if tissue else capture
-                verdicts[tissue] = assess_ingest(result, own, problems)
-                write_ingest_page(result, verdicts[tissue], folder / page_of(tissue), own)
-                if rrd is not None:
-                    report("writing for rerun", 0, 0)
-                    write_rrd(result, own, rrd)
-
         try:
-            if any(recording.tissue for recording in recordings):
-                if rrd is not None:
-                    raise NeecoError("--rrd: shows one tissue, and the recordings name theirs; leave it out")
-                results = ingest_tissues(recordings, output, report, complete_tissues)
-            else:
-                results = {"": ingest(recordings, output, report, complete)}
+            made = ingest_with_page(recordings, output, report, rrd)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("nothing was written") from None
+    results, assessments = made.results, made.assessments
     if as_json:
-        numbers = finite({tissue: result.as_json() | verdicts[tissue].as_json() for tissue, result in results.items()})
+        numbers = finite({name: result.as_json() | assessments[name].as_json() for name, result in results.items()})
         print(json.dumps(numbers.get("", {"tissues": numbers}), indent=2, allow_nan=False))
-        return list(verdicts.values())
+        return made
     for tissue, result in results.items():
         if tissue:
             print(f"tissue {tissue}:")
         print_result(result)
-    for problem in errors_only(problems):
+    for problem in errors_only(list(made.problems)):
         print(f"wrong: {problem}")
-    print(f"capture: {output}  ({len(problems)} remarks by `neeco check`)")
-    print(f"page: {', '.join(str(output / page_of(tissue)) for tissue in results)}")
+    print(f"capture: {output}  ({len(made.problems)} remarks by `neeco check`)")
+    print(f"page: {', '.join(map(str, made.pages))}")
     if rrd is not None:
         print(f"to scrub through: rerun {rrd}")
-    for tissue, verdict in verdicts.items():
-        first, *others = verdict.lines()
+    for tissue, assessment in assessments.items():
+        first, *others = assessment.lines()
         print(f"how good it is: {f'{tissue}: ' if tissue else ''}{first}", *others, sep="\n")
-    return list(verdicts.values())
-
-
-def page_of(tissue: str) -> str:
-    """The file of the page about one of several tissues; of the only one where it has no name."""
-    from neeco.ingest.timing.episodes import file_name
-
-    return f"{Path(PAGE).stem}_{file_name(tissue)}.html" if tissue else PAGE
+    return made
 
 
 def print_result(result: IngestResult) -> None:

@@ -47,6 +47,7 @@ INFO = "track.json"
 STEPS = "steps"  # the folder of what is done, gone at the end
 SECOND = "second"  # in it: steps by tissue and light that were learned again
 FOOTAGE = "footage"  # the folder of the output in which `neeco track` keeps a video as a capture
+PAGE = "track.html"
 RUN = "run"  # the folder of the scene by which footage over another tissue was tracked: a run
 OTHER_TISSUE = 3.0  # times the misfit over the own tissue that instruments have over tissue learned from footage
 MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
@@ -69,6 +70,14 @@ class Tracked:
     written: int
     min_trust: float
     scene: GaussianScene
+
+    @property
+    def page(self) -> Path:
+        """The page about all frames, once `write_track_page` has written it."""
+        return self.output / PAGE
+
+    def __repr__(self) -> str:
+        return f"Tracked({str(self.output)!r}, {self.written} of {len(self.records)} frames)"
 
     @property
     def verdict(self) -> str:
