@@ -311,7 +311,7 @@ def track(
     Raises NeecoError for a run or footage that cannot be used, an `output` that is not empty (without `resume`), and
     where no frame reaches `min_trust`.
 
-        tracked = neeco.track("runs/sample", "footage", "tracked", min_trust=0.7)
+        tracked = neeco.track("runs/sample", "footage", "tracked", start="first")
         print(tracked.verdict, tracked.written, len(neeco.read_capture(tracked.output).frames))
     """
     from neeco.ingest.footage_video import read_footage

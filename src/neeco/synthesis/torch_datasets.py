@@ -213,6 +213,9 @@ class LabelledImages(_Generated, Dataset[Sample]):
         super().__init__(scene, instruments, chosen, transform)
         self.count = count
 
+    def __repr__(self) -> str:
+        return f"LabelledImages({self.count} images, states={self._settings.states!r}, {', '.join(self.classes)})"
+
     def __len__(self) -> int:
         return self.count
 
@@ -263,6 +266,9 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
         super().__init__(scene, instruments, chosen, transform)
         self.start, self.shard = start, shard
 
+    def __repr__(self) -> str:
+        return f"LabelledStream(start={self.start}, states={self._settings.states!r}, {', '.join(self.classes)})"
+
     def __iter__(self) -> Iterator[Sample]:
         worker = get_worker_info()
         number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
@@ -307,6 +313,9 @@ class StoredImages(Dataset[Sample]):
         if not self._records:
             found = ", ".join(f"{name!r} ({count})" for name, count in Counter(r["split"] for r in records).items())
             raise NeecoError(f"{self.folder}: split {split!r} has no images; it has {found or 'none'}")
+
+    def __repr__(self) -> str:
+        return f"StoredImages({str(self.folder)!r}, {len(self._records)} images, {', '.join(self.classes)})"
 
     def __len__(self) -> int:
         return len(self._records)
