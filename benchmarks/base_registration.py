@@ -35,9 +35,10 @@ from rendered.base import BASE_FROM_CAMERA, SHARE, base_errors, wrong_base
 from scipy.interpolate import interp1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from neeco.capture.model import evenly_spaced, swap_camera_axes
+from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.files import write_json
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.ingest.cameras.still import moving_masks
 from neeco.ingest.registration.base import find_base
 

@@ -27,19 +27,21 @@ import cv2
 import numpy as np
 
 from neeco.capture import read_capture
-from neeco.capture.model import REFERENCE_PIXELS, Capture, FromVideo, InstrumentState, State, swap_camera_axes
+from neeco.capture.model import REFERENCE_PIXELS, Capture, FromVideo, InstrumentState, State
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.files import write_json
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project_world
-from neeco.ingest.cameras.sfm import SfmResult
-from neeco.ingest.cameras.still import moving_masks, reduced
+from neeco.ingest.cameras.still import moving_masks
 from neeco.ingest.foreground.motion import ResidualFlow
 from neeco.ingest.foreground.passing import passing_masks
+from neeco.ingest.frames.views import SfmResult, reduced
 from neeco.ingest.recording.model import IngestSettings
-from neeco.ingest.shaft.axis import Scene
-from neeco.ingest.shaft.from_video import FoundShaft, find_shaft, with_roll
+from neeco.ingest.shaft.axis import ShaftVideo
+from neeco.ingest.shaft.from_video import FoundShaft, find_shaft
+from neeco.ingest.timing.episodes import with_roll
 
 LOGGED_DEG = 1.0  # standard deviation stated of a roll that is the truth's
 
@@ -78,7 +80,15 @@ def measure(path: Path, diameter: float | None = None, write: Path | None = None
     rows = []
     for trocar in (True, False):
         start = process_time()
-        scene = Scene(cameras, times, np.zeros(len(times)), radius, lens.intrinsics, trocar, True)
+        scene = ShaftVideo(
+            world_from_camera=cameras,
+            times=times,
+            episodes=np.zeros(len(times)),
+            radius=radius,
+            intrinsics=lens.intrinsics,
+            trocar=trocar,
+            scaled=True,
+        )
         row: dict[str, Any] = {"capture": path.name, "trocar": trocar, "moving_iou": _overlap(masks, shown)}
         try:
             found = find_shaft(images, masks, scene, trocar=trocar)
@@ -113,7 +123,10 @@ def masks_of(capture: Capture, images: np.ndarray) -> tuple[np.ndarray, Lens]:
         seen.append(np.column_stack([np.full(len(which), row), which, pixels[which], np.zeros(len(which))]))
     cameras = np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames])
     count = np.zeros(len(points))
-    sfm = SfmResult(rows, cameras, points, capture.points.colors, count, count, np.concatenate(seen), None, 0.0)
+    sfm = SfmResult(
+        indices=rows, world_from_camera=cameras, points=points, colors=capture.points.colors, errors=count,
+        lengths=count, observations=np.concatenate(seen), lens=None, reprojection_px=0.0,
+    )  # fmt: skip
     times = np.array([frame.state.time for frame in frames])
     flow = ResidualFlow(lambda row: images[row], sfm, times, Lens.of(camera))
     return passing_masks(lambda row: images[row], flow, rows, IngestSettings().moving_px), lens

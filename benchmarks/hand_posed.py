@@ -26,13 +26,14 @@ from from_video import masks_of
 from scipy.ndimage import gaussian_filter1d
 
 from neeco.capture import Capture, Instrument, InstrumentState, State, read_capture, write_capture
-from neeco.capture.model import REFERENCE_PIXELS, FromVideo, Uncertainty, swap_camera_axes
+from neeco.capture.model import REFERENCE_PIXELS, FromVideo, Uncertainty
 from neeco.files import read_json
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.still import reduced
+from neeco.ingest.frames.views import reduced
 from neeco.ingest.posing.hand_posed import HandPose, write_answers
 from neeco.ingest.posing.posed_capture import PosedCapture, Posing, prepare
-from neeco.ingest.shaft.axis import Scene
+from neeco.ingest.shaft.axis import ShaftVideo
 from neeco.ingest.shaft.from_video import find_shaft
 
 HAND_DEG = 3.0
@@ -88,7 +89,15 @@ def shaft_from_video(true: Capture, masks: np.ndarray, shaft: tuple[float, float
     cameras = np.stack([frame.camera.world_from_camera.double().numpy() for frame in true.frames])
     times = np.array([frame.state.time for frame in true.frames])
     intrinsics = Lens.of(true.frames[0].camera.within(REFERENCE_PIXELS)).intrinsics
-    scene = Scene(cameras, times, np.zeros(len(times)), shaft[0] / 2, intrinsics, True, True)
+    scene = ShaftVideo(
+        world_from_camera=cameras,
+        times=times,
+        episodes=np.zeros(len(times)),
+        radius=shaft[0] / 2,
+        intrinsics=intrinsics,
+        trocar=True,
+        scaled=True,
+    )
     found = find_shaft(images, masks, scene, shaft[1])
     seen = FromVideo(shaft[0], found.working_length)
     return Shaft(np.linalg.inv(cameras) @ found.poses, found.known, found.uncertainties, seen)

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 import neeco
-from neeco.capture.kinematicsfile import kinematics_of
+from neeco.capture.readers import kinematics_of
 from neeco.errors import NeecoError
-from neeco.methods.kinematic.articulation.stated import StatedLinks
+from neeco.methods.kinematic.stated_links import StatedLinks
 
 
 def standing(links: StatedLinks, readings: dict[str, float]) -> list[tuple[Tensor, Tensor]]:

@@ -21,8 +21,9 @@ import torch
 from torch import Tensor
 
 from neeco.raster import Camera, Gaussians, rasterize
+from neeco.raster.cpu_backend import last_statistics
 from neeco.raster.losses import photometric_loss
-from neeco.raster.native import keep_freed_memory, last_statistics, set_threads, simd
+from neeco.raster.native import keep_freed_memory, set_threads, simd
 from neeco.raster.optimizer import adam_step
 from neeco.raster.reference import Projection, blend_weights, camera_from_world, project
 

@@ -25,7 +25,7 @@ FLOAT = 4  # bytes
 COPIED = 2**26  # floats: larger than any cache
 SIDE = {"cuda": 4096, "cpu": 512}  # of the matrices
 TRIES = 20
-FUNCTIONS = {  # of neeco.raster.triton.backend
+FUNCTIONS = {  # of neeco.raster.triton_backend
     "project": "project",
     "list_per_tile": "bin",
     "composite": "composite",
@@ -87,7 +87,7 @@ class Stages:
     @contextmanager
     def watching(self) -> Iterator[None]:
         """Notes every stage of the triton backend that runs in the block."""
-        from neeco.raster.triton import backend
+        from neeco.raster import triton_backend as backend
 
         plain = {name: getattr(backend, name) for name in FUNCTIONS}
         for name, stage in FUNCTIONS.items():

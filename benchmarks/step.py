@@ -20,7 +20,7 @@ from typing import Any
 
 import torch
 
-from neeco.capture.check import read_checked
+from neeco.capture.checks import read_checked
 from neeco.raster import losses, native, posing, shadow
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.raster.optimizer import Adam

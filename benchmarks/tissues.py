@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.capture.check import read_checked
+from neeco.capture.checks import read_checked
 from neeco.capture.model import Capture, PointCloud, Tissue
-from neeco.capture.reader import read_capture
+from neeco.capture.readers import read_capture
 from neeco.capture.writer import write_capture
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.training.run import open_run

@@ -42,15 +42,16 @@ from torch import Tensor
 
 from neeco.capture import read_capture, write_capture
 from neeco.capture.images import write_image
-from neeco.capture.model import Frame, InstrumentState, State, swap_camera_axes
+from neeco.capture.model import Frame, InstrumentState, State
 from neeco.evaluation.mask_folders import load_reference
 from neeco.geometry.camera import Camera
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 from neeco.labels.drawing import draw
 from neeco.synthesis.camera_effects import SMOKE_MM, apply_effects
-from neeco.tracking.fitting import Fitter
 from neeco.tracking.follow import Follower
+from neeco.tracking.parameters import fitter_of
 from neeco.tracking.track import state_of
 from neeco.tracking.trust import Reference
 from neeco.training.run import load_run, open_gaussian_run, open_run
@@ -273,7 +274,7 @@ def single(given: argparse.Namespace) -> None:
     chosen = [frame for frame in capture.frames if not given.splits or frame.split in given.splits][:: given.every]
     with open_gaussian_run(given.run, "track") as opened, torch.no_grad():
         scene = opened.scene
-        fitter = Fitter.of(scene)
+        fitter = fitter_of(scene)
         follower = Follower.of(chosen, fitter, Reference.of(fitter, opened.capture().split("train")))
         for k, frame in enumerate(chosen):
             began = time.process_time()

@@ -25,13 +25,14 @@ import numpy as np
 from PIL import Image, ImageOps
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.check import inspect_capture
-from neeco.capture.check_images import _Colors, check_images
-from neeco.capture.check_motion import _by_chance, _of_root, check_motion
-from neeco.capture.documents import Parsed, ProblemReport
-from neeco.capture.model import swap_camera_axes
-from neeco.capture.motion_evidence import Rays
-from neeco.capture.reader import parse_capture
+from neeco.capture.checks import inspect_capture
+from neeco.capture.checks.colors import _Colors, check_images
+from neeco.capture.checks.motion import _by_chance, _of_root, check_motion
+from neeco.capture.checks.motion_evidence import Rays
+from neeco.capture.documents import ProblemReport
+from neeco.capture.readers import parse_capture
+from neeco.capture.readers.parsed import Parsed
+from neeco.geometry.conventions import swap_camera_axes
 
 Document = dict[str, Any]
 Poses = Callable[[np.ndarray, np.ndarray], np.ndarray]  # of poses and cameras [N, 4, 4], OpenCV axes

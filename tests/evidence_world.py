@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neeco.capture.model import Camera, Frame, InstrumentState, State
 from neeco.geometry.rotations import rigid, rigid_from_vector, rotate_about
-from neeco.methods.carving.evidence import Evidence
+from neeco.methods.space_carving import Evidence
 
 PIVOT_MM, TIP_MM, RADIUS_MM = 8.0, 24.0, 3.0
 HINGE_ANGLE = 0.9  # rad about the shaft, in the true shaft frame

@@ -12,7 +12,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from neeco.capture.model import Capture, Frame, FromVideo, Instrument, InstrumentState, PointCloud, State, Uncertainty
-from neeco.capture.reader import read_capture
+from neeco.capture.readers import read_capture
 from neeco.capture.writer import write_capture
 from neeco.geometry.camera import Camera
 from neeco.ingest.posing.posed_capture import prepare

@@ -15,7 +15,7 @@ import yaml
 
 from neeco.capture.images import open_image
 from neeco.capture.points import read_ply
-from neeco.capture.urdf import read_urdf
+from neeco.capture.readers import read_urdf
 from neeco.errors import NeecoError
 from neeco.files import (
     LOCK,

@@ -29,6 +29,16 @@ ROOMS = (  # from the top down; rooms of one line do not know each other
     ("errors", "plausible"),
 )
 LEVELS = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
+# folders of ingest from the top down, below its own modules
+INGEST = (
+    *("posing", "registration", "shaft", "cameras", "foreground"),
+    *("frames", "timing", "recording", "readers", "calibration"),
+)
+# a package that loads the modules of a folder of its own when they are asked for, and they use what it declares
+LAZY = {
+    "neeco.studies.downstream <-> neeco.studies.downstream.models",
+    "neeco.synthesis <-> neeco.synthesis.writers",
+}
 OUTSIDE = ("__init__", "__main__", "_native")  # the package's version, its start (the command line's), the C++ kernels
 Graph = dict[str, set[str]]  # module -> modules it imports anywhere: at its top, in functions, for types alone
 
@@ -68,6 +78,21 @@ def graph() -> Graph:
 
 def room(module: str) -> str:
     return module.split(".")[1] if "." in module else "__init__"
+
+
+def folders(imports: Graph) -> Graph:
+    """The imports between folders. A package's own names count as its folder's; what it re-exports does not."""
+    packages = {name for name, path in modules().items() if path.name == "__init__.py"}
+
+    def folder(module: str) -> str:
+        return module if module in packages else module.rpartition(".")[0]
+
+    found: Graph = {folder(module): set() for module in imports}
+    for module, others in imports.items():
+        inside = f"{module}." if module in packages else None
+        imported = {folder(other) for other in others if inside is None or not other.startswith(inside)}
+        found[folder(module)] |= imported - {folder(module)}
+    return found
 
 
 def upward(imports: Graph) -> list[str]:
@@ -123,6 +148,21 @@ def test_no_circle_between_modules() -> None:
     assert circles({module: others - {lazy} for module, others in graph().items()}) == []
 
 
+def test_no_circle_between_folders() -> None:
+    imports = folders(graph())
+    root = "neeco"  # holds what all use (errors, files) and what uses all (api)
+    assert set(circles({folder: others - {root} for folder, others in imports.items()})) <= LAZY
+
+
+def test_a_folder_of_ingest_imports_only_from_folders_below() -> None:
+    imports = folders(graph())
+    for level, name in enumerate(INGEST):
+        below = {f"neeco.ingest.{other}" for other in INGEST[level + 1 :]}
+        assert {other for other in imports[f"neeco.ingest.{name}"] if other.startswith("neeco.ingest")} <= below
+    listed = {f"neeco.ingest.{name}" for name in INGEST}
+    assert {folder for folder in imports if folder.startswith("neeco.ingest.")} == listed
+
+
 @pytest.mark.parametrize(
     "source",
     [
@@ -136,9 +176,9 @@ def test_no_circle_between_modules() -> None:
     ],
 )
 def test_an_import_upward_is_seen_wherever_it_stands(source: str) -> None:
-    known = {"neeco", "neeco.cli", "neeco.raster", "neeco.raster.api"}
-    imports = {"neeco.raster.api": imports_of(source, "neeco.raster", known)}
-    assert upward(imports) == ["neeco.raster.api -> neeco.cli"]
+    known = {"neeco", "neeco.cli", "neeco.raster", "neeco.raster.rasterization"}
+    imports = {"neeco.raster.rasterization": imports_of(source, "neeco.raster", known)}
+    assert upward(imports) == ["neeco.raster.rasterization -> neeco.cli"]
 
 
 def test_rooms_of_one_line_do_not_know_each_other() -> None:

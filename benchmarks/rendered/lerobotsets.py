@@ -11,10 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.files import write_text
+from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.timing.interpolate import poses_at, readings_at
 from rendered.lerobotwriter import Episode, LeRobotWriter
 
 CAMERA, STATE = "observation.images.endoscope.left", "observation.state"

@@ -10,9 +10,9 @@ import yaml
 
 from neeco.errors import NeecoError
 from neeco.files import write_text
+from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.recording.file import read_recording
-from neeco.ingest.timing.interpolate import poses_at
 from rendered.pluswriter import frame_fields, write_mha
 
 START_S = 41.27  # of PLUS's clock, at the first frame

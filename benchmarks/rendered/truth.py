@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from neeco.capture.model import swap_camera_axes
+from neeco.geometry.conventions import swap_camera_axes
 from rendered.frames import DEPTH_STRIDE, DEPTH_UNIT_MM, Shot, has_depth, image_name
 from rendered.motion import Array, Moment
 from rendered.render import Lens

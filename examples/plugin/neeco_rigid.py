@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
-from neeco.methods.carving.evidence import CarvingSettings
-from neeco.methods.carving.shapes import carve_seeds
+from neeco.methods.space_carving import CarvingSettings
+from neeco.methods.tissue_fit import carve_seeds
 from neeco.scene.canonical import join_bodies, seed_instrument
 from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Posed, state_of
 from neeco.training.session import gaussian_session

@@ -1,4 +1,4 @@
-// Posing of bodies of links that joints move (raster/posing.py defines it), and its gradient: W Gaussians at a time.
+// Posing of bodies of links that joints move (raster/articulated.py defines it), and its gradient: W Gaussians at a time.
 //
 // The gradient undoes one joint after the other instead of remembering what lay between them.
 #pragma once

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
@@ -32,7 +32,7 @@ from neeco.training.train import ProgressRow
 from neeco.training.train import train as train_run
 
 if TYPE_CHECKING:
-    from neeco.report.ingest_page import Ingested
+    from neeco.report.ingested import Ingested
     from neeco.tracking.track import Tracked
 
 PathLike = str | os.PathLike[str]
@@ -367,20 +367,18 @@ def ingest(
     Raises NeecoError for unusable input: file, row or key, and what to do.
 
         made = neeco.ingest("recording.yaml", output="captures/liver")
-        print(made.path, made.verdict, len(made.capture.frames))
+        print(made.output, made.verdict, len(made.capture.frames))
     """
     from neeco.ingest.convert import convert_folder
-    from neeco.ingest.recording.file import check_frames, read_recording, recording_from_flags
-    from neeco.report.ingest_page import Ingested, ingest_with_page
+    from neeco.ingest.recording.file import recording_from_flags
+    from neeco.ingest.sources import folder_to_convert, read_recordings
+    from neeco.report.ingested import Ingested, ingest_and_report
 
-    output, report = Path(output), progress or _silent
-    if len(recordings) == 1 and Path(recordings[0]).is_dir():
-        return Ingested(output, notes=convert_folder(Path(recordings[0]), output))
-    if recordings:
-        check_frames(frames)
-        read = [read_recording(Path(path)) for path in recordings]
-        read = [one if frames is None else replace(one, frames=frames) for one in read]
-        return ingest_with_page(read, output, report)
+    sources, output, report = [Path(path) for path in recordings], Path(output), progress or _silent
+    if (folder := folder_to_convert(sources)) is not None:
+        return Ingested(output, notes=convert_folder(folder, output))
+    if sources:
+        return ingest_and_report(read_recordings(sources, frames), output, report)
     if video is None:
         raise NeecoError("--video: give the video (or a folder of images), or a recording.yaml")
     if intrinsics is not None and calibration is not None:
@@ -396,7 +394,7 @@ def ingest(
         fps=fps,
         shaft_diameter=shaft_diameter,
     )
-    return ingest_with_page([recording], output, report)
+    return ingest_and_report([recording], output, report)
 
 
 def _opened(run: Run | PathLike, device: str) -> runs.TrainedRun:

@@ -9,10 +9,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.timing.interpolate import poses_at, readings_at
 
 pytest.importorskip("av")
 

@@ -12,7 +12,7 @@ import torch
 from rendered_truth import frames_with_depth, seen_points, truth_of
 
 from neeco.capture import check_capture, errors_only, read_capture
-from neeco.capture.kinematicsfile import kinematics_of
+from neeco.capture.readers import kinematics_of
 
 FOCAL, WIDTH, HEIGHT = 54.0, 64, 48
 WRIST = 2

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neeco.capture import check_capture, errors_only, read_capture, transforms
-from neeco.capture.check import read_checked
+from neeco.capture import check_capture, errors_only, read_capture
+from neeco.capture.checks import read_checked
 from neeco.capture.points import read_ply, write_ply
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.cli import check as check_verb
@@ -362,8 +362,8 @@ def test_the_verb_prints_and_returns_a_status(folder, capsys):
 
 def test_a_capture_is_parsed_once_to_be_checked_and_handed_on(folder, monkeypatch):
     parsed = []
-    real = transforms.read_json
-    monkeypatch.setattr(transforms, "read_json", lambda path: parsed.append(path) or real(path))
+    real = json.loads
+    monkeypatch.setattr(json, "loads", lambda text: parsed.append(text) or real(text))
     assert len(read_checked(folder.root).frames) == 8
     assert len(parsed) == 1
 

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neeco.capture import check_images as checked
-from neeco.capture.check_images import agreements, check_images
-from neeco.capture.documents import Node, Parsed, ProblemReport
+from neeco.capture.checks import colors as checked
+from neeco.capture.checks.colors import agreements, check_images
+from neeco.capture.documents import Node, ProblemReport
 from neeco.capture.model import Frame, State
 from neeco.capture.points import PointCloud
+from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.camera import Camera
 
 FRAMES, WIDTH, HEIGHT, FOCAL, DISTANCE = 10, 96, 72, 90.0, 60.0

@@ -14,11 +14,11 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from neeco.capture import check_capture
-from neeco.capture.check import read_checked
-from neeco.capture.check_motion import check_motion
+from neeco.capture.checks import read_checked
+from neeco.capture.checks.motion import check_motion
 from neeco.capture.documents import ProblemReport
 from neeco.capture.kinematics import KinematicTree, Link
-from neeco.capture.reader import parse_capture
+from neeco.capture.readers import parse_capture
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
 Document = dict[str, Any]

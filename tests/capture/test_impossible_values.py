@@ -11,7 +11,7 @@ from PIL import Image
 
 from neeco.capture import check_capture, read_capture
 from neeco.capture.documents import Problem, condensed
-from neeco.capture.missing import similar_file
+from neeco.capture.readers.parsed import similar_file
 
 
 def told(folder) -> list[str]:

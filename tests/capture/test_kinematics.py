@@ -13,11 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kinematic_trees import at_rest, kinematic_trees, turned
 
-from neeco.capture.dvrk import read_dvrk_tool
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
-from neeco.capture.kinematicsfile import kinematics_of
+from neeco.capture.readers import kinematics_of, read_dvrk_tool
 from neeco.errors import NeecoError
-from neeco.raster.posing import ArticulatedBody, pose_bodies
+from neeco.raster.articulated import ArticulatedBody, pose_bodies
 
 WRISTED = {
     "pose_of": "tip",

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from neeco.capture import check_capture, errors_only, read_capture
-from neeco.capture.model import swap_camera_axes
-from neeco.capture.statefile import camera_to_json, read_states
+from neeco.capture.readers import read_states
+from neeco.capture.writer import camera_to_json
 from neeco.errors import NeecoError
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.rotations import RIGID_TOLERANCE, rigid_fault, rotation_error
 
 once_a_folder = settings(

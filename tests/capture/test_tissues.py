@@ -13,10 +13,10 @@ import torch
 from capture_folders import Folder
 
 from neeco.capture import read_capture
-from neeco.capture.check import check_capture, inspect_capture
+from neeco.capture.checks import check_capture, inspect_capture
 from neeco.capture.model import Capture, PointCloud, Tissue
-from neeco.capture.statefile import read_states, state_to_json
-from neeco.capture.writer import fingerprint, write_capture
+from neeco.capture.readers import read_states
+from neeco.capture.writer import fingerprint, state_to_json, write_capture
 from neeco.errors import NeecoError
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neeco.capture.urdf import read_urdf
+from neeco.capture.readers import read_urdf
 from neeco.errors import NeecoError
 from tests.capture.test_kinematics import turned
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from neeco.evaluation.align import AlignConfig, Fit, fit_frame, pose_change
+from neeco.fitting.alignment import AlignConfig, AlignedFrame, align_frame, pose_change
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +26,8 @@ LOOSE = AlignConfig(
 )
 
 
-def align(scene, frame, config=None) -> Fit:
-    return fit_frame(scene, frame, frame.load_image(), config=config)
+def align(scene, frame, config=None) -> AlignedFrame:
+    return align_frame(scene, frame, frame.load_image(), config=config)
 
 
 def test_a_displaced_instrument_and_camera_are_found_again(world, scene_and_frame):

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from neeco.ingest.shaft.axis import Scene, unit
+from neeco.geometry.lines import unit
+from neeco.ingest.shaft.axis import ShaftVideo
 
 WIDTH, HEIGHT, FOCAL, FRAMES, RATE = 160, 120, 142.0, 24, 12.0
 INTRINSICS = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
@@ -53,11 +54,19 @@ class ShaftWorld:
         end = end + 6 * np.sin(2.3 * time) * direction
         return end - self.camera(frame)[:3, 3], direction
 
-    def scene(self, trocar: bool = True, unit_mm: float = 1.0) -> Scene:
+    def scene(self, trocar: bool = True, unit_mm: float = 1.0) -> ShaftVideo:
         """What `find_shaft` is told; unit_mm: of the cameras' places, which is then not known."""
         cameras = np.stack([self.camera(frame) for frame in range(self.frames)])
         cameras[:, :3, 3] /= unit_mm
-        return Scene(cameras, self.times, np.zeros(self.frames), RADIUS, INTRINSICS, trocar, unit_mm == 1.0)
+        return ShaftVideo(
+            world_from_camera=cameras,
+            times=self.times,
+            episodes=np.zeros(self.frames),
+            radius=RADIUS,
+            intrinsics=INTRINSICS,
+            trocar=trocar,
+            scaled=unit_mm == 1.0,
+        )
 
     def _draw(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         y, x = (np.mgrid[: HEIGHT * FINER, : WIDTH * FINER] + 0.5) / FINER

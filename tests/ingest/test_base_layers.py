@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from ingest.base_world import episodes, views_of
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
@@ -19,6 +19,7 @@ from neeco.ingest.registration.base_layers import Layers, evenly_lit, fit_layers
 from neeco.ingest.registration.base_shape import SHIFTS
 from neeco.ingest.registration.find_bases import place_bases
 from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
+from neeco.ingest.timing.episodes import Episodes
 
 WIDTH, HEIGHT, FOCAL = 80, 64, 100.0
 INTRINSICS = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
@@ -146,24 +147,20 @@ def _log(arm: Arm) -> PoseLog:
     return PoseLog(path=None, clock="ros", times=times, positions=poses[:, :3, 3], quats=quats, gaps=(), notes=())
 
 
-def _data(arms: dict[str, Arm], bases: dict[str, StatedBase]) -> SimpleNamespace:
-    notes: list[str] = []
-    instruments = tuple(InstrumentLogs(name, base=base) for name, base in bases.items())
-    return SimpleNamespace(
-        recording=SimpleNamespace(path="recording.yaml", instruments=instruments),
-        poses={name: _log(arm) for name, arm in arms.items()}, joints={name: {} for name in arms},
-        clocks={"ros": ClockOffset(0.0, 0.0, GIVEN)}, notes=notes, note=notes.append,
-    )  # fmt: skip
+def _data(arms: dict[str, Arm], bases: dict[str, StatedBase]) -> Episodes:
+    instruments = [InstrumentLogs(name, base=base) for name, base in bases.items()]
+    logs = {name: _log(arm) for name, arm in arms.items()}
+    return episodes(instruments, logs, {"ros": ClockOffset(0.0, 0.0, GIVEN)})
 
 
-def _place(data: SimpleNamespace, images: np.ndarray) -> dict:
+def _place(data: Episodes, images: np.ndarray) -> dict:
     lens = Lens(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (), (WIDTH, HEIGHT))
     cameras = np.tile(np.eye(4), (len(TIMES), 1, 1))
 
     def no_masks(rows: np.ndarray) -> np.ndarray:
         return np.zeros((len(rows), HEIGHT, WIDTH), bool)
 
-    return place_bases(data, TIMES, cameras, lens, lambda row: images[row], no_masks)
+    return place_bases(data, views_of(TIMES, cameras, lens, lambda row: images[row]), no_masks)
 
 
 @pytest.mark.slow
@@ -173,7 +170,7 @@ def test_the_bases_of_two_arms_in_one_view_are_found_and_told():
     placed = _place(data, _images(LEFT, RIGHT))
     for name, arm in arms.items():
         assert arm.beside(placed[name].world_from_base) < 1.0
-    assert all("without outlines: its shaft explains" in note for note in data.notes)
+    assert all("without outlines: its shaft explains" in note for note in data.notes.sentences)
 
 
 def test_of_several_arms_one_that_hardly_moves_keeps_what_is_given():
@@ -182,7 +179,10 @@ def test_of_several_arms_one_that_hardly_moves_keeps_what_is_given():
     data = _data(arms, {name: StatedBase(RIGHT.wrong(6, 4), 5.0, 3.0) for name in arms})
     placed = _place(data, _images(resting))
     assert np.array_equal(placed["psm1"].world_from_base, RIGHT.wrong(6, 4))
-    assert "too little to find its base, which stays as given, sure to 5.0 mm and 3.0 deg" in data.notes[0]
+    assert (
+        "too little to find its base, which stays as given, with standard deviations 5.0 mm and 3.0 deg"
+        in data.notes.sentences[0]
+    )
 
 
 def test_one_that_moves_and_is_not_seen_is_refused():

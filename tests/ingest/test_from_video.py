@@ -11,17 +11,19 @@ import yaml
 from ingest.shaft_world import FOCAL, HEAD, HEIGHT, INTRINSICS, RADIUS, RATE, WIDTH, ShaftWorld
 
 from neeco.capture import errors_only, read_capture
-from neeco.capture.check import check_capture
+from neeco.capture.checks import check_capture
 from neeco.capture.images import write_image
 from neeco.capture.model import State
 from neeco.errors import NeecoError
+from neeco.geometry.lines import unit
 from neeco.ingest.assessment import assess_ingest
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.posing.hand_posed import HandPose
 from neeco.ingest.posing.posed_capture import PosedCapture
 from neeco.ingest.recording.file import read_recording, recording_from_flags
-from neeco.ingest.shaft.axis import axis_between, contour_normals, image_lines, unit
-from neeco.ingest.shaft.from_video import find_shaft, with_roll
+from neeco.ingest.shaft.axis import axis_between, contour_normals, image_lines
+from neeco.ingest.shaft.from_video import find_shaft
+from neeco.ingest.timing.episodes import with_roll
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from numpy.random import Generator
 from PIL import Image
 
 from neeco.capture import check_capture
-from neeco.capture.check import errors_only
+from neeco.capture.documents import errors_only
 from neeco.cli import main
 
 pytest.importorskip("av")

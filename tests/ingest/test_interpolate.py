@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from neeco.ingest.readers.interpolate import pose_smoothing, poses_at, reading_smoothing, readings_at
 from neeco.ingest.readers.logs import PoseLog, ReadingLog
-from neeco.ingest.timing.interpolate import pose_smoothing, poses_at, reading_smoothing, readings_at
 
 QUERIES = np.linspace(0.3, 4.6, 87)
 

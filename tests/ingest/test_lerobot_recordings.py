@@ -13,9 +13,9 @@ from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers import format_of, read_table
+from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
-from neeco.ingest.timing.interpolate import poses_at, readings_at
 
 pytest.importorskip("av")
 pytest.importorskip("pyarrow")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.sfm import SfmResult
 from neeco.ingest.foreground.motion import STEP, ResidualFlow, best_lag, carve_shape, observations_on, project_mask
+from neeco.ingest.frames.views import SfmResult
 
 PINHOLE = Lens(60.0, 60.0, 32.0, 24.0, (), (64, 48))
 ROWS = np.arange(14)
@@ -89,8 +89,9 @@ def test_what_moves_is_told_alike_in_small_and_large_images(times: int) -> None:
     seen = [[frame, point, 0, 0, point] for frame in range(4) for point in range(len(points))]
     count = np.zeros(len(points))
     sfm = SfmResult(
-        np.arange(4), np.tile(np.eye(4), (4, 1, 1)), points, count[:, None], count, count, np.array(seen), None, 0.0
-    )
+        indices=np.arange(4), world_from_camera=np.tile(np.eye(4), (4, 1, 1)), points=points, colors=count[:, None],
+        errors=count, lengths=count, observations=np.array(seen), lens=None, reprojection_px=0.0,
+    )  # fmt: skip
     visible = np.ones((times * height, times * width), bool)
     visible[:, : 40 * times] = False
     lens = Lens(

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from neeco.errors import NeecoError
 from neeco.ingest.readers import IMAGES, OTHER, POSES, READINGS, VideoSource, format_of, read_table
 from neeco.ingest.readers.columns import BASE, CAMERA, JointColumns, PoseColumns
+from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog, read_pose_log, read_reading_log
-from neeco.ingest.timing.interpolate import poses_at
 
 ARM, JAW, LEFT = "/PSM1/measured_cp", "/PSM1/jaw/measured_js", "/stereo/left/image_raw"
 STEP = 0.025  # s

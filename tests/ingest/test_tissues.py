@@ -10,7 +10,7 @@ from ingest.test_episodes import BEGINS, change, still_recordings
 from rendered_truth import benchmarks  # noqa: F401
 
 from neeco.capture import read_capture
-from neeco.capture.check import inspect_capture
+from neeco.capture.checks import inspect_capture
 from neeco.cli.ingest import Ingest, run
 from neeco.errors import NeecoError
 from neeco.ingest.recording.file import read_recording

@@ -23,7 +23,7 @@ from neeco.errors import NeecoError
 from neeco.raster import devices, rasterize
 from neeco.raster.triton import ready
 
-CHECKS = ("triton_checks.py", "triton_training_checks.py", "triton_posing_checks.py")
+CHECKS = ("triton_checks.py", "triton_training_checks.py", "triton_articulated_checks.py")
 here = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="needs triton")
 on_a_gpu = [pytest.mark.gpu, here, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")]
 
@@ -78,7 +78,7 @@ def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[s
     import triton
     from triton.runtime.jit import JITFunction
 
-    from neeco.raster.triton import backend
+    from neeco.raster import triton_backend as backend
 
     started: dict[str, Any] = {}
     run, project = JITFunction.run, backend.project
@@ -115,7 +115,7 @@ def test_every_kernel_compiles_without_a_gpu(
     """The interpreter takes what the compiler does not."""
     import triton
 
-    from neeco.raster.triton.backend import rasterize_triton
+    from neeco.raster.triton_backend import rasterize_triton
 
     triton.runtime.driver.set_active(NoDevice(capability))
     t, gaussians, camera = leaves(make_scene(5, **scene), torch.float32)
@@ -169,7 +169,7 @@ def test_the_kernels_of_posing_compile_without_a_gpu(
 ) -> None:
     import triton
 
-    from neeco.raster.triton.posing import Posing
+    from neeco.raster.triton.articulated import Posing
 
     triton.runtime.driver.set_active(NoDevice(capability))
     numbers, shapes = [None, torch.rand(22 + joints * (6 + joints))], [(9, 3), (9, 4), (9, 3), (9, 5)]

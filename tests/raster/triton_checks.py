@@ -20,7 +20,8 @@ from raster_scenes import TOLERANCE, Scene, assert_same_as_reference, decided_pi
 
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
-from neeco.raster.triton import backend, binning
+from neeco.raster import triton_backend as backend
+from neeco.raster.triton import binning
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's, of the interpreter
 

@@ -16,10 +16,10 @@ from wristed_world import READINGS, driver_state, make_driver, wrist
 from neeco.capture.kinematics import PRISMATIC, REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument
 from neeco.geometry.rotations import rotate_about
-from neeco.methods.kinematic.articulation import articulation_of
-from neeco.methods.kinematic.articulation.hinges import Hinges
-from neeco.methods.kinematic.articulation.stated import StatedLinks
-from neeco.raster.posing import pose_bodies
+from neeco.methods.kinematic.deformation import articulation_of
+from neeco.methods.kinematic.hinges import Hinges
+from neeco.methods.kinematic.stated_links import StatedLinks
+from neeco.raster.articulated import pose_bodies
 from neeco.scene.io import load_scene, save_scene
 
 

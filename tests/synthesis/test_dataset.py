@@ -9,7 +9,7 @@ from PIL import Image
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
-from neeco.capture.statefile import state_to_json
+from neeco.capture.writer import state_to_json
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY
 from neeco.labels.labellers import LABEL_THRESHOLD

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import neeco.files
-from neeco.capture.statefile import state_to_json
+from neeco.capture.writer import state_to_json
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.synthesis.dataset import synthesize

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Instrument, InstrumentState, State
-from neeco.capture.statefile import read_states, state_to_json
+from neeco.capture.readers import read_states
+from neeco.capture.writer import state_to_json
 from neeco.errors import NeecoError
 from neeco.synthesis.samplers import SIMILAR, OrbitViews, PerturbedViews, RecordedViews, instrument_axes, make_sampler
 from neeco.synthesis.states import (

@@ -16,16 +16,17 @@ from neeco.capture.images import write_image
 from neeco.capture.model import Capture, PointCloud, State
 from neeco.cli import main
 from neeco.errors import NeecoError
+from neeco.fitting.layers import InstrumentRenderer, TissueRenderer
+from neeco.fitting.parameters import DEG
 from neeco.geometry.camera import Camera
 from neeco.ingest.footage_video import read_footage
 from neeco.scene import GaussianScene
 from neeco.tracking import footage_again, footage_scene, footage_tissue
-from neeco.tracking.coordinates import DEG, Coordinates
-from neeco.tracking.drawing import InstrumentDrawer, Tissue
 from neeco.tracking.follow import Step
 from neeco.tracking.footage_scene import Colors, over_tissue
 from neeco.tracking.footage_tissue import passing
 from neeco.tracking.motion import Motion
+from neeco.tracking.parameters import TrackedParameters
 from neeco.tracking.track import state_of, track_footage
 from neeco.tracking.trust import TrackTrust
 from neeco.training.run import load_run
@@ -94,8 +95,8 @@ def test_no_colours_to_compare_change_nothing() -> None:
 
 def test_recoloured_instruments_look_so_and_tissue_stays() -> None:
     scene, colors = make_scene(), Colors((0.8, 0.9, 1.1), 1.2)
-    before = InstrumentDrawer(scene).draw(grasper_state(), CAMERA)
-    after = InstrumentDrawer(colors.of(scene)).draw(grasper_state(), CAMERA)
+    before = InstrumentRenderer(scene).draw(grasper_state(), CAMERA)
+    after = InstrumentRenderer(colors.of(scene)).draw(grasper_state(), CAMERA)
     solid = before[1] > 0.99
     expected = torch.tensor(colors.gain) * (before[0] / before[1][..., None])[solid] ** colors.gamma
     seen = (after[0] / after[1][..., None])[solid]
@@ -109,7 +110,7 @@ def test_instruments_stand_before_the_tissue_of_another_scene() -> None:
     own, other = make_scene(), other_wall()
     joined = over_tissue(own, other)
     state = grasper_state()
-    (color, alpha), (expected, opacity) = (InstrumentDrawer(scene).draw(state, CAMERA) for scene in (joined, own))
+    (color, alpha), (expected, opacity) = (InstrumentRenderer(scene).draw(state, CAMERA) for scene in (joined, own))
     assert torch.equal(color, expected)
     assert torch.equal(alpha, opacity)
     rows = ~joined.canonical.of_instruments
@@ -119,8 +120,8 @@ def test_instruments_stand_before_the_tissue_of_another_scene() -> None:
 def test_what_passes_before_the_tissue_is_masked_with_a_rim(tmp_path: Path) -> None:
     scene = make_scene()
     frame = record(scene, tmp_path, [grasper_state()], "train").frames[0]
-    mask = passing(frame, Tissue(scene))
-    label = InstrumentDrawer(scene).draw(grasper_state(), CAMERA)[1].numpy() > 0.5
+    mask = passing(frame, TissueRenderer(scene))
+    label = InstrumentRenderer(scene).draw(grasper_state(), CAMERA)[1].numpy() > 0.5
     assert mask[label].mean() > 0.95
     assert mask.mean() < 0.5
 
@@ -173,8 +174,8 @@ def test_another_tissue_broken_off_goes_on_to_the_same_bytes(
 def test_tissue_alone_is_learned_again(other_footage: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(footage_again, "ITERATIONS", 60)
     scene, trust = make_scene(), TrackTrust(0.9, 1.0, 1.0, 1.0)
-    coordinates = Coordinates.of(scene)
-    motion = Motion.of(coordinates, scene.recorded.states)
+    parameters = TrackedParameters.of(scene)
+    motion = Motion.of(parameters, scene.recorded.states)
     frames = [replace(f, camera=CAMERA) for f in other_footage.frames]
     steps = [
         Step(k, "followed", motion.begin(moving(1.2 * k)), 0.2, 1.0, trust, (), 0.0, 0.0) for k in range(len(frames))
@@ -192,7 +193,7 @@ def test_tissue_alone_is_learned_again(other_footage: Capture, monkeypatch: pyte
 def test_footage_without_the_instrument_is_trusted_nowhere(
     tracked_run: RecordedRun, other_footage: Capture, tmp_path: Path, short_rounds: None, what: str
 ) -> None:
-    wall = Tissue(other_wall()).draw(CAMERA, None)
+    wall = TissueRenderer(other_wall()).draw(CAMERA, None)
     frames = []
     for frame in other_footage.frames[:2]:
         path = tmp_path / f"{frame.name}.png"

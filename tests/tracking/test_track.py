@@ -20,18 +20,15 @@ from neeco.capture.model import Capture, State
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import TypicalErrors
+from neeco.fitting.fitter import loose_prior
+from neeco.fitting.layers import FrameView, InstrumentRenderer, TissueRenderer, color_matched, view_of
+from neeco.fitting.parameters import DEG
 from neeco.report.track_page import write_track_page
-from neeco.tracking.coordinates import DEG, Coordinates
-from neeco.tracking.drawing import InstrumentDrawer, Tissue, View, as_drawn, view_of
-from neeco.tracking.fitting import Fitter, wide
 from neeco.tracking.follow import LOOK_EVERY, Follower, Step
 from neeco.tracking.motion import Motion
+from neeco.tracking.parameters import TrackedParameters, fitter_of
 from neeco.tracking.track import Tracked, _Work, _write, state_of, track_footage
 from neeco.tracking.trust import Reference, TrackTrust
-
-
-def fitter_of(run: RecordedRun) -> Fitter:
-    return Fitter.of(run.scene)
 
 
 def off(found: State, true: State) -> tuple[float, float, float]:
@@ -54,16 +51,16 @@ def tracked(tracked_run: RecordedRun, footage: Capture, tmp_path_factory: pytest
 
 
 def test_an_increment_leads_from_one_state_to_another(tracked_run: RecordedRun) -> None:
-    coordinates = Coordinates.of(tracked_run.scene)
+    parameters = TrackedParameters.of(tracked_run.scene)
     one, other = grasper_state(jaw=0.4), grasper_state(3, -2, 75, 0.3, -0.5, 0.7)
-    reached = coordinates.moved(one, coordinates.between(one, other))
+    reached = parameters.moved(one, parameters.between(one, other))
     assert off(reached, other) == pytest.approx((0, 0, 0), abs=1e-4)
 
 
 def test_a_stretch_of_little_trust_is_gone_through_backwards_looking_for_other_rolls_in_every_frame(
     tmp_path: Path, tracked_run: RecordedRun
 ) -> None:
-    motion = Motion.of(Coordinates.of(tracked_run.scene), tracked_run.scene.recorded.states)
+    motion = Motion.of(TrackedParameters.of(tracked_run.scene), tracked_run.scene.recorded.states)
     moving = motion.begin(grasper_state())
     asked = []
 
@@ -91,17 +88,17 @@ def test_a_stretch_of_little_trust_is_gone_through_backwards_looking_for_other_r
 
 
 def test_a_joint_is_not_moved_beyond_its_bounds(tracked_run: RecordedRun) -> None:
-    coordinates = Coordinates.of(tracked_run.scene)
+    parameters = TrackedParameters.of(tracked_run.scene)
     opened = torch.tensor([0.0] * 6 + [5.0], dtype=torch.float64)
-    assert coordinates.moved(grasper_state(), opened).instruments["grasper"].joints["jaw_angle"] <= 1.2
+    assert parameters.moved(grasper_state(), opened).instruments["grasper"].joints["jaw_angle"] <= 1.2
 
 
 @pytest.mark.parametrize("size", [0.25, 1.0])
 def test_a_fit_ends_at_the_state_that_was_drawn_at_any_size(tracked_run: RecordedRun, size: float) -> None:
-    fitter, true = fitter_of(tracked_run), grasper_state(2, 1, 72, 0.1, 0.1, 0.5)
+    fitter, true = fitter_of(tracked_run.scene), grasper_state(2, 1, 72, 0.1, 0.1, 0.5)
     frame = record(tracked_run.scene, tracked_run.path / f"at-{size}", [true], "new").frames[0]
     view = view_of(frame, CAMERA, fitter.tissue, None)
-    near = wide(fitter.coordinates, 20, 20, 20)
+    near = loose_prior(fitter.parameters, 20, 20, 20)
     start = grasper_state(3.0, 0.3, 71, 0.13, 0.16, 0.55)
     fit = fitter.fit(view, start, near, levels=(size,), steps=(12,))
     assert fit is not None
@@ -113,32 +110,35 @@ def test_a_fit_ends_at_the_state_that_was_drawn_at_any_size(tracked_run: Recorde
 
 
 def test_an_instrument_that_only_changes_its_place_need_not_be_posed_again(tracked_run: RecordedRun) -> None:
-    drawer, one, other = InstrumentDrawer(tracked_run.scene), grasper_state(), grasper_state(2, -1, 68, 0.2, 0.4)
-    view = View(CAMERA, torch.zeros(64, 96, 3), torch.ones(64, 96), torch.full((64, 96, 3), 0.4), None, 115.0)
+    drawer, one, other = InstrumentRenderer(tracked_run.scene), grasper_state(), grasper_state(2, -1, 68, 0.2, 0.4)
+    black, wall = torch.zeros(64, 96, 3), torch.full((64, 96, 3), 0.4)
+    view = FrameView(camera=CAMERA, image=black, weight=torch.ones(64, 96), tissue=wall, shadow_of=None, diagonal=115.0)
     moved = drawer.moved(drawer.pose(one), one, other, view)
     assert (moved - drawer.composed(drawer.pose(other), view)).abs().max() < 1e-3  # float32, of 1
     assert (moved - drawer.composed(drawer.pose(one), view)).abs().max() > 0.1
 
 
 def test_a_fit_leaves_the_bound_of_a_joint(tracked_run: RecordedRun) -> None:
-    fitter, true = fitter_of(tracked_run), grasper_state(jaw=0.8)
+    fitter, true = fitter_of(tracked_run.scene), grasper_state(jaw=0.8)
     frame = record(tracked_run.scene, tracked_run.path / "at-bound", [true], "new").frames[0]
     view = view_of(frame, CAMERA, fitter.tissue, None)
-    bound = float(fitter.coordinates.instruments[0].high[0])
-    fit = fitter.fit(view, grasper_state(jaw=bound), wide(fitter.coordinates, 20, 20, 40), levels=(1.0,), steps=(12,))
+    bound = float(fitter.parameters.instruments[0].high[0])
+    fit = fitter.fit(
+        view, grasper_state(jaw=bound), loose_prior(fitter.parameters, 20, 20, 40), levels=(1.0,), steps=(12,)
+    )
     assert fit is not None
     assert off(fit.state, true)[2] < 2.5
 
 
 def test_what_is_in_front_is_not_held_against_a_state(tracked_run: RecordedRun) -> None:
-    fitter, true = fitter_of(tracked_run), grasper_state()
+    fitter, true = fitter_of(tracked_run.scene), grasper_state()
     frame = record(tracked_run.scene, tracked_run.path / "hidden", [true], "new").frames[0]
     view = view_of(frame, CAMERA, fitter.tissue, None)
-    fit = fitter.fit(view, true, wide(fitter.coordinates, 4, 4, 8))
+    fit = fitter.fit(view, true, loose_prior(fitter.parameters, 4, 4, 8))
     hidden = view.image.clone()
     hidden[24:44, 24:34] = torch.tensor([0.1, 0.9, 0.1])  # across the shaft
-    behind = fitter.fit(replace(view, image=hidden), true, wide(fitter.coordinates, 4, 4, 8))
-    wrong = fitter.fit(view, grasper_state(roll=0.6, jaw=0.9), wide(fitter.coordinates, 0.01, 0.01, 0.01))
+    behind = fitter.fit(replace(view, image=hidden), true, loose_prior(fitter.parameters, 4, 4, 8))
+    wrong = fitter.fit(view, grasper_state(roll=0.6, jaw=0.9), loose_prior(fitter.parameters, 0.01, 0.01, 0.01))
     assert fit is not None
     assert behind is not None
     assert wrong is not None
@@ -148,9 +148,12 @@ def test_what_is_in_front_is_not_held_against_a_state(tracked_run: RecordedRun) 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.6, 0.2), (1.6, 0.0), (1.0, 0.0)])
 def test_smoke_and_exposure_are_taken_out_by_the_tissue(tracked_run: RecordedRun, gain: float, offset: float) -> None:
-    tissue, image = Tissue(tracked_run.scene).draw(CAMERA, None), tracked_run.scene.render(moving(4), CAMERA).color
+    tissue, image = (
+        TissueRenderer(tracked_run.scene).render(CAMERA, None),
+        tracked_run.scene.render(moving(4), CAMERA).color,
+    )
     seen = (gain * image.clamp(0, 1) ** 2.2 + offset) ** (1 / 2.2)  # light, stored
-    found = as_drawn(seen, tissue, torch.ones(64, 96))
+    found = color_matched(seen, tissue, torch.ones(64, 96))
     assert (found - image.clamp(0, 1)).abs().max() < 0.02
 
 
@@ -158,9 +161,9 @@ def test_smoke_and_exposure_are_taken_out_by_the_tissue(tracked_run: RecordedRun
 def test_colours_that_are_not_the_tissues_stay_as_they_are(
     tracked_run: RecordedRun, spoil: Callable[[torch.Tensor], torch.Tensor]
 ) -> None:
-    tissue = Tissue(tracked_run.scene).draw(CAMERA, None)
+    tissue = TissueRenderer(tracked_run.scene).render(CAMERA, None)
     image = spoil(tissue)
-    assert torch.equal(as_drawn(image, tissue, torch.ones(64, 96)), image)
+    assert torch.equal(color_matched(image, tissue, torch.ones(64, 96)), image)
 
 
 def test_footage_gets_the_states_it_was_drawn_in(tracked: Tracked) -> None:
@@ -229,7 +232,7 @@ def test_an_instrument_is_found_where_nothing_is_known(
 def test_footage_without_the_instrument_is_trusted_nowhere(
     tracked_run: RecordedRun, footage: Capture, tmp_path: Path
 ) -> None:
-    wall = Tissue(tracked_run.scene).draw(CAMERA, None)
+    wall = TissueRenderer(tracked_run.scene).render(CAMERA, None)
     frames = []
     for k, pixels in enumerate((wall, torch.zeros_like(wall), 1 - wall)):
         path = tmp_path / f"{k}.png"
@@ -279,7 +282,7 @@ def test_a_run_without_instruments_is_refused_in_words(tracked_run: RecordedRun)
     bare = copy(tracked_run.scene)
     bare.instruments = ()
     with pytest.raises(NeecoError, match="the run has no instrument"):
-        Coordinates.of(bare)
+        TrackedParameters.of(bare)
 
 
 def test_a_wrong_run_is_told_in_one_line(footage: Capture, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -304,7 +307,7 @@ def test_an_opening_that_the_image_does_not_show_is_not_trusted(
     true, given = grasper_state(x, jaw=0.9), grasper_state(x, jaw=0.8)
     frame = record(tracked_run.scene, tmp_path, [true], "new").frames[0]
     reference = Reference(TypicalErrors(0.02, 0.02), 0.1, 1.0)
-    follower = Follower.of([frame], fitter_of(tracked_run), reference)
+    follower = Follower.of([frame], fitter_of(tracked_run.scene), reference)
     step = follower.begin(0, given)
     assert step.trust.overlap > 0.9
     assert (step.trust.determined > 0.95) == shown
@@ -312,8 +315,8 @@ def test_an_opening_that_the_image_does_not_show_is_not_trusted(
 
 
 def test_the_longer_it_is_unseen_the_less_is_known(tracked_run: RecordedRun) -> None:
-    coordinates = Coordinates.of(tracked_run.scene)
-    motion = Motion.of(coordinates, tracked_run.scene.recorded.states)
+    parameters = TrackedParameters.of(tracked_run.scene)
+    motion = Motion.of(parameters, tracked_run.scene.recorded.states)
     begun = motion.begin(moving(0))
     soon, late = motion.predict(begun, 1 / 25), motion.predict(begun, 6 / 25)
     assert bool((late.covariance.diagonal()[:7] > soon.covariance.diagonal()[:7]).all())
@@ -321,7 +324,7 @@ def test_the_longer_it_is_unseen_the_less_is_known(tracked_run: RecordedRun) -> 
 
 
 def test_the_recorded_pace_is_what_is_expected(tracked_run: RecordedRun) -> None:
-    motion = Motion.of(Coordinates.of(tracked_run.scene), tracked_run.scene.recorded.states)
+    motion = Motion.of(TrackedParameters.of(tracked_run.scene), tracked_run.scene.recorded.states)
     assert motion.interval == pytest.approx(1 / 25)
     jaw = float(motion.velocities[6, 6].sqrt())  # opens by 0.04 rad a frame
     assert jaw == pytest.approx(0.04 * 25, rel=0.2)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neeco.capture.images import write_image
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, Tissue
-from neeco.capture.reader import read_capture
+from neeco.capture.readers import read_capture
 from neeco.capture.writer import write_capture as write_folder
 from neeco.geometry.rotations import rigid_from_vector, rotate_about
 from neeco.raster import Camera, Gaussians, rasterize

@@ -9,10 +9,9 @@ import pytest
 import torch
 
 from neeco.capture.model import Frame, State
-from neeco.methods.breathing import HARMONICS, Breathing
-from neeco.methods.carving.tissue_fit import fit_tissue
-from neeco.methods.kinematic.breathing_search import find_breathing, find_period
+from neeco.methods.breathing import HARMONICS, Breathing, find_breathing, find_period
 from neeco.methods.static import Static
+from neeco.methods.tissue_fit import fit_tissue
 from neeco.raster import Camera, rasterize
 from neeco.scene import GaussianScene, Recorded
 from neeco.scene.canonical import seed_gaussians

@@ -15,12 +15,11 @@ from torch import Tensor
 from neeco.capture import read_capture
 from neeco.capture.model import Frame, InstrumentState, State
 from neeco.geometry.rotations import rigid_from_vector
-from neeco.methods.carving.evidence import CarvedShape, CarvingSettings, Evidence, carve
-from neeco.methods.carving.shapes import shape_around_frame
-from neeco.methods.carving.tissue_fit import tissue_evidence
 from neeco.methods.kinematic import discovery
-from neeco.methods.kinematic.articulation.hinges import Hinges
 from neeco.methods.kinematic.hinge_search import search_hinge, unbend_seeds
+from neeco.methods.kinematic.hinges import Hinges
+from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve, shape_around_frame
+from neeco.methods.tissue_fit import tissue_evidence
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
 from neeco.training.initial import begin_session, initial_scene

@@ -13,8 +13,8 @@ from capture_files import PIVOT_MM, WRIST_MM, grasper_body, write_grasper
 from neeco.capture import read_capture
 from neeco.methods.kinematic import wrist
 from neeco.methods.kinematic.articulation import LINK_LOGITS
-from neeco.methods.kinematic.articulation.hinges import Hinges
 from neeco.methods.kinematic.finish import conclude, extend_shaft, settle_links, shaft_coverage
+from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.wrist import color_boundary, measure_radius, place_wrists, replace_wrists
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians

@@ -10,7 +10,7 @@ import torch
 from rod_world import CAMERA, make_scene
 
 from neeco.capture.model import Frame
-from neeco.methods.kinematic.shadow import find_shadow
+from neeco.methods.kinematic.lamp_search import find_shadow
 from neeco.raster import rasterize
 from neeco.scene import GaussianScene
 from neeco.scene.training_views import TrainingViews

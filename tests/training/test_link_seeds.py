@@ -15,14 +15,12 @@ from wristed_world import shifted
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.fitting.refinement import RefineConfig, Refinement
 from neeco.geometry.rotations import rotate_about
-from neeco.methods.carving.evidence import CarvedShape, CarvingSettings, Evidence, carve
-from neeco.methods.kinematic.articulation.stated import StatedLinks
-from neeco.methods.kinematic.link_seeds import along_links, readings_of, start_links
-from neeco.methods.kinematic.reading_doubts import doubt_readings
+from neeco.methods.kinematic.link_search import along_links, doubt_readings, readings_of, start_links
+from neeco.methods.kinematic.stated_links import StatedLinks
+from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve
 from neeco.scene.drawable import Recorded
-from neeco.training.config import RefineConfig
-from neeco.training.refinement import Refinement
 
 SEARCH = CarvingSettings(seeds=600)
 PITCH_AT, YAW_AT, TIP, RADIUS = 4.0, 14.0, 30.0, 3.0  # mm along the shaft

@@ -10,10 +10,9 @@ import torch
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, State, Uncertainty
+from neeco.fitting.refinement import RefineConfig, Refinement
 from neeco.geometry.camera import Camera
 from neeco.scene.drawable import Recorded
-from neeco.training.config import RefineConfig
-from neeco.training.refinement import Refinement
 
 CPU = torch.device("cpu")
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), 60.0, 60.0, 32.0, 24.0, 64, 48)

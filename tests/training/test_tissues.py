@@ -13,7 +13,7 @@ import torch
 from capture_files import write_tissues
 
 from neeco.capture import read_capture
-from neeco.capture.check import check_capture, read_checked
+from neeco.capture.checks import check_capture, read_checked
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run

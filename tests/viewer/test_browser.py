@@ -18,7 +18,7 @@ from scene_worlds import make_nerf, make_scene
 from viewer_page import ViewerPage
 from viewer_world import brighter, grasper_scene, write_recorded_images, write_run
 
-from neeco.capture.statefile import read_states
+from neeco.capture.readers import read_states
 from neeco.evaluation.image_metrics import psnr
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import to_numpy

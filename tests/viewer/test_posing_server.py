@@ -17,7 +17,7 @@ from PIL import Image
 from posing_world import JOINT, NAME, PosingWorld, measured_world
 from viewer_world import grasper_scene, write_run
 
-from neeco.capture.reader import read_capture
+from neeco.capture.readers import read_capture
 from neeco.cli import main
 from neeco.ingest.posing.hand_posed import read_answers
 from neeco.viewer.posing_server import PosingServer

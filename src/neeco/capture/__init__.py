@@ -1,22 +1,68 @@
 """Captures: what was recorded, how it is read, written and checked."""
 
-from neeco.capture.check import check_capture
+from neeco.capture.checks import CaptureSummary, Checked, check_capture, inspect_capture, read_checked
 from neeco.capture.documents import Problem, errors_only
-from neeco.capture.model import Camera, Capture, Frame, Instrument, InstrumentState, PointCloud, State
-from neeco.capture.reader import read_capture
-from neeco.capture.writer import write_capture
+from neeco.capture.kinematics import KinematicTree, Link
+from neeco.capture.model import (
+    Camera,
+    Capture,
+    Frame,
+    FromVideo,
+    Instrument,
+    InstrumentState,
+    PointCloud,
+    State,
+    Tissue,
+    Uncertainty,
+    evenly_spaced,
+)
+from neeco.capture.readers import (
+    StateLine,
+    capture_of,
+    kinematics_of,
+    parse_capture,
+    parse_kinematics,
+    parse_lens,
+    read_capture,
+    read_dvrk_tool,
+    read_states,
+    read_urdf,
+)
+from neeco.capture.writer import camera_to_json, fingerprint, state_to_json, write_capture
 
 __all__ = [
     "Camera",
     "Capture",
+    "CaptureSummary",
+    "Checked",
     "Frame",
+    "FromVideo",
     "Instrument",
     "InstrumentState",
+    "KinematicTree",
+    "Link",
     "PointCloud",
     "Problem",
     "State",
+    "StateLine",
+    "Tissue",
+    "Uncertainty",
+    "camera_to_json",
+    "capture_of",
     "check_capture",
     "errors_only",
+    "evenly_spaced",
+    "fingerprint",
+    "inspect_capture",
+    "kinematics_of",
+    "parse_capture",
+    "parse_kinematics",
+    "parse_lens",
     "read_capture",
+    "read_checked",
+    "read_dvrk_tool",
+    "read_states",
+    "read_urdf",
+    "state_to_json",
     "write_capture",
 ]

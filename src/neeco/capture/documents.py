@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PureWindowsPath
 from typing import Any, Literal, NoReturn
 
 import numpy as np
 
-from neeco.capture.model import Frame, Instrument, InstrumentState
-from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
-from neeco.files import placeholder
-from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid_fault
 
 MANY_ALIKE = 3  # problems like another one, from which they are counted instead of listed
@@ -247,96 +241,3 @@ class Node:
         if fault is not None:
             self.error(*fault)
         return matrix if fault is None else None
-
-
-@dataclass(frozen=True)
-class ParsedTissue:
-    """One of several tissues, as far as it could be read."""
-
-    name: str
-    points: PointCloud | None  # None: none named
-    place: Node  # of the points
-
-
-@dataclass
-class Parsed:
-    """A capture as far as it could be read.
-
-    Frames without image, split, time or states that could be read are left out (and reported); where only the camera is
-    wrong they stay, so that the rest of them can be checked. `as_source`: it is read to be converted; then distorted
-    images (whose cameras say how) and absent ones (listed as `absent`) are no errors.
-    """
-
-    root: Path
-    frames: list[Frame] = field(default_factory=list)
-    places: list[Node] = field(default_factory=list)  # where each frame is described
-    instruments: tuple[Instrument, ...] = ()
-    points: PointCloud | None = None  # None: none named
-    points_place: Node | None = None
-    registered: bool = True
-    timed: bool = True  # the recording says when each frame was taken
-    says_units: bool = False  # the file names its unit of length
-    lens: Lens | None = None  # through which it was recorded
-    still: bool = False  # its cameras stood still
-    tissues: list[ParsedTissue] = field(default_factory=list)
-    over: str | None = None  # which of several tissues all of it is of
-    is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
-    without_camera: set[int] = field(default_factory=set)  # frames with a placeholder, as their camera is wrong
-    as_source: bool = False
-    absent: list[Problem] = field(default_factory=list)
-
-    def header(self, field: str) -> Node:
-        """The place `field` of the file that describes the first frame."""
-        field = field if self.over is None else f"{field} over {key_name(self.over)}"
-        return Node(None, self.places[0].file, field, self.places[0].report)
-
-    def with_cameras(self) -> Parsed:
-        """The same without the frames whose camera is a placeholder."""
-        rows = [row for row in range(len(self.frames)) if row not in self.without_camera]
-        frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
-        return replace(self, frames=frames, places=places, without_camera=set())
-
-    def by_tissue(self) -> list[Parsed]:
-        """What is of each tissue, whose world is its own, and has frames; all of it where there is one."""
-        if not self.tissues:
-            return [self]
-        parts = []
-        for tissue in self.tissues:
-            rows = [row for row, frame in enumerate(self.frames) if frame.state.tissue == tissue.name]
-            without = {index for index, row in enumerate(rows) if row in self.without_camera}
-            frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
-            part = replace(self, frames=frames, places=places, without_camera=without, tissues=[], over=tissue.name)
-            parts += [replace(part, points=tissue.points, points_place=tissue.place)] if rows else []
-        return parts
-
-    def states_of(self, name: str) -> list[tuple[Node, InstrumentState]]:
-        """(place of the state, state) of one instrument, over the frames that have it."""
-        return [
-            (place.child("instruments").item(list(frame.state.instruments).index(name)), frame.state.instruments[name])
-            for frame, place in zip(self.frames, self.places, strict=True)
-            if name in frame.state.instruments
-        ]
-
-
-def inside(root: Path, folder: Path, text: str) -> Path:
-    """The path `text`, taken relative to `folder`, which must lie inside `root` also after following symbolic links.
-
-    Raises NeecoError (without naming the field: the caller does) when it is absolute, leads out or is no path at all.
-    """
-    if os.path.isabs(text) or PureWindowsPath(text).is_absolute():
-        raise NeecoError(f"{printable(text)} is absolute; give a path relative to the capture's folder")
-    try:
-        path = Path(os.path.normpath(folder / text))
-        outside = not path.resolve().is_relative_to(root.resolve())
-    except (OSError, RuntimeError, ValueError):
-        raise NeecoError(f"{printable(text)} is not a usable path; repair it") from None
-    if path.is_symlink() and (problem := placeholder(path)):
-        raise NeecoError(f"{printable(text)} {problem}")
-    if outside:
-        raise NeecoError(f"{printable(text)} leaves the capture's folder; copy the file into it and name it from there")
-    return path
-
-
-def relative_name(file: Path, root: Path) -> str:
-    """How messages call a file of the capture."""
-    return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name

@@ -147,7 +147,7 @@ class KinematicTree:
         return link is not None
 
     def to_json(self) -> dict[str, Any]:
-        """What `neeco.capture.kinematicsfile` reads."""
+        """What `neeco.capture.readers.kinematics` reads."""
         written: dict[str, Any] = {"links": [_link_to_json(link) for link in self.links]}
         return written if self.pose_of is None else {"pose_of": self.pose_of} | written
 

@@ -17,7 +17,6 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from neeco.capture.conventions import OPENGL
 from neeco.capture.images import read_image, read_image_bytes, read_mask
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.points import PointCloud
@@ -27,6 +26,9 @@ from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import as_pose, number_text, position_text, rigid_fault
 from neeco.plausible import Fault, joint_fault
 
+SCHEMA = "neeco-capture/1"  # of the folder that holds a capture
+TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
+UNKNOWN_DEG = 180.0  # the standard deviation of an angle of which nothing is known
 REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
 STILL = 1e-9  # a coordinate that varies less than this in the recording tells nothing apart
 
@@ -328,15 +330,6 @@ class RecordedStates:
             values += given.pose[:3].detach().cpu().double().numpy().ravel().tolist()
             values += [given.joints[joint] for joint in sorted(given.joints)] if self.joints else []
         return values
-
-
-def swap_camera_axes(world_from_camera: np.ndarray) -> np.ndarray:
-    """Turn camera poses [..., 4, 4] from OpenGL axes (x right, y up, z back) to OpenCV axes (y down, z forward), or
-    back.
-
-    The only place where the two conventions meet.
-    """
-    return world_from_camera * np.diag(OPENGL.opencv_from_own)  # exact, and its own inverse
 
 
 def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from neeco.errors import NeecoError
 from neeco.files import read_bytes, write_atomically
+from neeco.geometry.lines import across_projectors, nearest_point
 
 UNKNOWN_DISTANCE_MM = 100.0  # how far a single, still camera is taken to look
 _TYPES = {
@@ -91,11 +92,9 @@ def points_in_view(poses: np.ndarray) -> PointCloud:
     or behind the cameras (a scope turns about its trocar), leave the distance unknown.
     """
     centers, axes = poses[:, :3, 3], poses[:, :3, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # removes what lies along each axis
-    normal = across.sum(axis=0)
     meeting = centers.mean(axis=0) + UNKNOWN_DISTANCE_MM * axes.mean(axis=0)
-    if np.linalg.eigvalsh(normal)[0] >= 1e-3 * len(poses):  # else the axes are parallel
-        nearest = np.linalg.solve(normal, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
+    if np.linalg.eigvalsh(across_projectors(axes).sum(axis=0))[0] >= 1e-3 * len(poses):  # else the axes are parallel
+        nearest = nearest_point(centers, axes)
         if np.median(((nearest - centers) * axes).sum(axis=1)) > 0:
             meeting = nearest
     distance = float(np.median(np.linalg.norm(centers - meeting, axis=1)))

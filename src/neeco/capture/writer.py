@@ -8,6 +8,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.capture.fromvideofile import from_video_to_json, uncertainty_to_json
 from neeco.capture.images import has_alpha, write_image
-from neeco.capture.model import Capture, Frame, Instrument, swap_camera_axes
+from neeco.capture.model import SCHEMA, Capture, Frame, FromVideo, Instrument, State, Uncertainty
 from neeco.capture.points import write_ply
-from neeco.capture.statefile import camera_to_json, state_to_json
-from neeco.capture.transforms import SCHEMA
 from neeco.errors import NeecoError
 from neeco.files import read_bytes, write_atomically, write_json
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.rotations import rigid_fault
 
 
@@ -121,6 +120,37 @@ def fingerprint(capture: Capture) -> str:
         digest.update(points.positions.tobytes())
         digest.update(points.colors.tobytes())
     return digest.hexdigest()
+
+
+def state_to_json(state: State) -> dict[str, Any]:
+    """The state as `read_states` takes it."""
+    return ({} if state.tissue is None else {"tissue": state.tissue}) | {
+        "time": state.time,
+        "instruments": [
+            {"name": name, "pose": instrument.pose.tolist(), "joints": dict(sorted(instrument.joints.items()))}
+            for name, instrument in state.instruments.items()
+        ],
+    }
+
+
+def camera_to_json(world_from_camera: np.ndarray) -> list[list[float]]:
+    """world_from_camera [4, 4] with OpenCV axes, as transforms.json writes it (OpenGL axes)."""
+    return (swap_camera_axes(world_from_camera) + 0.0).tolist()  # + 0.0: no negative zeros
+
+
+def from_video_to_json(seen: FromVideo) -> dict[str, float]:
+    """As `parse_from_video` takes it."""
+    return asdict(seen)
+
+
+def uncertainty_to_json(uncertainty: Uncertainty) -> dict[str, Any]:
+    """As `parse_uncertainty` takes it."""
+    written: dict[str, Any] = {
+        "translation_mm": [float(value) for value in uncertainty.translation_mm],
+        "rotation_deg": [float(value) for value in uncertainty.rotation_deg],
+    }
+    joints = {name: float(value) for name, value in sorted(uncertainty.joints_deg.items())}
+    return written | ({"joints_deg": joints} if joints else {})
 
 
 def _instrument_to_json(instrument: Instrument) -> dict[str, Any]:

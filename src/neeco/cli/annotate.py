@@ -34,7 +34,7 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Annotate, write the page, and say where both lie."""
-    from neeco.capture.check import read_checked
+    from neeco.capture.checks import read_checked
     from neeco.cli._progress import counting, resumable
     from neeco.raster.devices import device_of
     from neeco.report.run_page import write_annotated_page

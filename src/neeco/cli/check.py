@@ -14,7 +14,8 @@ from rich.text import Text
 from neeco.files import finite
 
 if TYPE_CHECKING:
-    from neeco.capture.check import CaptureSummary, Problem
+    from neeco.capture.checks import CaptureSummary
+    from neeco.capture.documents import Problem
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Print the problems of a capture; 1 when there are errors, else 0."""
-    from neeco.capture.check import errors_only, inspect_capture
+    from neeco.capture.checks import inspect_capture
+    from neeco.capture.documents import errors_only
 
     checked = inspect_capture(arguments.capture, arguments.transforms)
     problems, summary = checked.problems, checked.summary

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.align import fit_frame, pose_changes
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
 from neeco.evaluation.mask_folders import Reference, load_reference, truth_names
@@ -30,6 +29,7 @@ from neeco.evaluation.mask_metrics import (
     to_truth_ids,
 )
 from neeco.files import finite, write_json
+from neeco.fitting.alignment import align_frame, pose_changes
 from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
 from neeco.raster.native import synchronise
@@ -176,7 +176,7 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
         state, camera = frame.state, frame.camera
         if kind == "aligned":
             assert context.posed is not None
-            fit = fit_frame(context.posed, frame, image)
+            fit = align_frame(context.posed, frame, image)
             state, camera = fit.state, fit.camera
             row["moved"] = pose_changes(frame, state, camera)
             row["world_from_camera"] = camera.world_from_camera.tolist()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neeco.capture.images import open_image, read_labels, read_mask
 from neeco.capture.model import Capture, Frame
-from neeco.capture.reader import read_capture
+from neeco.capture.readers import read_capture
 from neeco.errors import NeecoError
 from neeco.files import read_json, require_inside, visible_entries
 

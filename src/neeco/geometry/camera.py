@@ -23,7 +23,7 @@ class Camera:
 
     A pinhole, unless it is given OpenCV's distortion or a round border, black beyond, as an endoscope has. `learned_fx`
     asks that an image of another size than the learned one show the same picture, larger or smaller (see `draw_through`
-    in neeco.raster.optics); `Scene.draw` sees to it. The pose may also be given as an array or nested lists, which
+    in neeco.raster.resampling); `Scene.draw` sees to it. The pose may also be given as an array or nested lists, which
     become float32 (`as_pose`). Raises NeecoError when it is not 4x4, or given so and no rotation and translation, for a
     size that is not whole and positive, and for other numbers that are not finite.
 
@@ -98,7 +98,7 @@ class Camera:
 
     @property
     def is_resampled(self) -> bool:
-        """Whether its image is made of that of another camera (see `draw_through` in neeco.raster.optics)."""
+        """Whether its image is made of that of another camera (see `draw_through` in neeco.raster.resampling)."""
         return self.learned_fx is not None or not self.is_pinhole
 
     def resized(self, width: int, height: int) -> Camera:

@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.capture.check_masks import masks_fault, measure_hidden, sample_points
-from neeco.capture.documents import Parsed, ProblemReport, condensed
-from neeco.capture.endonerf import MASKS, folder_images
+from neeco.capture.checks.masks import masks_fault, measure_hidden, sample_points
+from neeco.capture.documents import ProblemReport, condensed
 from neeco.capture.images import read_mask, write_labels
 from neeco.capture.model import Capture, Frame, evenly_spaced
-from neeco.capture.reader import capture_of, parse_capture
+from neeco.capture.readers import capture_of, parse_capture
+from neeco.capture.readers.endonerf import MASKS, folder_images
+from neeco.capture.readers.parsed import Parsed
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY, new_folder, own_folder

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from neeco.capture.model import Capture
-from neeco.capture.reader import read_capture
+from neeco.capture.readers import read_capture
 from neeco.errors import NeecoError
 from neeco.files import is_vacant, read_json, require_content, write_json
 from neeco.ingest.pipeline import ingest

@@ -19,9 +19,9 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
-from neeco.methods.carving.evidence import CarvingSettings
-from neeco.methods.carving.shapes import carve_seeds
+from neeco.methods.space_carving import CarvingSettings
 from neeco.methods.swept_volume import SweptVolume, bound_volume
+from neeco.methods.tissue_fit import carve_seeds
 from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
 from neeco.scene.deformation import (

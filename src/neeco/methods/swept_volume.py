@@ -8,9 +8,8 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
 from neeco.errors import NeecoError
-from neeco.methods.carving.evidence import carve
-from neeco.methods.carving.shapes import moves_with_pose
-from neeco.methods.carving.tissue_fit import tissue_evidence
+from neeco.methods.space_carving import carve, moves_with_pose
+from neeco.methods.tissue_fit import tissue_evidence
 from neeco.raster.devices import CachedPredicate
 from neeco.training.session import GaussianSession
 

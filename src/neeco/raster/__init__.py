@@ -1,8 +1,8 @@
 """Drawing Gaussians: `rasterize(gaussians, camera)`, differentiable, on the CPU, on CUDA or, slowly, anywhere."""
 
 from neeco.geometry.camera import Camera
-from neeco.raster.api import rasterize
 from neeco.raster.native import kernels
+from neeco.raster.rasterization import rasterize
 from neeco.raster.types import Gaussians, Headlight, Rendering
 
 __all__ = ["Camera", "Gaussians", "Headlight", "Rendering", "kernels", "rasterize"]

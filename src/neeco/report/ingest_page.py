@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,91 +11,15 @@ import torch
 from torch import Tensor
 
 from neeco.capture import read_capture
-from neeco.capture.check import Problem, inspect_capture
 from neeco.capture.model import Capture, Frame
-from neeco.errors import NeecoError
-from neeco.ingest.assessment import VERDICTS, Assessment, assess_ingest, clock_cost_mm, rms
-from neeco.ingest.pipeline import ingest
-from neeco.ingest.recording.model import Recording
+from neeco.ingest.assessment import Assessment, clock_cost_mm, rms
 from neeco.ingest.result import IngestResult
-from neeco.ingest.timing.episodes import file_name
-from neeco.ingest.tissues import ingest_tissues
 from neeco.report import ingest_figures as figures
 from neeco.report.charts import residual_chart
 from neeco.report.coverage import SPLIT_COLORS, degrees_of_freedom, extrapolations, histogram, unvisited
 from neeco.report.page import split_counts, write_page
-from neeco.report.rerun_log import require_rerun, write_rrd
 
-PAGE = "ingest.html"
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
-
-
-@dataclass(frozen=True)
-class Ingested:
-    """What an ingest made: the capture in folder `path`, and how far it can be trusted. `assessments` and `results` are
-    by tissue, under "" where there is one; a folder converted from another format has none, but `notes`."""
-
-    path: Path
-    assessments: Mapping[str, Assessment] = field(default_factory=dict)
-    results: Mapping[str, IngestResult] = field(default_factory=dict)
-    problems: tuple[Problem, ...] = ()  # found by `check`
-    notes: tuple[str, ...] = ()
-
-    @property
-    def verdict(self) -> str | None:
-        """ "good", "usable" or "doubtful", the worst of the tissues'; None of a converted folder."""
-        found = {VERDICTS[assessment.level] for assessment in self.assessments.values()}
-        return next((verdict for verdict in reversed(VERDICTS.values()) if verdict in found), None)
-
-    @cached_property
-    def capture(self) -> Capture:
-        """The capture, read from its folder."""
-        return read_capture(self.path)
-
-    @property
-    def pages(self) -> tuple[Path, ...]:
-        """The pages written, one for each tissue."""
-        return tuple(self.path / _page_of(tissue) for tissue in self.results)
-
-    def __repr__(self) -> str:
-        return f"Ingested({str(self.path)!r}, verdict={self.verdict!r})"
-
-
-def ingest_with_page(
-    recordings: Sequence[Recording], output: Path, progress: Callable[[str, int, int], None], rrd: Path | None = None
-) -> Ingested:
-    """Make the capture `output` from recordings, check and assess it, and write its pages, before anything appears at
-    `output`. rrd: a file that is written for the rerun viewer as well. Raises NeecoError for unusable input."""
-    if rrd is not None:
-        require_rerun()
-    several = any(recording.tissue for recording in recordings)
-    if several and rrd is not None:
-        raise NeecoError("--rrd: shows one tissue, and the recordings name theirs; leave it out")
-    problems: list[Problem] = []
-    assessments: dict[str, Assessment] = {}
-
-    def complete(results: Mapping[str, IngestResult], folder: Path) -> None:
-        progress("writing the page", 0, 0)
-        checked = inspect_capture(folder)
-        problems.extend(checked.problems)
-        capture = checked.capture or read_capture(folder)
-        for tissue, result in results.items():
-            own = capture.over(tissue) if tissue else capture
-            assessments[tissue] = assess_ingest(result, own, problems)
-            write_ingest_page(result, assessments[tissue], folder / _page_of(tissue), own)
-            if rrd is not None:
-                progress("writing for rerun", 0, 0)
-                write_rrd(result, own, rrd)
-
-    if several:
-        results = ingest_tissues(recordings, output, progress, complete)
-    else:
-        results = {"": ingest(recordings, output, progress, lambda result, folder: complete({"": result}, folder))}
-    return Ingested(output, assessments, results, tuple(problems))
-
-
-def _page_of(tissue: str) -> str:
-    return f"{Path(PAGE).stem}_{file_name(tissue)}.html" if tissue else PAGE
 
 
 def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, capture: Capture | None = None) -> None:

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from neeco import __version__
 from neeco.capture.documents import Node, RaisingReport
-from neeco.capture.kinematicsfile import kinematics_of
-from neeco.capture.lensfile import parse_lens
 from neeco.capture.model import Camera, Instrument, InstrumentState, State, share_lamps
+from neeco.capture.readers import kinematics_of
+from neeco.capture.readers.cameras import parse_lens
 from neeco.errors import NeecoError
 from neeco.files import HALVES, finite, require_content, require_like, write_atomically
 from neeco.geometry.rotations import rigid_fault

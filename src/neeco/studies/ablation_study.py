@@ -13,7 +13,7 @@ import torch
 
 from neeco import __version__
 from neeco.capture import Capture
-from neeco.capture.check import read_checked
+from neeco.capture.checks import read_checked
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import held_out_splits
 from neeco.files import own_folder, read_json, write_json

@@ -10,7 +10,7 @@ from typing import Any
 
 from neeco import __version__
 from neeco.capture import Capture
-from neeco.capture.check import read_checked
+from neeco.capture.checks import read_checked
 from neeco.capture.model import RecordedStates
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError

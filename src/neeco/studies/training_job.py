@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture import Capture, read_capture
-from neeco.capture.check import read_checked
+from neeco.capture.checks import read_checked
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError

@@ -18,13 +18,13 @@ from torch import Tensor
 from neeco.capture.model import Capture, Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
-from neeco.evaluation.align import AlignConfig, Fit, fit_frame, pose_changes
 from neeco.evaluation.trust import Trust, TypicalErrors, estimate_trust, typical_errors_of
+from neeco.fitting.alignment import AlignConfig, AlignedFrame, align_frame, pose_changes
 from neeco.geometry.distortion import field_pinhole
 from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
-from neeco.raster.optics import resampled, supersampled
+from neeco.raster.resampling import resampled, supersampled
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings
@@ -174,7 +174,7 @@ class _Annotator:
         )
         return drawing, missing
 
-    def _fitted(self, frame: Frame, image: Tensor, start: Tensor | None) -> tuple[Fit, LayeredDrawing, Trust]:
+    def _fitted(self, frame: Frame, image: Tensor, start: Tensor | None) -> tuple[AlignedFrame, LayeredDrawing, Trust]:
         fit, drawing = fitted(self.scene, self.labeller, frame, image, start)
         return fit, drawing, estimate_trust(drawing, image, frame.load_mask(), self.typical)
 
@@ -190,10 +190,10 @@ def _without_keypoints_in(missing: Tensor, label: InstrumentLabel) -> Instrument
 
 def fitted(
     scene: GaussianScene, labeller: CompositedLabels, frame: Frame, image: Tensor, start: Tensor | None
-) -> tuple[Fit, LayeredDrawing]:
+) -> tuple[AlignedFrame, LayeredDrawing]:
     """The poses of `frame` fitted to its image [H, W, 3], and what the scene draws there; `start`: a neighbour's
     increments, without which the search starts coarse."""
-    fit = fit_frame(scene, frame, image, start, None if start is None else FROM_NEIGHBOUR)
+    fit = align_frame(scene, frame, image, start, None if start is None else FROM_NEIGHBOUR)
     return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.min_component, tissue_image=True)
 
 

@@ -13,7 +13,7 @@ import torch
 from neeco.capture import read_capture
 from neeco.capture.images import write_image, write_labels
 from neeco.capture.model import State
-from neeco.capture.statefile import read_states
+from neeco.capture.readers import read_states
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE
 from neeco.files import write_json

@@ -17,7 +17,7 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import RecordedStates, State, evenly_spaced
-from neeco.capture.statefile import read_states
+from neeco.capture.readers import read_states
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
 from neeco.geometry.camera import Camera

@@ -42,11 +42,12 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from neeco.capture.documents import Node, RaisingReport
 from neeco.capture.images import open_image, read_image, read_labels
-from neeco.capture.lensfile import parse_lens
-from neeco.capture.model import InstrumentState, State, swap_camera_axes
+from neeco.capture.model import InstrumentState, State
+from neeco.capture.readers.cameras import parse_lens
 from neeco.errors import NeecoError, naming_arguments
 from neeco.files import read_json, require_inside, require_like
 from neeco.geometry.camera import Camera
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.labels.annotation import LabelledImage, keypoint_names
 from neeco.labels.labellers import instruments_of
 from neeco.raster.native import torch_threads

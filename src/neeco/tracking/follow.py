@@ -11,10 +11,10 @@ from typing import Any, Literal
 import torch
 
 from neeco.capture.model import Frame, InstrumentState, State
-from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.drawing import View
-from neeco.tracking.fitting import Fit, Fitter, wide
+from neeco.fitting.fitter import StateFit, loose_prior
+from neeco.fitting.layers import FrameView
 from neeco.tracking.motion import LONGEST, Motion, Moving
+from neeco.tracking.parameters import TrackedParameters, TrackingFitter
 from neeco.tracking.search import Search
 from neeco.tracking.trust import NONE, WRONG_DEG, Judge, Reference, TrackTrust
 
@@ -96,26 +96,28 @@ class Follower:
     """Follows instruments through frames, in either direction of time."""
 
     frames: Sequence[Frame]
-    fitter: Fitter
+    fitter: TrackingFitter
     motion: Motion
     search: Search
     judge: Judge
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], fitter: Fitter, reference: Reference, allowance: float = 1.0) -> Follower:
+    def of(
+        cls, frames: Sequence[Frame], fitter: TrackingFitter, reference: Reference, allowance: float = 1.0
+    ) -> Follower:
         """Of the instruments that the fitter draws; `allowance` as `Judge` has it."""
         search = Search.of(fitter)
         return cls(frames, fitter, search.motion, search, Judge(fitter, search, reference, allowance))
 
     @cached_property
-    def coordinates(self) -> Coordinates:
+    def parameters(self) -> TrackedParameters:
         """Of the states."""
-        return self.fitter.coordinates
+        return self.fitter.parameters
 
     def begin(self, frame: int, given: State) -> Step:
         """From a state that is about known."""
         view, time = self._view(frame, given), self.frames[frame].state.time
-        near = wide(self.coordinates, *GIVEN)
+        near = loose_prior(self.parameters, *GIVEN)
         fit = self.fitter.fit(view, given, near, levels=(0.125, 0.25, 0.5, 1.0), steps=(3, 3, 3, 4))
         if fit is None:
             return self._lost(frame, self.motion.begin(given), (), time, time)
@@ -151,7 +153,7 @@ class Follower:
             return self._look_again(before, frame, view)
         unlooked = 0 if trust.single < 1 or other is not None or before.unlooked >= LOOK_EVERY else before.unlooked + 1
         if other is not None and other.gain > fit.gain:
-            free = wide(self.coordinates, *GIVEN)
+            free = loose_prior(self.parameters, *GIVEN)
             better = self.fitter.fit(view, other.state, free, levels=(0.5, 1.0), steps=(3, 4))
             if better is not None and better.gain > fit.gain:
                 fit, how, predicted = better, "beside", self.motion.freed(predicted)
@@ -168,7 +170,7 @@ class Follower:
         recent = (*before.recent, fit.misfit)[-RECENT:]
         return Step(frame, how, moving, fit.misfit, fit.gain, trust, recent, time, searched_at, unlooked)
 
-    def _look_again(self, before: Step, frame: int, view: View | None) -> Step:
+    def _look_again(self, before: Step, frame: int, view: FrameView | None) -> Step:
         """Anywhere, unless that was done a moment ago."""
         time = self.frames[frame].state.time
         if abs(time - before.searched_at) < SEARCH_EVERY:
@@ -179,7 +181,7 @@ class Follower:
             return self._begun(frame, "found", best)
         return self._lost(frame, before.moving, before.recent, before.seen_at, time)
 
-    def _begun(self, frame: int, how: How, fit: Fit) -> Step:
+    def _begun(self, frame: int, how: How, fit: StateFit) -> Step:
         time = self.frames[frame].state.time
         trust, _ = self.judge.judge(fit)
         moving = self.motion.begin(replace(fit.state, time=time), fit.information)
@@ -199,7 +201,7 @@ class Follower:
             usual += [before.misfit] if before.unlooked < LOOK_EVERY else []
         return max(usual)
 
-    def _view(self, frame: int, state: State | None) -> View:
+    def _view(self, frame: int, state: State | None) -> FrameView:
         return self.fitter.view(self.frames[frame], state)
 
 

@@ -1,4 +1,4 @@
-"""Tissue and light of footage learned again, once it is known where the instruments are.
+"""TissueRenderer and light of footage learned again, once it is known where the instruments are.
 
 At first the tissue is learned beside what passes; where an instrument's shadow nearly always falls, it is learned as
 dark tissue, and highlights that were masked as passing are missing. Now the instruments are drawn where they were

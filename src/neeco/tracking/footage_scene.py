@@ -1,9 +1,9 @@
 """A run's instruments over the tissue of footage, in its light: the scene by which footage over another tissue is
 tracked.
 
-Tissue and light are those that footage itself shows (`neeco.tracking.footage_tissue`). Another camera has another
-exposure, white balance and contrast: the instruments' colours get one gain each for red, green and blue, and one gamma,
-fitted to where the instruments are found in a few frames, as are the lamps whose shadow they cast.
+Tissue and light are learned from the footage itself (`neeco.tracking.footage_tissue`). Another camera has another
+exposure, white balance and contrast. The instruments' colours therefore get one gain per channel and one gamma. Both,
+and the lamps whose shadow the instruments cast, are fitted in a few frames in which the instruments are found.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from neeco.capture.model import Frame, evenly_spaced
-from neeco.methods.kinematic.shadow import find_shadow
+from neeco.fitting.fitter import StateFit, loose_prior
+from neeco.fitting.layers import working_size
+from neeco.methods.kinematic.lamp_search import find_shadow
 from neeco.raster.reference import SH_C0
 from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.canonical import join_bodies
 from neeco.scene.training_views import TrainingViews
-from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.drawing import working_size
-from neeco.tracking.fitting import Fit, Fitter, wide
 from neeco.tracking.footage_tissue import Report, passing
+from neeco.tracking.parameters import TrackedParameters, TrackingFitter, fitter_of
 from neeco.tracking.search import Search
 from neeco.training.config import method_defaults
 from neeco.training.session import new_session
@@ -169,9 +169,9 @@ class Adapted:
 
 def adapted(scene: GaussianScene, frames: Sequence[Frame], report: Report) -> Adapted:
     """`scene`, of instruments over the tissue of `frames` (`over_tissue`), in their light."""
-    plain, coordinates = Fitter.of(scene), Coordinates.of(scene)
+    plain, parameters = fitter_of(scene), TrackedParameters.of(scene)
     chosen = [frames[k] for k in evenly_spaced(len(frames), FRAMES)]
-    found: list[tuple[Frame, Fit]] = []
+    found: list[tuple[Frame, StateFit]] = []
     guess = _guessed(plain, chosen)
     for tried in (Colors(), guess) if guess.differs else (Colors(),):
         fits = _found(tried.of(scene), chosen, report)
@@ -183,16 +183,16 @@ def adapted(scene: GaussianScene, frames: Sequence[Frame], report: Report) -> Ad
         most = MOST_MISFIT * found[0][1].misfit if found else 0.0
         colors = _colors(plain, [pair for pair in found[: max(1, round(USED * len(found)))] if pair[1].misfit <= most])
         lit = colors.of(scene)
-        fitter = Fitter.of(lit)
+        fitter = fitter_of(lit)
         found = [
             (frame, better)
             for frame, fit in found
-            if (better := fitter.fit(fitter.view(frame, fit.state), fit.state, wide(coordinates, *NEAR)))
+            if (better := fitter.fit(fitter.view(frame, fit.state), fit.state, loose_prior(parameters, *NEAR)))
         ]
     return Adapted(with_lamps(lit, found), colors)
 
 
-def with_lamps(scene: GaussianScene, found: Sequence[tuple[Frame, Fit]]) -> GaussianScene:
+def with_lamps(scene: GaussianScene, found: Sequence[tuple[Frame, StateFit]]) -> GaussianScene:
     """The scene with the lamps whose shadow its instruments cast on the tissue, as training finds them; with none where
     these explain too little."""
     made = _like(scene, scene.canonical)
@@ -208,9 +208,9 @@ def with_lamps(scene: GaussianScene, found: Sequence[tuple[Frame, Fit]]) -> Gaus
     return made.requires_grad_(False)
 
 
-def _found(scene: GaussianScene, frames: Sequence[Frame], report: Report) -> list[tuple[Frame, Fit]]:
+def _found(scene: GaussianScene, frames: Sequence[Frame], report: Report) -> list[tuple[Frame, StateFit]]:
     """Where the instruments of `scene` are in some frames, nothing known."""
-    fitter, found = Fitter.of(scene), []
+    fitter, found = fitter_of(scene), []
     search = Search.of(fitter)
     for done, frame in enumerate(frames):
         report("looking for the instruments' colours", done, len(frames))
@@ -220,14 +220,14 @@ def _found(scene: GaussianScene, frames: Sequence[Frame], report: Report) -> lis
     return found
 
 
-def _guessed(plain: Fitter, frames: Sequence[Frame]) -> Colors:
+def _guessed(plain: TrackingFitter, frames: Sequence[Frame]) -> Colors:
     """Before any state is known: from how often colours are among those of what passes before the tissue, and of the
     instruments drawn in recorded states."""
-    scene, rendered, seen = plain.drawer.scene, [], []
+    scene, rendered, seen = plain.instruments.scene, [], []
     recorded = scene.recorded
     for k in evenly_spaced(len(recorded.states), DRAWN):
         camera = working_size(recorded.cameras[k], recorded)
-        color, alpha = plain.drawer.draw(recorded.states[k], camera)
+        color, alpha = plain.instruments.render(recorded.states[k], camera)
         rendered.append((color / alpha[..., None])[alpha > SOLID])
     for frame in frames:
         shown = torch.from_numpy(passing(frame, plain.tissue, margin=0))
@@ -240,12 +240,12 @@ def _guessed(plain: Fitter, frames: Sequence[Frame]) -> Colors:
     return Colors.fitted(rows[0].float(), rows[1].float())
 
 
-def _colors(plain: Fitter, found: Sequence[tuple[Frame, Fit]]) -> Colors:
+def _colors(plain: TrackingFitter, found: Sequence[tuple[Frame, StateFit]]) -> Colors:
     """From the instruments as drawn in their recorded colours, and the frames."""
     rendered, seen = [], []
     for frame, fit in found:
         view = plain.view(frame, None)
-        color, alpha = plain.drawer.draw(fit.state, view.camera)
+        color, alpha = plain.instruments.render(fit.state, view.camera)
         solid = torch.from_numpy(binary_erosion((alpha > SOLID).numpy(), iterations=1)) & (view.weight > 0)
         rendered.append(color[solid] / alpha[solid][:, None])
         seen.append(view.image[solid])

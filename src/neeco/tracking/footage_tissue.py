@@ -17,8 +17,8 @@ from scipy.ndimage import binary_dilation, binary_opening, uniform_filter
 from neeco.capture.images import area_averaged, write_labels
 from neeco.capture.model import REFERENCE_PIXELS, Capture, Frame, State, evenly_spaced
 from neeco.errors import NeecoError
+from neeco.fitting.layers import TissueRenderer
 from neeco.scene import GaussianScene
-from neeco.tracking.drawing import Tissue
 from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
@@ -78,7 +78,7 @@ def _pixels(capture: Capture) -> float:
 def _masked(frames: Sequence[Frame], scene: GaussianScene, folder: Path) -> tuple[Frame, ...]:
     """The frames, what passes before the tissue left out of their masks."""
     folder.mkdir(parents=True, exist_ok=True)
-    tissue, masked = Tissue(scene), []
+    tissue, masked = TissueRenderer(scene), []
     for frame in frames:
         shown = ~passing(frame, tissue)
         given = frame.load_mask()
@@ -90,11 +90,11 @@ def _masked(frames: Sequence[Frame], scene: GaussianScene, folder: Path) -> tupl
     return tuple(masked)
 
 
-def passing(frame: Frame, tissue: Tissue, margin: int = RIM) -> np.ndarray:
+def passing(frame: Frame, tissue: TissueRenderer, margin: int = RIM) -> np.ndarray:
     """bool [H, W]: where a frame shows something before the tissue, with a rim (px of images of 320x256)."""
     camera = frame.camera.within(REFERENCE_PIXELS)
     image = area_averaged(frame.load_image(), camera.width, camera.height)
-    error = uniform_filter((tissue.draw(camera, None) - image).abs().mean(-1).numpy(), WINDOW)
+    error = uniform_filter((tissue.render(camera, None) - image).abs().mean(-1).numpy(), WINDOW)
     odd = error > max(ODD, TIMES * float(np.quantile(error, USUAL)))
     odd &= image.amin(-1).numpy() < WHITE
     odd = binary_opening(odd, iterations=SPECK)

@@ -16,14 +16,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from neeco.capture.model import Capture, Frame
-from neeco.capture.reader import read_capture
+from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_begun, read_bytes, read_json, require_same, write_json
+from neeco.fitting.fitter import loose_prior
 from neeco.scene import GaussianScene
 from neeco.scene.gaussian_scene import one_tissue
 from neeco.settings import with_fields
-from neeco.tracking.fitting import Fitter, wide
+from neeco.tracking.parameters import fitter_of
 from neeco.tracking.track import INFO
 from neeco.training.run import stored_config
 from neeco.training.train import ShowRow, train
@@ -127,8 +128,8 @@ def _named_apart(frames: Sequence[Frame], folder: Path) -> list[Frame]:
 def fitted(scene: GaussianScene, capture: Capture, on_progress: Callable[[int, int], None]) -> list[Frame]:
     """The frames of a capture; those trained on with states as the scene explains their images best, near the recorded
     ones."""
-    fitter = Fitter.of(scene)
-    near, frames = wide(fitter.coordinates, *NEAR), []
+    fitter = fitter_of(scene)
+    near, frames = loose_prior(fitter.parameters, *NEAR), []
     for done, frame in enumerate(capture.frames):
         on_progress(done, len(capture.frames))
         if frame.split == "train":

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import torch
 
 from neeco.capture.model import InstrumentState, State, evenly_spaced
+from neeco.fitting.fitter import MARGIN_PX, StateFit, loose_prior
+from neeco.fitting.layers import FrameView
+from neeco.fitting.parameters import DEG
 from neeco.geometry.camera import Camera
 from neeco.scene import Recorded
-from neeco.tracking.coordinates import DEG, Coordinates
-from neeco.tracking.drawing import View, reduced
-from neeco.tracking.fitting import MARGIN, Fit, Fitter, observed, wide
 from neeco.tracking.motion import Motion, Moving
+from neeco.tracking.parameters import TrackedParameters, TrackingFitter
 
 ALONG_MM = (-5.0, -2.5, 0.0, 2.5, 5.0)  # along the shaft: teeth, rings and its end hold a fit where it was
 ROLL_DEG = (-8.0, 0.0, 8.0)  # about it
@@ -37,48 +38,39 @@ QUARTER_MM = 0.25
 class Search:
     """Looks for the instruments in single frames."""
 
-    fitter: Fitter
+    fitter: TrackingFitter
     motion: Motion
     recorded: Recorded
 
     @classmethod
-    def of(cls, fitter: Fitter) -> Search:
+    def of(cls, fitter: TrackingFitter) -> Search:
         """By what was recorded of the scene that the fitter draws."""
-        recorded = fitter.drawer.scene.recorded
-        return cls(fitter, Motion.of(fitter.coordinates, recorded.states), recorded)
+        recorded = fitter.instruments.scene.recorded
+        return cls(fitter, Motion.of(fitter.parameters, recorded.states), recorded)
 
     @property
-    def coordinates(self) -> Coordinates:
-        return self.fitter.coordinates
+    def parameters(self) -> TrackedParameters:
+        return self.fitter.parameters
 
-    def ranked(self, view: View, states: Iterable[State], size: float) -> list[State]:
-        """The best first, as they explain a view reduced to `size`."""
-        seen, drawer = observed(view, size), self.fitter.drawer
-        scored = [
-            (float(seen.errors(reduced(drawer.composed(drawer.pose(state), view), size)).sum()), k, state)
-            for k, state in enumerate(states)
-        ]
-        return [state for _, _, state in sorted(scored, key=lambda item: item[:2])]
-
-    def beside(self, view: View, predicted: Moving, others: Sequence[State], usual: float) -> Fit | None:
+    def beside(self, view: FrameView, predicted: Moving, others: Sequence[State], usual: float) -> StateFit | None:
         """The best fit begun along the shaft, at other rolls, and where else the state may be by its covariance, from
         what is predicted and from `others`; the first whose misfit is `usual`."""
-        coordinates, tried = self.coordinates, []
+        parameters, tried = self.parameters, []
         for base in (predicted.state, *others):
-            for k in range(len(coordinates.instruments)):
+            for k in range(len(parameters.instruments)):
                 tried += [
-                    coordinates.moved(base, coordinates.along(k, along, roll * DEG))
+                    parameters.moved(base, parameters.along(k, along, roll * DEG))
                     for along in ALONG_MM
                     for roll in ROLL_DEG
                 ]
-        size, generator = coordinates.size, torch.Generator().manual_seed(0)
+        size, generator = parameters.size, torch.Generator().manual_seed(0)
         root = torch.linalg.cholesky(predicted.covariance[:size, :size])
         normal = torch.randn(SAMPLES, size, generator=generator, dtype=torch.float64)
-        tried += [coordinates.moved(predicted.state, increments) for increments in normal @ root.T]
+        tried += [parameters.moved(predicted.state, increments) for increments in normal @ root.T]
         precision = self.motion.precision(predicted) / SLACK**2
-        best: Fit | None = None
-        about = self.fitter.about(view, predicted.state, 2 * MARGIN)
-        for start in self.ranked(view if about is None else about, tried, 0.25)[:FOLLOWED]:
+        best: StateFit | None = None
+        about = self.fitter.about(view, predicted.state, 2 * MARGIN_PX)
+        for start in self.fitter.ranked(view if about is None else about, tried, 0.25)[:FOLLOWED]:
             fit = self.fitter.fit(view, predicted.state, precision, start, levels=(0.25, 0.5), steps=(4, 4))
             if fit is not None and (best is None or fit.gain > best.gain):
                 best = fit
@@ -88,15 +80,15 @@ class Search:
             return None
         return self.fitter.fit(view, predicted.state, precision, best.state, levels=(1.0,), steps=(4,))
 
-    def anywhere(self, view: View) -> Fit | None:
+    def anywhere(self, view: FrameView) -> StateFit | None:
         """The best fit, nothing else known: from recorded states, then from the best one turned and opened otherwise.
         None where none explains the image better than the tissue alone."""
-        fitter, far = self.fitter, wide(self.coordinates, *FAR)
-        starts = self._different(self.ranked(view, self.bank(view.camera), 0.125), STARTS)
+        fitter, far = self.fitter, loose_prior(self.parameters, *FAR)
+        starts = self._different(self.fitter.ranked(view, self.bank(view.camera), 0.125), STARTS)
         fits = [fitter.fit(view, state, far, levels=(0.125, 0.25), steps=(6, 4)) for state in starts]
         found = _by_gain(fits)
         if found:
-            others = self._different(self.ranked(view, self.turned(found[0].state), 0.25), TURNED)
+            others = self._different(self.fitter.ranked(view, self.turned(found[0].state), 0.25), TURNED)
             fits = [fitter.fit(view, state, far, levels=(0.25,), steps=(6,)) for state in others]
             found = _by_gain([*found, *fits])
         last = [fitter.fit(view, fit.state, far, levels=(0.5, 1.0), steps=(4, 4)) for fit in found[:FINALISTS]]
@@ -118,45 +110,50 @@ class Search:
 
     def turned(self, state: State) -> list[State]:
         """One instrument after the other at other rolls, with its joints as they are and otherwise."""
-        coordinates, found = self.coordinates, []
-        for k, item in enumerate(coordinates.instruments):
+        parameters, found = self.parameters, []
+        for k, item in enumerate(parameters.instruments):
             given = state.instruments[item.name].joints
             values = [given[name] for name in item.joints]
             for roll in (0.0, *OTHER_ROLLS):
-                rolled = coordinates.moved(state, coordinates.along(k, roll=roll * DEG))
+                rolled = parameters.moved(state, parameters.along(k, roll=roll * DEG))
                 found += [rolled] if roll else []
                 for j, slides in enumerate(item.slides):
                     for change in OTHER_JOINTS:
                         moved = [*values]
                         moved[j] += change * (QUARTER_MM if slides else DEG)
-                        found.append(coordinates.with_joints(rolled, k, moved))
+                        found.append(parameters.with_joints(rolled, k, moved))
         return found
 
     def _different(self, states: Sequence[State], count: int) -> list[State]:
         """The first few that differ in place, turn or joints."""
         chosen: list[State] = []
         for state in states:
-            if all(differ(self.coordinates, state, other, APART_DEG, APART_JOINT_DEG, APART_MM) for other in chosen):
+            if all(differ(self.parameters, state, other, APART_DEG, APART_JOINT_DEG, APART_MM) for other in chosen):
                 chosen.append(state)
             if len(chosen) == count:
                 break
         return chosen
 
 
-def _by_gain(fits: Iterable[Fit | None]) -> list[Fit]:
+def _by_gain(fits: Iterable[StateFit | None]) -> list[StateFit]:
     return sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.gain)
 
 
 def differ(
-    coordinates: Coordinates, one: State, other: State, degrees: float, joints: float, millimetres: float = math.inf
+    parameters: TrackedParameters,
+    one: State,
+    other: State,
+    degrees: float,
+    joint_degrees: float,
+    millimetres: float = math.inf,
 ) -> bool:
-    """Whether two states are turned by more than `degrees`, shifted by more than `millimetres`, or a joint by more than
-    `joints` deg (or as many quarters of a mm)."""
-    apart = coordinates.between(one, other)
-    for item, rows in zip(coordinates.instruments, coordinates.slices, strict=True):
-        own = apart[rows]
+    """Return whether two states differ by more than `degrees` of rotation, `millimetres`, or `joint_degrees` of a joint
+    (0.25 mm per degree where it is prismatic)."""
+    apart = parameters.between(one, other)
+    for item, (pose, rows) in zip(parameters.instruments, parameters.rows, strict=True):
+        own = apart[pose]
         units = torch.tensor([QUARTER_MM if slides else DEG for slides in item.slides], dtype=torch.float64)
-        turned, shifted = float(own[:3].norm()) / DEG, float(own[3:6].norm())
-        if turned > degrees or shifted > millimetres or bool((own[6:].abs() > joints * units).any()):
+        turned, shifted = float(own[:3].norm()) / DEG, float(own[3:].norm())
+        if turned > degrees or shifted > millimetres or bool((apart[rows].abs() > joint_degrees * units).any()):
             return True
     return False

@@ -22,19 +22,18 @@ import torch
 
 import neeco
 from neeco.capture.model import Capture, Frame, InstrumentState, State
-from neeco.capture.reader import read_capture
+from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, own_folder, read_begun, read_bytes, read_json, require_like, require_same, write_json
 from neeco.scene import Recorded
 from neeco.scene.gaussian_scene import one_tissue
 from neeco.scene.io import load_gaussians, save_scene
-from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.fitting import Fitter
 from neeco.tracking.follow import LOOK_EVERY, Follower, Step
 from neeco.tracking.footage_again import learned_again
 from neeco.tracking.footage_scene import adapted, over_tissue
 from neeco.tracking.footage_tissue import Report, learn_tissue
+from neeco.tracking.parameters import TrackedParameters, fitter_of
 from neeco.tracking.trust import Reference
 from neeco.training.run import stored_config, write_config
 
@@ -128,7 +127,7 @@ def track_footage(
     one_tissue(scene, "track")
     if footage.tissues:
         raise NeecoError(f"{footage.root}: tissues: footage is of one; track each tissue's by itself")
-    coordinates = Coordinates.of(scene)
+    parameters = TrackedParameters.of(scene)
     frames = sorted(footage.frames, key=lambda frame: frame.state.time)
     given = _first_state(footage, frames[0], scene) if start == "first" else None
     trained_on = run.capture()
@@ -150,19 +149,19 @@ def track_footage(
         stored = read_json(output / INFO) if (output / INFO).exists() else {}
         if not stored.get("complete"):
             write_json(output / INFO, info | {"complete": False})
-            fitter = Fitter.of(scene)
+            fitter = fitter_of(scene)
             reference = Reference.of(fitter, trained_on.split("train"))
             if tissue == "run":
                 follower = Follower.of(frames, fitter, reference)
                 steps = _Work(output / STEPS, follower, on_progress).all_steps(given)
             else:
                 scene, info["light"] = _over_footage(scene, footage, output / STEPS, on_stage)
-                follower = Follower.of(frames, Fitter.of(scene), reference, OTHER_TISSUE)
+                follower = Follower.of(frames, fitter_of(scene), reference, OTHER_TISSUE)
                 steps = _Work(output / STEPS, follower, on_progress).all_steps(given)
                 scene = _learned_again(scene, frames, steps, output / STEPS, on_stage)
-                follower = Follower.of(frames, Fitter.of(scene), reference, OTHER_TISSUE)
+                follower = Follower.of(frames, fitter_of(scene), reference, OTHER_TISSUE)
                 steps = _Work(output / STEPS / SECOND, follower, on_progress).all_steps(given)
-            records = [_record(frames[k], step, coordinates) for k, step in enumerate(steps)]
+            records = [_record(frames[k], step, parameters) for k, step in enumerate(steps)]
             info |= {"complete": True, "reference": reference.to_json(), "frames": records}
         else:
             info = stored
@@ -300,16 +299,16 @@ STEP = {
 }
 
 
-def _record(frame: Frame, step: Step, coordinates: Coordinates) -> dict[str, Any]:
+def _record(frame: Frame, step: Step, parameters: TrackedParameters) -> dict[str, Any]:
     """What track.json says of a frame. `deviation`: of rotation (rad), place (mm) and every joint, one standard
     deviation."""
     instruments = {}
     variance = step.moving.covariance.diagonal()
-    for item, rows in zip(coordinates.instruments, coordinates.slices, strict=True):
-        state, own = step.moving.state.instruments[item.name], variance[rows].clamp_min(0)
-        deviation = {"rotation": float(own[:3].sum().sqrt()), "place": float(own[3:6].sum().sqrt())}
+    for item, (pose, rows) in zip(parameters.instruments, parameters.rows, strict=True):
+        state, own = step.moving.state.instruments[item.name], variance[pose].clamp_min(0)
+        deviation = {"rotation": float(own[:3].sum().sqrt()), "place": float(own[3:].sum().sqrt())}
         most = (item.high - item.low) / math.sqrt(12)  # of a joint that may be anywhere between its bounds
-        joints = torch.minimum(own[6:].sqrt(), most).tolist()
+        joints = torch.minimum(variance[rows].clamp_min(0).sqrt(), most).tolist()
         deviation |= {f"joint.{name}": value for name, value in zip(item.joints, joints, strict=True)}
         instruments[item.name] = {
             "pose": state.pose.tolist(),

@@ -27,11 +27,14 @@ from torch import Tensor
 from neeco.capture.model import Frame, State, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import BESIDE, TypicalErrors, estimate_trust, typical_errors_of
+from neeco.fitting.fitter import StateFit, loose_prior
+from neeco.fitting.layers import over
+from neeco.fitting.parameters import DEG
 from neeco.geometry.camera import Camera
+from neeco.labels.labellers import CompositedLabels, composited_labels
+from neeco.raster import rasterize
 from neeco.scene import Recorded
-from neeco.tracking.coordinates import DEG, Coordinates, TrackedInstrument
-from neeco.tracking.drawing import LabelledView
-from neeco.tracking.fitting import Fit, Fitter, wide
+from neeco.tracking.parameters import TrackedInstrument, TrackedParameters, TrackingFitter
 from neeco.tracking.search import Search, differ
 
 REFERENCE_FRAMES = 16  # training frames that tell what is usual
@@ -84,19 +87,19 @@ class Reference:
     observed: float  # share of the label's pixels, at the worst of them
 
     @classmethod
-    def of(cls, fitter: Fitter, frames: Sequence[Frame]) -> Reference:
+    def of(cls, fitter: TrackingFitter, frames: Sequence[Frame]) -> Reference:
         """Of a few of the frames trained on, states fitted to each. Raises NeecoError when an image cannot be read."""
-        coordinates, scene = fitter.coordinates, fitter.drawer.scene
+        parameters, scene = fitter.parameters, fitter.instruments.scene
         chosen = [frames[k] for k in evenly_spaced(len(frames), REFERENCE_FRAMES)]
         states = dict(zip(scene.recorded.names, scene.recorded.states, strict=True))
-        near = wide(coordinates, 2.0, 2.0, 4.0)
-        judged, misfits, shares = [], [], []
+        near = loose_prior(parameters, 2.0, 2.0, 4.0)
+        renderer, judged, misfits, shares = LabelRenderer.of(fitter), [], [], []
         for frame in chosen:
             start = states.get(frame.name, frame.state)
             fit = fitter.fit(fitter.view(frame, start), start, near)
             if fit is None:
                 continue
-            drawing = fitter.labelled(fit)
+            drawing = renderer.render(fit)
             judged.append((drawing, fit.view.image, fit.view.weight > 0))
             misfits.append(fit.misfit)
             shares.append(observed_share(drawing))
@@ -112,6 +115,47 @@ class Reference:
         return {**asdict(self.errors), "misfit": round(self.misfit, 5), "observed": round(self.observed, 5)}
 
 
+@dataclass(frozen=True)
+class LabelledView:
+    """Instruments rendered over tissue, with what `neeco.evaluation.trust` needs."""
+
+    image: Tensor  # [h, w, 3] in [0, 1]
+    parts: Tensor  # [h, w] uint8
+    tissue_image: Tensor  # [h, w, 3]
+    alpha: Tensor  # [h, w]
+    unobserved: Tensor  # [h, w] share of a pixel that no training frame observed, or not from a similar direction
+
+
+@dataclass(frozen=True)
+class LabelRenderer:
+    """Renders fits of instruments with their labels."""
+
+    fitter: TrackingFitter
+    channels: Tensor  # [N, L] label channels of the instruments' Gaussians
+    threshold: float
+
+    @classmethod
+    def of(cls, fitter: TrackingFitter) -> LabelRenderer:
+        """With the scene's own labels. Raises NeecoError for a scene without."""
+        scene = fitter.instruments.scene
+        labels = CompositedLabels(scene)
+        return cls(fitter, labels.channels[scene.canonical.counts[0] :].contiguous(), labels.threshold)
+
+    @torch.no_grad()
+    def render(self, fit: StateFit) -> LabelledView:
+        """Return the fit's instruments over the tissue of its view, with their parts."""
+        alone, view = self.fitter.instruments.alone, fit.view
+        posed = self.fitter.instruments.pose(fit.state)
+        unobserved = alone.unobserved(posed, view.camera)
+        channels = torch.cat([self.channels, unobserved[:, None]], 1)
+        rendering = rasterize(posed, view.camera, channels=channels, background=posed.means.new_zeros(3))
+        assert rendering.channels is not None
+        parts, _ = composited_labels(replace(rendering, channels=rendering.channels[..., :-1]), self.threshold)
+        color, alpha = rendering.color.cpu(), rendering.alpha.cpu()
+        image = over(color, alpha, view.tissue).clamp(0, 1)
+        return LabelledView(image, parts.cpu(), view.tissue, alpha, rendering.channels[..., -1].cpu())
+
+
 def observed_share(drawing: LabelledView) -> float:
     """Of the label's pixels, as far as training frames observed what they show; 0 without a label."""
     label = drawing.parts > 0
@@ -124,24 +168,23 @@ def observed_share(drawing: LabelledView) -> float:
 class RecordedRange:
     """From where the instruments were seen in the frames that were learned from."""
 
-    coordinates: Coordinates
+    parameters: TrackedParameters
     directions: tuple[Tensor, ...]  # of every instrument [M, 3] unit, instrument frame: from its pivot to the camera
 
     @classmethod
-    def of(cls, coordinates: Coordinates, recorded: Recorded) -> RecordedRange:
+    def of(cls, parameters: TrackedParameters, recorded: Recorded) -> RecordedRange:
         """Of all recorded frames."""
         pairs = list(zip(recorded.states, recorded.cameras, strict=True))
         directions = [
-            torch.stack([_direction(item, state, camera) for state, camera in pairs])
-            for item in coordinates.instruments
+            torch.stack([_direction(item, state, camera) for state, camera in pairs]) for item in parameters.instruments
         ]
-        return cls(coordinates, tuple(directions))
+        return cls(parameters, tuple(directions))
 
     def beyond(self, state: State, camera: Camera) -> float:
         """deg from the nearest direction from which it was seen, of the instrument for which it is farthest."""
         angles = [
             float((recorded @ _direction(item, state, camera)).amax().clamp(-1, 1).arccos()) / DEG
-            for item, recorded in zip(self.coordinates.instruments, self.directions, strict=True)
+            for item, recorded in zip(self.parameters.instruments, self.directions, strict=True)
         ]
         return max(angles)
 
@@ -156,7 +199,7 @@ def _direction(item: TrackedInstrument, state: State, camera: Camera) -> Tensor:
 class Judge:
     """Says how far tracked states are trusted."""
 
-    fitter: Fitter
+    fitter: TrackingFitter
     search: Search
     reference: Reference
     allowance: float = 1.0  # times the usual misfit that is usual here: light and tissue may be learned less well
@@ -164,13 +207,18 @@ class Judge:
     @cached_property
     def range(self) -> RecordedRange:
         """Of the frames that the scene was learned from."""
-        return RecordedRange.of(self.fitter.coordinates, self.search.recorded)
+        return RecordedRange.of(self.fitter.parameters, self.search.recorded)
 
-    def judge(self, fit: Fit, look: bool = False) -> tuple[TrackTrust, Fit | None]:
+    @cached_property
+    def renderer(self) -> LabelRenderer:
+        """Renders fits with their labels."""
+        return LabelRenderer.of(self.fitter)
+
+    def judge(self, fit: StateFit, look: bool = False) -> tuple[TrackTrust, StateFit | None]:
         """Of a fitted state; and, where another was looked for (with `look`, or where the state is
         doubted), the best one found that differs."""
-        drawing, about = self.fitter.labelled(fit), fit.view
-        beside = BESIDE * about.whole / math.hypot(about.camera.width, about.camera.height)
+        drawing, about = self.renderer.render(fit), fit.view
+        beside = BESIDE * about.diagonal / math.hypot(about.camera.width, about.camera.height)
         overlap = estimate_trust(drawing, about.image, about.weight > 0, self.reference.errors, beside).value
         beyond = self.range.beyond(fit.state, about.camera)
         half = HALF_TRUSTED * self.allowance * self.reference.misfit / (1 + beyond / STRANGE_DEG)
@@ -185,13 +233,13 @@ class Judge:
         taken = min(1.0, max(0.0, (ratio - none) / (all_of_it - none)))
         return replace(trust, single=1 - AMBIGUOUS * taken), other
 
-    def _second(self, fit: Fit) -> Fit | None:
+    def _second(self, fit: StateFit) -> StateFit | None:
         """The best fit found, at half size, of a state that differs."""
-        coordinates, best, view = self.fitter.coordinates, None, fit.view
-        loose = wide(coordinates, *NEARBY)
-        for state in self.search.ranked(view, self.search.turned(fit.state), 0.25)[:OTHERS_FITTED]:
+        parameters, best, view = self.fitter.parameters, None, fit.view
+        loose = loose_prior(parameters, *NEARBY)
+        for state in self.fitter.ranked(view, self.search.turned(fit.state), 0.25)[:OTHERS_FITTED]:
             found = self.fitter.fit(view, state, loose, levels=(0.25, 0.5), steps=(4, 2))
-            if found is None or not differ(coordinates, found.state, fit.state, OTHER_DEG, OTHER_JOINT_DEG):
+            if found is None or not differ(parameters, found.state, fit.state, OTHER_DEG, OTHER_JOINT_DEG):
                 continue
             if best is None or found.gain > best.gain:
                 best = found

@@ -14,6 +14,7 @@ import yaml
 
 from neeco.errors import NeecoError
 from neeco.files import YamlLoader
+from neeco.fitting.refinement import RefineConfig
 from neeco.scene.method_registry import DEFAULT, method_class, method_settings
 from neeco.scene.training_session import RunLength
 from neeco.settings import name_and_value, plain, structure, with_fields
@@ -64,32 +65,6 @@ class DensityConfig:
     reset_opacity: float = 0.01  # to which opacity resets clamp
     prune_interval: int = 200  # iterations between prunings, and between re-centrings of the refinement
     prune_stop: float = 0.95  # share of the run
-
-
-@dataclass(frozen=True)
-class RefineConfig:
-    """What of the recorded geometry may be corrected while training; each part switches on its own."""
-
-    registration: bool = False  # one constant tracker-to-world correction (rigid + scale)
-    latency: bool = False  # one clock offset between images and poses
-    frame_poses: bool = False  # every training frame's instrument pose, smooth in time
-    frame_joints: bool = False  # every training frame's readings of joints in stated kinematics
-    cameras: bool = False  # every training frame's camera
-    start: int = 400  # iteration
-    rotation_rate: float = 6e-4  # rad, Adam's learning rate of frame_poses
-    translation_rate: float = 4e-2  # mm
-    camera_rate: float = 0.2  # times the rates of poses: SfM cameras are better than tracked instruments
-    joint_rate: float = 2e-3  # rad; where a joint slides, this and its priors count as so much at 20 mm from a pivot
-    unrecorded_rate: float = 2e-2  # of joints that nobody recorded
-    latency_rate: float = 2e-5  # s
-    prior_weight: float = 2e-5
-    prior_rotation: float = 4.4e-3  # rad, standard deviation of the prior: a tracker's 0.25 deg
-    prior_translation: float = 0.3  # mm
-    prior_joint: float = 1.5e-2  # rad: play and noise of encoders
-    prior_unrecorded: float = 0.1  # rad by which a joint that nobody recorded departs from the instants beside
-    registration_rotation_rate: float = 1e-4  # rad
-    registration_translation_rate: float = 1e-2  # mm
-    registration_scale_rate: float = 1e-4  # of the log scale
 
 
 @dataclass(frozen=True)

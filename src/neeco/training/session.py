@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import mse_loss
 
 from neeco.capture.model import Camera, Frame, State
+from neeco.fitting.refinement import Refinement
 from neeco.raster import Rendering, rasterize
 from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
@@ -25,7 +26,6 @@ from neeco.scene.training_session import GaussianTraining, Report, StepResult, c
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
 from neeco.training.density import GradientStatistics, control_density, reset_opacity
-from neeco.training.refinement import Refinement
 from neeco.training.resolution import Resolution
 from neeco.training.schedule import Schedule, due, order_by_pose
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 
 from neeco.capture import Capture
-from neeco.capture.check import read_checked
+from neeco.capture.checks import read_checked
 from neeco.capture.model import Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError, memory_failure

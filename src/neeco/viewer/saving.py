@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from neeco.capture.model import State
-from neeco.capture.statefile import StateLine, camera_to_json, read_states, state_to_json
+from neeco.capture.readers import StateLine, read_states
+from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.files import own_folder, write_text
 from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers, to_numpy

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from neeco.capture.model import Camera, State
-from neeco.capture.statefile import read_states
+from neeco.capture.readers import read_states
 from neeco.errors import NeecoError
 from neeco.files import write_atomically
 from neeco.geometry.rotations import quat_to_matrix, spread_directions

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from neeco.capture.distortion import opencv_distortion, stated_distortion
 from neeco.capture.documents import Node, RaisingReport, as_float, printable
+from neeco.capture.readers.cameras import opencv_distortion, stated_distortion
 from neeco.errors import NeecoError
 from neeco.files import require_file
 from neeco.geometry.camera import COEFFICIENTS

@@ -6,8 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from neeco.ingest.cameras.sfm_strategies import (
     motion_fault,
     strategies,
 )
+from neeco.ingest.frames.views import SfmResult, StageProgress
 from neeco.ingest.readers.video import require_installed
 from neeco.ingest.recording.model import MIN_FRAMES, IngestSettings
 
@@ -38,27 +38,6 @@ PEAK, DENSE_PEAK = 0.004, 0.002  # contrast of a feature: tissue is smooth, COLM
 MOTION_PAIRS = 40  # pairs of keyframes by which a scope that does not move is told
 # run by its path, not as a module of the package: nothing of ours may be loaded beside pycolmap
 WORKER = Path(__file__).with_name("_sfm_worker.py")
-
-StageProgress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
-
-
-@dataclass(frozen=True)
-class SfmResult:
-    """In SfM's own frame and unit."""
-
-    indices: np.ndarray  # [M] which of the images given got a camera
-    world_from_camera: np.ndarray  # [M, 4, 4] OpenCV axes
-    points: np.ndarray  # [P, 3]
-    colors: np.ndarray  # [P, 3] uint8
-    errors: np.ndarray  # [P] px
-    lengths: np.ndarray  # [P] images that see the point
-    observations: np.ndarray  # [Q, 5] row of world_from_camera, point, x px, y px, number of the image's feature
-    lens: Lens | None  # estimated; None where it was given
-    reprojection_px: float
-
-    def reliable_points(self, length: int = 4, error: float = 1.2) -> np.ndarray:
-        """[P] bool: seen by enough images and well fitted."""
-        return (self.lengths >= length) & (self.errors < error)
 
 
 def image_pairs(count: int, keys: Sequence[int], episodes: np.ndarray | None = None) -> list[tuple[int, int]]:

@@ -13,11 +13,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 
-from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
-from neeco.geometry.camera import Camera
+from neeco.capture.model import evenly_spaced
 from neeco.ingest.foreground.colors import color_levels, color_odds, whole_pieces
+from neeco.ingest.frames.views import reduced
 
 # noticing
 LOOKED_AT = 24  # frames, spread over the recording, that are compared with each other
@@ -101,14 +100,6 @@ def _features(grey: np.ndarray) -> np.ndarray:
                 row, column = np.unravel_index(cell.argmax(), cell.shape)
                 places.append((left + column, top + row))
     return np.array(places, np.float32).reshape(-1, 1, 2)
-
-
-def reduced(image: np.ndarray) -> np.ndarray:
-    """An image uint8 [H, W, 3] (or [H, W]) of at most REFERENCE_PIXELS, as what moves is looked for in."""
-    height, width = image.shape[:2]
-    small = Camera(torch.eye(4), width, width, width / 2, height / 2, width, height).within(REFERENCE_PIXELS)
-    size = small.width, small.height
-    return image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 @dataclass(frozen=True)

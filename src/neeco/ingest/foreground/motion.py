@@ -21,7 +21,7 @@ from neeco.capture.model import REFERENCE_PIXELS
 from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project, project_world
-from neeco.ingest.cameras.sfm import SfmResult
+from neeco.ingest.frames.views import SfmResult
 
 STEP = 4  # px between the places where flow is compared
 INTERVAL = 0.12  # s between frames that are compared: one and two intervals before and after

@@ -11,9 +11,9 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from neeco.ingest.cameras.still import reduced
 from neeco.ingest.foreground.colors import color_levels, color_odds, whole_pieces
 from neeco.ingest.foreground.motion import ResidualFlow
+from neeco.ingest.frames.views import reduced
 
 SUSPECT, SURE, TISSUE = 0.3, 0.7, 0.2  # share of neighbours in time against which a pixel moves: may, does, does not
 REACH = np.ones((9, 9), np.uint8)  # px about what may move, in which the instrument is

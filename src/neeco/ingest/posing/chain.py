@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neeco.capture.fromvideofile import UNKNOWN_DEG
+from neeco.capture.model import UNKNOWN_DEG
 from neeco.ingest.posing.roll_pairs import RollPairs
 from neeco.ingest.posing.silhouette_shapes import Shapes
 

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from neeco.capture.fromvideofile import UNKNOWN_DEG
-from neeco.capture.model import Capture, Instrument
-from neeco.capture.reader import read_capture
+from neeco.capture.model import UNKNOWN_DEG, Capture, Instrument
+from neeco.capture.readers import read_capture
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_json, write_json
 from neeco.ingest.posing.along_shaft import Load, Shafts

@@ -13,8 +13,8 @@ from neeco.ingest.readers import Table
 from neeco.ingest.readers._bagsurvey import Survey
 from neeco.ingest.readers.columns import BASE, PoseColumns
 from neeco.ingest.readers.frame_names import meaning_of, of_dvrk
+from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import NORM_TOLERANCE, read_pose_log
-from neeco.ingest.timing.interpolate import poses_at
 
 CHAIN_HEADER = ("t_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from neeco.errors import NeecoError
+from neeco.geometry.lines import distances_to_lines, nearest_point
 from neeco.ingest.readers import POSES, Stream, format_of, numbers, read_table
 from neeco.ingest.readers.columns import (
     BASE,
@@ -99,11 +100,8 @@ def shaft_of(positions: np.ndarray, quats: np.ndarray) -> Shaft:
     best = None
     for axis in range(3):
         lines = axis_directions(quats, axis)
-        across = np.eye(3) - lines[:, :, None] * lines[:, None, :]  # [R, 3, 3] what is off a line
-        # lines that are nearly parallel meet nowhere in particular: the least point then
-        point = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, positions), rcond=1e-6)[0]
-        off = np.einsum("nij,nj->ni", across, positions - point)
-        rms = float(np.sqrt((off**2).sum(1).mean()))
+        point = nearest_point(positions, lines, ridge=1e-9)
+        rms = float(np.sqrt((distances_to_lines(point, positions, lines) ** 2).mean()))
         if best is None or rms < best.rms:
             best = Shaft(axis, point, rms)
     assert best is not None

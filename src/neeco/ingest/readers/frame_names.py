@@ -10,8 +10,8 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from neeco.capture.conventions import CONVENTIONS, DVRK_ECM, OPENCV, ROS_BODY, AxisConvention
 from neeco.capture.documents import printable
+from neeco.geometry.conventions import CONVENTIONS, DVRK_ECM, OPENCV, ROS_BODY, AxisConvention
 from neeco.ingest.readers.columns import BASE, CAMERA
 
 CAMERA_FRAMES: dict[str, AxisConvention] = {CAMERA: OPENCV, **CONVENTIONS}  # what `frame` in recording.yaml may say

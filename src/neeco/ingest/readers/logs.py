@@ -15,8 +15,8 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.conventions import OPENCV
 from neeco.errors import NeecoError
+from neeco.geometry.conventions import OPENCV
 from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Table, column_index, count_rows, numbers, parse_number, read_table
 from neeco.ingest.readers import columns as named

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from neeco.capture.conventions import DVRK_ECM
 from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.errors import NeecoError
 from neeco.files import read_text
+from neeco.geometry.conventions import DVRK_ECM
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_of
 

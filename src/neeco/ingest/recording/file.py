@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from neeco.capture.documents import as_float, printable
-from neeco.capture.dvrk import READINGS as DVRK_READINGS
-from neeco.capture.dvrk import read_dvrk_tool
 from neeco.capture.kinematics import KinematicTree
-from neeco.capture.kinematicsfile import parse_kinematics
-from neeco.capture.urdf import read_urdf
+from neeco.capture.readers import read_dvrk_tool, read_urdf
+from neeco.capture.readers.dvrk import READINGS as DVRK_READINGS
+from neeco.capture.readers.kinematics import parse_kinematics
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.ingest.readers import columns as named

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.geometry.lines import nearest_point
 from neeco.ingest.foreground.silhouettes import Silhouettes
 
 STATIONS = 14
@@ -273,13 +274,10 @@ def moved(problem: Problem, fit: Fit, step: np.ndarray, pivot: np.ndarray) -> Fi
 
 
 def pivot_of(problem: Problem, fit: Fit) -> np.ndarray:
-    """[3] mm, world: the point nearest to all lines of the instrument: the trocar, where it moves about one."""
+    """The point [3] mm, world, nearest to all lines of the instrument: the trocar, where it moves about one."""
     world = fit.world_from_base @ instrument_in_base(problem, fit)
     through, along = world[:, :3, :3] @ fit.tip + world[:, :3, 3], world[:, :3, :3] @ fit.axis
-    across = np.eye(3) - along[:, :, None] * along[:, None]
-    weak = np.eye(3) * 1e-3 * len(along)  # lines that are almost parallel: near the instrument
-    middle = through.mean(0)
-    return np.asarray(middle + np.linalg.solve(across.sum(0) + weak, np.einsum("fij,fj->i", across, through - middle)))
+    return nearest_point(through, along, ridge=1e-3)
 
 
 def resized(problem: Problem, fit: Fit, factor: float) -> Fit:

@@ -17,10 +17,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
+from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.model import IngestSettings
 from neeco.ingest.timing.clock_search import SCOPE_MOTION, SURE, ClockOffset, clock_from_turning
-from neeco.ingest.timing.interpolate import poses_at
 
 MIN_FRAMES = 12
 MIN_TURN = 0.05  # rad, spread of the scope's directions below which the hand-eye rotation is not determined

@@ -1,8 +1,8 @@
-"""The two edges of a shaft in an image: roughly from its mask, then to a fraction of a pixel from its shading.
+"""The two edges of a shaft in an image: roughly from its mask, then at subpixel precision from its shading.
 
-What an edge is on a dark limb beside a shadow, no threshold tells: the limb of a cylinder under a lamp beside the lens
-fades as its surface turns away. So the profile across an edge is fitted as a whole: a cylinder's shading, blurred as
-the lens blurs, against tissue that may darken towards it. Where that edge lies is what fits best.
+On a dark limb next to a shadow no threshold finds the edge: under a lamp at the lens, the limb of a cylinder fades as
+its surface turns away. So the profile across an edge is fitted as a whole: a cylinder's shading, blurred as the lens
+blurs, against tissue that may darken towards it. The edge lies where that fits best.
 """
 
 from __future__ import annotations
@@ -13,35 +13,35 @@ import cv2
 import numpy as np
 
 from neeco.capture.model import evenly_spaced
-from neeco.ingest.shaft.axis import Axes, Edges, Intrinsics, axis_between, contour_normals, image_lines
+from neeco.ingest.shaft.axis import Intrinsics, ShaftAxes, ShaftEdges, axis_between, contour_normals, image_lines
 
 # from masks
-SIDEWAYS, LENGTHWAYS = 160, 720  # px of the strip that a mask is turned into
-TRIES, NEAR_LINE = 200, 1.2  # of a line through two places; px within which others lie on it
-STEEPEST = 0.35  # slope of an edge against the middle of the mask
-SHORTEST = 12  # px of shaft that an edge is looked for on
-CLEAR = 2.0  # px before its end, at which the shaft's edges are still its own
-PLACES, OUTLINE_PX = 12, 0.7  # on an edge; px by which a mask's edge is off as a whole
+STRIP_WIDTH, STRIP_LENGTH = 160, 720  # px of the strip along the shaft that a mask is resampled to
+RANSAC_SAMPLES, INLIER_PX = 200, 1.2  # of two places each; distance from their line
+MAX_SLOPE = 0.35  # of an edge against the middle of the mask
+MIN_LENGTH_PX = 12  # of shaft, for an edge to be detected
+HEAD_MARGIN_PX = 2.0  # before its end, from which the edges count
+PLACES, OUTLINE_SD_PX = 12, 0.7  # on an edge; standard deviation of a mask's edge as a whole
 
 # from shading
-BLOCK = 5  # px along the shaft that are one place
-REACH, STEP = 3.0, 0.1  # px about the prediction in which an edge is looked for
-INSIDE, OUTSIDE = 9.0, 6.0  # px to both sides that are fitted
-OF_RADIUS = 0.6  # that are fitted at most: the middle has reflections
-SAMPLING, FINE = 0.25, 0.05  # px, of images and of models
-LIGHT = (255 * (np.arange(256) / 255) ** 2.2).astype(np.float32)  # of the values of an image
-BLURS = (0.5, 0.7, 0.9, 1.2)  # px that a lens blurs by
-SYSTEMATIC = 0.15  # px by which whole edges are off, beside their noise
-LEAST = 1.0  # squares' sum of a profile that noise alone makes
-MOST = 60  # places along an edge
-FARTHEST, CLEAR_RADII = 30, 0.4  # diameters behind its end from which the shaft is looked for; radii to which
+BLOCK_PX = 5  # along the shaft, of one place
+REACH_PX, STEP_PX = 3.0, 0.1  # about the prediction in which an edge is searched for
+INSIDE_PX, OUTSIDE_PX = 9.0, 6.0  # to both sides that are fitted
+MAX_RADIUS_SHARE = 0.6  # that is fitted: the middle has reflections
+SAMPLE_PX, FINE_PX = 0.25, 0.05  # spacing of samples of images and of models
+LINEAR_LIGHT = (255 * (np.arange(256) / 255) ** 2.2).astype(np.float32)  # of the values of an image
+BLURS = (0.5, 0.7, 0.9, 1.2)  # standard deviations px of lenses
+SYSTEMATIC_SD_PX = 0.15  # of an edge as a whole, in addition to its noise
+MIN_MISFIT = 1.0  # sum of squares of a profile, from noise alone
+MAX_PLACES = 60  # along an edge
+MAX_DIAMETERS, MARGIN_RADII = 30, 0.4  # behind the shaft's end, between which it is searched for
 
 
 def outline_edges(
     masks: np.ndarray, ends: np.ndarray, directions: np.ndarray, radius: float, intrinsics: Intrinsics
-) -> tuple[Axes, Edges, np.ndarray]:
-    """The shaft of each mask [F, h, w], between two lines through its outline up to its `ends` [F, 2] px, about which
-    it goes along `directions` [F, 2].
+) -> tuple[ShaftAxes, ShaftEdges, np.ndarray]:
+    """Fit the shaft of each mask [F, h, w], between two lines through its outline up to its `ends` [F, 2] px, about
+    which it goes along `directions` [F, 2].
 
     Returns the axes, each from its own image, their points where the shaft ends; places on both edges; and which frames
     have them [F].
@@ -61,9 +61,9 @@ def outline_edges(
         if not np.isfinite(point).all() or point[2] <= radius:
             continue
         points[frame], axes[frame], pixels[frame] = point, axis, places
-        deviations[frame] = OUTLINE_PX * np.sqrt(PLACES)
+        deviations[frame] = OUTLINE_SD_PX * np.sqrt(PLACES)
         found[frame] = True
-    return Axes(points, axes), Edges(pixels, deviations), found
+    return ShaftAxes(points=points, directions=axes), ShaftEdges(pixels, deviations), found
 
 
 def _both_edges(
@@ -75,8 +75,8 @@ def _both_edges(
     for _ in range(2):  # the second time about the shaft's own middle
         aside = np.array([-direction[1], direction[0]])
         along, left, right = _outline(mask, end, direction)
-        behind = along < -CLEAR
-        if behind.sum() < SHORTEST:
+        behind = along < -HEAD_MARGIN_PX
+        if behind.sum() < MIN_LENGTH_PX:
             return None
         x = along[behind]
         weights = np.clip(1.2 - (x - x[0]) / max(float(np.ptp(x)), 1.0), 0.2, None)  # masks are best far from the head
@@ -94,20 +94,20 @@ def _both_edges(
 
 
 def _outline(mask: np.ndarray, point: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the mask ends to the left and right of a line through `point` px along `direction`: places along it, from
-    behind to the tip, and offsets across it, px; only where both ends lie in the image."""
+    """Outline of the mask left and right of a line through `point` px along `direction`: places along it, from behind
+    to the tip, and both offsets across it, px; only where both lie in the image."""
     aside = np.array([-direction[1], direction[0]])
-    x = np.arange(LENGTHWAYS) - LENGTHWAYS / 2
-    y = np.arange(SIDEWAYS) - SIDEWAYS / 2
+    x = np.arange(STRIP_LENGTH) - STRIP_LENGTH / 2
+    y = np.arange(STRIP_WIDTH) - STRIP_WIDTH / 2
     places = (point + x[None, :, None] * direction + y[:, None, None] * aside - 0.5).astype(np.float32)
     level = cv2.remap(mask.astype(np.float32), places[..., 0], places[..., 1], cv2.INTER_LINEAR)
     height, width = mask.shape
     shown = (places[..., 0] > 0) & (places[..., 0] < width - 1) & (places[..., 1] > 0) & (places[..., 1] < height - 1)
     on = level > 0.5
-    first, last = on.argmax(0), SIDEWAYS - 1 - on[::-1].argmax(0)
-    column = np.arange(LENGTHWAYS)
-    good = on.any(0) & (first > 0) & (last < SIDEWAYS - 1)
-    before, after = np.maximum(first - 1, 0), np.minimum(last + 1, SIDEWAYS - 1)
+    first, last = on.argmax(0), STRIP_WIDTH - 1 - on[::-1].argmax(0)
+    column = np.arange(STRIP_LENGTH)
+    good = on.any(0) & (first > 0) & (last < STRIP_WIDTH - 1)
+    before, after = np.maximum(first - 1, 0), np.minimum(last + 1, STRIP_WIDTH - 1)
     good &= shown[before, column] & shown[after, column]
     low, high = level[before, column], level[first, column]
     left = y[first] - (high - 0.5) / np.maximum(high - low, 1e-6)
@@ -117,29 +117,31 @@ def _outline(mask: np.ndarray, point: np.ndarray, direction: np.ndarray) -> tupl
 
 
 def _line(x: np.ndarray, y: np.ndarray, weights: np.ndarray, random: np.random.Generator) -> tuple[float, float] | None:
-    """Slope and offset of the line that most of the places x, y [N] px lie on, by weight; None: there is none."""
+    """Slope and offset of the line through most of the places x, y [N] px, by weight (RANSAC); None: there is none."""
     if len(x) < 6:
         return None
-    pairs = random.integers(0, len(x), (TRIES, 2))
+    pairs = random.integers(0, len(x), (RANSAC_SAMPLES, 2))
     pairs = pairs[np.abs(x[pairs[:, 0]] - x[pairs[:, 1]]) > min(8.0, 0.5 * np.ptp(x))]
     slopes = (y[pairs[:, 0]] - y[pairs[:, 1]]) / (x[pairs[:, 0]] - x[pairs[:, 1]])
     offsets = y[pairs[:, 0]] - slopes * x[pairs[:, 0]]
     missed = np.abs(y - slopes[:, None] * x - offsets[:, None])  # [T, N]
-    votes = (weights * np.clip(1 - (missed / NEAR_LINE) ** 2, 0, None)).sum(1) * (np.abs(slopes) < STEEPEST)
+    votes = (weights * np.clip(1 - (missed / INLIER_PX) ** 2, 0, None)).sum(1) * (np.abs(slopes) < MAX_SLOPE)
     if not len(votes) or votes.max() <= 0:
         return None
     slope, offset = float(slopes[votes.argmax()]), float(offsets[votes.argmax()])
     for _ in range(3):
-        near = np.abs(y - slope * x - offset) < NEAR_LINE
+        near = np.abs(y - slope * x - offset) < INLIER_PX
         if near.sum() < 4:
             return None
         slope, offset = (float(value) for value in np.polyfit(x[near], y[near], 1, w=weights[near]))
     return slope, offset
 
 
-def with_shafts(masks: np.ndarray, axes: Axes, radius: float, intrinsics: Intrinsics, which: np.ndarray) -> np.ndarray:
-    """Masks bool [F, h, w] that end, behind the points of the axes, at these shafts' contours; of the frames `which`
-    bool [F]."""
+def with_shafts(
+    masks: np.ndarray, axes: ShaftAxes, radius: float, intrinsics: Intrinsics, which: np.ndarray
+) -> np.ndarray:
+    """Return masks bool [F, h, w] that end, behind the points of the axes, at these shafts' contours, in the frames
+    `which` bool [F]."""
     found = masks.copy()
     _, height, width = masks.shape
     v, u = np.mgrid[:height, :width] + 0.5
@@ -159,15 +161,15 @@ def with_shafts(masks: np.ndarray, axes: Axes, radius: float, intrinsics: Intrin
 
 
 def shaded_edges(
-    images: np.ndarray, axes: Axes, radius: float, intrinsics: Intrinsics, blur: float
-) -> tuple[Edges, np.ndarray, float]:
-    """Edges of the shaft in images uint8 [F, h, w, 3], about the contours of its predicted axes, whose points are where
-    it ends.
+    images: np.ndarray, axes: ShaftAxes, radius: float, intrinsics: Intrinsics, blur: float
+) -> tuple[ShaftEdges, np.ndarray, float]:
+    """Detect the edges of the shaft in images uint8 [F, h, w, 3], near the contours of its predicted axes, whose points
+    are where it ends.
 
     Returns the edges, how many diameters of shaft each image shows [F], and the profiles' mean squared misfit.
     """
     count = len(images)
-    pixels, deviations = np.zeros((count, 2, MOST, 2)), np.full((count, 2, MOST), np.inf)
+    pixels, deviations = np.zeros((count, 2, MAX_PLACES, 2)), np.full((count, 2, MAX_PLACES), np.inf)
     diameters, misfits = np.zeros(count), []
     for frame in range(count):
         seen = _visible(axes.points[frame], axes.directions[frame], radius, intrinsics, images.shape[1:3])
@@ -176,18 +178,18 @@ def shaded_edges(
         ends, width = seen
         length = float(np.linalg.norm(ends[1] - ends[0]))
         diameters[frame] = length / width
-        if length < SHORTEST:
+        if length < MIN_LENGTH_PX:
             continue
-        light = LIGHT[images[frame]]  # shading and blur are of light, not of its gamma-coded values
+        light = LINEAR_LIGHT[images[frame]]  # shading and blur are of light, not of its gamma-coded values
         normals = contour_normals(axes.points[frame], axes.directions[frame], radius)
         for side, line in enumerate(image_lines(normals, intrinsics)):
             places, sure, misfit = _edge(light, ends, line, width / 2, blur)
             misfits += misfit.tolist()
-            keep = evenly_spaced(len(places), MOST)
+            keep = evenly_spaced(len(places), MAX_PLACES)
             pixels[frame, side, : len(keep)] = places[keep]
-            # an edge is off as a whole, too: its places do not all tell something new
-            deviations[frame, side, : len(keep)] = np.hypot(sure[keep], SYSTEMATIC * np.sqrt(max(len(keep), 1)))
-    return Edges(pixels, deviations), diameters, float(np.mean(misfits)) if misfits else np.inf
+            # an edge has an error as a whole, too: its places are not independent
+            deviations[frame, side, : len(keep)] = np.hypot(sure[keep], SYSTEMATIC_SD_PX * np.sqrt(max(len(keep), 1)))
+    return ShaftEdges(pixels, deviations), diameters, float(np.mean(misfits)) if misfits else np.inf
 
 
 def _visible(
@@ -197,11 +199,11 @@ def _visible(
     intrinsics: Intrinsics,
     size: tuple[int, ...],
 ) -> tuple[np.ndarray, float] | None:
-    """The ends [2, 2] px of the shaft's axis in the image, from the border to where the shaft ends, and how wide it is
-    there on average, px; None: none of it is in the image."""
+    """Ends [2, 2] px of the shaft's axis in the image, from the border to where the shaft ends, and its mean width px;
+    None: none of it is in the image."""
     fx, fy, cx, cy = intrinsics
     height, width = size[:2]
-    back = np.linspace(FARTHEST * 2, CLEAR_RADII, 400) * radius
+    back = np.linspace(MAX_DIAMETERS * 2, MARGIN_RADII, 400) * radius
     axis = point - back[:, None] * direction
     deep = np.maximum(axis[:, 2], 1e-6)
     places = np.stack([fx * axis[:, 0] / deep + cx, fy * axis[:, 1] / deep + cy], 1)
@@ -216,27 +218,26 @@ def _visible(
 def _edge(
     light: np.ndarray, ends: np.ndarray, line: np.ndarray, radius_px: float, blur: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places [N, 2] px of an edge near an image line, beside the stretch of the axis between `ends` [2, 2] px; their
+    """Places [N, 2] px of an edge near an image line, next to the stretch of the axis between `ends` [2, 2] px; their
     standard deviations [N] px and mean squared misfits [N]."""
     length = int(np.linalg.norm(ends[1] - ends[0]))
     middle = ends[0] + (np.arange(length) / max(length, 1))[:, None] * (ends[1] - ends[0])
     foot = middle - (middle @ line[:2] + line[2])[:, None] * line[:2]
     bases, used = _profile_bases(round(2 * radius_px) / 2, blur)
     offsets = _offsets()
-    places = (foot[:, None] - offsets[None, :, None] * line[:2] - 0.5).astype(
-        np.float32
-    )  # the line's normal is inwards
+    outwards = -line[:2]
+    places = (foot[:, None] + offsets[None, :, None] * outwards - 0.5).astype(np.float32)
     colors = cv2.remap(light, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     height, width = light.shape[:2]
     shown = (places > 0).all(-1) & (places[..., 0] < width - 1) & (places[..., 1] < height - 1)  # [S, U]
     whole = shown.all(1)
-    blocks = len(foot) // BLOCK
+    blocks = len(foot) // BLOCK_PX
     if not blocks:
         return np.zeros((0, 2)), np.zeros(0), np.zeros(0)
-    cut = blocks * BLOCK
-    whole = whole[:cut].reshape(blocks, BLOCK).all(1)
+    cut = blocks * BLOCK_PX
+    whole = whole[:cut].reshape(blocks, BLOCK_PX).all(1)
     profiles = (
-        np.median(colors[:cut].reshape(blocks, BLOCK, len(offsets), 3), axis=1)[whole] * used[:, None]
+        np.median(colors[:cut].reshape(blocks, BLOCK_PX, len(offsets), 3), axis=1)[whole] * used[:, None]
     )  # [B, U, 3]
     missed = (profiles**2).sum((1, 2))[:, None]
     missed = missed - (np.einsum("euk,buc->bekc", bases, profiles, optimize=True) ** 2).sum((2, 3))  # [B, E]
@@ -246,36 +247,36 @@ def _edge(
     best = np.clip(best, 1, missed.shape[1] - 2)
     low, least, high = missed[row, best - 1], missed[row, best], missed[row, best + 1]
     curvature = np.maximum(low - 2 * least + high, 1e-9)
-    shift = _candidates()[best] + STEP * 0.5 * (low - high) / curvature
-    noise = np.maximum(least, LEAST) / (3 * used.sum())
-    independent = SAMPLING  # neighbouring samples are of one pixel
-    sure = np.sqrt(2 * noise / independent * STEP**2 / curvature)
-    centers = foot[:cut].reshape(blocks, BLOCK, 2).mean(1)[whole]
+    shift = _candidates()[best] + STEP_PX * 0.5 * (low - high) / curvature
+    noise = np.maximum(least, MIN_MISFIT) / (3 * used.sum())
+    independent = SAMPLE_PX  # neighbouring samples are of one pixel
+    sure = np.sqrt(2 * noise / independent * STEP_PX**2 / curvature)
+    centers = foot[:cut].reshape(blocks, BLOCK_PX, 2).mean(1)[whole]
     found = centers - shift[:, None] * line[:2]
     return found[inner], sure[inner], noise[inner]
 
 
 def _offsets() -> np.ndarray:
-    """[U] px across an edge, outwards, at which images are sampled."""
-    return np.arange(-INSIDE, OUTSIDE + SAMPLING / 2, SAMPLING)
+    """Offsets [U] px across an edge, outwards, at which images are sampled."""
+    return np.arange(-INSIDE_PX, OUTSIDE_PX + SAMPLE_PX / 2, SAMPLE_PX)
 
 
 def _candidates() -> np.ndarray:
-    """[E] px at which an edge may lie."""
-    return np.arange(-REACH, REACH + STEP / 2, STEP)
+    """Offsets [E] px at which an edge may lie."""
+    return np.arange(-REACH_PX, REACH_PX + STEP_PX / 2, STEP_PX)
 
 
 @lru_cache(maxsize=256)
 def _profile_bases(radius_px: float, blur: float) -> tuple[np.ndarray, np.ndarray]:
     """Orthonormal profiles [E, U, K] that an edge at each candidate may have, and which samples count [U].
 
-    Profiles are made of four, blurred: tissue, tissue that changes evenly towards the edge (a shadow), the shaft, and
-    the shaft as a lamp beside the lens lights it, sqrt(1 - t^2) of the share t of its radius.
+    They span four, blurred: tissue, tissue that changes linearly towards the edge (a shadow), the shaft, and the shaft
+    lit by a lamp at the lens, sqrt(1 - t^2) of the share t of its radius.
     """
     offsets = _offsets()
-    used = (offsets >= -max(OF_RADIUS * radius_px, 2.0)).astype(float)
-    fine = np.arange(-INSIDE - 5, OUTSIDE + 5, FINE)
-    reach = np.arange(-4 * blur, 4 * blur + FINE / 2, FINE)
+    used = (offsets >= -max(MAX_RADIUS_SHARE * radius_px, 2.0)).astype(float)
+    fine = np.arange(-INSIDE_PX - 5, OUTSIDE_PX + 5, FINE_PX)
+    reach = np.arange(-4 * blur, 4 * blur + FINE_PX / 2, FINE_PX)
     kernel = np.exp(-0.5 * (reach / blur) ** 2)
     kernel /= kernel.sum()
     bases = []

@@ -1,7 +1,7 @@
-"""Where along its axis a shaft is: where it ends and the wrist begins, whose colours differ, and where the tip is.
+"""Places along a shaft's axis: where it ends and the wrist begins, whose colours differ, and where the tip is.
 
-Nothing is known of either colour. But what comes in at the image's border is shaft in most images that show much of the
-instrument, and what lies about the tip is not.
+Neither colour is known. But what enters at the image's border is shaft in most images that show much of the
+instrument, and what lies near the tip is not.
 """
 
 from __future__ import annotations
@@ -9,33 +9,31 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from neeco.geometry.lines import places_nearest_to_rays, unit
 from neeco.ingest.foreground.colors import LEVELS, color_odds
-from neeco.ingest.shaft.axis import Axes, Intrinsics
+from neeco.ingest.shaft.axis import Intrinsics, ShaftAxes
 
-SHAFT, HEAD = 0.3, 0.3  # of a long mask's length from the border, and from the tip, that are one and the other
-LONG = 0.5  # share of the images that show the most, from which the colours are learned first
-EDGE_PX = 2.0  # a tip, or an end, so near to where the mask begins or the image ends is not one
-ROUNDS = 4
-BESIDE = 3.0  # px about the end found, that teach neither colour
-MOST_ODDS = 3.0  # logarithm, that one place tells at most
+SHAFT_SHARE, HEAD_SHARE = 0.3, 0.3  # of a long mask's length from the border, and from the tip, at first
+LONG_SHARE = 0.5  # of the images, those with the longest masks, from which the colours are learned first
+EDGE_PX = 2.0  # from the mask's or the image's ends, within which a tip or an end does not count
+N_ROUNDS = 4
+MARGIN_PX = 3.0  # about the end found, that belongs to neither colour
+MAX_ODDS = 3.0  # absolute logarithm, of one place
 DARK = 12.0  # of 255, added before logarithms
-RANGES = ((-0.5, 0.9), (-0.3, 0.5), (2.4, 5.6))  # logarithms: red of green, green of blue, lightness
-TELLS = 0.5  # difference of the mean odds of shaft and head, from which colours tell them apart
+TINT_RANGES = ((-0.5, 0.9), (-0.3, 0.5), (2.4, 5.6))  # logarithms: red of green, green of blue, lightness
+MIN_CONTRAST = 0.5  # difference of the mean odds of shaft and head
 
 
-def axis_coordinates(axes: Axes, frame: int, pixels: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
-    """mm [N] along a frame's axis from its point to where the axis passes the rays of pixels [N, 2] nearest."""
+def axis_coordinates(axes: ShaftAxes, frame: int, pixels: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
+    """Coordinates [N] mm along a frame's axis, from its point, nearest to the rays of pixels [N, 2]."""
     fx, fy, cx, cy = intrinsics
-    rays = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], 1)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    point, direction = axes.points[frame], axes.directions[frame]
-    slant = rays @ direction
-    return np.asarray((rays @ point * slant - direction @ point) / np.maximum(1 - slant**2, 1e-6))
+    rays = unit(np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], 1))
+    return places_nearest_to_rays(axes.points[frame], axes.directions[frame], rays)
 
 
-def tips_along(masks: np.ndarray, axes: Axes, intrinsics: Intrinsics) -> np.ndarray:
-    """mm [F] along each axis, from its point, to the tip of its mask [F, h, w]; NaN where the tip is not in the
-    image."""
+def tips_along(masks: np.ndarray, axes: ShaftAxes, intrinsics: Intrinsics) -> np.ndarray:
+    """Coordinates [F] mm along each axis, from its point, of the tip of its mask [F, h, w]; NaN where that is not in
+    the image."""
     count, height, width = masks.shape
     tips = np.full(count, np.nan)
     for frame, mask in enumerate(masks):
@@ -52,9 +50,9 @@ def tips_along(masks: np.ndarray, axes: Axes, intrinsics: Intrinsics) -> np.ndar
 
 
 def shaft_ends(images: np.ndarray, masks: np.ndarray, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """px [F] along each line, through `points` [F, 2] px along unit `directions` [F, 2] towards the tip, at which the
-    shaft ends in the masks [F, h, w] of images uint8 [F, h, w, 3]. NaN where it does not end within the mask, or the
-    line is NaN; in all frames, where the colours of shaft and head are alike."""
+    """Coordinates [F] px along lines, through `points` [F, 2] px along unit `directions` [F, 2] towards the tip, where
+    the shaft ends in the masks [F, h, w] of images uint8 [F, h, w, 3]. NaN where it does not end within the mask, or
+    the line is NaN; in all frames, where the colours of shaft and head are similar."""
     assert images.shape[1:3] == masks.shape[1:3]
     frames = [frame for frame in np.flatnonzero(np.isfinite(points[:, 0])) if masks[frame].any()]
     ends = np.full(len(images), np.nan)
@@ -66,29 +64,29 @@ def shaft_ends(images: np.ndarray, masks: np.ndarray, points: np.ndarray, direct
         along = (np.stack([u, v], 1) + 0.5 - points[frame]) @ directions[frame]
         seen[frame] = _tints(images[frame][v, u]), along, float(along.min()), float(along.max())
     lengths = np.array([seen[frame][3] - seen[frame][2] for frame in frames])
-    ranked = np.argsort(-lengths)[: max(1, round(LONG * len(frames)))]
+    ranked = np.argsort(-lengths)[: max(1, round(LONG_SHARE * len(frames)))]
     shaft, head = [], []
     for frame in (frames[i] for i in ranked):
         colors, along, first, last = seen[frame]
-        shaft.append(colors[along < first + SHAFT * (last - first)])
-        head.append(colors[along > last - HEAD * (last - first)])
+        shaft.append(colors[along < first + SHAFT_SHARE * (last - first)])
+        head.append(colors[along > last - HEAD_SHARE * (last - first)])
     difference = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(N_ROUNDS):
         colors = np.concatenate([*shaft, *head])
         is_shaft = np.arange(len(colors)) < sum(map(len, shaft))
-        odds = np.clip(color_odds(colors, is_shaft, ~is_shaft).of_color, -MOST_ODDS, MOST_ODDS)
+        odds = np.clip(color_odds(colors, is_shaft, ~is_shaft).of_color, -MAX_ODDS, MAX_ODDS)
         shaft, head = [], []
         for frame in frames:
             own, along, first, last = seen[frame]
             bins = np.floor(along - first).astype(int)
             count = np.bincount(bins)
             mean = np.bincount(bins, odds[own]) / np.maximum(count, 1)
-            # of all places at which the shaft may end, the one that explains every place's colour best
+            # the end that explains the colours of all places best
             gained = np.concatenate([[0.0], np.cumsum(mean)])
             best = int(gained.argmax())
             ends[frame] = first + best
-            shaft.append(own[along < ends[frame] - BESIDE])
-            head.append(own[along > ends[frame] + BESIDE])
+            shaft.append(own[along < ends[frame] - MARGIN_PX])
+            head.append(own[along > ends[frame] + MARGIN_PX])
         if not any(map(len, shaft)) or not any(map(len, head)):
             return np.full(len(images), np.nan)
         difference = float(odds[np.concatenate(shaft)].mean() - odds[np.concatenate(head)].mean())
@@ -96,16 +94,16 @@ def shaft_ends(images: np.ndarray, masks: np.ndarray, points: np.ndarray, direct
         _, _, first, last = seen[frame]
         if not first + EDGE_PX < ends[frame] < last - EDGE_PX:
             ends[frame] = np.nan
-    return ends if difference > TELLS else np.full(len(images), np.nan)
+    return ends if difference > MIN_CONTRAST else np.full(len(images), np.nan)
 
 
 def _tints(pixels: np.ndarray) -> np.ndarray:
-    """[N] of pixels uint8 [N, 3], as `color_levels` numbers colours, by tints, which tell grey from grey, and
+    """Colours [N] of pixels uint8 [N, 3], numbered as by `color_levels`, but by tints, which separate greys, and
     lightness."""
     red, green, blue = np.log(pixels.astype(np.float64) + DARK).T
     light = (red + green + blue) / 3
     level = [
         np.clip((value - low) / (high - low) * LEVELS, 0, LEVELS - 1).astype(np.int64)
-        for value, (low, high) in zip((red - green, green - blue, light), RANGES, strict=True)
+        for value, (low, high) in zip((red - green, green - blue, light), TINT_RANGES, strict=True)
     ]
     return np.asarray((level[0] * LEVELS + level[1]) * LEVELS + level[2])

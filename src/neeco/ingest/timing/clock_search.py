@@ -13,8 +13,8 @@ from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation, Slerp
 
 from neeco.errors import NeecoError
+from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog
-from neeco.ingest.timing.interpolate import poses_at
 
 STEP = 0.02  # s, of the coarse search for an offset
 STRIDE = 0.12  # s, over which a turn is measured: long enough to stand out of the tracker's noise

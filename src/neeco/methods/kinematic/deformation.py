@@ -21,21 +21,22 @@ from neeco.capture.model import Frame, Instrument, State
 from neeco.geometry.camera import Camera
 from neeco.methods.breathing import RATES as BREATHING_RATES
 from neeco.methods.breathing import BreathingTissue
-from neeco.methods.carving.evidence import CarvingSettings
 from neeco.methods.kinematic.articulation import (
     LABEL_SHARE,
     LINK_LOGITS,
     ArticulatedInstruments,
     Articulation,
-    articulation_of,
 )
 from neeco.methods.kinematic.discovery import find_instruments
 from neeco.methods.kinematic.finish import conclude
 from neeco.methods.kinematic.hinge_search import hinge_joints
+from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.label_shares import store_label_shares
-from neeco.methods.kinematic.shadow import find_shadow
+from neeco.methods.kinematic.lamp_search import find_shadow
+from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.kinematic.wrist import place_wrists, replace_wrists
-from neeco.raster.posing import ArticulatedBody, pose_bodies
+from neeco.methods.space_carving import CarvingSettings
+from neeco.raster.articulated import ArticulatedBody, pose_bodies
 from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformation import (
@@ -322,3 +323,10 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             )
             found[name] = 0.0 if fixed else rates[parameter] * scale
         return found
+
+
+def articulation_of(instrument: Instrument) -> Articulation:
+    """Return the links that the instrument's kinematics state, or else a shaft with a hinge per joint, which is found
+    from the images."""
+    tree = instrument.kinematics
+    return StatedLinks(tree) if tree is not None and tree.readings else Hinges(tuple(instrument.joints))

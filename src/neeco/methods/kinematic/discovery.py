@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import torch
 
-from neeco.methods.breathing import BreathingTissue
-from neeco.methods.carving.shapes import carved_shape
-from neeco.methods.carving.tissue_fit import fit_tissue, tissue_evidence
+from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
-from neeco.methods.kinematic.articulation.hinges import Hinges
-from neeco.methods.kinematic.articulation.stated import StatedLinks
-from neeco.methods.kinematic.breathing_search import find_breathing
 from neeco.methods.kinematic.hinge_search import start_hinges
-from neeco.methods.kinematic.link_seeds import along_links, readings_of, start_links
-from neeco.methods.kinematic.reading_doubts import doubt_readings
+from neeco.methods.kinematic.hinges import Hinges
+from neeco.methods.kinematic.link_search import along_links, doubt_readings, readings_of, start_links
+from neeco.methods.kinematic.stated_links import StatedLinks
+from neeco.methods.space_carving import carved_shape
+from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
 from neeco.scene.canonical import join_bodies, seed_instrument
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.training.session import GaussianSession

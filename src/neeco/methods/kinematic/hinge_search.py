@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Frame, Instrument
-from neeco.methods.carving.evidence import CarvedShape, CarvingSettings, Evidence, camera_from_instrument, center_line
-from neeco.methods.kinematic.articulation.hinges import Hinges
+from neeco.methods.kinematic.hinges import Hinges
+from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, camera_from_instrument, center_line
 from neeco.scene.training_session import Report
 from neeco.training.session import GaussianSession
 

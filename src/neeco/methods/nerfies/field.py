@@ -34,7 +34,7 @@ from torch import Tensor, nn
 from neeco.capture.model import Camera, Instrument, State
 from neeco.errors import NeecoError
 from neeco.raster.devices import tf32_products
-from neeco.raster.optics import draw_through
+from neeco.raster.resampling import draw_through
 from neeco.raster.types import Rendering
 from neeco.scene.deformation import octave_angles, octave_weights
 from neeco.scene.drawable import Recorded

@@ -8,7 +8,7 @@ from typing import Any
 
 from neeco import __version__
 from neeco.capture import Capture
-from neeco.capture.check import read_checked
+from neeco.capture.checks import read_checked
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of

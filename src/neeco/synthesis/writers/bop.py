@@ -20,9 +20,10 @@ import numpy as np
 import torch
 
 from neeco.capture.images import read_labels, write_labels
-from neeco.capture.model import InstrumentState, State, swap_camera_axes
+from neeco.capture.model import InstrumentState, State
 from neeco.files import write_json
 from neeco.geometry.camera import Camera
+from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import INTRINSICS
 from neeco.labels.annotation import bounding_box
 from neeco.labels.drawing import extended_silhouettes

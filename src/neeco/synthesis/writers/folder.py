@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from neeco.capture.images import write_image, write_labels, write_png
-from neeco.capture.statefile import camera_to_json, state_to_json
+from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.errors import NeecoError
 from neeco.files import read_text, require_like, write_atomically, write_text
 from neeco.geometry.lens import Lens

@@ -1,0 +1,259 @@
+"""Read COLMAP sparse models, binary and text (format: COLMAP's documentation, "Output Format").
+
+Not by pycolmap, which an installation may lack and which ends in a traceback for damaged files.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import dropwhile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neeco.capture.documents import Node, Problem, ProblemReport, printable
+from neeco.capture.model import TEST_EVERY, Frame, PointCloud, State
+from neeco.capture.readers.cameras import opencv_distortion
+from neeco.capture.readers.parsed import NOWHERE, Parsed, inside, missing_file, relative_name
+from neeco.errors import NeecoError
+from neeco.files import read_bytes
+from neeco.geometry.camera import Camera
+from neeco.geometry.conventions import COLMAP
+from neeco.geometry.rotations import quat_to_matrix
+from neeco.plausible import center_fault, focal_fault, size_fault
+
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+}  # fmt: skip
+_COEFFICIENTS = {  # in a model's parameters, behind the focal lengths and the principal point
+    "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "SIMPLE_RADIAL_FISHEYE": ("k1",), "RADIAL_FISHEYE": ("k1", "k2"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Intrinsics:
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Image:
+    name: str
+    camera_id: int
+    quaternion: tuple[float, ...]  # wxyz, camera_from_world
+    translation: tuple[float, ...]  # camera_from_world
+
+
+def find_model(root: Path) -> Path | None:
+    """The folder of a capture that holds a COLMAP model, or None."""
+    for folder in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0", root):
+        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder
+    return None
+
+
+def parse_colmap(model: Path, root: Path, report: ProblemReport, *, as_source: bool = False) -> Parsed:
+    """Read a COLMAP model; problems go to `report`. Lengths are in the model's own unit. as_source: see `Parsed`.
+
+    Images lie in `images/` beside it; sorted by name, every 8th is a test frame, and time is the order.
+    """
+    parsed = Parsed(root, timed=False, as_source=as_source)
+    suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
+    parse_cameras, parse_images, parse_points = _PARSERS[suffix]
+    try:
+        cameras = _parse(model / f"cameras{suffix}", parse_cameras)
+        images = _parse(model / f"images{suffix}", parse_images)
+    except NeecoError as error:
+        report.error(relative_name(model, root), "", str(error).removeprefix(f"{model}/"))
+        return parsed
+    _parse_points(model / f"points3D{suffix}", parse_points, parsed, report)
+    file = relative_name(model / f"images{suffix}", root)
+    if not images:
+        report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
+    for order, image in enumerate(sorted(images, key=lambda item: item.name)):
+        place = Node(None, file, printable(image.name), report)
+        try:
+            path = inside(root, root / "images", image.name)
+            camera = _camera(image, cameras, parsed)
+        except NeecoError as error:
+            place.error_from(error)
+            continue
+        if not path.is_file():
+            message, remedy = missing_file(root / "images", image.name)
+            fault = Problem("error", file, place.field, f"{message} in images/", remedy)
+            (parsed.absent if as_source and remedy == NOWHERE else report.problems).append(fault)
+            continue
+        split = "test" if order % TEST_EVERY == 0 else "train"
+        parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
+        parsed.places.append(place)
+    return parsed
+
+
+def _parse_points(
+    path: Path, parse: Callable[[bytes], list[tuple[float, ...]]], parsed: Parsed, report: ProblemReport
+) -> None:
+    parsed.points_place = Node(None, relative_name(path, parsed.root), "", report)
+    try:
+        rows = np.array(_parse(path, parse), dtype=np.float64).reshape(-1, 6)
+    except NeecoError as error:
+        parsed.points_place.error(str(error).removeprefix(f"{path}: "))
+        return
+    positions = rows[:, :3].astype(np.float32)
+    if not np.isfinite(positions).all():
+        parsed.points_place.error("holds points that are NaN or infinite", "remove them")
+        return
+    parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
+
+
+def _camera(image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> Camera:
+    """Raises NeecoError, which does not name the image, for distorted images read in place, too."""
+    if image.camera_id not in cameras:
+        raise NeecoError(f"uses camera {image.camera_id}, which the model lacks; export it again")
+    given = cameras[image.camera_id]
+    names = _COEFFICIENTS.get(given.model)
+    if names is None:
+        raise NeecoError(
+            f"its camera model is {given.model}; run `colmap image_undistorter` first, which gives PINHOLE"
+        )
+    fx, fy, cx, cy = (given.params[0], *given.params[: len(given.params) - len(names)])[-4:]  # or one focal length
+    width, height, coefficients = given.width, given.height, given.params[len(given.params) - len(names) :]
+    fault = size_fault(width, height) or focal_fault(fx, fy, width, height) or center_fault(cx, cy, width, height)
+    if fault is not None or not all(math.isfinite(value) for value in coefficients):
+        message = "its distortion is not finite" if fault is None else f"its camera is impossible: {fault[0]}"
+        raise NeecoError(f"{message}; repair the cameras file")
+    stated = dict(zip(names, coefficients, strict=True))
+    distortion = opencv_distortion(given.model, stated, (fx, fy, cx, cy), (width, height))
+    if distortion and not parsed.as_source:
+        raise NeecoError(
+            f"its camera model is {given.model}: the images are distorted; undistort them: neeco ingest {parsed.root} "
+            "--output CAPTURE (or `colmap image_undistorter`)"
+        )
+    pose = torch.from_numpy(_world_from_camera(image)).float()
+    return Camera(pose, fx, fy, cx, cy, width, height, distortion=distortion)
+
+
+def _world_from_camera(image: _Image) -> np.ndarray:
+    """[4, 4] from COLMAP's camera_from_world. Raises NeecoError when it is no rigid transform."""
+    quaternion, translation = np.array(image.quaternion), np.array(image.translation)
+    norm = np.linalg.norm(quaternion)
+    if not (0.99 < norm < 1.01 and np.abs(translation).max() < 1e9):  # nor when NaN
+        raise NeecoError("its pose is not a finite unit quaternion and translation; drop it")
+    rotation = quat_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T
+    pose[:3, 3] = -rotation.T @ translation
+    return COLMAP.camera_to_opencv(pose)
+
+
+def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:
+    """`parse` applied to a file's content; damage becomes NeecoError."""
+    content = read_bytes(path, "a file of a COLMAP model", "no such file; export the whole COLMAP model")
+    try:
+        return parse(content)
+    except (struct.error, ValueError, IndexError, KeyError, OverflowError):
+        raise NeecoError(f"{path}: is damaged or not a COLMAP model file; export it again") from None
+
+
+class _Stream:
+    """Little-endian values of a binary file, one after the other."""
+
+    def __init__(self, content: bytes) -> None:
+        self.content, self.offset = content, 0
+
+    def take(self, layout: str) -> tuple:
+        values = struct.unpack_from("<" + layout, self.content, self.offset)
+        self.offset += struct.calcsize("<" + layout)
+        return values
+
+    def skip(self, count: int) -> None:
+        self.offset += count
+        if self.offset > len(self.content):
+            raise ValueError("truncated")
+
+    def name(self) -> str:
+        end = self.content.index(b"\0", self.offset)
+        text = self.content[self.offset : end].decode("utf-8")
+        self.offset = end + 1
+        return text
+
+
+def _cameras_binary(content: bytes) -> dict[int, _Intrinsics]:
+    stream = _Stream(content)
+    cameras = {}
+    for _ in range(stream.take("Q")[0]):
+        camera_id, model_id, width, height = stream.take("iiQQ")
+        model, count = _MODELS[model_id]
+        cameras[camera_id] = _Intrinsics(model, width, height, stream.take(f"{count}d"))
+    return cameras
+
+
+def _images_binary(content: bytes) -> list[_Image]:
+    stream = _Stream(content)
+    images = []
+    for _ in range(stream.take("Q")[0]):
+        _, *pose, camera_id = stream.take("i7di")
+        images.append(_Image(stream.name(), camera_id, tuple(pose[:4]), tuple(pose[4:])))
+        stream.skip(24 * stream.take("Q")[0])  # x, y, point id of each observation
+    return images
+
+
+def _points_binary(content: bytes) -> list[tuple[float, ...]]:
+    stream = _Stream(content)
+    rows: list[tuple[float, ...]] = []
+    for _ in range(stream.take("Q")[0]):
+        _, x, y, z, red, green, blue, _error, track = stream.take("Q3d3BdQ")
+        rows.append((x, y, z, red, green, blue))
+        stream.skip(8 * track)
+    return rows
+
+
+def _lines(content: bytes) -> list[str]:
+    return [line for line in content.decode("utf-8").splitlines() if not line.startswith("#")]
+
+
+def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
+    cameras = {}
+    for line in _lines(content):
+        if line.strip():
+            camera_id, model, width, height, *params = line.split()
+            expected = dict(_MODELS.values()).get(model, len(params))
+            if len(params) != expected:
+                raise ValueError("parameters missing")
+            cameras[int(camera_id)] = _Intrinsics(model, int(width), int(height), tuple(map(float, params)))
+    return cameras
+
+
+def _images_text(content: bytes) -> list[_Image]:
+    images = []
+    # two lines an image; the second (observations) may be empty, so only every other line is read
+    for line in list(dropwhile(lambda line: not line.strip(), _lines(content)))[::2]:
+        if line.strip():
+            _, *pose, camera_id, name = line.split(maxsplit=9)
+            values = tuple(map(float, pose))
+            images.append(_Image(name.strip(), int(camera_id), values[:4], values[4:]))
+    return images
+
+
+def _points_text(content: bytes) -> list[tuple[float, ...]]:
+    rows = [tuple(map(float, line.split()[1:7])) for line in _lines(content) if line.strip()]
+    if any(len(row) != 6 for row in rows):
+        raise ValueError("columns missing")
+    return rows
+
+
+_PARSERS = {
+    ".bin": (_cameras_binary, _images_binary, _points_binary),
+    ".txt": (_cameras_text, _images_text, _points_text),
+}

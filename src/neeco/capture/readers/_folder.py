@@ -1,0 +1,144 @@
+"""Read a capture, whatever kind of folder holds it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neeco.capture.documents import Node, ProblemReport, errors_only
+from neeco.capture.model import Capture, Frame, Instrument, State, Tissue, share_lamps
+from neeco.capture.points import PointCloud, points_in_view
+from neeco.capture.readers._colmap import find_model, parse_colmap
+from neeco.capture.readers._transforms import is_blender, load_document, parse_blender, parse_transforms
+from neeco.capture.readers.endonerf import is_endonerf_folder, parse_endonerf
+from neeco.capture.readers.parsed import Parsed, inside
+from neeco.errors import NeecoError
+from neeco.files import require_utf8
+
+
+def read_capture(path: Path | str, transforms: str = "transforms.json", *, background: float = 1.0) -> Capture:
+    """Read a capture: neeco-capture/1, nerfstudio, Blender / D-NeRF transforms, a COLMAP model or an EndoNeRF folder.
+
+    path: the capture's folder, or a transforms file in it. transforms: which file of the folder to read.
+    background: what shows through transparent pixels (0 black, 1 white). Image pixels are not read here.
+    Raises NeecoError with the first problem found; `check_capture` finds all of them.
+
+        capture = neeco.read_capture("samples/liver-mini")
+        frame = capture.split("test")[0]
+        frame.load_image().shape, frame.camera.fx, frame.state.instruments["maryland"].pose
+    """
+    report = ProblemReport()
+    parsed = parse_capture(path, report, transforms, background)
+    if not parsed.frames and not errors_only(report.problems):
+        report.error(transforms, "frames", "no frame could be read", "run `neeco check` on the capture")
+    report.raise_first(parsed.root)
+    return capture_of(parsed)
+
+
+def capture_of(parsed: Parsed) -> Capture:
+    """What was read without an error, as a capture, the poses of articulated instruments as those of their roots.
+    Raises NeecoError for an image whose name is not in UTF-8."""
+    frames, instruments = tuple(parsed.frames), parsed.instruments
+    for frame in frames:
+        require_utf8(frame.image_path)
+    tissues = tuple(
+        Tissue(tissue.name, _points(tissue.points, [frame for frame in frames if frame.state.tissue == tissue.name]))
+        for tissue in parsed.tissues
+    )
+    points = PointCloud(measured=False) if tissues else _points(parsed.points, frames)
+    if parsed.still:
+        lit = share_lamps([frame.camera for frame in frames], [frame.state for frame in frames])
+        frames = tuple(replace(frame, camera=camera) for frame, camera in zip(frames, lit, strict=True))
+    if any(item.unrecorded for item in instruments):
+        frames = tuple(replace(frame, state=_with_unrecorded(frame.state, instruments)) for frame in frames)
+    if any(item.kinematics is not None and item.kinematics.pose_of is not None for item in instruments):
+        frames = tuple(replace(frame, state=_of_roots(frame.state, instruments, parsed)) for frame in frames)
+        instruments = tuple(
+            item if item.kinematics is None else replace(item, kinematics=replace(item.kinematics, pose_of=None))
+            for item in instruments
+        )
+    return Capture(
+        parsed.root, frames, instruments, points, parsed.registered, parsed.timed, parsed.lens, parsed.still, tissues
+    )
+
+
+def _points(measured: PointCloud | None, frames: Sequence[Frame]) -> PointCloud:
+    """The points of one world, random ones in view of its frames where none were measured."""
+    if measured is not None or not frames:
+        return measured or PointCloud(measured=False)
+    return points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames]))
+
+
+def _with_unrecorded(state: State, instruments: Sequence[Instrument]) -> State:
+    """The state with every joint that nobody recorded half way between its limits."""
+    filled = dict(state.instruments)
+    for item in instruments:
+        if item.unrecorded and item.name in filled:
+            halfway = {joint: item.halfway(joint) for joint in item.unrecorded}
+            filled[item.name] = replace(filled[item.name], joints={**filled[item.name].joints, **halfway})
+    return replace(state, instruments=filled)
+
+
+def _of_roots(state: State, instruments: Sequence[Instrument], parsed: Parsed) -> State:
+    """The state with poses of any other link of an instrument made those of its root, by its kinematics as stated."""
+    moved = dict(state.instruments)
+    for item in instruments:
+        tree, given = item.kinematics, state.instruments.get(item.name)
+        if tree is None or tree.pose_of is None or given is None:
+            continue
+        if missing := [name for name in sorted(tree.readings_of(tree.pose_of)) if name not in given.joints]:
+            raise NeecoError(
+                f"{parsed.root}: kinematics of {item.name}: reading {missing[0]!r} is missing in a frame; run `neeco "
+                "check` on the capture"
+            )
+        root = tree.world_from_root(given.pose.double().numpy(), given.joints)
+        moved[item.name] = replace(given, pose=torch.from_numpy(root))
+    return replace(state, instruments=moved)
+
+
+def parse_capture(
+    path: Path | str,
+    report: ProblemReport,
+    transforms: str = "transforms.json",
+    background: float = 1.0,
+    *,
+    as_source: bool = False,
+) -> Parsed:
+    """Read as much of a capture as can be read; what is wrong with it goes to `report`. as_source: see `Parsed`. Raises
+    NeecoError for a path that is not in UTF-8."""
+    path = Path(path)
+    require_utf8(path)
+    if os.path.isfile(path):
+        path, transforms = path.parent, path.name
+    if not os.path.isdir(path):
+        report.error(str(path), "", "no such folder", "give the folder of a capture")
+        return Parsed(path)
+    try:
+        file = inside(path, path, transforms)
+    except NeecoError as error:
+        Node(None, transforms, "", report).error_from(error)
+        return Parsed(path)
+    if file.is_file():
+        document = load_document(file, path, report)
+        if is_blender(document):
+            return parse_blender({file: document}, path, background, as_source=as_source)
+        return parse_transforms(document, file.parent, path, background, as_source=as_source)
+    if transforms != "transforms.json":
+        report.error(transforms, "", "no such file", "name a transforms file of the capture")
+        return Parsed(path)
+    splits = [path / f"transforms_{split}.json" for split in ("train", "val", "test")]
+    if blender_files := [file for file in splits if file.is_file()]:
+        documents = {file: load_document(file, path, report) for file in blender_files}
+        return parse_blender(documents, path, background, as_source=as_source)
+    if (model := find_model(path)) is not None:
+        return parse_colmap(model, path, report, as_source=as_source)
+    if is_endonerf_folder(path):
+        return parse_endonerf(path, report)
+    message = "no such file, nor transforms_train.json, a COLMAP model or poses_bounds.npy"
+    report.error("transforms.json", "", message, "is it a capture?")
+    return Parsed(path)

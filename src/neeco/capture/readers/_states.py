@@ -1,0 +1,245 @@
+"""Instrument states in JSON: those of a transforms file's frames, and files of one state a line.
+
+A line is `{"time": 0, "instruments": [{"name", "pose": 4x4, "joints": {name: rad}}], "camera": 4x4}`;
+`camera` (world_from_camera, OpenGL axes, as in transforms.json) and `time` may be left out, other keys are ignored;
+where a scene has several tissues, `"tissue"` names the state's.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neeco.capture.documents import Node, RaisingReport, printable
+from neeco.capture.model import Frame, FromVideo, Instrument, InstrumentState, State, Uncertainty
+from neeco.capture.readers.kinematics import parse_kinematics
+from neeco.errors import NeecoError
+from neeco.files import read_text
+from neeco.geometry.conventions import swap_camera_axes
+
+Limits = tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class StateLine:
+    """One line: a state and, when given, the camera that sees it."""
+
+    state: State
+    world_from_camera: np.ndarray | None  # [4, 4], OpenCV axes
+
+
+def read_states(path: Path, instruments: Sequence[Instrument], tissues: Sequence[str] = ()) -> list[StateLine]:
+    """Read and check a file of states against the scene's instruments and, where it has several, tissues.
+
+    Raises NeecoError naming file, line and field: unreadable, not JSON, an instrument, joint or tissue missing or
+    unknown, a pose that is not rigid, a joint outside its limits.
+    """
+    missing = "no such file; --states takes interpolate, extrapolate, grid or a file of states"
+    lines = read_text(Path(path), "one JSON object per line", missing).split("\n")
+    states = [
+        _parse_line(line, f"{path}: line {number}", instruments, tissues)
+        for number, line in enumerate(lines, 1)
+        if line.strip()
+    ]
+    if not states:
+        raise NeecoError(f"{path}: no states in it; give one JSON object per line")
+    return states
+
+
+def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
+    """The instrument states of one frame ({} where it lists none), or None when one of them could not be read."""
+    if not frame.has("instruments"):
+        return {}
+    node = frame.child("instruments")
+    states: dict[str, InstrumentState] = {}
+    good = isinstance(node.value, list)
+    for item in node.items():
+        if not item.is_object():
+            good = False
+            continue
+        name = item.child("name").text()
+        pose = item.child("pose").rigid()
+        nodes = _joint_nodes(item)
+        joints = {joint: child.number() for joint, child in (nodes or {}).items()}
+        known = {joint: value for joint, value in joints.items() if value is not None}
+        trust = _trust(item)
+        uncertainty = parse_uncertainty(item.child("uncertainty"), known) if item.has("uncertainty") else None
+        if name in states:
+            item.child("name").error(f"{printable(name)} comes twice here", "keep one state per instrument")
+            good = False
+        if name is None or pose is None or nodes is None or len(known) < len(joints):
+            good = False
+            continue
+        states[name] = InstrumentState(torch.from_numpy(pose), known, trust, uncertainty)
+    return states if good else None
+
+
+def declared_instruments(document: Node) -> tuple[Instrument, ...]:
+    """The instruments of the header, with their joints' limits and kinematics; () where the header lists none."""
+    if not document.has("instruments"):
+        return ()
+    instruments: dict[str, Instrument] = {}
+    for item in document.child("instruments").items():
+        if not item.is_object():
+            continue
+        name = item.child("name").text()
+        joints: dict[str, Limits] = {}
+        unrecorded = []
+        for joint, node in (_joint_nodes(item) or {}).items():
+            is_object = node.value is not None and node.is_object()
+            has_limits = is_object and node.has("limits")
+            joints[joint] = node.child("limits").range("rad") if has_limits else None
+            if is_object and _is_unrecorded(node):
+                unrecorded.append(joint)
+                if not has_limits:
+                    node.child("limits").error("is missing", "state between which values to look for the joint")
+        if name is None:
+            continue
+        if name in instruments:
+            item.child("name").error(f"{printable(name)} is declared twice", "give every instrument its own name")
+        tree = parse_kinematics(item.child("kinematics")) if item.has("kinematics") else None
+        seen = parse_from_video(item.child("from_video")) if item.has("from_video") else None
+        instruments[name] = Instrument(name, joints, tree, tuple(unrecorded), seen)
+    return tuple(instruments.values())
+
+
+def all_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) -> tuple[Instrument, ...]:
+    """Declared instruments, then those that only frames name; joints likewise."""
+    joints: dict[str, dict[str, Limits]] = {item.name: dict(item.joints) for item in declared}
+    for frame in frames:
+        for name, state in frame.state.instruments.items():
+            known = joints.setdefault(name, {})
+            for joint in state.joints:
+                known.setdefault(joint, None)
+    stated = {item.name: item for item in declared}
+    return tuple(
+        replace(stated[name], joints=limits) if name in stated else Instrument(name, limits)
+        for name, limits in joints.items()
+    )
+
+
+def parse_from_video(node: Node) -> FromVideo | None:
+    """`{"shaft_diameter_mm", "working_length_mm"}`; None, and reported, where it is not that."""
+    if not node.is_object():
+        return None
+    diameter = node.child("shaft_diameter_mm").number(above=0)
+    working = node.child("working_length_mm").number(least=0)
+    return None if diameter is None or working is None else FromVideo(diameter, working)
+
+
+def parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty | None:
+    """`{"translation_mm": [x, y, z], "rotation_deg": [x, y, z], "joints_deg": {name: sd}}`, of a state with `joints`;
+    None, and reported, where it is not that."""
+    if not node.is_object():
+        return None
+    translation = _deviations(node.child("translation_mm"), "in the camera's axes, mm")
+    rotation = _deviations(node.child("rotation_deg"), "about the instrument's x, y, z, degrees")
+    named: dict[str, float] = {}
+    good = translation is not None and rotation is not None
+    if node.has("joints_deg"):
+        given = node.child("joints_deg")
+        good &= given.is_object()
+        for name in given.value if isinstance(given.value, dict) else ():
+            deviation = given.child(name).number(least=0)
+            if name not in joints:
+                given.child(name).error("the state has no such joint", "leave it out")
+                good = False
+            elif deviation is None:
+                good = False
+            else:
+                named[name] = deviation
+    if not good or translation is None or rotation is None:
+        return None
+    return Uncertainty(translation, rotation, named)
+
+
+def _deviations(node: Node, what: str) -> tuple[float, float, float] | None:
+    found = node.numbers(3, f"standard deviations {what}")
+    if found is None:
+        return None
+    if min(found) < 0:
+        node.error(f"{min(found):g} is no standard deviation", "give numbers of 0 or more")
+        return None
+    return found[0], found[1], found[2]
+
+
+def _trust(item: Node) -> float | None:
+    """What a tracked state says of itself; None, reported where it is no share, of one that says nothing."""
+    trust = item.child("trust").number() if item.has("trust") else None
+    if trust is not None and not 0 <= trust <= 1:
+        item.child("trust").error(f"is {trust:g}, not a share", "give 0 to 1, or leave it out")
+        return None
+    return trust
+
+
+def _is_unrecorded(joint: Node) -> bool:
+    """Whether a joint of the header says `"recorded": false`."""
+    if not joint.has("recorded"):
+        return False
+    recorded = joint.child("recorded")
+    if not isinstance(recorded.value, bool):
+        recorded.error(f"expected true or false, found {printable(recorded.value)}", "correct it")
+    return recorded.value is False
+
+
+def _joint_nodes(item: Node) -> dict[str, Node] | None:
+    """What stands under each name in `joints` ({} where there is none), or None when that is no object."""
+    if not item.has("joints"):
+        return {}
+    node = item.child("joints")
+    return {name: node.child(name) for name in node.value} if node.is_object() else None
+
+
+def _parse_line(text: str, where: str, instruments: Sequence[Instrument], tissues: Sequence[str]) -> StateLine:
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError) as error:  # beside what is no JSON: endless numbers and nesting
+        reason = error.msg if isinstance(error, json.JSONDecodeError) else "a number or the nesting is beyond measure"
+        raise NeecoError(f"{where}: not valid JSON: {reason}; give one JSON object per line") from None
+    node = Node(value, where, "", RaisingReport())
+    if not isinstance(node.child("instruments").value, list):
+        node.child("instruments").error("missing", 'expected {"instruments": [{"name", "pose", "joints"}]}')
+    known = {instrument.name: instrument for instrument in instruments}
+    names = [item.child("name") for item in node.child("instruments").items()]
+    for name in names:
+        if not isinstance(name.value, str) or name.value not in known:
+            name.error(f"{name.value!r} is not in the scene", f"it has {', '.join(known) or 'no instruments'}")
+    if missing := [name for name in known if name not in [item.value for item in names]]:
+        node.child("instruments").error(f"{', '.join(missing)} missing", "give every instrument of the scene")
+    given = parse_instruments(node) or {}
+    for item, instrument in zip(node.child("instruments").items(), given, strict=True):
+        _check_joints(item, known[instrument])
+    time = node.child("time").number() if node.has("time") else None
+    camera = node.child("camera")
+    if isinstance(camera.value, dict):
+        camera = camera.child("transform_matrix")
+    pose = None if camera.value is None else camera.rigid()
+    # in the scene's order, so that files list them in one order, without joints that the scene does not have
+    states = {
+        name: InstrumentState(
+            given[name].pose,
+            {joint: given[name].joints.get(joint, item.halfway(joint)) for joint in item.joints},
+        )
+        for name, item in known.items()
+    }
+    tissue = node.child("tissue")
+    if tissues and tissue.value not in tissues:
+        what = "missing" if tissue.value is None else f"{printable(tissue.value)} is not in the scene"
+        tissue.error(what, f"name one of its tissues: {', '.join(tissues)}")
+    state = State(states, time or 0.0, tissue.value if tissues else None)
+    return StateLine(state, None if pose is None else swap_camera_axes(pose))
+
+
+def _check_joints(item: Node, instrument: Instrument) -> None:
+    """Refuse a state without one of its instrument's joints, with one that it does not have, or an impossible value."""
+    joints = item.child("joints")
+    if not all(joints.has(joint) for joint in instrument.joints if joint not in instrument.unrecorded):
+        joints.error(f"expected these joints, in rad: {', '.join(instrument.joints)}")
+    for joint, value in (joints.value or {}).items():
+        if (fault := instrument.joint_fault(joint, value)) is not None:
+            joints.child(joint).error(*fault)

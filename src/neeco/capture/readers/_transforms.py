@@ -1,0 +1,335 @@
+"""Read transforms files: neeco-capture/1, what nerfstudio writes, and Blender's and D-NeRF's of one split each."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neeco.capture.documents import Node, ProblemReport, printable
+from neeco.capture.images import EXTENSIONS
+from neeco.capture.model import SCHEMA, TEST_EVERY, Frame, Instrument, State
+from neeco.capture.points import PointCloud, random_points, read_ply
+from neeco.capture.readers._states import all_instruments, declared_instruments, parse_instruments
+from neeco.capture.readers.cameras import CameraFields, parse_lens, placeholder_camera
+from neeco.capture.readers.parsed import NOWHERE, Parsed, ParsedTissue, inside, missing_file, relative_name
+from neeco.errors import NeecoError
+from neeco.files import read_json
+from neeco.geometry.conventions import swap_camera_axes
+from neeco.plausible import time_fault
+
+BLENDER_HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there
+STATE_LIKE = ("instrument", "instrument_pose", "instrument_states", "tool", "tools", "joints", "states")  # frames' keys
+_MILLIMETRES = ("mm", "millimeter", "millimetre", "millimeters", "millimetres")
+
+
+def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
+    """A JSON file as the node of its object. What cannot be parsed is reported and gives an empty object."""
+    name = relative_name(file, root)
+    value: Any = {}
+    try:
+        value = read_json(file)
+    except NeecoError as error:
+        report.error(name, "", str(error).removeprefix(f"{file}: "))
+    except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels
+        report.error(name, "", "not usable JSON: a number or the nesting is beyond all measure")
+    node = Node(value, name, "", report)
+    return node if node.is_object() else Node({}, name, "", report)
+
+
+def parse_transforms(
+    document: Node, folder: Path, root: Path, background: float = 1.0, *, as_source: bool = False
+) -> Parsed:
+    """Read the transforms file in `folder` of the capture at `root`, given its content. Relative paths start at the
+    file. as_source: see `Parsed`."""
+    parsed = Parsed(root, as_source=as_source)
+    _parse_header(document, parsed)
+    _parse_tissues(document, folder, parsed)
+    _parse_frames(document, folder, parsed, background)
+    _parse_points(document, folder, parsed)
+    parsed.instruments = all_instruments(parsed.frames, declared_instruments(document))
+    _warn_of_unread_states(document, parsed)
+    return parsed
+
+
+def is_blender(document: Node) -> bool:
+    """Whether a transforms file gives the field of view instead of intrinsics and no states, as Blender's exporters
+    do."""
+    value = document.value
+    return "camera_angle_x" in value and "fl_x" not in value and not _lists_states(document)
+
+
+def _lists_states(document: Node) -> bool:
+    return "instruments" in document.value or any("instruments" in frame for frame in _frame_objects(document))
+
+
+def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0, *, as_source: bool = False) -> Parsed:
+    """Read the files of a Blender capture, given with their content, one split each, named by the file.
+
+    Transparent pixels show `background`. Without a point cloud, and without states, seeded random ones in a cube are
+    used. Where no frame at all has a time and no state nothing moves (NeRF's synthetic scenes): every frame then has
+    time 0. as_source: see `Parsed`.
+    """
+    parsed = Parsed(root, as_source=as_source)
+    declared: dict[str, Instrument] = {}
+    for file, document in files.items():
+        suffix = file.stem.rpartition("_")[2]
+        split = suffix if suffix in ("train", "val", "test") else None
+        _parse_header(document, parsed)
+        _parse_frames(document, file.parent, parsed, background, split, EXTENSIONS)
+        if parsed.points is None:
+            _parse_points(document, file.parent, parsed)
+        declared = {item.name: item for item in declared_instruments(document)} | declared
+    parsed.instruments = all_instruments(parsed.frames, tuple(declared.values()))
+    for document in files.values():
+        _warn_of_unread_states(document, parsed)
+    if parsed.instruments:
+        return parsed
+    if not any("time" in frame for document in files.values() for frame in _frame_objects(document)):
+        parsed.frames = [replace(frame, state=replace(frame.state, time=0.0)) for frame in parsed.frames]
+        parsed.timed = True
+    if parsed.points is None:
+        parsed.points = random_points(np.zeros(3), BLENDER_HALF_SIZE)
+        parsed.points_place = next(iter(files.values())).child("ply_file_path")
+    return parsed
+
+
+def _frame_objects(document: Node) -> list[dict[str, Any]]:
+    frames = document.value.get("frames")
+    return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
+
+
+def _warn_of_unread_states(document: Node, parsed: Parsed) -> None:
+    """Warn of states under other names than `instruments`, where no frame has any under that."""
+    for index, frame in enumerate(_frame_objects(document)):
+        found = [key for key in STATE_LIKE if frame.get(key) is not None]
+        if found and not parsed.instruments:
+            message = "is not read: instrument states belong into `instruments`"
+            remedy = 'write [{"name", "pose": 4x4 mm, "joints": {name: rad}}] there'
+            document.child("frames").item(index).child(found[0]).warning(message, remedy)
+            return
+
+
+def _parse_header(document: Node, parsed: Parsed) -> None:
+    """Check what holds for the whole file: schema and units, and read `instrument_frame`, `camera_motion` and
+    `lens`."""
+    value = document.value
+    schema = value.get("schema", SCHEMA)
+    if schema != SCHEMA:
+        document.child("schema").error(
+            f"is {printable(schema)}, not {SCHEMA!r}", "use a version of neeco that knows it"
+        )
+    if value.get("units", "mm") not in _MILLIMETRES:
+        message = f"is {printable(value['units'])}; lengths must be mm"
+        document.child("units").error(message, "convert all poses and points")
+    registration = value.get("instrument_frame", "world")
+    if registration not in ("world", "unregistered"):
+        document.child("instrument_frame").error(f"is {printable(registration)}", "write 'world' or 'unregistered'")
+    parsed.registered = parsed.registered and registration != "unregistered"
+    motion = value.get("camera_motion", "moving")
+    if motion not in ("moving", "still"):
+        document.child("camera_motion").error(f"is {printable(motion)}", "write 'moving' or 'still'")
+    parsed.still = parsed.still or motion == "still"
+    if document.has("lens"):
+        parsed.lens = parse_lens(document.child("lens"))
+    parsed.says_units = parsed.says_units or value.get("units") is not None or value.get("schema") == SCHEMA
+
+
+def _parse_frames(
+    document: Node,
+    folder: Path,
+    parsed: Parsed,
+    background: float,
+    split: str | None = None,
+    extensions: tuple[str, ...] = (),
+) -> None:
+    """Append the file's frames. `split` names them all where given; `extensions` are tried on paths without one."""
+    nodes = document.child("frames")
+    if nodes.value is None:
+        nodes.error("is missing", "list the images and their cameras there")
+        return
+    if not isinstance(nodes.value, list):
+        nodes.error(f"expected a list, found {printable(nodes.value)}")
+        return
+    splits, header = _Splits(document, split), _HeaderReport(document, len(nodes.value))
+    timed = 0
+    for index, node in enumerate(nodes.items()):
+        if not node.is_object():
+            continue
+        image_path = None
+        if (file := node.child("file_path")).value is None:
+            file.error("is missing", "name the frame's image")
+        else:
+            image_path = _image(file, folder, parsed, extensions)
+        name = splits.of(node, index)
+        pose = node.child("transform_matrix").rigid()
+        mask_path = _file(node.child("mask_path"), folder, parsed.root) if node.has("mask_path") else None
+        time = _time(node) if node.has("time") else float(index)
+        timed += node.has("time")
+        instruments, tissue = parse_instruments(node), _tissue_of(node, parsed)
+        if image_path is None:
+            continue
+        camera = CameraFields(node, header.document, image_path, parsed).camera()
+        if name is None or time is None or instruments is None:
+            continue
+        if pose is None or camera is None:
+            parsed.without_camera.add(len(parsed.frames))
+        camera = camera or placeholder_camera(image_path)
+        if pose is not None:
+            opencv = torch.from_numpy(swap_camera_axes(pose)).to(torch.float32)
+            camera = replace(camera, world_from_camera=opencv)
+        parsed.frames.append(Frame(image_path, camera, State(instruments, time, tissue), name, mask_path, background))
+        parsed.places.append(node)
+    header.pass_on()
+    if nodes.value == []:
+        nodes.error("is empty", "list the images and their cameras there")
+    elif timed < len(nodes.value):  # where not every frame has a time, the order stands in for all: no mix of units
+        parsed.timed = False
+        for order, frame in enumerate(parsed.frames):
+            parsed.frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
+
+
+def _time(frame: Node) -> float | None:
+    time = frame.child("time").number()
+    fault = None if time is None else time_fault(time)
+    if fault is not None:
+        frame.child("time").error(*fault)
+    return None if fault is not None else time
+
+
+def _parse_tissues(document: Node, folder: Path, parsed: Parsed) -> None:
+    """Read the names of several tissues and the points of each, if the file lists any."""
+    if not document.has("tissues"):
+        return
+    if document.child("tissues").value == []:
+        document.child("tissues").error("is empty", "list the tissues there, or leave it out where there is one")
+    if document.has("ply_file_path"):
+        document.child("ply_file_path").error("is of no tissue", "name a file of points in each of the tissues")
+    for item in document.child("tissues").items():
+        if not item.is_object():
+            continue
+        place = item.child("name")
+        name = place.text("give every tissue a name")
+        if name in [tissue.name for tissue in parsed.tissues]:
+            place.error(f"{printable(name)} comes twice", "give every tissue its own name")
+        elif name is not None:
+            parsed.tissues.append(ParsedTissue(name, *_points_of(item, folder, parsed.root)))
+
+
+def _tissue_of(frame: Node, parsed: Parsed) -> str | None:
+    """The tissue that a frame shows, of those listed; None where there is one, or, reported, it names none of them."""
+    names, place = [tissue.name for tissue in parsed.tissues], frame.child("tissue")
+    if names and not frame.has("tissue"):
+        place.error("is missing", f"name one of the file's tissues: {', '.join(names)}")
+    elif frame.has("tissue") and (place.text() is not None) and place.value not in names:
+        listed = f"the file's tissues are {', '.join(names)}" if names else "the file lists no tissues"
+        place.error(f"{printable(place.value)} is unknown: {listed}", "correct it, or list it in `tissues`")
+    return place.value if place.value in names else None
+
+
+def _parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
+    """Read the point cloud that `ply_file_path` names, if it names one."""
+    if not parsed.tissues:
+        parsed.points, parsed.points_place = _points_of(document, folder, parsed.root)
+
+
+def _points_of(node: Node, folder: Path, root: Path) -> tuple[PointCloud | None, Node]:
+    """The point cloud that an object's `ply_file_path` names, None where it names none that can be used, and its
+    place."""
+    place = node.child("ply_file_path")
+    path = _file(place, folder, root) if node.has("ply_file_path") else None
+    if path is None:
+        return None, place
+    name = relative_name(path, root)
+    place = Node(None, name, "vertex", node.report)
+    try:
+        points = read_ply(path)
+    except NeecoError as error:
+        node.report.error(name, "", str(error).removeprefix(f"{path}: "))
+        return None, place
+    if bad := int((~np.isfinite(points.positions).all(axis=1)).sum()):
+        place.error(f"{bad} points are NaN or infinite", "remove them from the file")
+        return None, place
+    return points, place
+
+
+class _Splits:
+    """Which split each frame belongs to: its own word, else nerfstudio's lists, else every 8th is test."""
+
+    def __init__(self, document: Node, split: str | None) -> None:
+        self.fixed = split
+        self.listed: dict[str, str] | None = None
+        lists = [(name, document.child(f"{name}_filenames")) for name in ("train", "val", "test")]
+        if any(node.value is not None for _, node in lists):
+            self.listed = {}
+            for name, node in lists:
+                for item in node.items() if node.value is not None else ():
+                    text = item.text()
+                    self.listed.update({} if text is None else {text: name})
+        self.some_say = any(frame.get("split") is not None for frame in _frame_objects(document))
+
+    def of(self, frame: Node, index: int) -> str | None:
+        if self.fixed is not None:
+            return self.fixed
+        if frame.has("split"):
+            return frame.child("split").text()
+        if self.listed is not None:
+            name = self.listed.get(str(frame.value.get("file_path")))
+            if name is None:
+                frame.warning("is in none of train_filenames, val_filenames, test_filenames and is left out")
+            return name
+        if self.some_say:
+            frame.child("split").error("is missing while other frames have one", "name the frame's split")
+            return None
+        return "test" if index % TEST_EVERY == 0 else "train"
+
+
+def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()) -> Path | None:
+    """The existing file inside the capture that a node names; `extensions` are tried on paths without one."""
+    text = node.text()
+    if text is None:
+        return None
+    try:
+        candidates = [inside(root, folder, text + extension) for extension in ("", *extensions)]
+    except NeecoError as error:
+        node.error_from(error)
+        return None
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    node.error(*missing_file(folder, text))
+    return None
+
+
+def _image(node: Node, folder: Path, parsed: Parsed, extensions: tuple[str, ...]) -> Path | None:
+    """`_file` of a frame's image. Of a source, one that is nowhere is counted, and no error."""
+    before = len(node.report.problems)
+    found = _file(node, folder, parsed.root, extensions)
+    problems = node.report.problems
+    if parsed.as_source and len(problems) > before and problems[-1].remedy == NOWHERE:
+        parsed.absent.append(problems.pop())
+    return found
+
+
+class _HeaderReport(ProblemReport):
+    """What is wrong with the camera at the file's top level: reported once, with how many frames it concerns.
+
+    A number that neither a frame nor the top level gives counts as the top level's.
+    """
+
+    def __init__(self, document: Node, frames: int) -> None:
+        super().__init__()
+        self.document = Node(document.value, document.file, document.field, self)
+        self.report, self.first, self.frames = document.report, len(document.report.problems), frames
+
+    def pass_on(self) -> None:
+        """Pass the problems on, each once, before those of the frames."""
+        merged = []
+        for problem, count in Counter(self.problems).items():
+            concerned = "" if self.frames == 1 else f", for {count} of {self.frames} frames"
+            merged.append(replace(problem, message=problem.message + concerned))
+        self.report.problems[self.first : self.first] = merged

@@ -1,0 +1,312 @@
+"""Cameras and lenses as files state them: camera models of nerfstudio, COLMAP, instant-ngp; the `lens` block."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neeco.capture.documents import Node, as_float, printable
+from neeco.capture.images import image_size
+from neeco.capture.readers.parsed import Parsed
+from neeco.errors import NeecoError
+from neeco.geometry.camera import COEFFICIENTS, Camera
+from neeco.geometry.lens import BORDER, COEFFICIENT_NAMES, INTRINSICS, Border, Lens
+from neeco.plausible import LARGEST_SIZE, focal_fault, size_fault
+
+MOST_PX = 65_536.0  # no image is as large
+MOST_BENT = 1e6  # nor any coefficient of a lens
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIDISTANT", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+POLYNOMIAL = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+MODELS = (*POLYNOMIAL, *FISHEYE)
+NAMES = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+LISTS = ("distortion_params", "distortion_coefficients", "distortion")  # keys of bare lists of coefficients
+NOT_READ = ("ftheta_p0", "ftheta_p1", "latlong", "orthographic")  # instant-ngp's keys of lenses that are none of MODELS
+# order of a bare list of coefficients, by its length: six are nerfstudio's, the rest OpenCV's
+LISTED = {
+    4: ("k1", "k2", "p1", "p2"),
+    5: ("k1", "k2", "p1", "p2", "k3"),
+    6: ("k1", "k2", "k3", "k4", "p1", "p2"),
+    8: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+WIDEST_ANGLE = math.radians(80)  # off the axis, that a lens fitted by OpenCV's rational model may see
+MISFIT_PX = 0.1  # largest error of that fit
+
+
+@dataclass(frozen=True)
+class StatedDistortion:
+    """What a file says of a lens's distortion: one of MODELS, and the coefficients that are not 0, by NAMES."""
+
+    model: str
+    coefficients: Mapping[str, float]
+    place: Node | None  # of what tells it: a fisheye model or the first coefficient; None: there is no distortion
+
+
+def stated_distortion(node_of: Callable[[str], Node]) -> StatedDistortion | None:
+    """Read a lens's distortion as nerfstudio and instant-ngp write it; `node_of` gives the value of a key.
+
+    None, and reported, where it cannot be read.
+    """
+    named = node_of("camera_model")
+    model = str(named.value or "PINHOLE").upper()
+    if node_of("is_fisheye").value is True:
+        model = "OPENCV_FISHEYE"
+    wrong = [node for key in NOT_READ if (node := node_of(key)).value]
+    wrong += [named] if model not in MODELS else []
+    if wrong:
+        message = f"is {printable(wrong[0].value)}; this lens model cannot be undistorted"
+        wrong[0].error(message, "undistort the images first, and write PINHOLE")
+        return None
+    found: dict[str, Node] = {}
+    for key in LISTS:
+        node = node_of(key)
+        zeros = isinstance(node.value, list) and all(as_float(item) == 0 for item in node.value)
+        if node.value is None or isinstance(node.value, str) or zeros:  # text is a remark
+            continue
+        names = LISTED.get(len(node.value)) if isinstance(node.value, list) else None
+        if names is None:
+            node.error(f"expected 4, 5, 6 or 8 coefficients, found {printable(node.value)}", "correct it")
+            return None
+        found |= dict(zip(NAMES[:4] if model in FISHEYE and len(names) == 4 else names, node.items(), strict=True))
+    for name in NAMES:
+        node = node_of(name)
+        if node.value is None or (as_float(node.value) == 0 and name in found):
+            continue
+        if name in found and found[name].value != node.value:
+            node.error(f"is {printable(node.value)}, and {found[name].field} is another", "state each once")
+            return None
+        found.setdefault(name, node)
+    numbers = {name: node.number() for name, node in found.items()}
+    known = {name: number for name, number in numbers.items() if number}
+    if None in numbers.values():
+        return None
+    if model in FISHEYE:
+        return StatedDistortion(model, known, named if named.value else node_of("is_fisheye"))
+    return StatedDistortion(model, known, found[min(known, key=NAMES.index)] if known else None)
+
+
+def opencv_distortion(
+    model: str,
+    coefficients: Mapping[str, float],
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int] | None,
+) -> tuple[float, ...]:
+    """OpenCV's k1, k2, p1, p2[, k3, k4, k5, k6] of a lens of one of MODELS; empty without distortion.
+
+    coefficients: by NAMES, absent ones are 0. intrinsics: fl_x, fl_y, cx, cy px; size: (width, height) px, None: twice
+    the principal point. Other models than OpenCV's are fitted. Raises NeecoError ("what is wrong; what to do").
+    """
+    return _opencv_distortion(model, tuple(coefficients.get(name, 0.0) for name in NAMES), intrinsics, size)
+
+
+@lru_cache(maxsize=8)
+def _opencv_distortion(
+    model: str,
+    coefficients: tuple[float, ...],
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int] | None,
+) -> tuple[float, ...]:
+    k1, k2, k3, k4, k5, k6, p1, p2 = coefficients
+    if model in FISHEYE:
+        if any((k5, k6, p1, p2)):
+            raise NeecoError("a fisheye lens has coefficients k1 to k4 alone; calibrate again")
+        return fit_rational(lambda angle: angle * _polynomial(angle**2, (k1, k2, k3, k4)), intrinsics, size)
+    if k4 and not (k5 or k6 or model == "FULL_OPENCV"):  # nerfstudio's, of the radius to the eighth power
+        radial = fit_rational(lambda a: np.tan(a) * _polynomial(np.tan(a) ** 2, (k1, k2, k3, k4)), intrinsics, size)
+        return (*radial[:2], p1, p2, *radial[4:])
+    if k4 or k5 or k6:
+        return k1, k2, p1, p2, k3, k4, k5, k6
+    return (k1, k2, p1, p2, k3) if any((k1, k2, p1, p2, k3)) else ()
+
+
+def fit_rational(
+    bend: Callable[[np.ndarray], np.ndarray],
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int] | None,
+) -> tuple[float, ...]:
+    """OpenCV's eight coefficients of the rational model that shows rays where `bend` does, to MISFIT_PX or better.
+
+    bend: angles [N] off the axis, rad, to radii [N] in the image, in focal lengths. Least squares, reweighted by the
+    denominator. Raises NeecoError ("what is wrong; what to do").
+    """
+    fl_x, fl_y, cx, cy = intrinsics
+    width, height = size or (2 * cx, 2 * cy)
+    theta = np.linspace(1e-3, WIDEST_ANGLE, 2000)
+    bent = bend(theta)
+    beyond = bent > math.hypot(max(cx, width - cx) / fl_x, max(cy, height - cy) / fl_y)
+    used = slice(int(np.argmax(beyond)))
+    if not beyond.any() or (np.diff(bent[used]) <= 0).any():
+        what = f"sees farther than {math.degrees(WIDEST_ANGLE):.0f} degrees off its axis, or folds the image over"
+        raise NeecoError(f"this lens {what}; crop the images, or calibrate again")
+    radius, share = np.tan(theta[used]), bent[used] / np.tan(theta[used])
+    powers = (radius[:, None] ** 2) ** np.arange(1, 4)  # [N, 3]
+    weight = radius
+    for _ in range(8):
+        rows = np.hstack([powers, -share[:, None] * powers]) * weight[:, None]
+        found = np.linalg.lstsq(rows, (share - 1) * weight, rcond=None)[0]
+        weight = radius / np.maximum(1 + powers @ found[3:], 1e-6)
+    error = np.abs((1 + powers @ found[:3]) / (1 + powers @ found[3:]) - share) * radius * max(fl_x, fl_y)
+    if not error.max() < MISFIT_PX:
+        raise NeecoError(
+            f"this lens bends too much for OpenCV's rational model ({error.max():.2f} px off); crop the images, or "
+            "calibrate again"
+        )
+    return (*found[:2].tolist(), 0.0, 0.0, *found[2:].tolist())
+
+
+def _polynomial(squares: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """1 + k1 s + k2 s^2 + ... of squares s [N]."""
+    return np.asarray(np.polynomial.polynomial.polyval(squares, (1.0, *coefficients)))
+
+
+def parse_lens(node: Node) -> Lens | None:
+    """The lens that a node describes; None, and reported, where that is none."""
+    if not node.is_object():
+        return None
+    size = [node.child(key).integer(least=1) for key in ("w", "h")]
+    focal = [node.child(key).number(above=0, below=MOST_PX) for key in INTRINSICS[:2]]
+    center = [node.child(key).number(above=-MOST_PX, below=MOST_PX) for key in INTRINSICS[2:]]
+    border = _border(node.child("border")) if node.has("border") else None
+    distortion = _distortion(node)
+    width, height = size
+    fl_x, fl_y, cx, cy = *focal, *center
+    if width is None or height is None or fl_x is None or fl_y is None or cx is None or cy is None:
+        return None
+    if distortion is None or (border is None and node.has("border")):
+        return None
+    if (fault := size_fault(width, height) or focal_fault(fl_x, fl_y, width, height)) is not None:
+        node.error(*fault)
+        return None
+    lens = Lens(fl_x, fl_y, cx, cy, distortion, (width, height), border)
+    try:
+        lens.pinhole((width, height))
+    except NeecoError as error:
+        node.error_from(NeecoError(str(error).removeprefix("lens: ")))
+        return None
+    return lens
+
+
+def _distortion(node: Node) -> tuple[float, ...] | None:
+    """The coefficients up to the last that is given, as many as one of OpenCV's models has."""
+    given = [node.has(name) for name in COEFFICIENT_NAMES]
+    last = len(given) - given[::-1].index(True) if any(given) else 0
+    names = COEFFICIENT_NAMES[: min(count for count in COEFFICIENTS if count >= last)]
+    read = [node.child(name).number(above=-MOST_BENT, below=MOST_BENT) if node.has(name) else 0.0 for name in names]
+    known = tuple(value for value in read if value is not None)
+    return known if len(known) == len(read) else None
+
+
+def _border(node: Node) -> Border | None:
+    if not node.is_object():
+        return None
+    x, y = (node.child(key).number(above=-MOST_PX, below=MOST_PX) for key in BORDER[:2])
+    radius = node.child(BORDER[2]).number(above=1, below=MOST_PX)
+    return None if x is None or y is None or radius is None else (x, y, radius)
+
+
+def placeholder_camera(image_path: Path) -> Camera:
+    """A camera for an image whose own is wrong, so that image and states can still be checked."""
+    width, height = _size_or_largest(image_path)
+    return Camera(torch.eye(4), fx=width, fy=width, cx=width / 2, cy=height / 2, width=width, height=height)
+
+
+def _size_or_largest(image_path: Path) -> tuple[int, int]:
+    try:
+        return image_size(image_path)
+    except NeecoError:  # reported when the images are checked
+        return LARGEST_SIZE, LARGEST_SIZE
+
+
+class CameraFields:
+    """Looks a camera's numbers up in the frame first, then at the top level, and checks them."""
+
+    def __init__(self, frame: Node, document: Node, image_path: Path, parsed: Parsed) -> None:
+        self.frame, self.document, self.image_path, self.parsed = frame, document, image_path, parsed
+
+    def camera(self) -> Camera | None:
+        """The frame's camera at the origin; None, and reported, where its numbers are wrong."""
+        stated = self._distortion()
+        size = self._size()
+        width, height = size or _size_or_largest(self.image_path)
+        fx = self._focal("fl_x", "camera_angle_x", width)
+        fy = self._focal("fl_y", "camera_angle_y", height) if self._has("fl_y", "camera_angle_y") else fx
+        cx, cy = self._center("cx", width), self._center("cy", height)
+        if size is None or fx is None or fy is None or cx is None or cy is None or stated is None:
+            return None
+        if (fault := focal_fault(fx, fy, width, height)) is not None:
+            self._node("fl_x" if self._has("fl_x") else "camera_angle_x").error(*fault)
+            return None
+        try:
+            distortion = opencv_distortion(stated.model, stated.coefficients, (fx, fy, cx, cy), size)
+        except NeecoError as error:
+            (stated.place or self._node("camera_model")).error_from(error)
+            return None
+        return Camera(torch.eye(4), fx, fy, cx, cy, width, height, distortion=distortion)
+
+    def _has(self, *keys: str) -> bool:
+        return any(self.frame.has(key) or self.document.has(key) for key in keys)
+
+    def _node(self, key: str) -> Node:
+        return (self.frame if self.frame.has(key) else self.document).child(key)
+
+    def _distortion(self) -> StatedDistortion | None:
+        """None, and reported, where it cannot be read, and for distorted images that are read in place."""
+        stated = stated_distortion(self._node)
+        if stated is None or stated.place is None or self.parsed.as_source:
+            return stated
+        message = f"is {printable(stated.place.value)}: only PINHOLE is drawn, and the images are distorted"
+        stated.place.error(message, f"undistort them: neeco ingest {self.parsed.root} --output CAPTURE")
+        return None
+
+    def _size(self) -> tuple[int, int] | None:
+        """(width, height), from the image itself where not stated."""
+        if not self._has("w", "h"):
+            try:
+                return image_size(self.image_path)
+            except NeecoError as error:
+                message = str(error).removeprefix(f"{self.image_path}: ")
+                self.frame.child("file_path").error(f"{printable(self.image_path.name)}: {message}")
+                return None
+        width, height = (self._positive(key) for key in ("w", "h"))
+        if width is None or height is None:
+            return None
+        if (fault := size_fault(width, height)) is not None:
+            self._node("w").error(*fault)
+            return None
+        return int(width), int(height)
+
+    def _focal(self, key: str, angle_key: str, extent: int) -> float | None:
+        """Focal length in px, from the field of view where only that is given."""
+        if self._has(key) or not self._has(angle_key):
+            return self._positive(key)
+        angle = self._positive(angle_key)
+        if angle is not None and angle >= math.pi:
+            self._node(angle_key).error(f"is {angle:g} rad, not below pi", "give the field of view in radians")
+            return None
+        return None if angle is None else 0.5 * extent / math.tan(0.5 * angle)
+
+    def _center(self, key: str, extent: int) -> float | None:
+        """Principal point in px: inside the image, its middle where not stated."""
+        if not self._has(key):
+            return extent / 2
+        value = self._node(key).number()
+        if value is not None and not 0 < value < extent:
+            self._node(key).error(f"is {value:g}, outside the image (0 .. {extent})", "give it in pixels of this image")
+            return None
+        return value
+
+    def _positive(self, key: str) -> float | None:
+        node = self._node(key)
+        if node.value is None:
+            node.error("is missing", "give the camera's intrinsics at the top level or in every frame")
+            return None
+        value = node.number()
+        if value is not None and value <= 0:
+            node.error(f"is {value:g}, must be positive")
+            return None
+        return value

@@ -1,0 +1,167 @@
+"""Read EndoNeRF folders (Wang et al., MICCAI 2022): `poses_bounds.npy`, images/, masks/ and depth/.
+
+The poses are LLFF's (Mildenhall et al. 2019): a row of 17 numbers per image, 3x5 [R | t | height width focal] row by
+row, then the nearest and farthest depth; the columns of R are the camera's down, right and backwards axes.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neeco.capture.documents import Node, ProblemReport, printable
+from neeco.capture.images import EXTENSIONS
+from neeco.capture.model import TEST_EVERY, Frame, PointCloud, State
+from neeco.capture.points import random_points
+from neeco.capture.readers.parsed import Parsed, inside
+from neeco.errors import NeecoError
+from neeco.files import placeholder, visible_entries
+from neeco.geometry.camera import Camera
+from neeco.geometry.conventions import LLFF
+from neeco.plausible import focal_fault, size_fault
+
+POSES_FILE = "poses_bounds.npy"
+MASKS = "masks"
+COLUMNS = 17
+FIRST_TEST = 1  # frames 1, 9, 17, ... test, as in EndoGaussian, SurgicalGaussian and Deform3DGS: numbers compare
+STILL = 1e-6  # of a pose's entries: less is one still camera
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One image's row: camera pose (OpenCV axes), size, focal length and depth bounds, in the folder's own unit."""
+
+    world_from_camera: np.ndarray  # [4, 4]
+    width: int
+    height: int
+    focal: float
+    near: float
+    far: float
+
+
+def is_endonerf_folder(root: Path) -> bool:
+    """Whether a folder has EndoNeRF's poses."""
+    return (root / POSES_FILE).is_file()
+
+
+def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
+    """Read an EndoNeRF folder; problems and what such a folder lacks go to `report`. Lengths are in its own unit.
+
+    Images are paired with poses by sorted name. There are no instrument states; tool masks and depth maps are not used;
+    where the depth bounds are usable, random points fill the space between them.
+    """
+    file = Node(None, POSES_FILE, "", report)
+    parsed = Parsed(root, timed=False, points_place=file.child("points"), is_endonerf=True)
+    try:
+        table = _load(root)
+    except NeecoError as error:
+        file.error_from(error)
+        return parsed
+    images = folder_images(root, "images", report)
+    if len(images) != len(table):
+        message = f"has {len(table)} rows for {len(images)} images in images/"
+        file.error(message, "each image needs one row, in the order of the sorted names")
+        return parsed
+    rows = []
+    for order, (path, values) in enumerate(zip(images, table, strict=True)):
+        place = file.item(order)
+        row = _row(values, place)
+        if row is None:
+            continue
+        rows.append(row)
+        pose = torch.from_numpy(row.world_from_camera).float()
+        camera = Camera(pose, row.focal, row.focal, row.width / 2, row.height / 2, row.width, row.height)
+        split = "test" if order % TEST_EVERY == FIRST_TEST else "train"
+        parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
+        parsed.places.append(place)
+    parsed.points = _points(rows)
+    _warn_of_limits(root, rows, file)
+    return parsed
+
+
+def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
+    """The images in a folder of the capture, sorted by name; those that lead out of it are reported and left out."""
+    if not (root / folder).is_dir():
+        return []
+    paths = []
+    for path in visible_entries(root / folder):
+        if path.suffix not in EXTENSIONS:
+            continue
+        try:
+            paths.append(inside(root, root / folder, path.name))
+        except NeecoError as error:
+            Node(None, f"{folder}/{path.name}", "", report).error_from(error)
+    return paths
+
+
+def _load(root: Path) -> np.ndarray:
+    """The table [N, 17] as float64. Raises NeecoError, which does not name the file."""
+    remedy = "write an array of N x 17 numbers with numpy.save"
+    path = inside(root, root, POSES_FILE)
+    if problem := placeholder(path):
+        raise NeecoError(problem)
+    try:
+        # mapped, so that a wrong header cannot make us allocate more than the file holds
+        with warnings.catch_warnings(action="ignore"):  # of files that Python 2 wrote
+            table = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception:  # damaged headers make numpy raise nearly anything
+        raise NeecoError(f"is damaged or not an array of plain numbers; {remedy}") from None
+    if not isinstance(table, np.ndarray) or table.dtype.kind not in "fiu":
+        raise NeecoError(f"is not an array of plain numbers; {remedy}")
+    if table.ndim != 2 or table.shape[1] != COLUMNS or not len(table):
+        raise NeecoError(f"has shape {printable(table.shape)}, expected N x {COLUMNS}; {remedy}")
+    return np.array(table, dtype=np.float64)
+
+
+def _row(values: np.ndarray, place: Node) -> _Row | None:
+    matrix = values[:15].reshape(3, 5)
+    with np.errstate(invalid="ignore"):
+        pose = LLFF.camera_to_opencv(matrix[:, :4])
+    rigid = replace(place, value=pose.tolist()).rigid()
+    height, width, focal = (float(value) for value in matrix[:, 4])
+    if (fault := size_fault(width, height) or focal_fault(focal, focal, width, height)) is not None:
+        message = f"its height, width and focal length are {height:g}, {width:g}, {focal:g}: {fault[0]}"
+        place.error(message, "write whole pixels and a positive focal length in the fifth column")
+        return None
+    if rigid is None:
+        return None
+    return _Row(rigid, int(width), int(height), focal, float(values[15]), float(values[16]))
+
+
+def _points(rows: list[_Row]) -> PointCloud | None:
+    """Random points about the middle of the depth bounds; None when the bounds are unusable."""
+    good = [row for row in rows if np.isfinite([row.near, row.far]).all() and 0 <= row.near < row.far < 1e9]
+    if not good or len(good) < len(rows):
+        return None
+    middles = np.array([(row.near + row.far) / 2 for row in good])
+    forward = np.stack([row.world_from_camera[:3, 2] for row in good])
+    centers = np.stack([row.world_from_camera[:3, 3] for row in good]) + middles[:, None] * forward
+    half_width = max(0.5 * row.width / row.focal * middle for row, middle in zip(good, middles, strict=True))
+    half_depth = max(0.5 * (row.far - row.near) for row in good)
+    return random_points(centers.mean(axis=0), max(half_width, half_depth))
+
+
+def _warn_of_limits(root: Path, rows: list[_Row], file: Node) -> None:
+    """Warn of what such a folder lacks, and of what in it is not read."""
+    remedy = "only methods that need none can be trained, such as 3dgs"
+    file.child("instruments").warning("no instrument states", remedy)
+    file.child("units").warning("names no unit of length", "lengths are taken as mm: distances may be off")
+    poses = np.stack([row.world_from_camera for row in rows]) if rows else np.zeros((0, 4, 4))
+    if len(poses) > 1 and np.ptp(poses, axis=0).max() < STILL:
+        message = "the camera never moves, so the images do not tell depth"
+        file.child("poses").warning(message, "views other than the recorded one will be wrong")
+    elif len(poses) > 1:
+        remedy = "folders prepared for some EndoNeRF successors hold right, down, forwards: reorder those"
+        file.child("poses").warning("camera axes are taken as LLFF's: down, right, backwards", remedy)
+    if (root / MASKS).is_dir():
+        message = "tool masks (white = tool) are not loss masks (black = ignored) and are left out"
+        remedy = (
+            f"`neeco ingest {printable(root.name)} --output CAPTURE` turns them into loss masks that ignore the tool"
+        )
+        file.report.warning(f"{MASKS}/", "", message, remedy)
+    if (root / "depth").is_dir():
+        file.report.warning("depth/", "", "depth maps are not read", "training starts from random points")

@@ -1,0 +1,197 @@
+"""The states of a scene's instruments fitted to one frame, from a state nearby: instruments over tissue, coarse to
+fine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Frame, State
+from neeco.fitting.layers import FrameView, InstrumentRenderer, TissueRenderer, over, reduced, view_of, working_size
+from neeco.fitting.minimise import ImageResidual, minimise
+from neeco.fitting.parameters import StateParameters, precision_of
+from neeco.raster.types import Gaussians
+
+HUBER = 0.05  # colour residual beyond which the cost of a pixel is linear
+CORRELATION_PX = 25.0  # pixels of the full size that count as one observation, since residuals of neighbours correlate
+STEPS = (0.2, 0.1, 0.5, 0.1)  # deg, mm, deg and mm of joints: finite differences at full size
+SMALL_STEP = (0.05, 0.05, 0.1, 0.05)  # the same: a smaller step is the last
+STEPS_AT_ONCE = 2  # steps between new differences and shadows; more would attract the fit to where it was
+NEIGHBOURHOOD = 0.015  # of the image's diagonal: pixels this close to an instrument belong to its misfit
+FOREGROUND_WIDTH = 0.02  # of the diagonal: areas as wide that neither instrument nor tissue explains are foreground
+FOREGROUND_ERROR = 3 * HUBER * (0.1 - HUBER / 2)  # Huber error of a pixel whose colours are off by 0.1
+FOREGROUND_RIM_PX = 5  # side of the square by which such areas are widened
+MAX_HIDDEN = 0.3  # share of an instrument behind the foreground; if more, it is rather somewhere else
+MARGIN_PX = 28  # about the instruments, that a fit looks at
+
+P = TypeVar("P", bound=StateParameters, covariant=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateFit:
+    """A state, and how well it explains a frame."""
+
+    state: State
+    cost: float  # of pixels and prior, -log probability
+    gain: float  # by how much pixels cost less than with the tissue alone; comparable between crops
+    misfit: float  # mean squared error in HUBERs per pixel of instrument, on it and close by, without foreground
+    information: Tensor  # [P, P] of the pixels on the parameters
+    view: FrameView  # the crop about the instruments, with the shadow of `state`
+
+
+@dataclass(frozen=True)
+class _CropProblem:
+    """The parameters of states before a view's tissue as it is, images reduced to `size` (see `FitProblem`)."""
+
+    fitter: Fitter[StateParameters]
+    view: FrameView
+    size: float
+    residual: ImageResidual
+    expected: State
+    precision: Tensor
+
+    def render(self, at: Tensor) -> tuple[Gaussians, Tensor]:
+        posed = self.fitter.instruments.pose(self.fitter.parameters.moved(self.expected, at))
+        return posed, reduced(self.fitter.instruments.composed(posed, self.view), self.size)
+
+    def differences(self, at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
+        parameters = self.fitter.parameters
+        state = parameters.moved(self.expected, at)
+        # the pose of a single instrument moves all Gaussians as one
+        n_rigid = 6 if len(parameters.instruments) == 1 else 0
+        for index, step in enumerate((parameters.each(*STEPS) / self.size).tolist()):
+            moved, change = at.clone(), step * parameters.inwards(state, index, step)
+            moved[index] += change
+            if index < n_rigid:
+                other = parameters.moved(self.expected, moved)
+                yield reduced(self.fitter.instruments.moved(posed, state, other, self.view), self.size), change
+            else:
+                yield self.render(moved)[1], change
+
+
+@dataclass(frozen=True)
+class Fitter(Generic[P]):
+    """Fits the states of a scene's instruments over its tissue."""
+
+    instruments: InstrumentRenderer
+    parameters: P
+    tissue: TissueRenderer
+
+    def view(self, frame: Frame, state: State | None) -> FrameView:
+        """Return a frame at the size worked on, over tissue with the shadow of instruments in `state` (None: none)."""
+        return view_of(frame, working_size(frame.camera, self.instruments.scene.recorded), self.tissue, state)
+
+    def fit(
+        self,
+        view: FrameView,
+        expected: State,
+        precision: Tensor,
+        start: State | None = None,
+        *,
+        levels: tuple[float, ...] = (0.5, 1.0),
+        steps: tuple[int, ...] = (3, 3),
+    ) -> StateFit | None:
+        """Return the state that explains `view` best; None where the fit leads out of the image.
+
+        precision [P, P]: of the prior about `expected`. start: where the fit begins; None: at `expected`. levels: sizes
+        of the images compared, as shares of the view's; steps: at each.
+        """
+        parameters = self.parameters
+        increments = torch.zeros(parameters.size, dtype=torch.float64)
+        if start is not None:
+            increments = parameters.between(expected, start)
+        small = parameters.each(*SMALL_STEP)
+        cost, information = math.inf, torch.zeros_like(precision)
+        for level, count in zip(levels, steps, strict=True):
+            crop = self.about(view, parameters.moved(expected, increments))
+            if crop is None:
+                return None
+            residual = residual_of(crop, level)
+            for first in range(0, count, STEPS_AT_ONCE):
+                crop = self.with_shadow(crop, parameters.moved(expected, increments))
+                problem = _CropProblem(self, crop, level, residual, expected, precision)
+                max_steps = min(count - first, STEPS_AT_ONCE)
+                found = minimise(problem, [increments], max_steps, small=small, linearised_for=STEPS_AT_ONCE)
+                increments, cost = found.parameters, found.cost
+                information = information if found.information is None else found.information
+                if found.settled:
+                    break
+        state = parameters.moved(expected, increments)
+        crop = self.about(view, state)
+        if crop is None:
+            return None
+        crop = self.with_shadow(crop, state)
+        gain, misfit = self._explained(crop, state)
+        return StateFit(state=state, cost=cost, gain=gain, misfit=misfit, information=information, view=crop)
+
+    def ranked(self, view: FrameView, states: Iterable[State], size: float) -> list[State]:
+        """Return states, the best first, by how well they explain a view reduced to `size`."""
+        residual, renderer = residual_of(view, size), self.instruments
+        scored = [
+            (float(residual.errors(reduced(renderer.composed(renderer.pose(state), view), size)).sum()), k, state)
+            for k, state in enumerate(states)
+        ]
+        return [state for _, _, state in sorted(scored, key=lambda item: item[:2])]
+
+    def about(self, view: FrameView, state: State, margin: float = MARGIN_PX) -> FrameView | None:
+        """Return the crop of a view about the instruments in `state`; None where they are outside."""
+        box = self.instruments.box(state, view.camera, margin)
+        return None if box is None else view.crop(box)
+
+    def with_shadow(self, view: FrameView, state: State) -> FrameView:
+        """Return the view with the shadow of instruments in `state`, or of a state that differs from it by less than
+        two finite differences."""
+        if not self.tissue.shaded:
+            return view
+        if view.shadow_of is not None:
+            changed = self.parameters.between(view.shadow_of, state).abs()
+            if bool((changed < 2 * self.parameters.each(*STEPS)).all()):
+                return view
+        return replace(view, tissue=self.tissue.render(view.camera, state), shadow_of=state)
+
+    def _explained(self, view: FrameView, state: State) -> tuple[float, float]:
+        """Return `gain` and `misfit` (see `StateFit`) of a state before a view that holds all of the instruments."""
+        color, alpha = self.instruments.render(state, view.camera)
+        residual = residual_of(view, 1.0)
+        with_it, without = (residual.errors(image).sum(2) for image in (over(color, alpha, view.tissue), view.tissue))
+        gain = residual.scale * float((without - with_it).sum(dtype=torch.float64))
+        unexplained = (with_it > FOREGROUND_ERROR) & (without > FOREGROUND_ERROR)
+        hidden = wide_areas(unexplained, round(FOREGROUND_WIDTH * view.diagonal))
+        opaque = alpha * view.weight
+        if float(opaque[hidden].sum()) > MAX_HIDDEN * float(opaque.sum()):
+            hidden = torch.zeros_like(hidden)
+        about = widened(alpha > 0.5, round(NEIGHBOURHOOD * view.diagonal)) & ~hidden
+        pixels = float(opaque[~hidden].sum())
+        return gain, float(with_it[about].sum()) / (0.5 * HUBER**2 * 3 * max(pixels, 1.0))
+
+
+def wide_areas(mask: Tensor, pixels: int) -> Tensor:
+    """Return where a mask bool [h, w] holds a square of so many pixels, and the rims of these areas."""
+    square = np.ones((pixels, pixels), np.uint8)
+    opened = cv2.morphologyEx(mask.numpy().astype(np.uint8), cv2.MORPH_OPEN, square)
+    return torch.from_numpy(cv2.dilate(opened, np.ones((FOREGROUND_RIM_PX, FOREGROUND_RIM_PX), np.uint8)) > 0)
+
+
+def widened(mask: Tensor, pixels: int) -> Tensor:
+    """Return a mask bool [h, w], wider by so many pixels on each side."""
+    square = np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)
+    return torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), square) > 0)
+
+
+def residual_of(view: FrameView, size: float) -> ImageResidual:
+    """Return the residual of a view reduced to `size` times its size, of the same weight at any size."""
+    scale = size**-2 / (HUBER**2 * CORRELATION_PX * 3)
+    weight = torch.where(reduced(view.weight[..., None], size)[..., 0] > 0.99, 1.0, 0.0)
+    return ImageResidual(reduced(view.image, size), weight, HUBER, scale)
+
+
+def loose_prior(parameters: StateParameters, degrees: float, millimetres: float, joint_degrees: float) -> Tensor:
+    """Return the precision [P, P] of a prior with such standard deviations; of prismatic joints 0.25 mm per degree."""
+    return precision_of(parameters.each(degrees, millimetres, joint_degrees, joint_degrees / 4))

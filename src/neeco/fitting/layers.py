@@ -1,0 +1,216 @@
+"""Instruments rendered alone, in a crop, over tissue that was rendered once: cheap enough to fit states by."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neeco.capture.images import area_averaged
+from neeco.capture.model import Frame, State
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import project_world
+from neeco.raster import rasterize
+from neeco.raster.shadow import GAMMA, shadowed
+from neeco.raster.types import Gaussians
+from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
+
+BLOCK_PX = 8  # images are trimmed and crops rounded to multiples of it, so that they can be halved three times exactly
+MAX_PIXELS = 160_000  # of images worked on, to which larger ones are reduced
+MIN_OPACITY = 0.2  # of Gaussians that say where the instrument is
+MARGIN_QUANTILE = 0.002  # share of them at each side that a crop need not hold
+
+N_TRIMMINGS = 5  # of pixels that a linear map of colours does not explain: instruments and foreground
+SAME_COLOR = 0.02  # mean difference of colours in [0, 1] below which they are left as they are
+MAX_UNEXPLAINED = 0.5  # of the colours' standard deviation
+GAIN_RANGE = (0.2, 3.0)
+
+Box = tuple[int, int, int, int]  # px: left, top, right, bottom
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameView:
+    """A frame's image, reduced or cropped, its counted pixels, and the tissue behind the instruments."""
+
+    camera: Camera
+    image: Tensor  # [h, w, 3]
+    weight: Tensor  # [h, w], 0 where pixels do not count
+    tissue: Tensor  # [h, w, 3]
+    shadow_of: State | None  # whose instruments' shadow falls on it; None: no shadow
+    diagonal: float  # px, of the image that it is cropped from
+
+    def crop(self, box: Box) -> FrameView:
+        """Return the part in a box."""
+        left, top, right, bottom = box
+        camera = self.camera
+        camera = replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=right - left, height=bottom - top)
+        inside = slice(top, bottom), slice(left, right)
+        image, weight, tissue = self.image[inside], self.weight[inside], self.tissue[inside]
+        return replace(self, camera=camera, image=image, weight=weight, tissue=tissue)
+
+
+def working_size(camera: Camera, recorded: Recorded) -> Camera:
+    """Return the camera of the size worked on: no larger than MAX_PIXELS nor than the training images, trimmed to
+    multiples of BLOCK_PX."""
+    learned = recorded.scale * max(other.fx for other in recorded.cameras)
+    factor = min(1.0, math.sqrt(MAX_PIXELS / (camera.width * camera.height)), learned / camera.fx)
+    scaled = camera if factor == 1 else camera.scaled(factor)
+    width, height = (max(BLOCK_PX, size // BLOCK_PX * BLOCK_PX) for size in (scaled.width, scaled.height))
+    return replace(scaled, width=width, height=height)
+
+
+def view_of(frame: Frame, camera: Camera, tissue: TissueRenderer, state: State | None) -> FrameView:
+    """Return a frame at the size of `camera` (see `working_size`), over the tissue with the shadow of instruments in
+    `state`. Raises NeecoError when its image cannot be read."""
+    image, mask, given = frame.load_image(), frame.load_mask(), frame.camera
+    counted = torch.ones(given.height, given.width) if mask is None else mask.float()
+    factor = camera.fx / given.fx
+    width, height = max(camera.width, round(given.width * factor)), max(camera.height, round(given.height * factor))
+    if (width, height) != (given.width, given.height):
+        image, counted = area_averaged(image, width, height), area_averaged(counted[..., None], width, height)[..., 0]
+    inside = slice(0, camera.height), slice(0, camera.width)
+    weight = torch.where(counted[inside] > 0.99, 1.0, 0.0)
+    rendered = tissue.render(camera, state)
+    return FrameView(
+        camera=camera,
+        image=color_matched(image[inside], rendered, weight),
+        weight=weight,
+        tissue=rendered,
+        shadow_of=state,
+        diagonal=math.hypot(camera.width, camera.height),
+    )
+
+
+def color_matched(image: Tensor, tissue: Tensor, weight: Tensor) -> Tensor:
+    """Return an image [h, w, 3] in the colours of the scene, without the effects of smoke, exposure and white balance.
+
+    These are a linear map of each channel's light, fitted robustly to the tissue. The image itself is returned where
+    its colours agree, or no map explains them.
+    """
+    small = (reduced(each, 1 / BLOCK_PX).flatten(0, 1) for each in (image, tissue, weight[..., None]))
+    observed, rendered, counted = (each.clamp(0, 1) ** GAMMA for each in small)
+    used = counted[:, 0] > 0.99
+    for _ in range(N_TRIMMINGS):
+        if int(used.sum()) < 8:
+            return image
+        (some, others), spread = (each[used] for each in (observed, rendered)), rendered[used].var(0)
+        gain = ((some - some.mean(0)) * (others - others.mean(0))).mean(0) / spread.clamp_min(1e-6)
+        offset = some.mean(0) - gain * others.mean(0)
+        off = (observed - gain * rendered - offset).abs().amax(1)
+        used = (off <= 2 * off[counted[:, 0] > 0.99].median()) & (counted[:, 0] > 0.99)
+    changed = ((gain - 1) * rendered[used] + offset).abs().mean()
+    explained = off[used].mean() < MAX_UNEXPLAINED * observed[used].std(0).mean()
+    if changed < SAME_COLOR or not explained or bool(((gain < GAIN_RANGE[0]) | (gain > GAIN_RANGE[1])).any()):
+        return image
+    return ((image**GAMMA - offset) / gain).clamp_min(0) ** (1 / GAMMA)
+
+
+def over(color: Tensor, alpha: Tensor, tissue: Tensor) -> Tensor:
+    """Composite a colour [h, w, 3] rendered over black, with its alpha [h, w], over tissue [h, w, 3]."""
+    return color + (1 - alpha[..., None]) * tissue
+
+
+def reduced(image: Tensor, size: float) -> Tensor:
+    """Return an image [h, w, C] at `size` times its size.
+
+    Renderings are made at full size and then reduced, too: rendered small, every Gaussian is widened by as many of the
+    larger pixels, and a fit would place the instrument too far away.
+    """
+    if size == 1:
+        return image
+    many = round(1 / size)  # divides the size of crops
+    height, width = image.shape[0] // many, image.shape[1] // many
+    rows = image.reshape(height, many, -1).sum(1)  # [h, W * C]
+    return rows.view(height, width, many, -1).sum(2) / many**2
+
+
+class InstrumentRenderer:
+    """Renders a scene's instruments without its tissue; images are on the CPU whatever device renders."""
+
+    def __init__(self, scene: GaussianScene) -> None:
+        self.scene = scene
+        self.alone = _without_tissue(scene)
+        self._black = scene.canonical.means.new_zeros(3)
+
+    @torch.no_grad()
+    def pose(self, state: State) -> Gaussians:
+        """Return the instruments' Gaussians in `state`."""
+        return self.alone.at(state)
+
+    def render(self, state: State, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Return (colour [h, w, 3] over black, alpha [h, w]) of the instruments in `state`."""
+        return self._rendered(self.pose(state), camera)
+
+    def composed(self, posed: Gaussians, view: FrameView) -> Tensor:
+        """Return posed instruments over a view's tissue, [h, w, 3]."""
+        return over(*self._rendered(posed, view.camera), view.tissue)
+
+    def moved(self, posed: Gaussians, state: State, other: State, view: FrameView) -> Tensor:
+        """Return `composed` of `other`, which differs from the `state` of `posed` by the pose of the only instrument:
+        the camera is moved instead, and nothing need be posed again."""
+        (name,) = other.instruments
+        was, now = (self.alone.registered(each).instruments[name].pose.double() for each in (state, other))
+        camera = view.camera
+        camera_pose = was @ torch.linalg.inv(now) @ camera.world_from_camera.to(now)
+        return self.composed(posed, replace(view, camera=replace(camera, world_from_camera=camera_pose.float())))
+
+    @torch.no_grad()
+    def _rendered(self, posed: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
+        rendering = rasterize(posed, camera, background=self._black)
+        return rendering.color.cpu(), rendering.alpha.cpu()
+
+    @torch.no_grad()
+    def box(self, state: State, camera: Camera, margin: float) -> Box | None:
+        """Return the box of the instruments in the image, `margin` px wider; None where they are outside of it."""
+        posed = self.pose(state)
+        means = posed.means[posed.opacities > MIN_OPACITY]
+        pixels, depth = project_world(means, camera)
+        x, y = pixels.unbind(-1)
+        inside = (depth > camera.near) & (x > 0) & (x < camera.width) & (y > 0) & (y < camera.height)
+        if not inside.any():
+            return None
+        ends = torch.tensor([MARGIN_QUANTILE, 1 - MARGIN_QUANTILE], device=x.device)
+        (left, right), (top, bottom) = (values[inside].quantile(ends).tolist() for values in (x, y))
+        return (
+            max(0, int((left - margin) // BLOCK_PX) * BLOCK_PX),
+            max(0, int((top - margin) // BLOCK_PX) * BLOCK_PX),
+            min(camera.width, -int(-(right + margin) // BLOCK_PX) * BLOCK_PX),
+            min(camera.height, -int(-(bottom + margin) // BLOCK_PX) * BLOCK_PX),
+        )
+
+
+class TissueRenderer:
+    """Renders the tissue of a learned scene, with the shadow that its instruments cast."""
+
+    def __init__(self, scene: GaussianScene) -> None:
+        self.scene = scene
+        self._rows = slice(0, scene.canonical.counts[0])
+
+    @property
+    def shaded(self) -> bool:
+        """Whether instruments cast a shadow on it."""
+        return self.scene.casts_shadow
+
+    @torch.no_grad()
+    def render(self, camera: Camera, state: State | None) -> Tensor:
+        """Return [h, w, 3] with the shadow of instruments in `state` (None: without)."""
+        gaussians = self.scene.at(self.scene.recorded.states[0] if state is None else state)
+        if state is not None:
+            gaussians = shadowed(gaussians, camera, rasterize)
+        elif gaussians.headlight is not None:
+            gaussians = replace(gaussians, headlight=replace(gaussians.headlight, shadow=None))
+        return rasterize(gaussians.select(self._rows), camera).color.clamp(0, 1).cpu()
+
+
+def _without_tissue(scene: GaussianScene) -> GaussianScene:
+    """Return a scene of the instruments alone: the same modules, Gaussians of its own."""
+    scene.visibility()  # measured on the whole scene, where training did not store it
+    tissue, *others = scene.canonical.counts
+    tensors = {name: tensor[tissue:].contiguous() for name, tensor in scene.canonical.tensors().items()}
+    own = CanonicalGaussians.from_tensors(tensors, (0, *others))
+    alone = GaussianScene(scene.method, own, scene.deformation, scene.instruments, scene.recorded, scene.center)
+    alone.load_state_dict(scene.state_dict())
+    alone.sh_degree = scene.sh_degree
+    return alone.to(scene.center.device).requires_grad_(False)

@@ -1,0 +1,135 @@
+"""Levenberg-Marquardt on the difference between a rendering and an image.
+
+Residuals have Huber weights. Columns of the Jacobian are finite differences of renderings, so that no scene needs to
+be differentiable. `alignment` fits poses to recorded frames with it, `fitter` the instruments of footage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+Posed = TypeVar("Posed")  # what is rendered
+MAX_TRIALS = 3  # steps tried from one linearisation, each damped ten times more
+
+
+@dataclass(frozen=True)
+class ImageResidual:
+    """The difference between a rendering and an image, and its weight against the prior."""
+
+    target: Tensor  # [h, w, 3]
+    weight: Tensor  # [h, w], 0 where pixels do not count
+    huber: float  # colour residual beyond which the cost of a pixel is linear
+    scale: float  # of a squared residual against the prior
+
+    def of(self, image: Tensor) -> Tensor:
+        """Return the residual [h, w, 3] of a rendering."""
+        return smoothed(image - self.target, self.weight)
+
+    def cost(self, image: Tensor) -> float:
+        """Return the Huber cost of a rendering, -log probability."""
+        return self.scale * float(self.errors(image).sum(dtype=torch.float64))
+
+    def errors(self, image: Tensor) -> Tensor:
+        """Return the Huber error [h, w, 3] of every value of a rendering."""
+        residual = self.of(image).abs()
+        return torch.where(residual < self.huber, 0.5 * residual**2, self.huber * (residual - 0.5 * self.huber))
+
+
+class FitProblem(Protocol[Posed]):
+    """What is fitted to an image: parameters [P] float64, and how they are rendered."""
+
+    @property
+    def residual(self) -> ImageResidual:
+        """The image and what counts of it."""
+
+    @property
+    def precision(self) -> Tensor:
+        """[P, P] of the prior, whose mean is zero."""
+
+    def render(self, parameters: Tensor) -> tuple[Posed, Tensor]:
+        """Return what is posed by the parameters, and its image [h, w, 3]."""
+
+    def differences(self, parameters: Tensor, posed: Posed) -> Iterable[tuple[Tensor, float]]:
+        """Return for every parameter the image with that one changed, and by how much."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Minimum(Generic[Posed]):
+    """The end of a descent."""
+
+    parameters: Tensor  # [P] float64
+    cost: float  # of image and prior
+    posed: Posed
+    image: Tensor  # [h, w, 3]
+    information: Tensor | None  # [P, P] of the image alone, at the last linearisation; None: no step was taken
+    settled: bool  # no step from fresh differences lowers the cost, or the last one was small
+
+
+def minimise(
+    problem: FitProblem[Posed],
+    starts: Sequence[Tensor],
+    max_steps: int,
+    *,
+    small: Tensor | None = None,
+    linearised_for: int = 1,
+) -> Minimum[Posed]:
+    """Take Levenberg-Marquardt steps from the best of `starts` (each [P] float64); every accepted one lowers the cost.
+
+    small [P]: a step of which every entry is smaller is the last. linearised_for: steps taken with the differences of
+    one state.
+    """
+    residual, precision = problem.residual, problem.precision
+
+    def evaluated(at: Tensor) -> tuple[float, Tensor, Posed, Tensor]:
+        posed, image = problem.render(at)
+        return residual.cost(image) + 0.5 * float(at @ precision @ at), at, posed, image
+
+    cost, parameters, posed, image = min(map(evaluated, starts), key=lambda found: found[0])
+    damping, information, settled = 1e-3, None, False
+    for step in range(max_steps):
+        off = residual.of(image)
+        weight = residual.scale / (off.abs() / residual.huber).clamp_min(1.0)
+        if step % linearised_for == 0:
+            columns = [
+                smoothed(moved - image, residual.weight).flatten() / change
+                for moved, change in problem.differences(parameters, posed)
+            ]
+            jacobian = torch.stack(columns)  # [P, h * w * 3]
+        weighted = jacobian * weight.flatten()
+        information = (weighted @ jacobian.T).double()
+        normal = information + precision
+        gradient = (weighted @ off.flatten()).double() + precision @ parameters
+        for _ in range(MAX_TRIALS):
+            system = normal + damping * torch.diag(torch.diagonal(normal))
+            change = torch.linalg.solve(system, gradient)
+            trial = evaluated(parameters - change)
+            if trial[0] < cost:
+                break
+            damping *= 10
+        else:
+            settled = step % linearised_for == 0
+            break
+        cost, parameters, posed, image = trial
+        damping = max(damping / 10, 1e-6)
+        if small is not None and bool((change.abs() < small).all()):
+            settled = True
+            break
+    return Minimum(parameters=parameters, cost=cost, posed=posed, image=image, information=information, settled=settled)
+
+
+def smoothed(difference: Tensor, weight: Tensor) -> Tensor:
+    """Return [h, w, 3] blurred (3x3 binomial) over the counted pixels: an edge's residual stays linear over a larger
+    shift."""
+    counted = (difference * weight[..., None]).flatten(1)  # [h, w * 3]
+    down = counted + counted
+    down[1:] += counted[:-1]
+    down[:-1] += counted[1:]
+    across = down + down
+    across[:, 3:] += down[:, :-3]
+    across[:, :-3] += down[:, 3:]
+    return across.mul_(1 / 16).view_as(difference)

@@ -1,0 +1,144 @@
+"""The parameters by which states and cameras are corrected, and priors on them.
+
+Every fit uses them: Levenberg-Marquardt on one image (`alignment`, `fitter`) and Adam during training (`refinement`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neeco.capture.model import InstrumentState, State
+from neeco.geometry.camera import Camera
+from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
+
+DEG = math.pi / 180
+
+
+def moved_pose(pose: Tensor, increment: Tensor, pivot: Tensor | None = None) -> Tensor:
+    """Return `pose` [4, 4] moved in its own frame, in the increment's precision; differentiable.
+
+    increment [6]: rotation vector (rad) about `pivot` [3] mm (None: the origin), then translation (mm).
+    """
+    step = rigid_from_vector(increment)
+    if pivot is not None:
+        step[:3, 3] += pivot - step[:3, :3] @ pivot
+    return pose.to(increment) @ step
+
+
+def moved_camera(camera: Camera, increment: Tensor) -> Camera:
+    """Return `camera` moved in its own frame by `increment` [6] (see `moved_pose`)."""
+    return replace(camera, world_from_camera=moved_pose(camera.world_from_camera, increment))
+
+
+def precision_of(deviations: Tensor) -> Tensor:
+    """Return the precision [P, P] of a prior with independent standard deviations [P] about zero."""
+    return torch.diag(deviations**-2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InstrumentParameters:
+    """The parameters of one instrument: six of its pose (see `moved_pose`), then one per joint (rad or mm)."""
+
+    name: str
+    joints: tuple[str, ...]
+    slides: tuple[bool, ...]  # which joints are prismatic
+    pivot: Tensor | None = None  # [3] mm, instrument frame, about which rotations turn; None: the origin
+    low: Tensor | None = None  # [J] rad or mm, bounds of the joints' values; None: unbounded
+    high: Tensor | None = None
+
+    def within_bounds(self, joint: int, value: Any) -> Any:
+        """Return the value of joint number `joint`, clamped to its bounds."""
+        if self.low is None or self.high is None:
+            return value
+        return min(max(value, float(self.low[joint])), float(self.high[joint]))
+
+
+@dataclass(frozen=True)
+class StateParameters:
+    """A vector of P parameters that correct a state: those of every instrument, then six of the camera."""
+
+    instruments: tuple[InstrumentParameters, ...]
+    joints_last: bool = False  # the joints of all instruments follow all poses; else each instrument's follow its pose
+    camera: bool = False  # whether the camera has parameters
+
+    @cached_property
+    def rows(self) -> tuple[tuple[slice, slice], ...]:
+        """Places in the vector of each instrument's pose and joints."""
+        found, joints_before = [], 0
+        for index, item in enumerate(self.instruments):
+            pose = 6 * index + (0 if self.joints_last else joints_before)
+            joints = 6 * len(self.instruments) + joints_before if self.joints_last else pose + 6
+            found.append((slice(pose, pose + 6), slice(joints, joints + len(item.joints))))
+            joints_before += len(item.joints)
+        return tuple(found)
+
+    @cached_property
+    def size(self) -> int:
+        """P."""
+        return sum(6 + len(item.joints) for item in self.instruments) + 6 * self.camera
+
+    def vector(
+        self, radians: float, millimetres: float, joints: tuple[float, float], camera: tuple[float, float] = (0.0, 0.0)
+    ) -> Tensor:
+        """Return [P] float64 with one number for rotations, translations, joints (revolute rad, prismatic mm), and the
+        camera's rotation and translation."""
+        values = torch.empty(self.size, dtype=torch.float64)
+        for item, (pose, rows) in zip(self.instruments, self.rows, strict=True):
+            values[pose] = torch.tensor([radians] * 3 + [millimetres] * 3, dtype=torch.float64)
+            values[rows] = torch.tensor([joints[slides] for slides in item.slides], dtype=torch.float64)
+        if self.camera:
+            values[-6:] = torch.tensor([camera[0]] * 3 + [camera[1]] * 3, dtype=torch.float64)
+        return values
+
+    def each(self, degrees: float, millimetres: float, joint_degrees: float, joint_millimetres: float) -> Tensor:
+        """Return the `vector` [P] of numbers given in degrees and mm."""
+        return self.vector(degrees * DEG, millimetres, (joint_degrees * DEG, joint_millimetres))
+
+    def corrected(self, state: State, poses: Sequence[Tensor], joints: Sequence[Sequence[Any]]) -> State:
+        """Return `state` with every instrument's pose moved by [6] of `poses`, its joints by [J] of `joints`, within
+        their bounds; differentiable where these are tensors."""
+        instruments = dict(state.instruments)
+        for item, increment, changes in zip(self.instruments, poses, joints, strict=True):
+            given = instruments[item.name]
+            values = {
+                name: item.within_bounds(index, given.joints[name] + change)
+                for index, (name, change) in enumerate(zip(item.joints, changes, strict=False))
+            }
+            pose = moved_pose(given.pose, increment, item.pivot)
+            instruments[item.name] = InstrumentState(pose, {**given.joints, **values})
+        return replace(state, instruments=instruments)
+
+    def moved(self, state: State, parameters: Tensor) -> State:
+        """Return `state` corrected by `parameters` [P] float64."""
+        poses, joints = zip(*self.rows, strict=True)
+        return self.corrected(
+            state, [parameters[rows] for rows in poses], [parameters[rows].tolist() for rows in joints]
+        )
+
+    def between(self, state: State, other: State) -> Tensor:
+        """Return the parameters [P] with which `moved(state, …)` is `other`."""
+        found = torch.zeros(self.size, dtype=torch.float64)
+        for item, (pose, joints) in zip(self.instruments, self.rows, strict=True):
+            a, b = state.instruments[item.name], other.instruments[item.name]
+            step = torch.linalg.inv(a.pose.double()) @ b.pose.double()
+            shift = step[:3, 3]
+            if item.pivot is not None:
+                shift = shift - item.pivot + step[:3, :3] @ item.pivot
+            found[pose] = torch.cat([vector_from_rotation(step[:3, :3]), shift])
+            found[joints] = torch.tensor([b.joints[name] - a.joints[name] for name in item.joints], dtype=torch.float64)
+        return found
+
+    def inwards(self, state: State, index: int, step: float) -> int:
+        """Return 1, or -1 where parameter `index` is a joint that `step` upwards would move beyond its bounds."""
+        for item, (_, joints) in zip(self.instruments, self.rows, strict=True):
+            if joints.start <= index < joints.stop:
+                value = state.instruments[item.name].joints[item.joints[index - joints.start]] + step
+                return -1 if item.high is not None and value > float(item.high[index - joints.start]) else 1
+        return 1

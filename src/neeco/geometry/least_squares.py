@@ -1,0 +1,65 @@
+"""Nonlinear least squares over states that are not plain vectors (rotations, poses, shapes)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+State = TypeVar("State")
+MAX_TRIALS = 6  # steps, each shorter, before a state counts as the minimum
+DAMPING_FACTOR = 4.0  # by which damping grows after a trial that fails, and falls after a step
+MIN_DAMPING, FREE_DAMPING = 1e-6, 1e-5  # the least; and that at which a step counts as undamped
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation(Generic[State]):
+    """A cost about one state: Gauss-Newton information [P, P] (dense or sparse), gradient [P], value, and function."""
+
+    information: np.ndarray | sparse.spmatrix
+    gradient: np.ndarray
+    value: float
+    cost: Callable[[State], float]
+
+    def step(self, damping: float) -> np.ndarray:
+        """The damped step [P]: the information's diagonal counts `1 + damping` times (Marquardt 1963)."""
+        diagonal = self.information.diagonal()
+        if isinstance(self.information, np.ndarray):
+            return np.asarray(np.linalg.solve(self.information + damping * np.diag(diagonal), -self.gradient))
+        damped = self.information + damping * sparse.diags(diagonal + 1e-9)
+        return np.asarray(splu(damped.tocsc()).solve(-self.gradient))
+
+
+def levenberg_marquardt(
+    state: State,
+    linearise: Callable[[State], Linearisation[State]],
+    move: Callable[[State, np.ndarray], State],
+    *,
+    max_steps: int,
+    damping: float,
+    tolerance: float,
+) -> State:
+    """Minimise a cost from a first state.
+
+    move(state, step [P]): the state after a step in its own parameters; tolerance: share of the cost that an undamped
+    step must save to be followed by another. Robust losses are the caller's: weights in the linearisation, values in
+    its cost.
+    """
+    for _ in range(max_steps):
+        at = linearise(state)
+        for _ in range(MAX_TRIALS):
+            trial = move(state, at.step(damping))
+            value = at.cost(trial)
+            if value < at.value:
+                break
+            damping *= DAMPING_FACTOR
+        else:
+            return state
+        state, damping = trial, max(damping / DAMPING_FACTOR, MIN_DAMPING)
+        if at.value - value < tolerance * at.value and damping <= FREE_DAMPING:
+            return state
+    return state

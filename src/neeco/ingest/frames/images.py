@@ -1,0 +1,196 @@
+"""The chosen frames of a recording as images: written, undistorted once the lens is known, their dark border masked."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neeco.capture.images import open_image, write_image, write_labels
+from neeco.capture.model import evenly_spaced
+from neeco.errors import NeecoError
+from neeco.geometry.lens import Border, Lens
+from neeco.ingest.calibration.lens import BORDER_SAMPLES, find_border, visible_mask
+from neeco.ingest.frames.selection import choose_frames, describe_ranges, frame_features, frozen_frames
+from neeco.ingest.frames.views import StageProgress, Views
+from neeco.ingest.readers import VideoSource
+from neeco.ingest.recording.model import MIN_FRAMES
+from neeco.ingest.timing.episodes import Episodes
+
+MIN_REPEATED = 5  # frames with the picture before them that are worth a note where no state contradicts it
+ASPECT_TOLERANCE = 0.02  # of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ChosenImages:
+    """The video frames that are kept, in `folder`/raw as PNG, and their border's masks in `folder`/visible."""
+
+    folder: Path
+    size: tuple[int, int]  # width, height px
+    lens: Lens | None  # None: not known yet
+    selected: np.ndarray  # [K] video frames
+    dropped: Mapping[int, str]  # of other video frames, why
+    border: Border | None  # the endoscope's, in the frames as recorded
+
+    @property
+    def names(self) -> list[str]:
+        """File names in `folder`/raw."""
+        return [f"{frame:06d}.png" for frame in self.selected]
+
+    def load(self, row: int) -> np.ndarray:
+        """Return one of the chosen frames, uint8 [H, W, 3]."""
+        return np.asarray(open_image(self.folder / "raw" / f"{self.selected[row]:06d}.png").convert("RGB"))
+
+    def loader(self, rows: np.ndarray) -> Callable[[int], np.ndarray]:
+        """Return `load` for some rows alone."""
+        return lambda place: self.load(int(rows[place]))
+
+    def views(self, data: Episodes, rows: np.ndarray, world_from_camera: np.ndarray) -> Views:
+        """Return the views of chosen frames `rows` [M] with cameras [M, 4, 4]. The lens has to be known."""
+        assert self.lens is not None
+        frames = self.selected[rows]
+        return Views(
+            rows=rows, frames=frames, times=data.times[frames], episodes=data.episode_of(frames),
+            world_from_camera=world_from_camera, load=self.loader(rows), pinhole=self.lens.pinhole(self.size),
+            visible=self.field_of_view,
+        )  # fmt: skip
+
+    @property
+    def field_of_view(self) -> np.ndarray | None:
+        """bool [H, W] within the border, undistorted as the images are; None without a border."""
+        if self.border is None:
+            return None
+        visible = visible_mask(self.border, self.size)
+        return visible if self.lens is None else self.lens.undistort_mask(visible)
+
+    @property
+    def masks(self) -> Path | None:
+        """Folder of the border's masks, one file per frame as pycolmap expects them; None without a border."""
+        return None if self.border is None else self.folder / "visible"
+
+    def mask_of(self, frame: int) -> Path | None:
+        """Return the border's mask of a video frame; None without a border."""
+        return None if self.masks is None else self.masks / f"{frame:06d}.png.png"
+
+    def rename(self, frame: int, name: str) -> Path:
+        """Give the image of a video frame the name that it has in the capture (until now by number: SfM orders images
+        by name); return its path."""
+        image = self.folder / "raw" / f"{frame:06d}.png"
+        return image.rename(image.with_name(f"{name}.png"))
+
+
+def choose_images(data: Episodes, folder: Path, progress: StageProgress) -> ChosenImages:
+    """Choose the frames to keep and write them into `folder`, undistorted where the lens is given.
+
+    Raises NeecoError for a lens of another image size, and where too few frames can be used.
+    """
+    lens = read_lens(data)
+    selected, dropped = _choose(data, progress)
+    size = data.video.size
+    images = ChosenImages(folder=folder, size=size, lens=lens, selected=selected, dropped=dropped, border=None)
+    _write(images, data.video, progress)
+    sample = selected[evenly_spaced(len(selected), BORDER_SAMPLES, floor=True)]
+    border = find_border(image for _, image in data.video.read(sample.tolist()))
+    if border is not None:
+        dark = 1 - visible_mask(border, size).mean()
+        data.notes.add(f"the endoscope's dark border ({dark:.0%} of the image) is masked")
+    images = replace(images, border=border)
+    _write_masks(images)
+    return images
+
+
+def undistort_images(images: ChosenImages, lens: Lens, video: VideoSource, progress: StageProgress) -> ChosenImages:
+    """Write images and masks anew, undistorted by a lens that was estimated."""
+    images = replace(images, lens=lens)
+    _write(images, video, progress)
+    _write_masks(images)
+    return images
+
+
+def _write(images: ChosenImages, video: VideoSource, progress: StageProgress) -> None:
+    folder, names = images.folder / "raw", images.names
+    folder.mkdir(exist_ok=True)
+    for done, (name, (_, image)) in enumerate(zip(names, video.read(images.selected.tolist()), strict=True)):
+        progress("writing frames", done, len(names))
+        straight = images.lens.undistort(image) if images.lens else image
+        write_image(folder / name, torch.from_numpy(straight.astype(np.float32) / 255))
+
+
+def _write_masks(images: ChosenImages) -> None:
+    visible, folder = images.field_of_view, images.masks
+    if visible is None or folder is None:
+        return
+    folder.mkdir(exist_ok=True)
+    first, *others = (folder / f"{name}.png" for name in images.names)
+    write_labels(first, torch.from_numpy(visible.astype(np.uint8) * 255))
+    for other in others:
+        shutil.copyfile(first, other)
+
+
+def read_lens(data: Episodes) -> Lens | None:
+    """Return the lens given, checked against the video's size. Raises NeecoError naming where it was given."""
+    lens, where = data.recording.read_lens()
+    for part in data.parts:
+        _check_pixels(part.video, lens, where, data)
+    if lens is not None:
+        lens.check_size(data.video.size, where)
+        try:
+            lens.pinhole(data.video.size)
+        except NeecoError as error:  # it does not know where it came from
+            raise NeecoError(f"{where}: {str(error).removeprefix('lens: ')}") from error
+    return lens
+
+
+def _check_pixels(video: VideoSource, lens: Lens | None, where: str, data: Episodes) -> None:
+    """Note a lens whose focal lengths contradict the pixels' shape. Raises NeecoError for pixels that are not square
+    and an unknown lens: structure from motion finds one focal length."""
+    if lens is None and video.pixel_aspect != 1:
+        raise NeecoError(
+            f"{video.path}: its pixels are not square ({video.pixel_aspect:.3g} times as wide as high); give the "
+            "intrinsics of the frames as stored, or square pixels: ffmpeg -vf scale=iw*sar:ih,setsar=1"
+        )
+    if lens is not None and video.pixel_aspect != 1:
+        found, expected = lens.fl_x / lens.fl_y, 1 / video.pixel_aspect
+        if abs(found / expected - 1) > ASPECT_TOLERANCE:
+            data.notes.add(
+                f"{where}: fl_x / fl_y is {found:.3g}, the shape of {video.path.name}'s pixels says {expected:.3g}"
+            )
+
+
+def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[int, str]]:
+    """Return the video frames to keep, and why others are not."""
+    count, recording = len(data.times), data.recording
+    settings = recording.settings
+
+    def images() -> Iterator[np.ndarray]:
+        for done, (_, image) in enumerate(data.video.read(range(count))):
+            progress("looking at the frames", done, count)
+            yield image
+
+    features = frame_features(images())
+    states, usable = data.coverage_states()
+    known = states.any()  # else the clocks are found later, by frames that are not frozen
+    frozen = frozen_frames(features, usable, states) if known else np.flatnonzero(features.repeats)
+    if len(frozen) >= (1 if known else MIN_REPEATED):
+        why = (
+            "while the state changes; frozen, and left out" if known else "and are left out; is the video frozen there?"
+        )
+        share = f"{len(frozen)} of {count} frames ({len(frozen) / count:.0%}: {describe_ranges(frozen)})"
+        data.notes.add(f"{data.video.path.name}: {share} repeat the picture before them {why}")
+    limit = recording.frames or settings.max_frames
+    selected, dropped = choose_frames(features, usable, states, limit, settings.min_sharpness)
+    if recording.frames is None and count > limit:
+        data.notes.add(f"{limit} of {count} frames are kept; ask for more with --frames")
+    if len(selected) < MIN_FRAMES:
+        reasons = Counter(why.split(":")[0] for why in dropped.values())
+        why = reasons.most_common(1)[0][0] if reasons else "the video is short"
+        raise NeecoError(
+            f"{data.video.path}: only {len(selected)} of {count} frames are usable (at least {MIN_FRAMES} are "
+            f"needed); most are dropped because: {why}"
+        )
+    return selected, dropped

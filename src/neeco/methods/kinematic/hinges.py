@@ -1,0 +1,230 @@
+"""Hinges across the shaft that are found from the images: each turns two jaws, one or both, by one reading."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from neeco.geometry.rotations import rotate_about
+from neeco.methods.kinematic.articulation import Articulation
+from neeco.scene.drawable import JointMotion, Skeleton
+
+JAWS_BEYOND = 0.75  # radii beyond the hinge, where nothing but jaws is
+PRONGS_FROM = (
+    0.55  # radii from the middle of the hinge's axis: short of that place are only the prongs that hold the jaws
+)
+PLACE_SOFTNESS = 0.2  # radii, of either border
+RULED_OUT = 10.0  # by which the logit of a link that places rule out is below all others
+FIXED_JAW_GAIN = 0.25  # rad per rad of reading: a part that turns less is a jaw that stands still
+MIN_PART_SHARE = 0.5  # of a Gaussian that counts as belonging to a part
+MIN_AT_TIP = 10  # Gaussians of a part, with fewer its tip stays unknown
+TIP_QUANTILE = 0.97  # of the distances of a part's Gaussians from its pivot: farther ones are its tip
+
+
+class Hinges(Articulation):
+    """A straight shaft and joints whose hinge axes cross it at right angles.
+
+    Joint j turns two jaws about the axis at `hinge_angle[j]` (rad, around the shaft) and `hinge_depth[j]` (mm, along
+    it); jaw k turns by `offsets[j, k] + gains[j, k] * (reading - middle[j])`, `middle` being the mean of the recorded
+    readings, or a change of the gains would turn everything. The reading is the angle between the two jaws, so the
+    gains are `scale * (share, share - 1)`: `share` is learned freely, `scale` stays near 1.
+    """
+
+    middle: Tensor  # [J] rad or mm, as the readings
+    closed: Tensor  # [J] the lowest recorded reading; nan: not known
+    tips: Tensor  # [J, 2, 3] mm, of each joint's jaws as learned; nan: not measured
+    rates: ClassVar[Mapping[str, float]] = {
+        **Articulation.rates,
+        "hinge_angle": 1e-2,
+        "hinge_depth": 8e-2,
+        "offsets": 6e-3,
+        "share": 6e-3,
+        "scale": 2e-4,
+    }
+    skeleton: Skeleton = (
+        ("shaft_far", "shaft_near"),
+        ("shaft_near", "hinge"),
+        ("hinge", "tip_left"),
+        ("hinge", "tip_right"),
+    )
+
+    def __init__(self, joint_names: tuple[str, ...]) -> None:
+        super().__init__()
+        count = len(joint_names)
+        self.reading_names = joint_names
+        self.link_count = 1 + 2 * count  # the shaft, and two jaws per joint
+        stems = [joint.removesuffix("_angle") for joint in joint_names]
+        sides = [f"{stem}_{side}" for stem in stems for side in ("left", "right")]
+        self.part_names = ("shaft", "wrist", *sides) if joint_names else ("instrument",)
+        self.register_buffer("middle", torch.zeros(count))
+        self.register_buffer("closed", torch.full((count,), math.nan))
+        self.register_buffer("tips", torch.full((count, 2, 3), math.nan))
+        self.hinge_angle = nn.Parameter(torch.zeros(count))
+        self.hinge_depth = nn.Parameter(torch.zeros(count))
+        self.offsets = nn.Parameter(torch.zeros(count, 2))
+        self.share = nn.Parameter(torch.full((count,), 0.5))
+        self.scale = nn.Parameter(torch.ones(count))
+
+    @property
+    def gains(self) -> Tensor:
+        """[J, 2] rad of each jaw per rad of reading."""
+        return self.scale[:, None] * torch.stack([self.share, self.share - 1], -1)
+
+    def first_joint(self) -> Tensor:
+        return self.hinge_depth.detach().min() if self.jointed else torch.zeros_like(self.radius)
+
+    def axes(self, shaft: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        """No gradient reaches the shaft: only spinning it teaches where it lies, or the hinges would move it."""
+        origin, direction = (part.detach() for part in shaft or self.shaft())
+        angle = self.hinge_angle
+        around = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1) @ self.base[:3, :3].T
+        axes = nn.functional.normalize(around - (around @ direction)[:, None] * direction, dim=1)
+        return origin + self.hinge_depth[:, None] * direction, axes
+
+    def values(self, readings: Mapping[str, float]) -> Tensor:
+        turned = [readings[name] - self.middle[joint] for joint, name in enumerate(self.reading_names)]
+        angles = self.offsets + self.gains * torch.stack(turned)[:, None] if turned else self.offsets
+        return torch.block_diag(*angles.split(1)) if len(turned) > 1 else angles  # a joint moves its own two jaws
+
+    def hinge(self, joint: int) -> tuple[Tensor, Tensor]:
+        """(pivot [3] mm, unit axis [3]) of one joint, instrument frame."""
+        pivots, axes = self.axes()
+        return pivots[joint], axes[joint]
+
+    def bend(self, points: Tensor, weights: Tensor, joints: Mapping[str, float]) -> Tensor:
+        """Move points [M, 3] by the joints; weights [M, link_count] sum to 1: the shaft, then two jaws per joint."""
+        pivots, axes = self.axes()
+        for index, name in enumerate(self.reading_names):
+            angle = weights[:, 1 + 2 * index : 3 + 2 * index] @ self.turns(index, joints[name])
+            points = rotate_about(points, axes[index], pivots[index], angle)
+        return points
+
+    def turns(self, joint: int, reading: float) -> Tensor:
+        """[2] rad by which a joint's two jaws are turned."""
+        return self.offsets[joint] + self.gains[joint] * (reading - self.middle[joint])
+
+    def opening(self, joint: int, reading: float) -> Tensor:
+        """[2] rad between a joint's two jaws and the shaft, along which they lie where the joint is closed."""
+        from_closed = self.gains[joint] * (reading - self.closed[joint])
+        return torch.where(self.closed[joint].isnan(), self.turns(joint, reading), from_closed)
+
+    def tips_at(self, joint: int, reading: float) -> Tensor:
+        """[2, 3] mm, instrument frame: the tips of a joint's left and right jaw. A tip that was not measured starts at
+        the shaft's end where the joint is closed."""
+        pivot, axis = self.hinge(joint)
+        origin, direction = self.shaft()
+        known = self.tips[joint].isfinite().all(1)  # [2]
+        points = torch.where(known[:, None], self.tips[joint], origin + self.extent[1] * direction)  # [2, 3]
+        angles = torch.where(known, self.turns(joint, reading), self.opening(joint, reading))
+        return rotate_about(points, axis, pivot, angles).index_select(0, self.left_right_order(joint))
+
+    def joint_points(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
+        """The first joint's hinge and tips."""
+        if not self.jointed:
+            return {}
+        left, right = self.tips_at(0, readings[self.reading_names[0]])
+        return {"hinge": self.hinge(0)[0], "tip_left": left, "tip_right": right}
+
+    def parts(self, points: Tensor, weights: Tensor) -> Tensor:
+        """A fixed jaw is learned as shaft, since it moves like it: beyond the hinge there are only jaws."""
+        if not self.jointed:
+            return weights.new_ones(len(weights), 1)
+        along, body = self.along_shaft(points), weights[:, 0]
+        jaws: list[Tensor] = []
+        for joint in range(len(self.reading_names)):
+            beyond = along > self.hinge_depth[joint] + JAWS_BEYOND * self.radius  # [M]
+            fixed_jaw = body[:, None] * (beyond[:, None] & self._fixed(joint))
+            pair = weights[:, 1 + 2 * joint : 3 + 2 * joint] + fixed_jaw
+            body = body - fixed_jaw.sum(1)
+            jaws += pair.index_select(1, self.left_right_order(joint)).unbind(1)
+        wrist = (along >= self.wrist_start).to(weights.dtype)
+        return torch.stack([body * (1 - wrist), body * wrist, *jaws], -1)
+
+    def settled(self, points: Tensor, logits: Tensor) -> Tensor:
+        if not self.jointed:
+            return logits
+        own, ruled_out = logits[:, : self.link_count], self._ruled_out(points) > 0.5
+        lowest = own.masked_fill(ruled_out, torch.inf).amin(1, keepdim=True)
+        settled = torch.where(ruled_out, torch.minimum(own, lowest - RULED_OUT), own)
+        return torch.cat([settled, logits[:, self.link_count :]], 1)
+
+    @torch.no_grad()
+    def _ruled_out(self, points: Tensor) -> Tensor:
+        """[M, link_count] in [0, 1]: how surely links cannot be at points [M, 3] mm. Near a hinge all move alike, and
+        images hardly tell: but jaws turn between the prongs of what holds them, and beyond those there is nothing else,
+        unless a jaw stands still."""
+        along, beyond, columns = self.along_shaft(points), points.new_ones(len(points)), []
+        for joint in range(len(self.reading_names)):
+            pivot, axis = self.hinge(joint)
+            aside = ((points - pivot) @ axis).abs() / self.radius
+            past = (along - self.hinge_depth[joint]) / self.radius - JAWS_BEYOND
+            past = (0.5 + past / PLACE_SOFTNESS).clamp(0, 1)
+            prongs = (0.5 + (aside - PRONGS_FROM) / PLACE_SOFTNESS).clamp(0, 1) * (1 - past)
+            columns += [prongs, prongs]
+            beyond = beyond * past * ~self._fixed(joint).any()
+        return torch.stack([beyond, *columns], 1)
+
+    def _fixed(self, joint: int) -> Tensor:
+        """[2] bool: which of a joint's jaws stands still, if any."""
+        gains = self.gains[joint].detach().abs()
+        return (gains < FIXED_JAW_GAIN) & (gains == gains.min())
+
+    def left_right_order(self, joint: int) -> Tensor:
+        """A joint's two jaws (0 and 1) as indices [2], the left one first.
+
+        The hinge axis is given the sign that makes its largest component in the instrument frame positive; the left
+        jaw opens towards (shaft direction x axis).
+        """
+        _, axis = self.hinge(joint)
+        sign = torch.sign(axis.gather(0, axis.abs().argmax()[None]))
+        left = (sign * self.gains[joint]).argmin()
+        return torch.stack([left, 1 - left])
+
+    def moved_by(self, reading: str, weights: Tensor) -> Tensor:
+        joint = self.reading_names.index(reading)
+        return weights[:, 1 + 2 * joint : 3 + 2 * joint].sum(1)
+
+    def motion(self, weights: Tensor) -> tuple[list[JointMotion], Tensor]:
+        turns = weights.new_zeros(len(weights), len(self.reading_names), 2)
+        found = []
+        for joint, name in enumerate(self.reading_names):
+            pair = weights[:, 1 + 2 * joint : 3 + 2 * joint]
+            turns[:, joint, 0] = pair @ self.turns(joint, 0.0)
+            turns[:, joint, 1] = pair @ self.gains[joint]
+            found.append(JointMotion(*self.hinge(joint), name))
+        return found, turns
+
+    def measure_tips(self, points: Tensor, weights: Tensor) -> None:
+        """The tips of every joint's jaws are where their Gaussians lie farthest from the hinge."""
+        shares = self.parts(points, weights)
+        for joint in range(len(self.reading_names)):
+            pivot, _ = self.hinge(joint)
+            found = torch.full_like(self.tips[joint], torch.nan)
+            for side, part in enumerate(self.left_right_order(joint).tolist()):
+                tip = farthest(points[shares[:, 2 + 2 * joint + side] > MIN_PART_SHARE], pivot)
+                if tip is not None:
+                    found[part] = tip
+            self.tips[joint] = found
+
+    def describe(self, reading: str) -> dict[str, Any]:
+        """Axis and pivot in the instrument's frame, and how the jaws turn by the reading."""
+        joint = self.reading_names.index(reading)
+        pivot, axis = self.hinge(joint)
+        return {
+            "axis": [round(float(v), 5) for v in axis],
+            "pivot_mm": [round(float(v), 3) for v in pivot],
+            "gains": [round(float(v), 4) for v in self.gains[joint]],
+            "offsets_rad": [round(float(v), 4) for v in self.turns(joint, 0.0)],
+        }
+
+
+def farthest(points: Tensor, pivot: Tensor) -> Tensor | None:
+    """[3] the middle of those of points [M, 3] that lie farthest from `pivot` [3]; None where there are too few."""
+    if len(points) < MIN_AT_TIP:
+        return None
+    away = (points - pivot).norm(dim=1)
+    return points[away >= away.quantile(TIP_QUANTILE)].mean(0)

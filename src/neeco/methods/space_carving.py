@@ -1,0 +1,452 @@
+"""Rough instrument shapes by space carving from the residuals of a tissue-only scene, without masks, CAD or labels.
+
+A short static fit explains the tissue; each image's residual is the evidence. Points of a rigid instrument project onto
+evidence in all frames, whatever its pose; points of tissue do not. Background that no fit explains does so too, but
+under any frame's pose: points that score as well with exchanged poses are left out. The carved volume gives the shaft's
+axis (which need not be the sensor's z), the tip, and seeds for the Gaussians.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad
+
+from neeco.capture.model import Frame
+from neeco.errors import NeecoError
+from neeco.geometry.projection import project
+from neeco.raster import rasterize
+from neeco.scene.gaussian_scene import GaussianScene
+from neeco.scene.training_views import TrainingViews
+from neeco.training.session import GaussianSession
+
+SOLID = (0.85, 0.75, 0.65)  # mean evidence of a point surely inside: the strictest level that enough points reach
+MIN_SOLID = 8  # solid points without which nothing is carved
+FEW_SOLID = 24  # solid points: with fewer, the finer grid is tried
+SEED_SPREAD = 0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame
+POSSIBLE = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
+
+
+@dataclass(frozen=True)
+class CarvingSettings:
+    """`tissue_steps`: of the tissue-only fit whose residual is the evidence; `long_tissue_steps`: of the one with
+    density control, where the first leaves more than `max_evidence` on average; `evidence_frames`: the most training
+    frames used; `evidence_floor`, `evidence_range`: residual at which evidence begins and, above that, saturates
+    (images in [0, 1]); `grid`, `fine_grid`: voxels per side, the second where the first finds too few of a thin
+    instrument; `pose_shifts`: exchanges of poses among frames that evidence is compared with; `motion_ratio`: evidence
+    under an instrument's own poses to that under exchanged ones, at least; `seeds`: points per instrument."""
+
+    tissue_steps: int = 500
+    long_tissue_steps: int = 1500
+    max_evidence: float = 0.25
+    evidence_frames: int = 120
+    evidence_floor: float = 0.04
+    evidence_range: float = 0.06
+    grid: int = 48
+    fine_grid: int = 72
+    pose_shifts: int = 4
+    motion_ratio: float = 1.5
+    seeds: int = 3000
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, int) and value < 1:
+                raise NeecoError(f"deformation.carving.{name}: {value} is too small; give at least 1")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Residuals of F frames as soft masks, and the cameras that project points into them, on one device.
+
+    H and W are the largest of the frames' heights and widths; outside its own image a frame has no evidence.
+    """
+
+    hits: Tensor  # [F, H, W] in [0, 1]
+    depths: Tensor  # [F, H, W] mm, of the tissue; inf where there is none
+    camera_from_world: Tensor  # [F, 4, 4]
+    intrinsics: Tensor  # [F, 4] fx, fy, cx, cy
+    frames: tuple[Frame, ...]
+
+    @cached_property
+    def distance(self) -> float:
+        """Median distance from camera to tissue, mm: the scale of the scene."""
+        return float(self.depths[self.depths.isfinite() & (self.depths > 0)].median())
+
+    @cached_property
+    def sizes(self) -> Tensor:
+        """[F, 2] width and height px of each frame's image."""
+        sizes = [[frame.camera.width, frame.camera.height] for frame in self.frames]
+        return torch.tensor(sizes, device=self.device)
+
+    @property
+    def device(self) -> torch.device:
+        """Device of all tensors."""
+        return self.hits.device
+
+    @cached_property
+    def worlds(self) -> tuple[Tensor, ...]:
+        """Frames [F_t] of each tissue, in whose world their poses are; all where there is one."""
+        tissues = [frame.state.tissue for frame in self.frames]
+        return tuple(
+            torch.tensor([row for row, other in enumerate(tissues) if other == tissue], device=self.device)
+            for tissue in dict.fromkeys(tissues)
+        )
+
+    def subset(self, index: Tensor) -> Evidence:
+        """The frames `index` [M] alone."""
+        index = index.to(self.device)
+        frames = tuple(self.frames[i] for i in index.tolist())
+        return Evidence(
+            self.hits[index], self.depths[index], self.camera_from_world[index], self.intrinsics[index], frames
+        )
+
+    def look_up_camera(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Evidence at camera-frame points [F, Q, 3], and whether each is in the image and before the tissue; both
+        [F, Q]."""
+        z = points[..., 2]
+        fx, fy, cx, cy = (column[:, None] for column in self.intrinsics.unbind(1))
+        u, v = project(points, fx, fy, cx, cy)
+        height, width = self.hits.shape[1:]
+        own_width, own_height = self.sizes[:, :1], self.sizes[:, 1:]
+        inside = (z > 0.01 * self.distance) & (u >= 0) & (u < own_width) & (v >= 0) & (v < own_height)
+        column, row = u.nan_to_num().clamp(0, width - 1).long(), v.nan_to_num().clamp(0, height - 1).long()
+        place = (torch.arange(len(self.frames), device=self.device)[:, None] * height + row) * width + column
+        inside &= z < 1.02 * self.depths.view(-1)[place]
+        return self.hits.view(-1)[place], inside
+
+
+@torch.no_grad()
+def gather_evidence(scene: GaussianScene, views: TrainingViews, settings: CarvingSettings) -> Evidence:
+    """Residuals of a tissue-only `scene` against every n-th training image, at most `settings.evidence_frames`, on its
+    device. Where a mask is False there is no evidence."""
+    frames = views.frames
+    picked = list(range(0, len(frames), max(1, -(-len(frames) // settings.evidence_frames))))
+    hits, depths = [], []
+    for index in picked:
+        frame = frames[index]
+        rendering = rasterize(scene.at(frame.state), frame.camera)
+        residual = (rendering.color - views.target(index)).abs().mean(-1)
+        mask = views.mask(index)
+        if mask is not None:
+            residual = residual * mask
+        smooth = avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]
+        hits.append(((smooth - settings.evidence_floor) / settings.evidence_range).clamp(0, 1))
+        depths.append(torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)))
+    cameras, device = [frames[i].camera for i in picked], views.device
+    return Evidence(
+        _pad_and_stack(hits, 0.0),
+        _pad_and_stack(depths, torch.inf),
+        torch.stack([torch.linalg.inv(camera.world_from_camera.double()).float() for camera in cameras]).to(device),
+        torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras], device=device),
+        tuple(frames[i] for i in picked),
+    )
+
+
+def _pad_and_stack(images: list[Tensor], padding: float) -> Tensor:
+    """Images [H_i, W_i] of any sizes as one [F, H, W], padded at the right and below."""
+    height, width = max(image.shape[0] for image in images), max(image.shape[1] for image in images)
+    margins = [(0, width - image.shape[1], 0, height - image.shape[0]) for image in images]
+    return torch.stack([pad(image, margin, value=padding) for image, margin in zip(images, margins, strict=True)])
+
+
+@dataclass(frozen=True)
+class CarvedShape:
+    """Rough geometry of one instrument, instrument frame, mm."""
+
+    instrument_from_shaft: Tensor  # [4, 4], z along the shaft towards the tip, origin at the evidence's centroid
+    near: float  # mm along the shaft: first position seen often enough
+    tip: float  # mm along the shaft: last position with evidence
+    radius: float  # mm, of the solid part
+    center_line: Tensor  # [Z, 3] mm: position along the shaft, and the solid's centre across it (x, y), shaft frame
+    seeds: Tensor  # [M, 3] mm, points possibly inside, instrument frame
+    level: float  # mean evidence from which a point counts as solid
+
+
+def camera_from_instrument(evidence: Evidence, name: str) -> Tensor:
+    """[F, 4, 4] float32, the recorded poses of instrument `name` as each frame's camera sees them."""
+    poses = torch.stack([frame.state.instruments[name].pose.double() for frame in evidence.frames]).to(evidence.device)
+    return (evidence.camera_from_world.double() @ poses).float()
+
+
+def score_points(evidence: Evidence, transforms: Tensor, points: Tensor, chunk: int = 8192) -> tuple[Tensor, Tensor]:
+    """Mean evidence [Q] at points [Q, 3] over the frames that see them, and the fraction [Q] of frames that do.
+
+    `transforms` [F, 4, 4] take the points' frame to each camera's.
+    """
+    scores, seen = [], []
+    rotation, translation = transforms[:, :3, :3].transpose(1, 2), transforms[:, None, :3, 3]
+    for part in points.split(chunk):
+        hits, inside = evidence.look_up_camera(part @ rotation + translation)
+        scores.append((hits * inside).sum(0) / inside.sum(0).clamp_min(1))
+        seen.append(inside.float().mean(0))
+    return torch.cat(scores), torch.cat(seen)
+
+
+@dataclass(frozen=True)
+class PosedViews:
+    """Transforms from a coordinate frame fixed to an instrument to each camera, under the recorded poses and under
+    poses exchanged among the frames."""
+
+    evidence: Evidence
+    own: Tensor  # [F, 4, 4]
+    exchanged: Tensor  # [settings.pose_shifts, F, 4, 4]
+    motion_ratio: float  # as `CarvingSettings` has it
+
+    def seen_from(self, base: Tensor) -> PosedViews:
+        """The same for another coordinate frame, `base` [4, 4] in the present one."""
+        return PosedViews(self.evidence, self.own @ base, self.exchanged @ base, self.motion_ratio)
+
+    def scores(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """`score_points`, but 0 for what is nearly as evident under exchanged poses."""
+        score, seen = score_points(self.evidence, self.own, points)
+        likely = torch.nonzero(score > 0.5 * POSSIBLE)[:, 0]  # the others are far below all thresholds
+        static = score[likely] <= self.motion_ratio * self.exchanged_scores(points[likely])
+        score[likely[static]] = 0
+        return score, seen
+
+    def exchanged_scores(self, points: Tensor) -> Tensor:
+        """Mean evidence [Q] at points [Q, 3] over all exchanges of the poses."""
+        return torch.stack([score_points(self.evidence, other, points)[0] for other in self.exchanged]).mean(0)
+
+
+def posed_views(evidence: Evidence, name: str, settings: CarvingSettings, moved: Tensor | None = None) -> PosedViews:
+    """The views of instrument `name`; of a link of it that each frame's readings move by `moved` [F, 4, 4]. An exchange
+    keeps the cameras and shifts poses and readings among the frames."""
+    own = camera_from_instrument(evidence, name)
+    own = own if moved is None else own @ moved
+    cameras = evidence.camera_from_world.double()
+    poses = torch.linalg.inv(cameras) @ own.double()
+    count = settings.pose_shifts
+    exchanged = [(cameras @ _rolled(poses, k, count, evidence.worlds)).float() for k in range(1, count + 1)]
+    return PosedViews(evidence, own, torch.stack(exchanged), settings.motion_ratio)
+
+
+def _rolled(poses: Tensor, number: int, count: int, worlds: Sequence[Tensor]) -> Tensor:
+    """Poses [F, 4, 4] shifted among the frames of each world, in one of `count` ways."""
+    rolled = poses.clone()
+    for rows in worlds:
+        # uneven shifts, so that periodic motion does not come out the same
+        shift = round(len(rows) * (number + 0.1 * (number % 2)) / (count + 1))
+        rolled[rows] = poses[rows].roll(shift, 0)
+    return rolled
+
+
+def carved_shape(session: GaussianSession, evidence: Evidence, name: str, generator: torch.Generator) -> CarvedShape:
+    """The carved shape, or what of it is around the instrument's frame where the rest may be static parts of the scene.
+    Raises NeecoError when there is nothing."""
+    search = session.config.deformation.carving
+    shape = carve(evidence, name, generator, search)
+    if shape is None:
+        raise NeecoError(
+            f"instrument {name!r}: nothing in the images moves with its recorded pose; check that its poses are in the "
+            "cameras' world frame and in mm (`neeco check`), or train with --method neeco as published"
+        )
+    if moves_with_pose(session, evidence, name, shape):
+        return shape
+    return shape_around_frame(shape, evidence.distance, search.seeds, generator)
+
+
+def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, shape: CarvedShape) -> bool:
+    """Whether the evidence moves with the instrument: with poses exchanged among frames it must be weaker.
+
+    Where it is not (an instrument that hardly moves, say), carving cannot separate the instrument from static parts of
+    the scene.
+    """
+    search = session.config.deformation.carving
+    views = posed_views(evidence, name, search)
+    own, _ = score_points(evidence, views.own, shape.seeds)
+    other = views.exchanged_scores(shape.seeds)
+    moves = float(own.mean()) > search.motion_ratio * float(other.mean())
+    session.scene.diagnostics.setdefault("instruments", {})[name] = {
+        "evidence": round(float(own.mean()), 4),
+        "evidence_of_other_poses": round(float(other.mean()), 4),
+        "moves_with_its_pose": moves,
+    }
+    if not moves:
+        session.report(
+            f"warning: {name}: the images hardly depend on its recorded pose; its shape is searched around the "
+            "tracked frame, and its labels may be wrong (record more motion, or check that poses are registered)"
+        )
+    return moves
+
+
+def shape_around_frame(shape: CarvedShape, distance: float, count: int, generator: torch.Generator) -> CarvedShape:
+    """The initial shape where carving cannot be trusted: `count` seeds around the tracked frame, which is on the
+    body."""
+    spread = SEED_SPREAD * distance
+    seeds = (torch.randn(count, 3, generator=generator, device=generator.device) * spread).to(shape.seeds)
+    frame = torch.eye(4, device=seeds.device)
+    return replace(shape, instrument_from_shaft=frame, near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds)
+
+
+def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: CarvingSettings) -> CarvedShape | None:
+    """The shape of instrument `name`, or None when nothing in its frame is evident (wrong poses, or never in view)."""
+    reach = 0.6 * evidence.distance
+    views = posed_views(evidence, name, settings)
+    for side in (settings.grid, settings.fine_grid):
+        solid, level = _solid_points(views, reach, side)
+        if len(solid) >= FEW_SOLID:
+            break
+    if len(solid) < MIN_SOLID:
+        return None
+    base, line, radius = _refine_axis(views, _shaft_frame(views, solid), 2 * reach / (side - 1), level)
+    if line.shape[0] < 4:
+        return None
+    near, tip = float(line[0, 0]), float(line[-1, 0])
+    points = _sample_seeds(views.seen_from(base), near, tip, max(3 * radius, 0.08 * reach), settings.seeds, generator)
+    return CarvedShape(base, near, tip, radius, line, points @ base[:3, :3].T + base[:3, 3], level)
+
+
+def carve_along(
+    evidence: Evidence, name: str, base: Tensor, level: float, generator: torch.Generator, settings: CarvingSettings
+) -> CarvedShape | None:
+    """As `carve`, about a line that is known: the z axis of `base` [4, 4], instrument_from_shaft. None where there is
+    no evidence along it."""
+    reach = 0.6 * evidence.distance
+    views = posed_views(evidence, name, settings).seen_from(base)
+    line, radius = _solid_line(views, 2 * reach / (settings.fine_grid - 1), 0.09 * evidence.distance, level)
+    if len(line) < 4:
+        return None
+    near, tip = float(line[0, 0]), float(line[-1, 0])
+    points = _sample_seeds(views, near, tip, max(3 * radius, 0.08 * reach), settings.seeds, generator)
+    return CarvedShape(base, near, tip, radius, line[:, :3], points @ base[:3, :3].T + base[:3, 3], level)
+
+
+def _solid_points(views: PosedViews, reach: float, side: int) -> tuple[Tensor, float]:
+    """Points [S, 3] surely inside, of a grid of `side`^3 that ends `reach` mm from the frame's origin, and their level:
+    the strictest of SOLID that MIN_SOLID of them have."""
+    ticks = torch.linspace(-reach, reach, side, device=views.evidence.device)
+    grid = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
+    score, seen = views.scores(grid)
+    score[seen <= 0.25] = 0
+    level = next((level for level in SOLID if int((score > level).sum()) >= MIN_SOLID), SOLID[-1])
+    return grid[score > level], level
+
+
+def _shaft_frame(views: PosedViews, solid: Tensor) -> Tensor:
+    """instrument_from_shaft [4, 4] by the principal axis of solid points [S, 3], towards the end that more frames
+    see."""
+    center = solid.mean(0)
+    arm = (solid - center).double()
+    covariance = (arm[:, :, None] * arm[:, None, :]).sum(0)  # [3, 3]
+    direction = torch.from_numpy(np.linalg.eigh(covariance.cpu().numpy())[1][:, -1].copy()).to(solid)
+    along = (solid - center) @ direction
+    ends = torch.stack([center + along.min() * direction, center + along.max() * direction])
+    _, seen = score_points(views.evidence, views.own, ends)
+    if seen[0] > seen[1]:
+        direction = -direction
+    return frame_along(center, direction)
+
+
+def frame_along(origin: Tensor, direction: Tensor) -> Tensor:
+    """[4, 4] with z along `direction` and x as near as can be to the instrument frame's x (or y)."""
+    x = origin.new_tensor([1.0, 0.0, 0.0])
+    if abs(float(direction @ x)) > 0.9:
+        x = origin.new_tensor([0.0, 1.0, 0.0])
+    x = torch.nn.functional.normalize(x - (x @ direction) * direction, dim=0)
+    frame = torch.eye(4, device=origin.device)
+    frame[:3, 0], frame[:3, 1], frame[:3, 2] = x, torch.linalg.cross(direction, x), direction
+    frame[:3, 3] = origin
+    return frame
+
+
+def _refine_axis(views: PosedViews, base: Tensor, spacing: float, level: float) -> tuple[Tensor, Tensor, float]:
+    """Fit the axis to the solid's centre in slices, thrice; returns (base, centre line [Z, 3], radius mm)."""
+    half = 0.09 * views.evidence.distance
+    line, radius = base.new_zeros(0, 3), spacing
+    for _ in range(3):
+        rows, radius = _solid_line(views.seen_from(base), spacing, half, level)
+        if len(rows) < 4:
+            return base, base.new_zeros(0, 3), radius
+        line, area, seen = rows[:, :3], rows[:, 3], rows[:, 4]
+        near, tip = float(line[0, 0]), float(line[-1, 0])
+        # the ends are seen rarely (rear) or bend and open (front)
+        middle = (line[:, 0] > near + 0.15 * (tip - near)) & (line[:, 0] < near + 0.65 * (tip - near)) & (seen > 0.3)
+        if middle.sum() < 3:
+            middle = line[:, 0] < near + 0.65 * (tip - near)
+        slope = _robust_line(line[middle, 0], line[middle, 1:], (area * seen)[middle])
+        direction = base[:3, :3] @ torch.nn.functional.normalize(torch.cat([slope[0], slope.new_ones(1)]), dim=0)
+        origin = base[:3, :3] @ torch.cat([slope[1], slope.new_zeros(1)]) + base[:3, 3]
+        base = frame_along(origin, direction)
+        half = max(min(half, 4 * radius), 2 * spacing)
+    return base, line, radius
+
+
+def _solid_line(views: PosedViews, spacing: float, half: float, level: float) -> tuple[Tensor, float]:
+    """The rows [Z, 5] of `_slice_centers`, and the solid's radius mm by their median area."""
+    rows = _slice_centers(views, spacing, half, level)
+    area = float(rows[:, 3].median()) if len(rows) else 0.0
+    return rows, max(math.sqrt(area / math.pi), spacing / 4)
+
+
+def center_line(evidence: Evidence, name: str, shape: CarvedShape, settings: CarvingSettings) -> Tensor:
+    """[Z, 3] like `CarvedShape.center_line`, from other frames."""
+    views = posed_views(evidence, name, settings).seen_from(shape.instrument_from_shaft)
+    return _slice_centers(views, (shape.tip - shape.near) / 30, 4 * shape.radius, shape.level)[:, :3]
+
+
+def _slice_centers(views: PosedViews, spacing: float, half: float, level: float) -> Tensor:
+    """[Z, 5]: position along the shaft, centre of the solid across it (x, y), its area mm^2, fraction of frames that
+    see it."""
+    device = views.evidence.device
+    ticks = torch.linspace(-half, half, 21, device=device)
+    cell = float(ticks[1] - ticks[0]) ** 2
+    x, y = torch.meshgrid(ticks, ticks, indexing="ij")
+    rows = []
+    reach = 0.6 * views.evidence.distance
+    for z in torch.arange(-reach, reach, spacing, device=device):
+        plane = torch.stack([x.flatten(), y.flatten(), z.expand(x.numel())], -1)
+        score, seen = views.scores(plane)
+        score = torch.where(seen > 0.15, score, 0.0)
+        if score.max() < POSSIBLE:
+            continue
+        weight = (score - level).clamp_min(0)
+        weight = weight if weight.sum() > 0 else (score - 0.95 * score.max()).clamp_min(0)
+        center = (weight[:, None] * plane).sum(0) / weight.sum()
+        area = (score > level).sum() * cell
+        rows.append(torch.stack([z, center[0], center[1], area, seen.max()]))
+    return torch.stack(rows) if rows else ticks.new_zeros(0, 5)
+
+
+def _robust_line(positions: Tensor, values: Tensor, weights: Tensor) -> Tensor:
+    """[2, 2] slope and intercept of values [Z, 2] over positions [Z]; iteratively reweighted against outlying slices.
+
+    In closed form: LAPACK's least squares may differ in the last bit from run to run with the memory's alignment.
+    """
+    robust = torch.ones_like(positions)
+    for _ in range(10):
+        weight = (weights * robust + 1e-9)[:, None]
+        total = weight.sum(0)
+        x = positions[:, None]
+        middle_x, middle_y = (weight * x).sum(0) / total, (weight * values).sum(0) / total
+        spread = (weight * (x - middle_x).square()).sum(0).clamp_min(1e-12)
+        slope = (weight * (x - middle_x) * (values - middle_y)).sum(0) / spread
+        intercept = middle_y - slope * middle_x
+        residual = (values - x * slope - intercept).norm(dim=1)
+        robust = 1 / (1 + (residual / residual.median().clamp_min(1e-3)) ** 2)
+    return torch.stack([slope, intercept])
+
+
+def _sample_seeds(
+    views: PosedViews, near: float, tip: float, width: float, count: int, generator: torch.Generator
+) -> Tensor:
+    """[count, 3] shaft-frame points around the shaft where the evidence allows an instrument."""
+    length = tip - near
+    device, target = generator.device, views.evidence.device
+    random = torch.rand(20 * count, 3, generator=generator, device=device).to(target)
+    along = near - 0.1 * length + random[:, 2] * 1.2 * length
+    points = torch.stack([(2 * random[:, 0] - 1) * width, (2 * random[:, 1] - 1) * width, along], -1)
+    score, seen = views.scores(points)
+    chosen = points[(score > POSSIBLE) & (seen > 0.05)]
+    if len(chosen) < count:  # thin instruments: fill up with jittered copies
+        source = chosen if len(chosen) else points
+        extra = torch.randint(len(source), (count - len(chosen),), generator=generator, device=device)
+        jitter = torch.randn(len(extra), 3, generator=generator, device=device) * width * 0.05
+        chosen = torch.cat([chosen, source[extra.to(target)] + jitter.to(target)])
+    return chosen[:count]

@@ -1,0 +1,85 @@
+"""A short fit of the tissue alone, whose residual is the evidence of instruments."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from neeco.fitting.refinement import RefineConfig
+from neeco.methods.breathing import Breathing
+from neeco.methods.space_carving import Evidence, carved_shape, gather_evidence
+from neeco.methods.static import Static
+from neeco.scene.drawable import Recorded
+from neeco.scene.gaussian_scene import GaussianScene
+from neeco.scene.training_views import TrainingViews
+from neeco.training.config import TrainConfig, method_defaults
+from neeco.training.session import GaussianSession, new_session
+
+DENSITY_START = 200  # steps of a longer fit of the tissue before it adds Gaussians
+
+
+def tissue_evidence(
+    scene: GaussianScene, views: TrainingViews, config: TrainConfig, tissue: GaussianScene | None = None
+) -> Evidence:
+    """Fit a copy of the tissue without motion but that of breathing; the residual is the evidence. `tissue`: that fit,
+    where it was made before.
+
+    A few hundred steps suffice on textured tissue with enough sparse points. Where the residual is large, a longer fit
+    may add Gaussians.
+    """
+    settings = config.deformation.carving
+    tissue = tissue or fit_tissue(scene, views, config)
+    evidence = gather_evidence(tissue, views, settings)
+    if float(evidence.hits.mean()) <= settings.max_evidence:
+        return evidence
+    breathing = tissue.deformation.breathing if isinstance(tissue.deformation, Static) else None
+    longer = fit_tissue(scene, views, config, settings.long_tissue_steps, DENSITY_START, breathing)
+    return gather_evidence(longer, views, settings)
+
+
+def fit_tissue(
+    scene: GaussianScene,
+    views: TrainingViews,
+    config: TrainConfig,
+    steps: int | None = None,
+    density_start: int = 10**9,
+    breathing: Breathing | None = None,
+) -> GaussianScene:
+    """A copy of the tissue of `scene`, which holds it alone, after `steps` steps (None: `tissue_steps`), with density
+    control from `density_start` on; still, or breathing as it begins to with `breathing`."""
+    steps = config.deformation.carving.tissue_steps if steps is None else steps
+    canonical = scene.canonical.map(lambda tensor: tensor.clone())
+    deformation = Static()
+    if breathing is not None:
+        deformation.start_breathing(breathing)
+    recorded = Recorded(tissues=scene.recorded.tissues)
+    tissue = GaussianScene(Static.method, canonical, deformation, (), recorded, scene.center)
+    tissue.background = scene.background  # or the background of transparent images would be evidence
+    short = replace(
+        config,
+        iterations=steps,
+        minutes=None,
+        schedule=method_defaults(Static.method).schedule,
+        refine=RefineConfig(),
+        density_start=density_start,
+        density_stop=0.8,
+    )
+    session = new_session(tissue, views, short)
+    session.start()
+    while session.iteration < steps:
+        session.step()
+    tissue.requires_grad_(False)
+    return tissue
+
+
+def carve_seeds(session: GaussianSession) -> list[tuple[Tensor, float]]:
+    """Points [P, 3] mm on every instrument in its own frame, and its shaft's radius, mm. Raises NeecoError as
+    `find_instruments` does."""
+    session.report("looking for the instruments, on which Gaussians begin")
+    evidence = tissue_evidence(session.scene, session.views, session.config)
+    generator = torch.Generator().manual_seed(session.config.seed)
+    names = [instrument.name for instrument in session.scene.instruments]
+    shapes = [carved_shape(session, evidence, name, generator) for name in names]
+    return [(shape.seeds, shape.radius) for shape in shapes]

@@ -1,0 +1,88 @@
+"""The cpu backend: neeco's own C++ kernels, float32, several threads, the same bits every time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
+from neeco.raster.native import native
+from neeco.raster.types import Gaussians, Rendering, differentiable
+
+
+def rasterize_cpu(
+    gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
+) -> Rendering:
+    """`rasterize` with neeco's own C++ kernels. Inputs are taken as float32 on the CPU."""
+    given = differentiable(gaussians, camera, channels, background)
+    tensors = [None if t is None else _prepared(t) for t in given]
+    frames = None if gaussians.sh_frames is None else _prepared(gaussians.sh_frames.detach())
+    wanted = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    offsets = torch.zeros(len(gaussians), 2, requires_grad=wanted)
+    color, alpha, depth, composited, radii = _Rasterize.apply(offsets, frames, camera, wanted, *tensors)
+    return Rendering(color, alpha, depth, composited, radii, offsets)
+
+
+def last_statistics() -> dict[str, float]:
+    """Stage times in ms, and visible Gaussians and (tile, Gaussian) pairs, of the latest drawing and its gradient."""
+    return native().last_statistics()
+
+
+def _prepared(tensor: Tensor) -> Tensor:
+    if tensor.device.type != "cpu":
+        raise NeecoError(f"backend: cpu: tensors are on {tensor.device}; move them or use backend='cuda'")
+    return tensor.to(torch.float32).contiguous()
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, offsets: Tensor, frames: Tensor | None, camera: Camera, keep: bool, *tensors: Tensor | None
+    ) -> Any:
+        plain = [None if t is None else t.detach() for t in tensors]
+        means, quats, scales, opacities, sh, falloff, channels, left, vignette, world_from_camera, background = plain
+        assert means is not None
+        try:
+            drawing = native().Drawing(
+                means, quats, scales, opacities, sh, frames, falloff, vignette, left, channels, background,
+                world_from_camera,
+                camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
+            )  # fmt: skip
+            height, width = camera.height, camera.width
+            color = torch.empty(height, width, 3)
+            alpha = torch.empty(height, width)
+            depth = torch.empty(height, width)
+            radii = torch.empty(means.shape[0])
+            composited = None if channels is None else torch.empty(height, width, channels.shape[1])
+            drawing.forward(color, alpha, depth, composited, radii, keep)
+        except (ValueError, RuntimeError) as error:
+            raise NeecoError(f"rasterize: {error}") from error
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(radii)
+        if keep:
+            # Saved so that autograd notices when someone changes an input before the backward pass.
+            ctx.save_for_backward(alpha, depth, *tensors)
+            ctx.drawing = drawing
+        return color, alpha, depth, composited, radii
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> Any:
+        alpha, depth, *tensors = ctx.saved_tensors
+        images = [None if g is None else g.to(torch.float32).contiguous() for g in gradients[:4]]
+        *gaussians, vignette, pose, background = tensors
+        wanted = ctx.needs_input_grad[4:]
+        grads = [
+            torch.empty_like(t) if need and t is not None else None
+            for t, need in zip([*gaussians, vignette, pose], wanted[:10], strict=True)
+        ]
+        to_offsets = torch.empty(tensors[0].shape[0], 2)
+        ctx.drawing.backward(*images, alpha.detach(), depth.detach(), [*grads[:8], to_offsets, *grads[8:]])
+        to_background = None
+        if wanted[10] and images[0] is not None and background is not None:
+            to_background = ((1 - alpha.detach())[..., None] * images[0]).sum(dim=(0, 1))
+        return to_offsets, None, None, None, *grads, to_background

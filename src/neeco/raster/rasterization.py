@@ -1,0 +1,127 @@
+"""`rasterize`: one entry point, four backends."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
+from neeco.raster.devices import cuda_backend
+from neeco.raster.native import runs_native
+from neeco.raster.resampling import draw_through, of_learned_size, widened
+from neeco.raster.shadow import shadowed
+from neeco.raster.triton.ready import require_triton
+from neeco.raster.types import Gaussians, Rendering
+
+BACKENDS = ("auto", "reference", "cpu", "cuda", "triton")
+SH_COUNTS = (1, 4, 9, 16)
+
+
+def rasterize(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    channels: Tensor | None = None,
+    background: Tensor | None = None,
+    backend: str = "auto",
+) -> Rendering:
+    """Draw Gaussians (3D Gaussian splatting, Kerbl et al. 2023, with gsplat's conventions).
+
+    channels [N, C], C <= 32: composited like colour over background 0. background [3]: what lies behind; by default
+    the Gaussians' background, or black.
+    backend: "cpu" (native, float32), "reference" (plain torch, any float type and device, slow), "cuda" (gsplat),
+    "triton" (neeco's own, float32, on a CUDA device), or "auto": for tensors on a CUDA device cuda where gsplat is
+    installed, else triton; cpu for those on the CPU, reference on other devices and where `kernels("torch")` asks for
+    it. The camera's pose may stay on the CPU.
+
+    Defined by the reference:
+    - the projected covariance gets 0.3 px^2 on its diagonal; the projection is linearised at the mean, moved to within
+      1.3 x the field of view;
+    - alpha = min(0.999, opacity * exp(-distance^2 / 2)), nothing where it is below 1/255; a pixel is full, and takes
+      nothing more, once its transmittance would fall to 1e-4 or less;
+    - order is by depth, computed in float64 and rounded once to float32, equal depths by index;
+    - a camera with a lens, or with another size than the learned one, sees what `draw_through` makes of pinholes;
+    - Gaussians nearer than `camera.near`, or with a NaN or an infinity in any parameter, or with a quaternion of length
+      zero, draw nothing and get zero gradients.
+
+    Gradients reach means, quats, scales, opacities, sh, headlight, channels, background and
+    `camera.world_from_camera`, whose inverse is taken as [R^T | -R^T t].
+
+    Raises NeecoError where shapes do not fit, or the backend cannot be had.
+    """
+    if background is None:
+        background = gaussians.background
+    _check(gaussians, camera, channels, background)
+    if channels is not None and channels.shape[1] == 0:  # no kernel need know of none
+        rendering = rasterize(gaussians, camera, background=background, backend=backend)
+        return replace(rendering, channels=rendering.color.new_zeros((camera.height, camera.width, 0)))
+    if camera.is_resampled:
+        return draw_through(camera, partial(_rasterize_resized, gaussians, channels, background, backend))
+    gaussians = shadowed(gaussians, camera, partial(rasterize, backend=backend))
+    if backend == "auto":
+        on_cpu = "cpu" if runs_native(gaussians.means) else "reference"
+        backend = cuda_backend() if gaussians.means.is_cuda else on_cpu
+    if backend == "reference":
+        from neeco.raster.reference import rasterize_reference
+
+        return rasterize_reference(gaussians, camera, channels, background)
+    if backend == "cpu":
+        from neeco.raster.cpu_backend import rasterize_cpu
+
+        return rasterize_cpu(gaussians, camera, channels, background)
+    if backend == "cuda":
+        if not torch.cuda.is_available() or importlib.util.find_spec("gsplat") is None:
+            raise NeecoError("backend: cuda: needs a CUDA device and gsplat; install neeco[cuda] or use backend='cpu'")
+        from neeco.raster.gsplat_backend import rasterize_cuda
+
+        return rasterize_cuda(gaussians, camera, channels, background)
+    if backend == "triton":
+        require_triton(gaussians.means.device)
+        from neeco.raster.triton_backend import rasterize_triton
+
+        return rasterize_triton(gaussians, camera, channels, background)
+    raise NeecoError(f"backend: {backend!r}: unknown; use one of {', '.join(BACKENDS)}")
+
+
+def _rasterize_resized(
+    gaussians: Gaussians, channels: Tensor | None, background: Tensor | None, backend: str, camera: Camera
+) -> Rendering:
+    """`rasterize` for a pinhole of the learned size or a larger one; shadows are as soft as they were learned."""
+    draw = partial(rasterize, backend=backend)
+    pinhole = replace(camera, learned_fx=None)
+    gaussians = shadowed(gaussians, replace(of_learned_size(camera), learned_fx=None), draw)
+    return draw(widened(gaussians, camera), pinhole, channels=channels, background=background)
+
+
+def _check(gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None) -> None:
+    n = gaussians.means.shape[0]
+    k = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
+    expected: list[tuple[str, Tensor | None, tuple[int, ...]]] = [
+        ("means", gaussians.means, (n, 3)),
+        ("quats", gaussians.quats, (n, 4)),
+        ("scales", gaussians.scales, (n, 3)),
+        ("opacities", gaussians.opacities, (n,)),
+        ("sh", gaussians.sh, (n, k, 3)),
+        ("sh_frames", gaussians.sh_frames, (n, 4)),
+        ("background", background, (3,)),
+        ("camera.world_from_camera", camera.world_from_camera, (4, 4)),
+    ]
+    if gaussians.headlight is not None:
+        expected += [("headlight.falloff", gaussians.headlight.falloff, (n,))]
+        expected += [("headlight.vignette", gaussians.headlight.vignette, (2,))]
+    for name, tensor, shape in expected:
+        if tensor is not None and tuple(tensor.shape) != shape:
+            raise NeecoError(f"rasterize: {name}: shape {tuple(tensor.shape)}, expected {shape}")
+    if k not in SH_COUNTS:
+        raise NeecoError(f"rasterize: sh: {k} coefficients; expected one of {SH_COUNTS}")
+    if channels is not None and (channels.dim() != 2 or channels.shape[0] != n or channels.shape[1] > 32):
+        raise NeecoError(f"rasterize: channels: shape {tuple(channels.shape)}, expected ({n}, C) with C <= 32")
+    if camera.width < 1 or camera.height < 1:
+        raise NeecoError(f"rasterize: camera: size {camera.width} x {camera.height}; both must be positive")
+    if not (camera.near > 0 and camera.fx > 0 and camera.fy > 0):
+        raise NeecoError("rasterize: camera: near, fx and fy must be positive")

@@ -1,0 +1,102 @@
+"""The triton backend: float32, drawn and differentiated by neeco's own Triton kernels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
+from neeco.raster.triton.binning import Lists, Tiles, list_per_tile
+from neeco.raster.triton.composite import Images, composite, composite_backward
+from neeco.raster.triton.project import Inputs, Projected, project
+from neeco.raster.triton.project_backward import project_backward
+from neeco.raster.triton.ready import working_on
+from neeco.raster.types import Gaussians, Rendering, differentiable
+
+TILE = 16  # px
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What the gradient needs of a drawing. No tensor of it is an input or an output of autograd."""
+
+    projected: Projected
+    lists: Lists
+    tiles: Tiles
+    left: Tensor
+    full_at: Tensor
+
+
+def rasterize_triton(
+    gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
+) -> Rendering:
+    """`rasterize` with Triton kernels on the device of the means. Inputs are taken as float32.
+
+    The image has the same bits every time; gradients do where `torch.use_deterministic_algorithms(True)` asks for it.
+    """
+    device = gaussians.means.device
+    frames = None if gaussians.sh_frames is None else gaussians.sh_frames.detach()
+    tensors = [
+        None if tensor is None else tensor.to(torch.float32).contiguous()
+        for tensor in (*differentiable(gaussians, camera.to(device), channels, background), frames)
+    ]
+    for tensor in tensors:
+        if tensor is not None and tensor.device != device:
+            raise NeecoError(f"backend: triton: tensors are on {device} and {tensor.device}; move them to one device")
+    wanted = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    offsets = torch.zeros(len(gaussians), 2, device=device, requires_grad=wanted)
+    with working_on(device):
+        color, alpha, depth, composited, radii = _Rasterize.apply(offsets, camera, wanted, *tensors)
+    return Rendering(color, alpha, depth, composited, radii, offsets)
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, offsets: Tensor, camera: Camera, keep: bool, *tensors: Tensor | None) -> Any:
+        inputs = Inputs(*(None if t is None else t.detach() for t in tensors))  # type: ignore[arg-type]
+        size = TILE
+        tiles = Tiles(size, -(-camera.width // size), -(-camera.height // size))
+        projected = project(inputs, camera, tiles)
+        lists = list_per_tile(
+            projected.ellipses, projected.counts, projected.depths, tiles, camera.width, camera.height
+        )
+        images = composite(
+            projected.records, inputs.channels, lists, inputs.background, tiles, camera.width, camera.height
+        )
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(projected.radii)
+        if keep:
+            # Saved so that autograd notices when someone changes an input before the backward pass.
+            ctx.save_for_backward(images.alpha, images.depth, *tensors)
+            ctx.camera = camera
+            ctx.drawing = Drawing(projected, lists, tiles, images.left, images.full_at)
+        return images.color, images.alpha, images.depth, images.channels, projected.radii
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> Any:
+        alpha, depth, *tensors = ctx.saved_tensors
+        inputs, drawing, camera = Inputs(*tensors), ctx.drawing, ctx.camera
+        to_color, to_alpha, to_depth, to_channels = (
+            None if gradient is None else gradient.to(torch.float32).contiguous() for gradient in gradients[:4]
+        )
+        wanted = ctx.needs_input_grad[3:]
+        images = Images(depth, alpha, depth, None, drawing.left, drawing.full_at)
+        with working_on(alpha.device):
+            sums = composite_backward(
+                drawing.projected.records, inputs.channels, drawing.lists, inputs.background, drawing.tiles, images,
+                (to_color, to_alpha, to_depth, to_channels),
+            )  # fmt: skip
+            to = project_backward(inputs, drawing.projected, camera, sums, wanted[4], wanted[8] or wanted[9])
+        to_background = None
+        if wanted[10] and to_color is not None and inputs.background is not None:
+            to_background = ((1 - alpha)[..., None] * to_color).sum(dim=(0, 1))
+        grads = [to.means, to.quats, to.scales, to.opacities, to.sh, to.falloff, to.channels, to.left]
+        grads += [to.vignette, to.pose]
+        needed = [gradient if need else None for gradient, need in zip(grads, wanted, strict=False)]
+        return to.centers, None, None, *needed, to_background, None

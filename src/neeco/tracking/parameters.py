@@ -1,0 +1,104 @@
+"""The parameters by which tracked states are corrected: rotations about a joint, joints near their recorded range."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Instrument, State
+from neeco.errors import NeecoError
+from neeco.fitting.fitter import Fitter
+from neeco.fitting.layers import InstrumentRenderer, TissueRenderer
+from neeco.fitting.parameters import InstrumentParameters, StateParameters
+from neeco.methods.kinematic.articulation import ArticulatedInstruments
+from neeco.scene import GaussianScene
+
+RANGE_BELOW, RANGE_ABOVE = 0.1, 0.5  # of a joint's recorded range: how far below and above it a joint may be
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackedInstrument(InstrumentParameters):
+    """The parameters of one instrument, its shaft's axis, and the bounds of its joints."""
+
+    pivot: Tensor  # [3] mm, instrument frame: its first joint, or where its shaft ends
+    axis: Tensor  # [3] unit, along the shaft, instrument frame
+    low: Tensor  # [J] rad or mm
+    high: Tensor
+
+
+@dataclass(frozen=True)
+class TrackedParameters(StateParameters):
+    """The parameters of all instruments of a scene."""
+
+    instruments: tuple[TrackedInstrument, ...]
+
+    @classmethod
+    def of(cls, scene: GaussianScene) -> TrackedParameters:
+        """Take them from a scene. Raises NeecoError for one that does not keep tissue and instruments apart, or has no
+        instrument."""
+        deformation = scene.deformation
+        if not (deformation.separates_instruments and isinstance(deformation, ArticulatedInstruments)):
+            raise NeecoError(
+                f"track: method {scene.method} does not keep tissue and instruments apart; use a run of method "
+                "kinematic"
+            )
+        if not scene.instruments:
+            raise NeecoError("track: the run has no instrument; train on a capture that records one")
+        if not scene.recorded.states:
+            raise NeecoError("track: the run remembers no recorded frame; train it again with this version")
+        found = []
+        for instrument, articulation in zip(scene.instruments, deformation.articulations, strict=True):
+            shaft = articulation.shaft()
+            if articulation.jointed:
+                pivot = articulation.axes(shaft)[0][-1]
+            else:
+                pivot = articulation.keypoints({})["shaft_near"]
+            found.append(_tracked(instrument, scene.recorded.states, pivot, shaft[1]))
+        return cls(tuple(found))
+
+    def along(self, instrument: int, millimetres: float = 0.0, roll: float = 0.0) -> Tensor:
+        """Return the parameters [P] that shift one instrument along its shaft and roll it (rad) about it."""
+        axis, (pose, _) = self.instruments[instrument].axis, self.rows[instrument]
+        increments = torch.zeros(self.size, dtype=torch.float64)
+        increments[pose] = torch.cat([roll * axis, millimetres * axis])
+        return increments
+
+    def with_joints(self, state: State, instrument: int, values: Sequence[float]) -> State:
+        """Return `state` with one instrument's joints at `values` [J]."""
+        item = self.instruments[instrument]
+        given = state.instruments[item.name]
+        joints = dict(zip(item.joints, map(float, values), strict=True))
+        return replace(state, instruments={**state.instruments, item.name: replace(given, joints=joints)})
+
+
+TrackingFitter = Fitter[TrackedParameters]
+
+
+def fitter_of(scene: GaussianScene) -> TrackingFitter:
+    """Return the fitter of a scene's instruments over its tissue. Raises NeecoError as `TrackedParameters.of`."""
+    return Fitter(InstrumentRenderer(scene), TrackedParameters.of(scene), TissueRenderer(scene))
+
+
+def _tracked(instrument: Instrument, states: Sequence[State], pivot: Tensor, axis: Tensor) -> TrackedInstrument:
+    names = tuple(instrument.joints)
+    values = torch.tensor(
+        [[state.instruments[instrument.name].joints[name] for name in names] for state in states], dtype=torch.float64
+    ).reshape(len(states), len(names))
+    low, high = values.amin(0), values.amax(0)
+    low, high = low - RANGE_BELOW * (high - low), high + RANGE_ABOVE * (high - low)
+    for k, name in enumerate(names):
+        limits = instrument.joints[name]
+        if limits is not None:  # noise of what was recorded may pass them
+            low[k], high[k] = max(float(low[k]), limits[0]), min(float(high[k]), limits[1])
+    return TrackedInstrument(
+        name=instrument.name,
+        joints=names,
+        slides=tuple(instrument.slides(name) for name in names),
+        pivot=pivot.detach().cpu().double(),
+        axis=axis.detach().cpu().double(),
+        low=low,
+        high=high,
+    )
