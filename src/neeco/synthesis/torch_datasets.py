@@ -56,9 +56,9 @@ from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import load_gaussians, save_scene
 from neeco.synthesis.dataset import INFO, SCENE_FILE
 from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, StatesRefused, limit_threads
+from neeco.synthesis.parallel import PackedSpec
 from neeco.synthesis.samplers import make_sampler
 from neeco.synthesis.settings import PATH_PREFIX, LabelWay, Settings, Views
-from neeco.synthesis.workers import PackedSpec
 from neeco.synthesis.writers.folder import read_public_records, stem
 from neeco.training.run import TrainedRun, load_run
 
@@ -330,11 +330,11 @@ class StoredImages(Dataset[Sample]):
         labelled = LabelledImage.of(
             read_image(image, size),
             torch.from_numpy(depth),
-            read_labels(files["parts"], size),
-            read_labels(files["ignore"], size) == self._ignored,
-            record["labels"],
-            self.part_names,
-            self.keypoint_names,
+            parts=read_labels(files["parts"], size),
+            ignore=read_labels(files["ignore"], size) == self._ignored,
+            labels=record["labels"],
+            part_names=self.part_names,
+            keypoint_names=self.keypoint_names,
         )
         state = State(
             {i["name"]: InstrumentState(i["pose"], i["joints"]) for i in record["instruments"]},
