@@ -357,7 +357,7 @@ def _read(recording: Recording, notes: Notes, episode: int) -> Episode:
     rolls = {item.name: read_reading_log(item.roll) for item in items if item.roll is not None}
     scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
     _check_bases(recording, scope, poses)
-    video = recording.open()
+    video = recording.source.open()
     logs: list[PoseLog | ReadingLog] = [*poses.values(), *([scope] if scope else [])]
     logs += [log for held in joints.values() for log in held.values()] + [*rolls.values()]
     for note in (*recording.notes, *(note for log in logs for note in log.notes), *video.notes):
@@ -450,7 +450,7 @@ def _check_video(recording: Recording, video: VideoSource) -> None:
     rate, length = 1 / float(np.median(np.diff(video.times))), video.times[-1] - video.times[0]
     if not (MIN_FPS < rate < MAX_FPS and length < LONGEST):
         raise NeecoError(
-            f"{recording.times or video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
+            f"{video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
             "cannot be; correct fps or the times' unit"
         )
     if min(video.size) < MIN_SIDE_PX:
