@@ -17,7 +17,7 @@ from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.fitting.refinement import RefineConfig, Refinement
 from neeco.geometry.rotations import rotate_about
-from neeco.methods.kinematic.link_search import along_links, doubt_readings, readings_of, start_links
+from neeco.methods.kinematic.link_search import align_to_links, check_readings, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve
 from neeco.scene.drawable import Recorded
@@ -118,9 +118,9 @@ def test_a_carved_line_is_kept_where_the_links_agree_and_else_theirs_is_taken(
 ) -> None:
     evidence, shape = carved
     links, kept, told = started(carved), session(evidence), session(evidence)
-    assert along_links(kept, links, evidence, "tool", shape, torch.Generator().manual_seed(0)).seeds is shape.seeds
+    assert align_to_links(kept, links, evidence, "tool", shape, torch.Generator().manual_seed(0)).seeds is shape.seeds
     astray = CarvedShape(**vars(shape) | {"instrument_from_shaft": torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))})
-    again = along_links(told, links, evidence, "tool", astray, torch.Generator().manual_seed(0))
+    again = align_to_links(told, links, evidence, "tool", astray, torch.Generator().manual_seed(0))
     assert told.said
     assert not kept.said
     assert float(again.instrument_from_shaft[2, 2]) > 0.99
@@ -189,7 +189,7 @@ def test_readings_that_drive_other_joints_than_they_say_are_doubted(
 ) -> None:
     asked = session(carved[0])
     readings = [change(given) for given in readings_of(asked, carved[0], "tool")]
-    doubt_readings(asked, started(carved), carved[0], asked.scene.instruments[0], readings)
+    check_readings(asked, started(carved), carved[0], asked.scene.instruments[0], readings)
     assert set(asked.scene.diagnostics.get("doubted_readings", {})) == doubted
     assert all(words in line for line in asked.said)
     assert len(asked.said) == bool(doubted)

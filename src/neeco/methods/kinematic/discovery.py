@@ -8,7 +8,7 @@ from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
 from neeco.methods.kinematic.hinge_search import start_hinges
 from neeco.methods.kinematic.hinges import Hinges
-from neeco.methods.kinematic.link_search import along_links, doubt_readings, readings_of, start_links
+from neeco.methods.kinematic.link_search import align_to_links, check_readings, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import carved_shape
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
@@ -38,14 +38,14 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
         shape = carved_shape(session, evidence, instrument.name, generator)
         articulation = articulated.articulations[index]
         if isinstance(articulation, StatedLinks):
-            shape = along_links(session, articulation, evidence, instrument.name, shape, generator)
+            shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
         articulation.base.copy_(shape.instrument_from_shaft)
         articulation.extent.copy_(torch.tensor([shape.near, shape.tip]))
         articulation.radius.fill_(shape.radius)
         columns = articulated.logit_count
         if isinstance(articulation, StatedLinks):
             seeds, logits = start_links(session, articulation, evidence, instrument.name, shape, columns, generator)
-            doubt_readings(session, articulation, evidence, instrument, readings_of(session, evidence, instrument.name))
+            check_readings(session, articulation, evidence, instrument, readings_of(session, evidence, instrument.name))
         else:
             assert isinstance(articulation, Hinges)
             seeds, logits = start_hinges(session, articulation, evidence, instrument.name, shape, columns, generator)
