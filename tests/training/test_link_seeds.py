@@ -101,7 +101,7 @@ def started(carved: tuple[Evidence, CarvedShape]) -> StatedLinks:
 
 def test_every_link_is_seeded_where_it_is(carved: tuple[Evidence, CarvedShape]) -> None:
     links, generator = started(carved), torch.Generator().manual_seed(0)
-    seeds, logits = start_links(session(carved[0]), links, carved[0], "tool", carved[1], 4, generator)
+    seeds, logits = start_links(session(carved[0]), links, carved[0], "tool", carved[1], columns=4, generator=generator)
     assert logits.shape == (len(seeds), 4)
     owners = logits.argmax(1)
     for k, (near, far) in enumerate(((-45, PITCH_AT), (PITCH_AT, YAW_AT), (YAW_AT, TIP), (YAW_AT, TIP))):
@@ -133,7 +133,13 @@ def test_links_of_a_joint_that_nobody_recorded_are_seeded_on_their_sides(carved:
     evidence = carved[0]
     asked = session(evidence, ("jaw",))
     seeds, logits = start_links(
-        asked, started(carved), evidence, "tool", carved[1], 4, torch.Generator().manual_seed(0)
+        asked,
+        started(carved),
+        evidence,
+        "tool",
+        carved[1],
+        columns=4,
+        generator=torch.Generator().manual_seed(0),
     )
     owners = logits.argmax(1)
     for link, sense in ((2, 1.0), (3, -1.0)):  # jaw_left turns by half of the reading about x, which takes z to -y
@@ -160,7 +166,9 @@ def test_links_that_nobody_recorded_open_from_where_they_are_closed() -> None:
     shape = carve(evidence, "tool", torch.Generator().manual_seed(0), SEARCH)
     assert shape is not None
     asked, links = session(evidence, ("jaw",)), started((evidence, shape))
-    seeds, logits = start_links(asked, links, evidence, "tool", shape, 4, torch.Generator().manual_seed(0))
+    seeds, logits = start_links(
+        asked, links, evidence, "tool", shape, columns=4, generator=torch.Generator().manual_seed(0)
+    )
     found = readings_of(asked, evidence, "tool")[0]["jaw"]
     assert found < 0.3  # of 1.6; half way is 0.8
     ahead = torch.tensor([0, -np.sin(HEADING), np.cos(HEADING)]).float()

@@ -24,7 +24,7 @@ MOST_JOINTS, MOST_LINKS = 31, 32  # of a body, as kernels are made
 Rows = tuple[Tensor, Tensor, Tensor, Tensor]  # means [N, 3], quats [N, 4], scales [N, 3], sh_frames [N, 4]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ArticulatedBody:
     """How one body's links move, and where it is; lengths in mm, angles in rad, all but the pose in the body's frame.
 

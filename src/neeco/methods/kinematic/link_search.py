@@ -85,6 +85,7 @@ def start_links(
     evidence: Evidence,
     name: str,
     shape: CarvedShape,
+    *,
     columns: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
@@ -105,7 +106,7 @@ def start_links(
     seeds, owners = [of_shaft[chosen]], [torch.zeros(count, dtype=torch.long)]
     each = (settings.seeds - count) // max(links.link_count - 1, 1)
     for link in range(1, links.link_count):
-        found = _on_link(views, links, link, shape.radius, each, generator, sides.get(link))
+        found = _on_link(views, links, link, shape.radius, count=each, generator=generator, side=sides.get(link))
         seeds.append(found)
         owners.append(torch.full((len(found),), link))
     points, owner = torch.cat(seeds), torch.cat(owners).to(shape.seeds.device)
@@ -203,6 +204,7 @@ def _on_link(
     links: StatedLinks,
     link: int,
     radius: float,
+    *,
     count: int,
     generator: torch.Generator,
     side: tuple[Tensor, Tensor] | None,
@@ -210,7 +212,7 @@ def _on_link(
     """Sample points [count, 3] mm at rest that stay on evidence when moved with a link, and better than with any other;
     in the half spaces `side` (point mm, unit directions) where given."""
     device = links.points.device
-    centers, reaches = (part.to(device) for part in links.where(link, REACH_RADII * radius, MARGIN_RADII * radius))
+    centers, reaches = (part.to(device) for part in links.extent_of(link, REACH_RADII * radius, MARGIN_RADII * radius))
     total = CANDIDATES_PER_SEED * count
     random = torch.rand(total, 4, generator=generator, device=generator.device).to(device)
     which = (random[:, 3] * len(centers)).long().clamp_max(len(centers) - 1)
@@ -300,7 +302,7 @@ class _Volumes:
         """Sample points [CHECK_POINTS, 3] mm about a link at rest."""
         radius = float(self.links.radius)
         centers, half = (
-            part.cpu() for part in self.links.where(link, CHECK_REACH_RADII * radius, CHECK_MARGIN_RADII * radius)
+            part.cpu() for part in self.links.extent_of(link, CHECK_REACH_RADII * radius, CHECK_MARGIN_RADII * radius)
         )
         which = torch.randint(len(centers), (CHECK_POINTS,), generator=generator)
         away = 2 * torch.rand(CHECK_POINTS, 3, generator=generator) - 1
