@@ -26,21 +26,10 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
+from neeco.methods.networks import HALF_BY_DEFAULT, RecordedTimes, check_warm_up, encode, half_resolved, robust_bounds
 from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformation import (
-    HALF_BY_DEFAULT,
-    UNPERTURBED,
-    LabelledByMotion,
-    Perturbation,
-    Posed,
-    RecordedTimes,
-    check_warm_up,
-    encode,
-    half_resolved,
-    log_linear,
-    robust_bounds,
-)
+from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Perturbation, Posed, log_linear
 from neeco.scene.method import PLAIN_TRAINING
 
 DEPTH, SKIP = 8, 4  # layers; the one after which the input is given again

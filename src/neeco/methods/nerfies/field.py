@@ -33,10 +33,10 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Camera, Instrument, State
 from neeco.errors import NeecoError
+from neeco.methods.networks import octave_angles, octave_weights
 from neeco.raster.devices import tf32_products
 from neeco.raster.resampling import draw_through
 from neeco.raster.types import Rendering
-from neeco.scene.deformation import octave_angles, octave_weights
 from neeco.scene.drawable import Recorded
 
 HEAD_RANGE = 1e-4  # the warp's heads start in U(-1e-4, 1e-4): the untrained field hardly moves anything
