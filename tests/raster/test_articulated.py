@@ -17,7 +17,7 @@ from articulated_worlds import Tree, assert_same_as_definition, hinges, make_wor
 from neeco.errors import NeecoError
 from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import kernels
-from neeco.raster.articulated import MOST_JOINTS, ArticulatedBody, pose_bodies
+from neeco.raster.articulated import MAX_JOINTS, ArticulatedBody, pose_bodies
 from neeco.raster.native import set_threads
 
 
@@ -178,6 +178,6 @@ def test_a_chain_moves_what_lies_beyond_each_joint() -> None:
 
 
 def test_a_body_of_too_many_joints_is_refused() -> None:
-    world = make_world((2,), (hinges(MOST_JOINTS + 1),))
+    world = make_world((2,), (hinges(MAX_JOINTS + 1),))
     with pytest.raises(NeecoError, match="a body of 32 joints and 33 links; at most 31 and 32"):
         posed(world, torch.float32)

@@ -40,7 +40,7 @@ from neeco.scene.method import PLAIN_TRAINING
 MARGIN = 1.2  # the cube's side, in those of the points' longest
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HexPlaneSettings:
     """`channels` per plane and resolution; `resolution` of space, doubled `levels` - 1 times; `time_resolution`;
     `width` of the network; `warm_up`: share of the training over which all of it is off; `rate_scale` multiplies the

@@ -37,7 +37,7 @@ MEMBER_LOGITS = "member_logits"  # the per-Gaussian extra [N, I] of learned memb
 SURE = 6.0  # its size at the start: 0.2 % of a motion smear what does not take part
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NPSSettings:
     """depth, width, L_mean, L_state as published; `identity` keeps the raw inputs beside their encodings.
 

@@ -40,7 +40,7 @@ def octaves(values: Tensor, count: int) -> Tensor:
     return torch.cat([values, encode(values, count, unit=1.0)], -1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TimeMLPSettings:
     """`width` of the network and the octaves `L_mean`, `L_time` as published (None: 10, or 6 where synthetic);
     `synthetic`: the variant for D-NeRF's data; `warm_up`: share of the training over which the network is off;

@@ -59,7 +59,7 @@ WRISTS_AGAIN_AT = (0.6, 0.8)  # shares of the run
 PRIOR_WEIGHT = 1e-5  # on what is learned of stated kinematics, in squared standard deviations
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class KinematicSettings:
     """`shaft_roll`: probability of spinning the shaft (a surface of revolution) by a random angle, from iteration
     `shaft_roll_start` on; `opacity_penalty`: on the instruments' mean opacity, a tenth of it from iteration

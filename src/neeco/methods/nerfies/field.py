@@ -60,7 +60,7 @@ PUBLISHED: Mapping[str, int | float] = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NerfiesSettings:
     """`rays` per step; `coarse_samples` and `fine_samples` along each (0 fine: one network draws); template `depth` x
     `width`, with `frequencies` of points and `view_frequencies` of directions; warp `warp_depth` x `warp_width`, with
