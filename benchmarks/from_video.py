@@ -34,14 +34,13 @@ from neeco.files import write_json
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project_world
-from neeco.ingest.cameras.still import moving_masks
-from neeco.ingest.foreground.motion import ResidualFlow
-from neeco.ingest.foreground.passing import passing_masks
+from neeco.ingest.foreground.masks import moving_masks, passing_masks
+from neeco.ingest.foreground.residual_flow import ResidualFlow
 from neeco.ingest.frames.views import SfmResult, reduced
 from neeco.ingest.recording.model import IngestSettings
 from neeco.ingest.shaft.axis import ShaftVideo
 from neeco.ingest.shaft.from_video import FoundShaft, find_shaft
-from neeco.ingest.timing.synchronized import with_roll
+from neeco.ingest.timing.episodes import with_roll
 
 LOGGED_DEG = 1.0  # standard deviation stated of a roll that is the truth's
 
@@ -123,7 +122,10 @@ def masks_of(capture: Capture, images: np.ndarray) -> tuple[np.ndarray, Lens]:
         seen.append(np.column_stack([np.full(len(which), row), which, pixels[which], np.zeros(len(which))]))
     cameras = np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames])
     count = np.zeros(len(points))
-    sfm = SfmResult(rows, cameras, points, capture.points.colors, count, count, np.concatenate(seen), None, 0.0)
+    sfm = SfmResult(
+        indices=rows, world_from_camera=cameras, points=points, colors=capture.points.colors, errors=count,
+        lengths=count, observations=np.concatenate(seen), lens=None, reprojection_px=0.0,
+    )  # fmt: skip
     times = np.array([frame.state.time for frame in frames])
     flow = ResidualFlow(lambda row: images[row], sfm, times, Lens.of(camera))
     return passing_masks(lambda row: images[row], flow, rows, IngestSettings().moving_px), lens

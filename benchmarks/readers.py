@@ -166,10 +166,10 @@ RECORDINGS: dict[str, Callable[[Contents, Path], Path]] = {
 def measure(path: Path) -> None:
     """Read a recording and print the processor's seconds, those of the logs alone, frames and peak memory MiB."""
     from neeco.ingest.recording.file import read_recording
-    from neeco.ingest.timing.synchronized import SynchronizedRecording
+    from neeco.ingest.timing.episodes import read_episodes
 
     started = time.process_time()
-    data = SynchronizedRecording(read_recording(path))
+    data = read_episodes([read_recording(path)])
     logs = time.process_time() - started
     frames = sum(1 for _ in data.video.read(range(len(data.times))))
     seconds = time.process_time() - started

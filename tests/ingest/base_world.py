@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from neeco.geometry.lens import Lens
+from neeco.ingest.frames.views import Views
+from neeco.ingest.readers import VideoSource
+from neeco.ingest.readers.logs import PoseLog
+from neeco.ingest.recording.model import InstrumentLogs, Recording
+from neeco.ingest.timing.clock_search import ClockOffset
+from neeco.ingest.timing.episodes import Episode, Episodes
+from neeco.ingest.timing.notes import Notes
 
 WIDTH, HEIGHT, FOCAL = 160, 128, 145.0
 INTRINSICS = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
@@ -108,3 +119,23 @@ def errors(found: np.ndarray, poses: np.ndarray, truth: np.ndarray = WORLD_FROM_
     rest = local - local.mean(0)
     rms = [float(np.sqrt(np.square(part).sum(1).mean())) for part in (rest, raw)]
     return rms[0], rms[1], float(np.degrees(turn.magnitude()))
+
+
+def episodes(
+    instruments: Sequence[InstrumentLogs], poses: Mapping[str, PoseLog], clocks: Mapping[str, ClockOffset]
+) -> Episodes:
+    """A recording in memory with pose logs alone."""
+    recording = Recording(Path("recording.yaml"), instruments=tuple(instruments))
+    video = VideoSource(Path("video.mp4"), (WIDTH, HEIGHT), (), np.zeros(2))
+    joints: dict[str, dict] = {name: {} for name in poses}
+    part = Episode(recording=recording, video=video, poses=poses, joints=joints, rolls={}, scope=None, clocks=clocks)
+    return Episodes((part,), video, Notes(["recording"]))
+
+
+def views_of(times: np.ndarray, cameras: np.ndarray, lens: Lens, load: Callable[[int], np.ndarray]) -> Views:
+    """Views of every frame of a video."""
+    rows = np.arange(len(times))
+    return Views(
+        rows=rows, frames=rows, times=times, episodes=np.zeros(len(times), int), world_from_camera=cameras, load=load,
+        pinhole=lens,
+    )  # fmt: skip

@@ -170,8 +170,9 @@ class Recorded:
         count = len(points)
         lens = None if params else Lens(fl_x, fl_y, cx, cy, (0.0,) * 4)
         return SfmResult(
-            indices, cameras, points, np.full((count, 3), 120, dtype=np.uint8), np.full(count, 0.5), np.full(count, 9),
-            np.array(seen, dtype=np.float64).reshape(-1, 5), lens, 0.4,
+            indices=indices, world_from_camera=cameras, points=points, errors=np.full(count, 0.5),
+            colors=np.full((count, 3), 120, dtype=np.uint8), lengths=np.full(count, 9),
+            observations=np.array(seen, dtype=np.float64).reshape(-1, 5), lens=lens, reprojection_px=0.4,
         )  # fmt: skip
 
 

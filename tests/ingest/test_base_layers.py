@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from ingest.base_world import episodes, views_of
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
@@ -15,10 +15,17 @@ from neeco.geometry.lens import Lens
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
-from neeco.ingest.registration.base_layers import Layers, evenly_lit, fit_layers, line_through_trocar
-from neeco.ingest.registration.base_shape import SHIFTS
 from neeco.ingest.registration.find_bases import place_bases
+from neeco.ingest.registration.layers import (
+    ArmImages,
+    LayerModel,
+    evenly_lit,
+    fit_layers,
+    line_through_trocar,
+)
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
 from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
+from neeco.ingest.timing.episodes import Episodes
 
 WIDTH, HEIGHT, FOCAL = 80, 64, 100.0
 INTRINSICS = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
@@ -123,14 +130,15 @@ def test_a_wrist_that_bends_behind_what_is_logged_leaves_no_line():
 
 
 def test_a_dark_shaft_is_found_before_a_dark_clamp_without_masks_while_another_arm_moves():
-    images, poses = evenly_lit(_images(LEFT, RIGHT)), np.tile(LEFT.poses_at(TIMES), (len(SHIFTS), 1, 1, 1))
+    images, poses = evenly_lit(_images(LEFT, RIGHT)), np.tile(LEFT.poses_at(TIMES), (len(CLOCK_SHIFTS_S), 1, 1, 1))
     line, given = line_through_trocar(poses[0]), LEFT.wrong(6, 4)
     assert line is not None
     usable = np.ones(images.shape[:3], bool)
-    layers = Layers(images, INTRINSICS, poses, line, usable, WIDTH)
+    arm = ArmImages(images=images, intrinsics=INTRINSICS, poses=poses, line=line, usable=usable)
+    layers = LayerModel(arm, WIDTH)
     right, wrong = (layers.losses(base, 0.0, RADIUS, 0.0).mean() for base in (LEFT.camera_from_base, given))
     assert right < 0.8 * wrong
-    found = fit_layers(images, INTRINSICS, poses, line, (given, 5.0, 3.0), 0.0, usable, np.random.default_rng(0))
+    found = fit_layers(arm, (given, 5.0, 3.0), 0.0, np.random.default_rng(0))
     assert LEFT.beside(given) > 4
     assert LEFT.beside(found.camera_from_base) < 1.0
     assert found.found
@@ -146,24 +154,20 @@ def _log(arm: Arm) -> PoseLog:
     return PoseLog(path=None, clock="ros", times=times, positions=poses[:, :3, 3], quats=quats, gaps=(), notes=())
 
 
-def _data(arms: dict[str, Arm], bases: dict[str, StatedBase]) -> SimpleNamespace:
-    notes: list[str] = []
-    instruments = tuple(InstrumentLogs(name, base=base) for name, base in bases.items())
-    return SimpleNamespace(
-        recording=SimpleNamespace(path="recording.yaml", instruments=instruments),
-        poses={name: _log(arm) for name, arm in arms.items()}, joints={name: {} for name in arms},
-        clocks={"ros": ClockOffset(0.0, 0.0, GIVEN)}, notes=notes, note=notes.append,
-    )  # fmt: skip
+def _data(arms: dict[str, Arm], bases: dict[str, StatedBase]) -> Episodes:
+    instruments = [InstrumentLogs(name, base=base) for name, base in bases.items()]
+    logs = {name: _log(arm) for name, arm in arms.items()}
+    return episodes(instruments, logs, {"ros": ClockOffset(0.0, 0.0, GIVEN)})
 
 
-def _place(data: SimpleNamespace, images: np.ndarray) -> dict:
+def _place(data: Episodes, images: np.ndarray) -> dict:
     lens = Lens(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (), (WIDTH, HEIGHT))
     cameras = np.tile(np.eye(4), (len(TIMES), 1, 1))
 
     def no_masks(rows: np.ndarray) -> np.ndarray:
         return np.zeros((len(rows), HEIGHT, WIDTH), bool)
 
-    return place_bases(data, TIMES, cameras, lens, lambda row: images[row], no_masks)
+    return place_bases(data, views_of(TIMES, cameras, lens, lambda row: images[row]), no_masks)
 
 
 @pytest.mark.slow
@@ -173,7 +177,7 @@ def test_the_bases_of_two_arms_in_one_view_are_found_and_told():
     placed = _place(data, _images(LEFT, RIGHT))
     for name, arm in arms.items():
         assert arm.beside(placed[name].world_from_base) < 1.0
-    assert all("without outlines: its shaft explains" in note for note in data.notes)
+    assert all("without outlines: its shaft explains" in note for note in data.notes.sentences)
 
 
 def test_of_several_arms_one_that_hardly_moves_keeps_what_is_given():
@@ -182,7 +186,10 @@ def test_of_several_arms_one_that_hardly_moves_keeps_what_is_given():
     data = _data(arms, {name: StatedBase(RIGHT.wrong(6, 4), 5.0, 3.0) for name in arms})
     placed = _place(data, _images(resting))
     assert np.array_equal(placed["psm1"].world_from_base, RIGHT.wrong(6, 4))
-    assert "too little to find its base, which stays as given, sure to 5.0 mm and 3.0 deg" in data.notes[0]
+    assert (
+        "too little to find its base, which stays as given, with standard deviations 5.0 mm and 3.0 deg"
+        in data.notes.sentences[0]
+    )
 
 
 def test_one_that_moves_and_is_not_seen_is_refused():

@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from neeco.cli.ingest import CHOICES, Ingest, run
+from neeco.cli.ingest import Ingest, run
 from neeco.ingest.readers.choices import axis_directions, find_rotations, largest_step, open_poses, shaft_of
-from neeco.report.choice_picture import write_choice_picture
+from neeco.report.choice_picture import CHOICES, write_choice_picture
 
 pytest.importorskip("av")
 pytest.importorskip("pyarrow")

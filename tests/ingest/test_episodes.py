@@ -12,14 +12,15 @@ from rendered_truth import benchmarks  # noqa: F401
 
 from neeco.capture import Capture, read_capture
 from neeco.capture.checks import inspect_capture
-from neeco.cli.ingest import Ingest, print_result, recordings_of, run
+from neeco.cli.ingest import Ingest, recordings_of, run
 from neeco.errors import NeecoError
-from neeco.ingest.frames.selection import assign_splits
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import Recording
-from neeco.ingest.timing.episodes import PAUSE_S, Episodes, episode_names, separate
+from neeco.ingest.splits import assign_splits
+from neeco.ingest.timing.compatibility import episode_names, separate
+from neeco.ingest.timing.episodes import PAUSE_S, read_episodes
 
 BEGINS = (0.0, 2.0, 4.5)  # s of the bar's motion
 
@@ -52,12 +53,9 @@ def ingested(paths: list[Path], output: Path) -> Capture:
     return read_capture(ingest([read_recording(path) for path in paths], output, silent).capture)
 
 
-def test_recordings_of_a_still_scope_become_one_capture_with_every_pose_in_its_place(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_recordings_of_a_still_scope_become_one_capture_with_every_pose_in_its_place(tmp_path: Path) -> None:
     result = ingest([read_recording(path) for path in still_recordings(tmp_path, (1, 1))], tmp_path / "capture", silent)
-    print_result(result)
-    assert f"episode take_1: {FRAMES} of {FRAMES} frames kept" in capsys.readouterr().out
+    assert f"episode take_1: {FRAMES} of {FRAMES} frames kept" in result.lines()
     capture = read_capture(result.capture)
     assert capture.still
     assert capture.registered
@@ -78,7 +76,7 @@ def test_recordings_of_a_still_scope_become_one_capture_with_every_pose_in_its_p
 
 def test_the_recording_names_whole_episodes_to_test(tmp_path: Path) -> None:
     splits = {"test_episodes": ["take_0"], "unseen_episodes": ["take_1"]}
-    data = Episodes([read_recording(path) for path in still_recordings(tmp_path, splits=splits)])
+    data = read_episodes([read_recording(path) for path in still_recordings(tmp_path, splits=splits)])
     frames, rule = np.arange(len(data.times)), data.recording.splits
     assert rule is not None
     names, words = assign_splits(frames, np.tile(np.eye(4), (len(frames), 1, 1)), {}, rule, data.ranges)
@@ -124,7 +122,7 @@ def test_what_one_capture_cannot_hold_is_refused_in_one_line(
     paths = still_recordings(tmp_path, (1, 1))
     change(paths[1], **changes)
     with pytest.raises(NeecoError) as error:
-        Episodes([read_recording(path) for path in paths])
+        read_episodes([read_recording(path) for path in paths])
     assert words in str(error.value)
     assert str(error.value).startswith(str(paths[1]))
     assert "\n" not in str(error.value)
@@ -139,12 +137,12 @@ def test_what_one_capture_cannot_hold_is_refused_in_one_line(
 )
 def test_splits_name_what_there_is(tmp_path: Path, splits: dict[str, object], words: str) -> None:
     with pytest.raises(NeecoError, match=words):
-        Episodes([read_recording(path) for path in still_recordings(tmp_path, (1, 1), splits=splits)])
+        read_episodes([read_recording(path) for path in still_recordings(tmp_path, (1, 1), splits=splits)])
 
 
 def test_names_come_from_files_or_from_their_folders_and_differ() -> None:
     def named(*paths: str) -> tuple[str, ...]:
-        return episode_names([Recording(Path(path)) for path in paths])
+        return episode_names([Recording(Path(path), None) for path in paths])
 
     assert named("a/one.yaml", "a/two.yaml") == ("one", "two")
     assert named("/day 1/recording.yaml", "/day2/recording.yaml") == ("day_1", "day2")
@@ -152,8 +150,8 @@ def test_names_come_from_files_or_from_their_folders_and_differ() -> None:
 
 
 def test_logs_on_the_joint_timeline_say_what_each_says_on_its_own(tmp_path: Path) -> None:
-    data = Episodes([read_recording(path) for path in still_recordings(tmp_path)])
-    log = data.poses["bar"]
+    data = read_episodes([read_recording(path) for path in still_recordings(tmp_path)])
+    log = data.joint_log(lambda part: part.poses["bar"])
     times = data.times
     np.testing.assert_allclose(
         poses_at(log, times, 0.0)[0], np.concatenate([
@@ -246,7 +244,7 @@ class TestEpisodesOfADataSet:
     def test_an_episode_that_is_not_there_is_named(self, written: Path) -> None:
         change(written, episodes=[0, 7])
         with pytest.raises(NeecoError, match="holds no episode 7; its episodes are 0 to 2"):
-            Episodes(separate([read_recording(written)]))
+            read_episodes(separate([read_recording(written)]))
 
     def test_files_that_hold_one_recording_have_no_episodes(self, tmp_path: Path) -> None:
         (path,) = still_recordings(tmp_path, (1,), episodes=[0, 1])

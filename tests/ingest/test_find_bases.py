@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-from ingest.base_world import FOCAL, HEIGHT, INTRINSICS, WIDTH, WORLD_FROM_BASE, disturbed, errors, make_world
+from ingest.base_world import (
+    FOCAL,
+    HEIGHT,
+    INTRINSICS,
+    WIDTH,
+    WORLD_FROM_BASE,
+    disturbed,
+    episodes,
+    errors,
+    make_world,
+    views_of,
+)
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
@@ -21,21 +30,17 @@ STILL = np.tile(np.eye(4), (44, 1, 1))
 
 
 def _data(world, base, clocks=None):
-    """What `SynchronizedRecording` knows of one arm whose log begins before the video."""
+    """An episode of one arm whose log begins before the video."""
     times = np.arange(-0.4, world.times[-1] + 0.4, 0.02)
     poses = type(world)(world.masks, world.camera_from_world, times, False).poses_at(0.0)
     quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     log = PoseLog(path=None, clock="ros", times=times, positions=poses[:, :3, 3], quats=quats, gaps=(), notes=())
-    notes: list[str] = []
-    recording = SimpleNamespace(path="recording.yaml", instruments=(InstrumentLogs("psm1", base=base),))
-    return SimpleNamespace(
-        recording=recording, poses={"psm1": log}, joints={"psm1": {}}, clocks=clocks or {}, notes=notes,
-        note=notes.append,
-    )  # fmt: skip
+    return episodes([InstrumentLogs("psm1", base=base)], {"psm1": log}, clocks or {})
 
 
-def _black(row):
-    return np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+def _black(world, cameras=STILL):
+    black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    return views_of(world.times, cameras, LENS, lambda row: black)
 
 
 def _no_masks(rows):
@@ -45,33 +50,33 @@ def _no_masks(rows):
 def test_an_exact_base_is_taken_as_it_is():
     world = make_world(44)
     data = _data(world, StatedBase(WORLD_FROM_BASE))
-    placed = place_bases(data, world.times, STILL, LENS, _black, _no_masks)["psm1"]
+    placed = place_bases(data, _black(world), _no_masks)["psm1"]
     assert np.array_equal(placed.world_from_base, WORLD_FROM_BASE)
     assert placed.clock is None
 
 
 def test_an_arm_that_says_nothing_of_its_base_is_left_alone():
     world = make_world(44)
-    assert place_bases(_data(world, None), world.times, STILL, LENS, _black, _no_masks) == {}
+    assert place_bases(_data(world, None), _black(world), _no_masks) == {}
 
 
 @pytest.mark.slow
 def test_a_rough_base_is_found_with_its_clock_and_told_in_a_note():
     world = make_world(44)
     data = _data(world, StatedBase(disturbed(8, 5, 1, world), 5.0, 3.0))
-    placed = place_bases(data, world.times, STILL, LENS, _black, lambda rows: world.masks[rows])["psm1"]
+    placed = place_bases(data, _black(world), lambda rows: world.masks[rows])["psm1"]
     assert errors(placed.world_from_base, world.poses_at(0.0))[0] < 0.8
     assert placed.clock.source == "found with the base"
     assert abs(placed.clock.seconds - 0.03) < 0.008
-    assert "its base was found from what moves in 44 frames" in data.notes[0]
-    assert "mm and" in data.notes[0]
+    assert "its base was found from what moves in 44 frames" in data.notes.sentences[0]
+    assert "mm and" in data.notes.sentences[0]
 
 
 def test_what_shows_no_shaft_names_the_recording():
     world = make_world(44)
     data = _data(world, StatedBase())
     with pytest.raises(NeecoError, match=r"recording\.yaml: instrument 'psm1': camera_from_base"):
-        place_bases(data, world.times, STILL, LENS, _black, lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool))
+        place_bases(data, _black(world), lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool))
     assert LENS.intrinsics == INTRINSICS
 
 
@@ -80,12 +85,12 @@ def test_a_rough_base_is_found_before_a_scope_that_moves():
     world = make_world(44, moving_camera=True)
     data = _data(world, StatedBase(disturbed(8, 5, 1, world), 5.0, 3.0, to_world=True))
     cameras = np.linalg.inv(world.camera_from_world)
-    placed = place_bases(data, world.times, cameras, LENS, _black, lambda rows: world.masks[rows])["psm1"]
+    placed = place_bases(data, _black(world, cameras), lambda rows: world.masks[rows])["psm1"]
     assert errors(placed.world_from_base, world.poses_at(0.0))[0] < 1.2  # of 3.5 s in all
 
 
 def test_a_base_stated_to_the_world_is_not_taken_for_one_to_the_camera():
     world = make_world(44, moving_camera=True)
     data = _data(world, StatedBase(WORLD_FROM_BASE, to_world=True))
-    placed = place_bases(data, world.times, np.linalg.inv(world.camera_from_world), LENS, _black, _no_masks)["psm1"]
+    placed = place_bases(data, _black(world, np.linalg.inv(world.camera_from_world)), _no_masks)["psm1"]
     assert np.array_equal(placed.world_from_base, WORLD_FROM_BASE)

@@ -23,7 +23,7 @@ from neeco.ingest.posing.posed_capture import PosedCapture
 from neeco.ingest.recording.file import read_recording, recording_from_flags
 from neeco.ingest.shaft.axis import axis_between, contour_normals, image_lines
 from neeco.ingest.shaft.from_video import find_shaft
-from neeco.ingest.timing.synchronized import with_roll
+from neeco.ingest.timing.episodes import with_roll
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from neeco.ingest.readers.columns import PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.timing.synchronized import SynchronizedRecording
+from neeco.ingest.timing.episodes import read_episodes
 
 ROWS = 40
 ARMS = ("master left", "master right", "slave left", "slave right")
@@ -91,19 +91,19 @@ def test_there_is_a_row_for_every_image_of_the_video(frames, rate, message, tria
     world.text(write_template(trial.parent), "recording.yaml")
     recording = read_recording(world.folder / "recording.yaml")
     if message is None or "begin together" in message:
-        notes = SynchronizedRecording(recording).notes
+        notes = read_episodes([recording]).notes.sentences
         expected = [f"Suturing_B001_capture1.mp4: {message}"] if message else []
         assert [note for note in notes if "images for" in note] == expected
     else:
         with pytest.raises(NeecoError, match=message):
-            SynchronizedRecording(recording)
+            read_episodes([recording])
 
 
 def test_a_log_on_the_videos_clock_that_is_longer_than_the_video_is_noted(world):
     world.video(frames=40)
     world.write("t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz", world.rows(), "tool.csv")  # 5 s
     world.text("video: video.mp4\ninstruments: [{name: a, poses: {file: tool.csv, clock: video}}]", "recording.yaml")
-    notes = SynchronizedRecording(read_recording(world.folder / "recording.yaml")).notes
+    notes = read_episodes([read_recording(world.folder / "recording.yaml")]).notes.sentences
     assert "tool.csv: goes from 0.0 to 5.0 s on the video's clock, the video from 0.0 to 1.6 s" in str(notes)
 
 

@@ -19,7 +19,7 @@ from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.file import read_recording
-from neeco.ingest.timing.synchronized import SynchronizedRecording
+from neeco.ingest.timing.episodes import read_episodes
 
 pytest.importorskip("pycolmap")
 
@@ -146,8 +146,8 @@ def states_with_limits(recording: Path, limits: list[float]) -> list[float]:
     document["instruments"][0]["joints"]["jaw_angle"]["limits"] = limits
     document["sync"]["em"] = OFFSET
     recording.write_text(yaml.safe_dump(document))
-    synchronized = SynchronizedRecording(read_recording(recording))
-    states, usable = synchronized.states_at(synchronized.times)
+    data = read_episodes([read_recording(recording)])
+    states, usable = data.with_assumed_clocks().states_at(data.times)
     return states["tool"][1]["jaw_angle"][usable].tolist()
 
 

@@ -22,7 +22,7 @@ from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, Pose
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording, recording_from_flags
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.timing.synchronized import SynchronizedRecording
+from neeco.ingest.timing.episodes import read_episodes
 
 SIZE = (64, 48)  # px
 FOCAL = (60.0, 60.0, 32.0, 24.0)
@@ -114,16 +114,16 @@ def test_a_dvrks_bag_becomes_a_recording_by_one_command(
     lens, _ = recording.read_lens()
     assert lens is not None
     assert lens.intrinsics == FOCAL
-    data = SynchronizedRecording(recording)
+    data = read_episodes([recording])
     times = data.times[2:-2]
-    states, usable = data.states_at(times)
+    states, usable = data.with_assumed_clocks().states_at(times)
     assert usable.all()
     found, joints = states["PSM2"]
     turned = np.array([-1000, -1000, 1000])  # ECM: x left, y up
     np.testing.assert_allclose(found[:, :3, 3], [turned * shaft(time) for time in times], atol=0.01)
     np.testing.assert_allclose(joints["wrist_pitch"], times, atol=1e-6)
     np.testing.assert_allclose(joints["jaw"], 0.3 * times, atol=1e-6)
-    assert data.poses["PSM1"].frame == CAMERA
+    assert data.parts[0].poses["PSM1"].frame == CAMERA
 
 
 def test_a_laparoscope_in_another_base_than_the_arms_is_not_taken_for_registration(tmp_path: Path) -> None:
@@ -139,10 +139,10 @@ def test_a_laparoscope_in_another_base_than_the_arms_is_not_taken_for_registrati
         path.write_text(yaml.safe_dump(document | {"laparoscope": scope | ({"frame": frame} if frame else {})}))
         recording = read_recording(path)
         if refused:
-            message = refusal(lambda recording=recording: SynchronizedRecording(recording))
+            message = refusal(lambda recording=recording: read_episodes([recording]))
             assert "laparoscope: its poses are stated in ECM_base, those of PSM1 in PSM_base" in message
         else:
-            SynchronizedRecording(recording)
+            read_episodes([recording])
 
 
 def test_bags_of_other_robots_offer_what_was_measured(tmp_path: Path) -> None:
@@ -173,8 +173,8 @@ def test_a_bag_alone_is_enough_where_it_holds_one_of_each(tmp_path: Path) -> Non
             bag.pose("/tool/pose", time, shaft(time), [1, 0, 0, 0], "tracker")
             bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
     recording = recording_from_flags(bag.path, bag.path)
-    data = SynchronizedRecording(recording)
-    states, usable = data.states_at(data.times)
+    data = read_episodes([recording])
+    states, usable = data.with_assumed_clocks().states_at(data.times)
     assert usable.all()
     np.testing.assert_allclose(states["instrument"][0][20, :3, 3], 1000 * shaft(0.8), atol=0.01)
 
@@ -310,7 +310,7 @@ def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path, monkeypa
     """The limit is lowered: a bomb of its real size would take seconds to make."""
     from neeco.ingest.readers import _bagfile
 
-    monkeypatch.setattr(_bagfile, "LARGEST_CHUNK", 60_000)
+    monkeypatch.setattr(_bagfile, "MAX_CHUNK_BYTES", 60_000)
     for kind, packed in (("a.bag", "bz2"), ("b.bag", "lz4"), ("c.bag", None), ("d-mcap", "zstd"), ("e-db3", "zstd")):
         with BagWriter(tmp_path, kind, packed=packed) as bag:
             for time in range(4):
@@ -324,7 +324,7 @@ def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path, monkeypa
 def test_packed_bytes_are_unpacked_up_to_a_limit_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
     from neeco.ingest.readers import _bagfile
 
-    monkeypatch.setattr(_bagfile, "LARGEST_CHUNK", 1000)
+    monkeypatch.setattr(_bagfile, "MAX_CHUNK_BYTES", 1000)
     assert _bagfile.unpack(bz2.compress(bytes(1000)), "bz2") == bytes(1000)
     for data in (bz2.compress(bytes(1001)), bz2.compress(bytes(900))[:-5], b"BZh"):
         with pytest.raises((OSError, _bagfile.ReaderError)):

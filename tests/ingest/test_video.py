@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 
 from neeco.errors import NeecoError
-from neeco.ingest.frames.images import _read_lens
+from neeco.ingest.frames.images import read_lens
 from neeco.ingest.readers.video import open_images, open_video
 from neeco.ingest.recording.file import read_recording
-from neeco.ingest.timing.episodes import Episodes
+from neeco.ingest.timing.episodes import read_episodes
 
 pytest.importorskip("av")
 
@@ -74,8 +74,8 @@ def test_pixels_that_are_not_square_need_a_lens_that_says_so(world):
 
     def lens_of(text):
         world.text(f"video: pal.mkv\n{text}", "recording.yaml")
-        data = Episodes([read_recording(world.folder / "recording.yaml")])
-        return _read_lens(data), [note for note in data.notes if "fl_x / fl_y is 1," in note]
+        data = read_episodes([read_recording(world.folder / "recording.yaml")])
+        return read_lens(data), [note for note in data.notes.sentences if "fl_x / fl_y is 1," in note]
 
     with pytest.raises(NeecoError, match=r"pal\.mkv: its pixels are not square .*; give the intrinsics"):
         lens_of("")

@@ -22,13 +22,13 @@ from neeco.capture.images import write_image
 from neeco.capture.model import Frame, State
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
-from neeco.ingest.assessment import SHOWN, assess_ingest
-from neeco.ingest.foreground.motion import RoughShape
+from neeco.ingest.assessment import MAX_SHOWN, assess_ingest
+from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.result import IngestResult
 from neeco.ingest.timing.clock_search import ClockOffset
-from neeco.ingest.timing.notes import Doubt
+from neeco.ingest.timing.notes import Contradiction
 from neeco.report import ingest_page
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
 from neeco.report.ingest_figures import in_view, main_axes, posed_picture, read_tracks, round_length
@@ -63,18 +63,23 @@ def made(folder: Path, **changes) -> IngestResult:
     )
     dropped = tuple((frame, f"blurred: {frame % 50}% of its neighbours' sharpness") for frame in (96, 97, 98, 105))
     result = IngestResult(
-        folder, "rec <1>.yaml", 106, 25.0, (240, 192), np.arange(count), times, (*dropped, (99, "no camera")),
-        {"em": clock, "jaw_angle": ClockOffset(-0.0097, 0.0, "given")}, registration, np.arange(count), 0.36,
-        len(capture.points.positions), {capture.instruments[0].name: shaft()} if capture.instruments else {},
-        "unseen: jaw_angle above 59 deg", ("12 rows dropped: <NaN>",),
-        ("with the lens given: ends after 2 of 80 keyframes", "taken: all frames at once"),
+        capture=folder, recording="rec <1>.yaml", video_frames=106, video_fps=25.0, size=(240, 192),
+        selected=np.arange(count), selected_times=times, dropped=(*dropped, (99, "no camera")),
+        clocks={"em": clock, "jaw_angle": ClockOffset(-0.0097, 0.0, "given")}, registration=registration,
+        registered_frames=np.arange(count), reprojection_px=0.36, points=len(capture.points.positions),
+        shapes={capture.instruments[0].name: shaft()} if capture.instruments else {},
+        split_rule="unseen: jaw_angle above 59 deg", notes=("12 rows dropped: <NaN>",),
+        search=("with the lens given: ends after 2 of 80 keyframes", "taken: all frames at once"),
     )  # fmt: skip
     return replace(result, **changes)
 
 
 def based(overlap: float) -> BaseRegistration:
     """A base found from outlines that overlap with what moves by so much."""
-    return BaseRegistration(np.eye(4), 0.0, 0.0, np.ones(3), np.ones(3), (), 0.0, 0.0, overlap, 0.5, 1.0, 100)
+    return BaseRegistration(
+        world_from_base=np.eye(4), clock_s=0.0, clock_sd_s=0.0, sd_mm=np.ones(3), sd_deg=np.ones(3), open_directions=(),
+        moved_mm=0.0, turned_deg=0.0, overlap=overlap, overlap_before=0.5, residual_px=1.0, frames=100, from_masks=True,
+    )  # fmt: skip
 
 
 def write_ingest_page(result: IngestResult, path: Path) -> None:
@@ -238,8 +243,8 @@ def test_the_side_view_has_the_tissue_ahead_of_the_camera():
         ({"clocks": {"em": ClockOffset(0.0, 0.08, "scope motion")}}, "bad", "Clock em"),
         ({"clocks": {"jaw_angle": ClockOffset(0.0, float("nan"), "assumed")}}, "careful", "jaw_angle"),
         ({"dropped": tuple((i, "blurred") for i in range(60))}, "careful", "60 of 106"),
-        ({"doubts": (Doubt("nothing moves with the tool", True),)}, "bad", "Doubtful: nothing moves"),
-        ({"doubts": (Doubt("the video runs 4 % fast", False),)}, "careful", "with care: the video runs"),
+        ({"contradictions": (Contradiction("nothing moves with the tool", True),)}, "bad", "Doubtful: nothing moves"),
+        ({"contradictions": (Contradiction("the video is fast", False),)}, "careful", "with care: the video is"),
         ({"bases": {"psm1": based(0.68)}}, "careful", "overlap by 0.68"),
         ({"bases": {"psm1": based(0.92)}}, "good", "Ready"),
         ({"dropped": tuple((i, "not among the 40 that cover") for i in range(60))}, "good", "Ready"),
@@ -248,7 +253,7 @@ def test_the_side_view_has_the_tissue_ahead_of_the_camera():
 def test_the_verdict_names_what_is_doubtful(changes, level, piece):
     verdict = assess_ingest(made(SAMPLE, **changes), read_capture(SAMPLE))
     assert verdict.level == level
-    assert piece in " ".join([verdict.headline, *verdict.doubts])
+    assert piece in " ".join([verdict.headline, *verdict.warnings])
 
 
 def test_what_check_finds_is_in_the_verdict():
@@ -266,13 +271,13 @@ def test_what_check_finds_is_in_the_verdict():
 
 
 def test_the_terminal_gets_a_doubtful_verdict_in_capitals_and_the_first_doubts():
-    doubts = tuple(Doubt(f"reason {number}", True) for number in range(SHOWN + 3))
-    verdict = assess_ingest(made(SAMPLE, doubts=doubts), read_capture(SAMPLE))
+    found = tuple(Contradiction(f"reason {number}", True) for number in range(MAX_SHOWN + 3))
+    verdict = assess_ingest(made(SAMPLE, contradictions=found), read_capture(SAMPLE))
     first, *others = verdict.lines()
     assert first == "DOUBTFUL: reason 0."
-    assert others == [*(f"  - Reason {number}." for number in range(1, SHOWN + 1)), "  - and 2 more doubts"]
+    assert others == [*(f"  - Reason {number}." for number in range(1, MAX_SHOWN + 1)), "  - and 2 more warnings"]
     assert verdict.as_json()["verdict"] == "doubtful"
-    assert len(verdict.as_json()["doubts"]) == SHOWN + 3
+    assert len(verdict.as_json()["doubts"]) == MAX_SHOWN + 3
 
 
 def test_frames_that_left_the_capture_after_registering_are_no_residuals_of_it(tmp_path):

@@ -1,4 +1,4 @@
-"""`neeco compare`: methods beside each other on the same frames, under the same budget."""
+"""`neeco compare`: methods compared on the same frames, under the same budget."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Compare:
     output: Path
     """Folder to write; absent, empty, or of this comparison begun earlier."""
     seeds: int = 1
-    """How many seeds of each method, from 0; with 2 or more the tables tell mean and standard deviation."""
+    """How many seeds of each method, from 0; with 2 or more the tables have mean and standard deviation."""
     minutes: float | None = None
     """Each run trains so long by the clock on the wall."""
     cpu_minutes: float | None = None
@@ -44,7 +44,7 @@ class Compare:
     masks: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """NAME=FOLDER: masks that something else made of the same frames, scored in the same table; repeatable."""
     workers: int = 1
-    """Runs at once, by Ray (install neeco[cluster]); each gets its share of the cores. RAY_ADDRESS names a cluster."""
+    """Runs at once; each gets its share of the cores. RAY_ADDRESS names a Ray cluster (install neeco[cluster])."""
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,13 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from neeco.ingest.assessment import Assessment
     from neeco.ingest.recording.model import Recording
-    from neeco.ingest.result import IngestResult
-
-PAGE = "ingest.html"
-RECORDING = "recording.yaml"
-CHOICES = "recording_choices.png"
 
 
 @dataclass(frozen=True)
@@ -67,39 +63,45 @@ class Ingest:
 
 def run(args: Ingest) -> int:
     """Ingest, convert, or write a template."""
+    from neeco.cli._output import require_ending
     from neeco.errors import NeecoError
-    from neeco.ingest.readers import format_of
+    from neeco.ingest.convert import convert_folder
+    from neeco.ingest.sources import folder_to_convert
+    from neeco.report.choice_picture import write_draft
+    from neeco.report.ingested import ingest_and_report
 
     if args.formats:
-        _refuse_beside(args, "--formats", keep=("formats",))
+        _refuse_others(args, "--formats", keep=("formats",))
         return _list_formats()
     if args.init:
-        _refuse_beside(args, "--init", keep=())
+        _refuse_others(args, "--init", keep=())
         if len(args.source) > 1:
             raise NeecoError("--init: looks at one folder or file; give one")
-        return _init(args.source[0] if args.source else Path())
-    output = args.output and Path(os.path.normpath(args.output))  # a/../b is b, whatever a is
-    if output is None:
+        print(*write_draft(args.source[0] if args.source else Path(), print), sep="\n")
+        return 0
+    if args.output is None:
         raise NeecoError("--output: give the folder of the capture to write")
-    for source in args.source:
-        if (known := format_of(source)) is not None and source.exists():
-            raise NeecoError(
-                f"{source}: is in a recording's format ({known.format}) but says not what is what in it; write that "
-                f"down first: neeco ingest --init {source}"
-            )
-        if source.is_dir():
-            if (source / RECORDING).is_file():
-                raise NeecoError(f"{source}: holds a recording; give the file: {source / RECORDING}")
-            if len(args.source) > 1:
-                raise NeecoError(f"{source}: is a folder; of several recordings give each recording.yaml")
-            _refuse_beside(args, f"{source}: a folder in another format", keep=("output",))
-            return _convert(source, output)
-    verdicts = _ingest(recordings_of(args), output, args.rrd, args.json)
-    return 1 if args.strict and any(verdict.level == "bad" for verdict in verdicts) else 0
+    output = Path(os.path.normpath(args.output))  # a/../b is b, whatever a is
+    if (folder := folder_to_convert(args.source)) is not None:
+        _refuse_others(args, f"{folder}: a folder in another format", keep=("output",))
+        for sentence in convert_folder(folder, output):
+            print(f"note: {sentence}")
+        print(f"capture: {output}  (next: neeco check {output})")
+        return 0
+    recordings = recordings_of(args)
+    if args.rrd is not None:
+        require_ending("--rrd", args.rrd, ".rrd")
+    with _progress_bars() as progress:
+        try:
+            done = ingest_and_report(recordings, output, progress, args.rrd)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("nothing was written") from None
+    print(json.dumps(done.as_json(), indent=2, allow_nan=False) if args.json else "\n".join(done.lines()))
+    return 1 if args.strict and done.verdict == "doubtful" else 0
 
 
-def _refuse_beside(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
-    """Raise NeecoError when an option was given that would be ignored beside `what`."""
+def _refuse_others(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
+    """Raise NeecoError when an option was given that `what` would ignore."""
     from neeco.errors import NeecoError
 
     for option in fields(Ingest):
@@ -120,82 +122,30 @@ def _list_formats() -> int:
     return 0
 
 
-def _init(folder: Path) -> int:
-    from neeco.errors import NeecoError
-    from neeco.files import write_text
-    from neeco.ingest.recording.template import holds_streams, write_template
-    from neeco.report.choice_picture import write_choice_picture
-
-    path = (folder.parent if holds_streams(folder) else folder) / RECORDING
-    if path.exists():
-        raise NeecoError(f"{path}: already exists; edit it, or move it away first")
-    write_text(path, write_template(folder, lambda problem: print(f"left out: {problem}")))
-    picture = path.with_name(CHOICES)
-    try:
-        if holds_streams(folder) and write_choice_picture(folder, picture):
-            print(f"wrote {picture}: what its poses would be under each choice that the file leaves open")
-    except NeecoError as error:  # recording.yaml, which names the choices, is written all the same
-        print(f"no picture of the choices that the file leaves open: {error}")
-    print(f"wrote {path}: look through it, then: neeco ingest {path} --output CAPTURE")
-    return 0
-
-
-def _convert(folder: Path, output: Path) -> int:
-    from neeco.ingest.convert import convert_folder
-
-    for sentence in convert_folder(folder, output):
-        print(f"note: {sentence}")
-    print(f"capture: {output}  (next: neeco check {output})")
-    return 0
-
-
 def recordings_of(args: Ingest) -> list[Recording]:
-    """The recordings that the words name. Raises NeecoError naming the option."""
+    """Return the recordings that the arguments name. Raises NeecoError naming the option."""
     from neeco.errors import NeecoError
-    from neeco.ingest.recording.file import check_frames, read_recording, recording_from_flags
+    from neeco.ingest.recording.file import recording_from_flags
+    from neeco.ingest.sources import read_recordings
 
     if args.source:
-        _refuse_beside(
-            args, f"{args.source[0]}: says what was recorded", keep=("output", "frames", "rrd", "json", "strict")
-        )
-        check_frames(args.frames)
-        recordings = [read_recording(source) for source in args.source]
-        return [item if args.frames is None else replace(item, frames=args.frames) for item in recordings]
+        keep = ("output", "frames", "rrd", "json", "strict")
+        _refuse_others(args, f"{args.source[0]}: says what was recorded", keep)
+        return read_recordings(args.source, args.frames)
     if args.video is None:
         raise NeecoError("--video: give the video (or images' folder), or a recording.yaml (`neeco ingest --init`)")
     if args.intrinsics is not None and args.calibration is not None:
         raise NeecoError("--calibration: given beside --intrinsics; give one of them")
     recording = recording_from_flags(
-        args.video,
-        args.instrument,
-        args.laparoscope,
-        args.joint,
-        args.calibration or args.intrinsics,
-        args.sync,
-        args.frames,
-        args.fps,
-        args.shaft_diameter,
-    )
+        args.video, args.instrument, args.laparoscope, args.joint, args.calibration or args.intrinsics,
+        sync=args.sync, frames=args.frames, fps=args.fps, shaft_diameter=args.shaft_diameter,
+    )  # fmt: skip
     return [recording]
 
 
-def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json: bool) -> list[Assessment]:
-    """Make the capture, print what was found and how good it is; the verdict on each tissue."""
-    from neeco.capture import read_capture
-    from neeco.capture.checks import inspect_capture
-    from neeco.capture.documents import Problem, errors_only
-    from neeco.cli._output import require_ending
-    from neeco.errors import NeecoError
-    from neeco.files import finite
-    from neeco.ingest.assessment import assess_ingest
-    from neeco.ingest.pipeline import ingest
-    from neeco.ingest.tissues import ingest_tissues
-    from neeco.report.ingest_page import write_ingest_page
-    from neeco.report.rerun_log import require_rerun, write_rrd
-
-    if rrd is not None:
-        require_ending("--rrd", rrd, ".rrd")
-        require_rerun()
+@contextmanager
+def _progress_bars() -> Iterator[Callable[[str, int, int], None]]:
+    """Yield a function that shows the progress of one stage after another, on a terminal."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
@@ -208,78 +158,4 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
                 tasks[what] = bar.add_task(what, total=total or None)
             bar.update(tasks[what], completed=done, total=total or None)
 
-        problems: list[Problem] = []
-        verdicts: dict[str, Assessment] = {}
-
-        def complete(result: IngestResult, folder: Path) -> None:
-            complete_tissues({"": result}, folder)
-
-        def complete_tissues(results: dict[str, IngestResult], folder: Path) -> None:
-            report("writing the page", 0, 0)
-            checked = inspect_capture(folder)
-            problems.extend(checked.problems)
-            capture = checked.capture or read_capture(folder)
-            for tissue, result in results.items():
-                own = capture.over(tissue) if tissue else capture
-                verdicts[tissue] = assess_ingest(result, own, problems)
-                write_ingest_page(result, verdicts[tissue], folder / page_of(tissue), own)
-                if rrd is not None:
-                    report("writing for rerun", 0, 0)
-                    write_rrd(result, own, rrd)
-
-        try:
-            if any(recording.tissue for recording in recordings):
-                if rrd is not None:
-                    raise NeecoError("--rrd: shows one tissue, and the recordings name theirs; leave it out")
-                results = ingest_tissues(recordings, output, report, complete_tissues)
-            else:
-                results = {"": ingest(recordings, output, report, complete)}
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt("nothing was written") from None
-    if as_json:
-        numbers = finite({tissue: result.as_json() | verdicts[tissue].as_json() for tissue, result in results.items()})
-        print(json.dumps(numbers.get("", {"tissues": numbers}), indent=2, allow_nan=False))
-        return list(verdicts.values())
-    for tissue, result in results.items():
-        if tissue:
-            print(f"tissue {tissue}:")
-        print_result(result)
-    for problem in errors_only(problems):
-        print(f"wrong: {problem}")
-    print(f"capture: {output}  ({len(problems)} remarks by `neeco check`)")
-    print(f"page: {', '.join(str(output / page_of(tissue)) for tissue in results)}")
-    if rrd is not None:
-        print(f"to scrub through: rerun {rrd}")
-    for tissue, verdict in verdicts.items():
-        first, *others = verdict.lines()
-        print(f"how good it is: {f'{tissue}: ' if tissue else ''}{first}", *others, sep="\n")
-    return list(verdicts.values())
-
-
-def page_of(tissue: str) -> str:
-    """The file of the page about one of several tissues; of the only one where it has no name."""
-    from neeco.ingest.timing.episodes import file_name
-
-    return f"{Path(PAGE).stem}_{file_name(tissue)}.html" if tissue else PAGE
-
-
-def print_result(result: IngestResult) -> None:
-    """What an ingest found, in lines."""
-    numbers = result.as_json()
-    print(f"{numbers['kept']} of {numbers['video_frames']} video frames kept, {numbers['points']} points")
-    for name, (first, last) in result.episodes.items():
-        count = int(((result.selected >= first) & (result.selected <= last)).sum())
-        print(f"episode {name}: {count} of {last + 1 - first} frames kept")
-    if result.still:
-        print(f"still scope: the world is its camera's frame; the tissue's depth is {result.tissue}")
-    if not result.registered:
-        print("not registered: instrument poses stay in their tracker's frame")
-    elif result.registration is not None:
-        fit = numbers["registration"]
-        print(f"registered to {fit['position_rms_mm']:.2f} mm, {fit['rotation_rms_deg']:.2f} deg rms")
-    for name, clock in result.clocks.items():
-        print(f"clock {name}: {clock} ({clock.source})")
-    for sentence in result.search:
-        print(f"cameras: {sentence}")
-    for note in result.notes:
-        print(f"note: {note}")
+        yield report

@@ -1,4 +1,4 @@
-"""How far an ingested capture can be trusted, in words."""
+"""The verdict on an ingested capture."""
 
 from __future__ import annotations
 
@@ -12,87 +12,87 @@ from neeco.capture.documents import Problem
 from neeco.capture.model import UNKNOWN_DEG, Capture
 from neeco.ingest.result import IngestResult
 
-# Limits above which an ingest is doubted: conventions, not measurements.
+# Limits above which there is a warning: conventions, not measurements.
 POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.015, 0.5
 SEVERE = 3.0  # times the limit
-FEW_TRAIN, FEW_POINTS = 20, 100
-LITTLE_OVERLAP = 0.8  # of a base's outline with what moves: nine tenths are usual, half is another instrument or time
-NO_OVERLAP = 0.6
-SHOWN = 5  # doubts listed by `lines`
+MIN_TRAIN_FRAMES, MIN_POINTS = 20, 100
+MIN_OVERLAP = 0.8  # of a base's outline with what moves: nine tenths are usual, half is another instrument or time
+MIN_PLAUSIBLE_OVERLAP = 0.6
+MAX_SHOWN = 5  # warnings listed by `lines`
 VERDICTS = {"good": "good", "careful": "usable", "bad": "doubtful"}
 USABLE = ("not among the", "beside an unseen frame")  # how reasons begin that do not speak against a frame
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """headline: one sentence; doubts: why it is not better, one sentence each, the worst first."""
+    """headline: one sentence; warnings: why it is not better, one sentence each, the worst first."""
 
     level: Literal["good", "careful", "bad"]
     headline: str
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """The verdict for a terminal: the headline, a doubtful one's in capitals, and the first SHOWN doubts."""
+        """Return the verdict for a terminal: headline (in capitals if doubtful) and the first MAX_SHOWN warnings."""
         verdict, _, rest = self.headline.partition(":")
         words = {"good": f"good. {self.headline}", "careful": self.headline, "bad": f"{verdict.upper()}:{rest}"}
         shown = [words[self.level]]
-        others = [doubt for doubt in self.doubts if not self.headline.endswith(_lower(doubt))]
-        shown += [f"  - {doubt}" for doubt in others[:SHOWN]]
-        return shown + ([f"  - and {len(others) - SHOWN} more doubts"] if len(others) > SHOWN else [])
+        others = [warning for warning in self.warnings if not self.headline.endswith(_lower(warning))]
+        shown += [f"  - {warning}" for warning in others[:MAX_SHOWN]]
+        return shown + ([f"  - and {len(others) - MAX_SHOWN} more warnings"] if len(others) > MAX_SHOWN else [])
 
     def as_json(self) -> dict[str, Any]:
-        """For scripts (`--json`)."""
-        return {"verdict": VERDICTS[self.level], "headline": self.headline, "doubts": list(self.doubts)}
+        """Return the verdict for scripts (`--json`)."""
+        return {"verdict": VERDICTS[self.level], "headline": self.headline, "doubts": list(self.warnings)}
 
 
 def rms(values: np.ndarray) -> float:
-    """Root mean square; 0 of nothing."""
+    """Return the root mean square; 0 of nothing."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
 
 
 def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Problem] = ()) -> Assessment:
     """Judge a finished ingest by its own numbers, by contradictions in its recording, and by the problems that `check`
     found in its capture; nothing here knows the truth."""
-    severe = [_sentence(doubt.sentence) for doubt in result.doubts if doubt.severe]
+    severe = [_sentence(item.sentence) for item in result.contradictions if item.severe]
     grave = [problem for problem in problems if problem.severity == "error" or problem.contradicted]
     severe += [_sentence(str(problem)) for problem in grave]
-    doubts = [_sentence(doubt.sentence) for doubt in result.doubts if not doubt.severe]
+    mild = [_sentence(item.sentence) for item in result.contradictions if not item.severe]
     for value, limit, sentence in _measured(result, capture):
         if value > limit:
-            (severe if value > SEVERE * limit else doubts).append(sentence)
+            (severe if value > SEVERE * limit else mild).append(sentence)
     for name, base in result.bases.items():
-        if base.overlap < LITTLE_OVERLAP:
+        if base.overlap < MIN_OVERLAP:
             sentence = f"The outline of {name} and what moves overlap by {base.overlap:.2f} only: is its clock right?"
-            (severe if base.overlap < NO_OVERLAP else doubts).append(sentence)
+            (severe if base.overlap < MIN_PLAUSIBLE_OVERLAP else mild).append(sentence)
     train = len(capture.split("train"))
-    if train < FEW_TRAIN:
+    if train < MIN_TRAIN_FRAMES:
         severe.append(f"Only {train} frames are left to train on.")
     unusable = sum(not why.startswith(USABLE) for _, why in result.dropped)
     if unusable > 0.5 * result.video_frames:
-        doubts.append(f"{unusable} of {result.video_frames} video frames were dropped as unusable.")
-    if result.points < FEW_POINTS:
-        doubts.append(f"Only {result.points} tissue points were found.")
-    doubts += [
+        mild.append(f"{unusable} of {result.video_frames} video frames were dropped as unusable.")
+    if result.points < MIN_POINTS:
+        mild.append(f"Only {result.points} tissue points were found.")
+    mild += [
         f"Clock {name} was neither given nor found: {clock.source}."
         for name, clock in result.clocks.items()
         if not np.isfinite(clock.sd)
     ]
     if result.in_video and not _rolls_known(capture):
-        doubts.append("The instrument's roll is not known: log it, or pose frames by hand, before training.")
-    doubts += [_sentence(str(problem)) for problem in problems if problem not in grave]
+        mild.append("The instrument's roll is not known: log it, or pose frames by hand, before training.")
+    mild += [_sentence(str(problem)) for problem in problems if problem not in grave]
     if not capture.instruments:
-        doubts.append("No instrument was tracked: only methods without states, such as 3dgs, can be trained.")
+        mild.append("No instrument was tracked: only methods without states, such as 3dgs, can be trained.")
         if not severe:
-            return Assessment("careful", "Cameras only: there is no instrument to pose.", tuple(doubts))
+            return Assessment("careful", "Cameras only: there is no instrument to pose.", tuple(mild))
     elif not capture.registered:
         severe.append(
             "Cameras and instrument do not meet: instrument poses are in a frame of their own, so that it cannot be "
             "drawn where it was."
         )
     if severe:
-        return Assessment("bad", "Doubtful: " + _lower(severe[0]), (*severe, *doubts))
-    if doubts:
-        return Assessment("careful", "Usable, with care: " + _lower(doubts[0]), tuple(doubts))
+        return Assessment("bad", "Doubtful: " + _lower(severe[0]), (*severe, *mild))
+    if mild:
+        return Assessment("careful", "Usable, with care: " + _lower(mild[0]), tuple(mild))
     fit = "nothing measured speaks against it" if result.registration is None else "cameras and instrument fit together"
     return Assessment("good", f"Ready to train: {fit}.", ())
 
@@ -102,9 +102,9 @@ def _sentence(text: str) -> str:
 
 
 def _rolls_known(capture: Capture) -> bool:
-    """Whether every state's roll is sure to less than UNKNOWN_DEG."""
-    sure = [state.uncertainty for frame in capture.frames for state in frame.state.instruments.values()]
-    return all(item is None or item.rotation_deg[2] < UNKNOWN_DEG for item in sure)
+    """Return whether every state's roll has a standard deviation below UNKNOWN_DEG."""
+    deviations = [state.uncertainty for frame in capture.frames for state in frame.state.instruments.values()]
+    return all(item is None or item.rotation_deg[2] < UNKNOWN_DEG for item in deviations)
 
 
 def _lower(sentence: str) -> str:
@@ -112,7 +112,7 @@ def _lower(sentence: str) -> str:
 
 
 def _measured(result: IngestResult, capture: Capture) -> list[tuple[float, float, str]]:
-    """(value, limit, sentence for a value above the limit)."""
+    """Return (value, limit, sentence for a value above the limit)."""
     measured = []
     if (pixels := result.reprojection_px) is not None:
         sentence = f"Tissue points are off by {pixels:.2f} px on average in the images they were found in."
@@ -136,8 +136,10 @@ def _measured(result: IngestResult, capture: Capture) -> list[tuple[float, float
 
 
 def clock_cost_mm(name: str, sd: float, capture: Capture) -> float | None:
-    """How far an instrument moves in the clock's standard deviation, at its 90th percentile of speed; None for a
-    joint's clock or where it is not known."""
+    """Return the mm that an instrument moves within a clock's standard deviation, at its 90th percentile of speed.
+
+    None for a joint's clock, and where the deviation is not known.
+    """
     joints = {joint for instrument in capture.instruments for joint in instrument.joints}
     speeds = [instrument_speed(capture, instrument.name) for instrument in capture.instruments]
     if name in joints or not speeds or not np.isfinite(sd):
@@ -146,7 +148,7 @@ def clock_cost_mm(name: str, sd: float, capture: Capture) -> float | None:
 
 
 def instrument_speed(capture: Capture, name: str) -> float:
-    """mm/s, 90th percentile over frames next to each other in time; 0 for fewer than two frames."""
+    """Return the 90th percentile of an instrument's speed between consecutive frames, mm/s; 0 for fewer than two."""
     frames = sorted((f for f in capture.frames if name in f.state.instruments), key=lambda frame: frame.state.time)
     if len(frames) < 2:
         return 0.0

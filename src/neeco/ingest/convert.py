@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.capture.checks.masks import masks_fault, measure_hidden, sample_points
+from neeco.capture.checks.frames import masks_fault, measure_hidden, sample_points
 from neeco.capture.documents import ProblemReport, condensed
 from neeco.capture.images import read_mask, write_labels
 from neeco.capture.model import Capture, Frame, evenly_spaced
@@ -24,7 +24,7 @@ from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY, new_folder, own_folder
 from neeco.geometry.lens import Border
-from neeco.ingest.calibration.lens import BORDER_SAMPLES, find_border, visible_mask
+from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.cameras.undistortion import undistort_frames
 
 
@@ -80,7 +80,7 @@ def _doubtful_masks(capture: Capture) -> list[str]:
     """What to say of loss masks that may be inverted."""
     masked = [frame for frame in capture.frames if frame.mask_path is not None]
     found = []
-    for index in evenly_spaced(len(masked), BORDER_SAMPLES, floor=True):
+    for index in evenly_spaced(len(masked), MAX_BORDER_FRAMES, floor=True):
         frame, mask = masked[index], masked[index].load_mask()
         points = {tissue.name: tissue.points for tissue in capture.tissues}.get(str(frame.state.tissue), capture.points)
         assert mask is not None
@@ -94,7 +94,7 @@ def _shared_border(frames: Sequence[Frame]) -> Border | None:
     NeecoError when an image cannot be read."""
     if len({(frame.camera.width, frame.camera.height) for frame in frames}) != 1:
         return None
-    chosen = evenly_spaced(len(frames), BORDER_SAMPLES, floor=True)
+    chosen = evenly_spaced(len(frames), MAX_BORDER_FRAMES, floor=True)
     return find_border(frames[index].load_image_bytes().numpy() for index in chosen)
 
 
@@ -115,7 +115,7 @@ def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path)
     """
     sizes = [(frame.camera.width, frame.camera.height) for frame in frames]
     white = []
-    for index in evenly_spaced(len(frames), BORDER_SAMPLES, floor=True):
+    for index in evenly_spaced(len(frames), MAX_BORDER_FRAMES, floor=True):
         tool = read_mask(masks[index], sizes[index])
         white.append(measure_hidden(frames[index].load_image(), ~tool, None, np.zeros((0, 3))))
     fault = masks_fault(white)

@@ -46,7 +46,7 @@ def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, r
     recording = recording_from_flags(path)
     recording = replace(
         recording,
-        frames=len(recording.open().times),
+        frames=len(recording.source.open().times),
         settings=replace(recording.settings, scene_distance_mm=_distance(scene)),
     )
 

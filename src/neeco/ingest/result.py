@@ -1,4 +1,4 @@
-"""What an ingest found, for the page and for scripts."""
+"""The report on one ingest, for the page and for scripts."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from neeco.ingest.foreground.motion import RoughShape
+from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.timing.clock_search import ClockOffset
-from neeco.ingest.timing.notes import Doubt
+from neeco.ingest.timing.notes import Contradiction
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class IngestResult:
-    """Everything about one ingest. The capture itself (images, cameras, states, points) is read from `capture`."""
+    """Everything about one ingest but the capture itself (images, cameras, states, points), which lies at `capture`."""
 
     capture: Path
     recording: str  # where it came from, in words
@@ -40,7 +40,7 @@ class IngestResult:
     # camera_from_instrument [K, 4, 4] mm of each instrument before registration: the laparoscope's sensor taken for its
     # camera. NaN where a log has a gap; empty where there was no registration
     unregistered: dict[str, np.ndarray] = field(default_factory=dict)
-    # video frame -> [h, w] how often pixels were seen to move
+    # video frame -> [h, w] how often pixels moved
     moving: dict[int, np.ndarray] = field(default_factory=dict)
     registered: bool = True  # instrument poses are in the cameras' world
     bases: dict[str, BaseRegistration] = field(default_factory=dict)  # found from what moves, by instrument
@@ -48,7 +48,7 @@ class IngestResult:
     in_video: tuple[str, ...] = ()  # instruments that nothing tracked, found in the images
     # s of the capture's time at which each of several recordings has its own 0
     episode_starts: dict[str, float] = field(default_factory=dict)
-    doubts: tuple[Doubt, ...] = ()  # that parts of the recording contradict each other
+    contradictions: tuple[Contradiction, ...] = ()  # between parts of the recording
 
     @property
     def still(self) -> bool:
@@ -56,13 +56,13 @@ class IngestResult:
         return self.tissue is not None
 
     def frame_words(self, frame: int) -> str:
-        """What a video frame is called: its number, and of several recordings which is meant."""
+        """Return a video frame's number, and of several recordings which is meant."""
         name = self._episode_of(frame)
         return f"video frame {frame}" if name is None else f"{name}: video frame {frame - self.episodes[name][0]}"
 
     def log_times(self, frame: int, seconds: float) -> dict[str, float]:
-        """What the logs' clocks show, s, as a video frame is taken at `seconds` of the capture's time: of several
-        recordings, those of the frame's own."""
+        """Return the logs' times, s, of a video frame that is taken at `seconds` of the capture's time, by clock: of
+        several recordings, those of the frame's own."""
         name = self._episode_of(frame)
         if name is None:
             return {clock: float(ahead.at(np.array(seconds))) for clock, ahead in self.clocks.items()}
@@ -74,15 +74,15 @@ class IngestResult:
         }
 
     def _episode_of(self, frame: int) -> str | None:
-        """The name of the one of several recordings that a video frame is of."""
+        """Return the name of the one of several recordings that holds a video frame."""
         return next((name for name, (first, last) in self.episodes.items() if first <= frame <= last), None)
 
     def as_json(self) -> dict[str, Any]:
-        """Numbers for scripts (`--json`): mm, degrees, px, s."""
+        """Return numbers for scripts (`--json`): mm, degrees, px, s."""
         clocks = {
             name: {
                 "offset_s": clock.seconds,
-                "sd_s": clock.sd if np.isfinite(clock.sd) else None,  # nobody knows
+                "sd_s": clock.sd if np.isfinite(clock.sd) else None,  # not known
                 "rate": clock.rate,
                 "rate_sd": clock.rate_sd,
                 "source": clock.source,
@@ -114,3 +114,21 @@ class IngestResult:
             "notes": list(self.notes),
             "search": list(self.search),
         }
+
+    def lines(self) -> list[str]:
+        """Return what was found, for a terminal."""
+        numbers = self.as_json()
+        shown = [f"{numbers['kept']} of {numbers['video_frames']} video frames kept, {numbers['points']} points"]
+        for name, (first, last) in self.episodes.items():
+            count = int(((self.selected >= first) & (self.selected <= last)).sum())
+            shown.append(f"episode {name}: {count} of {last + 1 - first} frames kept")
+        if self.still:
+            shown.append(f"still scope: the world is its camera's frame; the tissue's depth is {self.tissue}")
+        if not self.registered:
+            shown.append("not registered: instrument poses stay in their tracker's frame")
+        elif self.registration is not None:
+            fit = numbers["registration"]
+            shown.append(f"registered to {fit['position_rms_mm']:.2f} mm, {fit['rotation_rms_deg']:.2f} deg rms")
+        shown += [f"clock {name}: {clock} ({clock.source})" for name, clock in self.clocks.items()]
+        shown += [f"cameras: {sentence}" for sentence in self.search]
+        return shown + [f"note: {note}" for note in self.notes]

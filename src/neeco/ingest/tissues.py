@@ -13,10 +13,12 @@ from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.convert import staged
 from neeco.ingest.frames.views import StageProgress
-from neeco.ingest.pipeline import Placed, WorldIngest
+from neeco.ingest.pipeline import find_world, finish
 from neeco.ingest.recording.model import EACH, Recording, Splits
 from neeco.ingest.result import IngestResult
-from neeco.ingest.timing.episodes import check_alike, episode_names, file_name, refuse_other_words, separate
+from neeco.ingest.timing.compatibility import check_shared_settings, episode_names, file_name, separate
+from neeco.ingest.timing.episodes import check_episodes, read_episodes
+from neeco.ingest.world import World
 
 
 def ingest_tissues(
@@ -25,18 +27,21 @@ def ingest_tissues(
     progress: StageProgress,
     complete: Callable[[dict[str, IngestResult], Path], None] = lambda results, folder: None,
 ) -> dict[str, IngestResult]:
-    """As `ingest`, of recordings that name their tissues: each tissue gets a world of its own, found from its own
-    recordings; what was found of each, by its name."""
-    worlds = by_tissue(separate(recordings))
+    """Make a capture of recordings that name their tissues, as `ingest` does of others; return a report on each tissue.
+
+    Each tissue gets a world of its own, found from its own recordings.
+    """
     with staged(output) as folder:
-        parts = {}
-        for number, (tissue, own) in enumerate(worlds.items()):
-            (folder / f"world_{number}").mkdir()
-            parts[str(tissue)] = WorldIngest(own, folder / f"world_{number}", progress, str(tissue))
-        check_alike([part for one in parts.values() for part in one.data.parts], worlds=True)
-        placed = {tissue: one.place() for tissue, one in parts.items()}
-        readings = _joined_readings(list(placed.values()))
-        found = {tissue: one.finish(output, placed[tissue], readings) for tissue, one in parts.items()}
+        progress("reading logs and video", 0, 0)
+        read = {str(tissue): read_episodes(own, str(tissue)) for tissue, own in by_tissue(separate(recordings)).items()}
+        check_episodes([part for data in read.values() for part in data.parts], tissues=True)
+        worlds = {}
+        for number, (tissue, data) in enumerate(read.items()):
+            own = folder / f"world_{number}"
+            own.mkdir()
+            worlds[tissue] = find_world(data, own, progress)
+        readings = _joined_readings(list(worlds.values()))
+        found = {tissue: finish(world, output, readings) for tissue, world in worlds.items()}
         write_capture(_joined({tissue: capture for tissue, (capture, _) in found.items()}), folder / "capture")
         results = {tissue: result for tissue, (_, result) in found.items()}
         complete(results, folder / "capture")
@@ -44,7 +49,7 @@ def ingest_tissues(
 
 
 def _joined(captures: dict[str, Capture]) -> Capture:
-    """One capture of several tissues, from that of each. Raises NeecoError for what it can only state once."""
+    """Return one capture of several tissues, from that of each. Raises NeecoError for what it can only state once."""
     parts = list(captures.values())
     frames = tuple(
         replace(frame, state=replace(frame.state, tissue=tissue))
@@ -68,8 +73,10 @@ def _joined(captures: dict[str, Capture]) -> Capture:
 
 
 def by_tissue(recordings: Sequence[Recording]) -> dict[str | None, list[Recording]]:
-    """The recordings of every tissue, by its name; all under None where none names one. What the first says for all
-    (splits, frames, settings) is said in each. Raises NeecoError."""
+    """Return the recordings of every tissue, by its name; all under None where none names one.
+
+    What the first states for all (splits, frames, settings) is then stated in each. Raises NeecoError.
+    """
     if not any(recording.tissue for recording in recordings):
         return {None: list(recordings)}
     named = [replace(item, episode=name) for item, name in zip(recordings, episode_names(recordings), strict=True)]
@@ -90,7 +97,7 @@ def by_tissue(recordings: Sequence[Recording]) -> dict[str | None, list[Recordin
         )
     first = named[0]
     for item in named[1:]:
-        refuse_other_words(item, first)
+        check_shared_settings(item, first)
     for tissue, own in worlds.items():
         splits = first.splits and _splits_of(first.splits, named, own, str(tissue))
         worlds[tissue] = [replace(item, splits=splits, frames=first.frames, settings=first.settings) for item in own]
@@ -98,7 +105,7 @@ def by_tissue(recordings: Sequence[Recording]) -> dict[str | None, list[Recordin
 
 
 def _splits_of(splits: Splits, named: Sequence[Recording], own: Sequence[Recording], tissue: str) -> Splits:
-    """What the splits of all mean for the recordings of one tissue. Raises NeecoError."""
+    """Return the part of the splits of all that holds for the recordings of one tissue. Raises NeecoError."""
     names, known = [item.episode for item in own], {item.episode for item in named}
     tested, unseen = splits.test_episodes, splits.unseen_episodes
     for episode in tested + unseen:
@@ -121,10 +128,10 @@ def _splits_of(splits: Splits, named: Sequence[Recording], own: Sequence[Recordi
     return replace(found, unseen_fraction=0.0) if unseen and not found.unseen_episodes else found
 
 
-def _joined_readings(placed: Sequence[Placed]) -> dict[str, dict[str, np.ndarray]]:
-    """By instrument and joint, what was read over all tissues."""
-    names = {name: list(joints) for name, (_, joints) in placed[0].states.items()}
+def _joined_readings(worlds: Sequence[World]) -> dict[str, dict[str, np.ndarray]]:
+    """Return the readings over all tissues, by instrument and joint."""
+    names = {name: list(joints) for name, (_, joints) in worlds[0].states.items()}
     return {
-        name: {joint: np.concatenate([one.states[name][1][joint][one.usable] for one in placed]) for joint in joints}
+        name: {joint: np.concatenate([one.states[name][1][joint][one.usable] for one in worlds]) for joint in joints}
         for name, joints in names.items()
     }

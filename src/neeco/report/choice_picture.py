@@ -1,8 +1,9 @@
-"""A picture of what a recording's poses would be under each choice that its file leaves open."""
+"""A draft of a recording.yaml, and a picture of its poses under each choice that the recorded file leaves open."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,10 +11,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from neeco.files import write_atomically
+from neeco.errors import NeecoError
+from neeco.files import write_atomically, write_text
 from neeco.ingest.readers import IMAGES, VideoSource, format_of
 from neeco.ingest.readers.choices import AXES, OpenPoses, Reading, axis_directions, largest_step, open_poses, shaft_of
 from neeco.ingest.readers.columns import BASE
+from neeco.ingest.recording.template import holds_streams, write_template
+from neeco.ingest.sources import RECORDING
 from neeco.report.charts import page_style
 
 FRAMES = 3  # shown
@@ -22,6 +26,26 @@ AXIS_SHARE = 0.2  # of a body's distance, that its axes are drawn long
 COLORS = ("#d62728", "#2ca02c", "#1f77b4")  # x, y, z
 LINES = 24  # of a shaft, drawn
 MOST_ROWS = 10  # of choices
+CHOICES = "recording_choices.png"
+
+
+def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
+    """Write a recording.yaml for what lies at `source`, and a picture of the choices that its file leaves open, into
+    the folder or beside the file. Return lines on what was written; `report` is called with what is left out.
+
+    Raises NeecoError where a recording.yaml exists, and where there are no images.
+    """
+    path = (source.parent if holds_streams(source) else source) / RECORDING
+    if path.exists():
+        raise NeecoError(f"{path}: already exists; edit it, or move it away first")
+    write_text(path, write_template(source, lambda problem: report(f"left out: {problem}")))
+    lines, picture = [], path.with_name(CHOICES)
+    try:
+        if holds_streams(source) and write_choice_picture(source, picture):
+            lines.append(f"wrote {picture}: what its poses would be under each choice that the file leaves open")
+    except NeecoError as error:  # recording.yaml, which names the choices, is written all the same
+        lines.append(f"no picture of the choices that the file leaves open: {error}")
+    return [*lines, f"wrote {path}: look through it, then: neeco ingest {path} --output CAPTURE"]
 
 
 @page_style()

@@ -40,8 +40,8 @@ from neeco.studies.tables import (
     UNKNOWN,
     Cell,
     Column,
+    ResultTable,
     Row,
-    Table,
     csv_text,
     latex_table,
     markdown_table,
@@ -77,7 +77,7 @@ HEADINGS = {
 Values = dict[str, float | None]  # by measure; empty where the run failed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AblationRow:
     """One setting of a table: its numbers by measure, the paper's, and how both differ from the reference's."""
 
@@ -92,7 +92,7 @@ class AblationRow:
     agrees: dict[str, str | None]  # of each judged measure: do ours and the paper's differ in the same direction
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AblationTable:
     """A table with its numbers. `judged`, `measures`: those compared with the paper, and all that are shown."""
 
@@ -106,9 +106,9 @@ class AblationTable:
     curves: list[dict[str, Any]]  # held-out PSNR over the run: {comparison, label, iteration, progress, psnr}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AblationResult:
-    """What ablation.json holds."""
+    """The contents of ablation.json."""
 
     schema: str
     version: str
@@ -223,7 +223,15 @@ def _job(plan: AblationPlan, variant: Variant) -> TrainingJob:
         capture = plan.output / "captures" / variant.derived.name
         config = replace(config, transforms="transforms.json")
     folder = plan.output / "runs" / variant.name
-    return TrainingJob(variant.name, plan.seed, capture, folder, config, Budget(None, steps), device=plan.device)
+    return TrainingJob(
+        name=variant.name,
+        seed=plan.seed,
+        capture=capture,
+        folder=folder,
+        config=config,
+        budget=Budget(None, steps),
+        device=plan.device,
+    )
 
 
 def _paper_settings(iterations: int) -> tuple[str, ...]:
@@ -247,7 +255,7 @@ def _with_room_to_grow(config: TrainConfig) -> TrainConfig:
 
 
 def _shortcomings(method: str, steps: int, log_interval: int) -> list[str]:
-    """What runs of so many steps are too short to show."""
+    """Return notes on what runs of so many steps are too short to show."""
     notes = []
     if method == "neeco" and PHASE_1_SHARE * steps < log_interval:
         notes.append(
@@ -277,8 +285,8 @@ def _label_scores(
     """Scores by run of both ways to label it, for the runs whose table asks; and what could not be scored."""
     scores: dict[str, LabelScores] = {}
     failures = []
-    asked = (entry.variant.name for table in chosen for entry in table.entries if entry.label_way)
-    for name in dict.fromkeys(asked):
+    wanted = (entry.variant.name for table in chosen for entry in table.entries if entry.label_way)
+    for name in dict.fromkeys(wanted):
         if name not in folders:
             continue
         file = folders[name] / LABELS_FILE
@@ -319,11 +327,20 @@ def table_of(
     final = ("psnr",) if table.group == "paper" else FINAL_SCORES
     known = dict.fromkeys(key for row in rows for key, value in row.values.items() if value is not None)
     shown = [key for key in known if key not in judged and key.partition(".")[0] in final]
-    return AblationTable(table.name, table.group, table.title, table.question, judged, [*judged, *shown], rows, curves)
+    return AblationTable(
+        name=table.name,
+        group=table.group,
+        title=table.title,
+        question=table.question,
+        judged=judged,
+        measures=[*judged, *shown],
+        rows=rows,
+        curves=curves,
+    )
 
 
 def primary_split(splits: Sequence[str]) -> str:
-    """The held-out split that the paper's test numbers are set beside."""
+    """Return the held-out split that the paper's test numbers are compared with."""
     return "test" if "test" in splits else splits[0]
 
 
@@ -343,20 +360,20 @@ def _row(
             expected = paper[key] - paper_base[key] if key in paper else float(entry.expected)
             agrees[key] = direction(difference.get(key), expected)
     return AblationRow(
-        comparison.title,
-        entry.label,
-        entry is reference,
-        entry.variant.name,
-        ours,
-        paper,
-        "worse" if entry.expected and entry is not reference else "",
-        difference,
-        agrees,
+        comparison=comparison.title,
+        label=entry.label,
+        reference=entry is reference,
+        run=entry.variant.name,
+        values=ours,
+        paper=paper,
+        paper_direction="worse" if entry.expected and entry is not reference else "",
+        difference=difference,
+        agrees=agrees,
     )
 
 
 def direction(ours: float | None, paper: float) -> str | None:
-    """Whether two differences point the same way: "yes", "no", "even" when ours is below EVEN_DB, None unknown."""
+    """Compare the signs of two differences: "yes", "no", "even" when ours is below EVEN_DB, None unknown."""
     if ours is None:
         return None
     if abs(ours) < EVEN_DB:
@@ -428,7 +445,7 @@ def formatted(measure: str, value: float | None, *, signed: bool = False) -> str
     return f"{value:{'+' if signed else ''}.{digits}f}"
 
 
-def grid(table: AblationTable) -> Table:
+def grid(table: AblationTable) -> ResultTable:
     """A table for reading: per judged measure the paper's number, ours and whether they agree; the rest as ours alone.
 
     What is compared has a column of its own where it is not the same in all rows.
@@ -443,7 +460,7 @@ def grid(table: AblationTable) -> Table:
         cells = [text for measure in table.measures for text in _cells(row, measure, measure in table.judged)]
         keys = (row.comparison, row.label) if several else (row.label,)
         rows.append(Row(keys, tuple(map(Cell, cells)), reference=row.reference))
-    return Table(table.title, ("", "setting") if several else ("setting",), tuple(columns), tuple(rows))
+    return ResultTable(table.title, ("", "setting") if several else ("setting",), tuple(columns), tuple(rows))
 
 
 def _cells(row: AblationRow, measure: str, judged: bool) -> list[str]:
@@ -459,7 +476,7 @@ def _cells(row: AblationRow, measure: str, judged: bool) -> list[str]:
 
 
 def agreement(table: AblationTable) -> str:
-    """How many of the paper's directions ours shows, in words; "" for a table that judges nothing."""
+    """Return how many of the paper's directions ours shows, in words; "" for a table that judges nothing."""
     counts = Counter(agrees for row in table.rows for agrees in row.agrees.values())
     if not counts:
         return ""

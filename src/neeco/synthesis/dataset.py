@@ -1,4 +1,4 @@
-"""`neeco synthesize`: draw many states, write the acceptable ones with labels; and what any data set has as a whole.
+"""`neeco synthesize`: render many states and write the acceptable ones with labels; files of a data set as a whole.
 
 dataset.json says how it was made, and decides whether one begun may be continued. Index files, README.md and preview
 are written from the records of its images.
@@ -17,13 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import neeco
-from neeco import cluster
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_begun, read_bytes, require_same, write_json
 from neeco.labels.annotation import keypoint_names
-from neeco.labels.drawing import REACH
+from neeco.labels.drawing import EDGE_WIDTH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels
-from neeco.raster.native import threads
 from neeco.registry import plugins
 from neeco.synthesis.camera_effects import read_effects
 from neeco.synthesis.card import write_card
@@ -37,10 +35,10 @@ from neeco.synthesis.generator import (
     draw_to_folder,
     format_counts,
 )
+from neeco.synthesis.parallel import draw_in_workers
 from neeco.synthesis.preview import write_preview
-from neeco.synthesis.samplers import SIMILAR, states_fingerprint
+from neeco.synthesis.samplers import N_SIMILAR, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names
-from neeco.synthesis.workers import draw_in_processes, draw_on_cluster
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import (
     DEPTH_MM_PER_COUNT,
@@ -52,13 +50,13 @@ from neeco.synthesis.writers.folder import (
     record_path,
     write_states,
 )
+from neeco.workers import address, check_workers
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
     from neeco.training.run import GaussianRun
 
 SCHEMA = "neeco-dataset/1"
-SAME_IMAGES = ("0.1.0",)  # versions that draw the same images and labels as this one, so that their sets are continued
 INFO = "dataset.json"
 SCENE_FILE = "scene.safetensors"
 
@@ -72,13 +70,14 @@ REMEDIES = {  # where every given state was refused
 
 @dataclass(frozen=True)
 class Synthesized:
-    """What was made, and where it lies."""
+    """The data set that was written."""
 
     output: Path
     images: int
     made_now: int
     refused: dict[str, int]  # reason -> states refused
     skipped: list[int]  # indices whose prescribed state was refused every time
+    still: bool  # the scene was recorded from one place
 
 
 def synthesize(
@@ -95,17 +94,14 @@ def synthesize(
     its tissue under the instruments of those runs.
 
     Image `index` depends on (scene, settings, index) alone, however many `workers` share the work: processes started
-    anew, so that a script needs `if __name__ == "__main__"` about its own start.
-    Interrupted (Ctrl-C) or failing, it keeps and indexes what is done, for `resume`; where no image was drawn at all,
-    `output` is left as it was found. `on_progress` gets how many images are done. How many threads torch takes is the
-    caller's to set (`open_run`). Raises NeecoError for bad settings, an output that is not empty (without `resume`) or
-    was made with other settings, and when no acceptable state is found.
+    anew, so that a script needs `if __name__ == "__main__"` about its own start. Interrupted (Ctrl-C) or failing, it
+    keeps and indexes what is done, for `resume`; where no image was rendered at all, `output` is left as it was found.
+    `on_progress` gets how many images are done. How many threads torch takes is the caller's to set (`open_run`).
+    Raises NeecoError for bad settings, an output that is not empty (without `resume`) or was made with other settings,
+    and when no acceptable state is found.
     """
     settings.check()
-    if workers < 1:
-        raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
-    if cluster.address():
-        cluster.require_ray()
+    check_workers(workers)
     output = Path(output)
     runs = (run, *instrument_runs)
     scene, *instrument_scenes = (given.scene for given in runs)
@@ -115,7 +111,7 @@ def synthesize(
     identity = settings.identity() | {
         **settings.image_identity(recorded.width, recorded.height),
         "states_sha256": states_fingerprint(settings.states),
-        "similar_views": SIMILAR,
+        "similar_views": N_SIMILAR,
         "camera_effects": effects,
     }
     info = description(run, identity, instrument_runs)
@@ -130,7 +126,15 @@ def synthesize(
         info["tissues"] = list(scene.recorded.tissues)
     if generator.gains:
         info["color_gains"] = [[round(value, 4) for value in gain] for gain in generator.gains]
-    folder = DataSetFolder(output, settings.count, begun, info, generator.scene, generator.labeller, formats)
+    folder = DataSetFolder(
+        output=output,
+        count=settings.count,
+        begun=begun,
+        info=info,
+        scene=generator.scene,
+        labeller=generator.labeller,
+        formats=formats,
+    )
     with folder.being_written() as records:
         if records:
             on_progress(len(records))
@@ -146,32 +150,37 @@ def synthesize(
         if not images:
             remedies = "; ".join(REMEDIES[reason] for reason in refused if reason in REMEDIES)
             raise NeecoError(f"{settings.states}: every state was refused ({format_counts(refused)}); {remedies}")
-    return Synthesized(output, len(images), made, refused, skipped(records.values()))
+    return Synthesized(
+        output=output,
+        images=len(images),
+        made_now=made,
+        refused=refused,
+        skipped=skipped(records.values()),
+        still=scene.recorded.still,
+    )
 
 
 def _draw_all(
     generator: SampleGenerator, spec: GeneratorSpec, output: Path, missing: list[int], workers: int
 ) -> Iterator[Record]:
-    """The records of the missing images, as they are drawn."""
-    if cluster.address():
-        return draw_on_cluster(spec, output, missing, workers)
-    if workers > 1:
-        return draw_in_processes(spec, output, missing, workers, max(1, threads() // workers))
+    """Yield the records of the missing images as they are rendered."""
+    if missing and (workers > 1 or address()):
+        return draw_in_workers(spec, output, missing, workers)
     return (draw_to_folder(generator, output, index) for index in missing)
 
 
 def description(
     run: GaussianRun, settings: dict[str, Any], instrument_runs: Sequence[GaussianRun] = ()
 ) -> dict[str, Any]:
-    """How a data set of the run's scene, or of its tissue under the instruments of `instrument_runs`, is made: what
-    dataset.json begins with. `settings` must stay the same for it to be continued."""
+    """Return what dataset.json begins with: how a data set of the run's scene, or of its tissue under the instruments
+    of `instrument_runs`, is made. `settings` must stay the same for it to be continued."""
     info = {
         "schema": SCHEMA,
         "version": neeco.__version__,
         "scene_sha256": _digest(run),
         "settings": settings,
         "soft": {"share_per_count": SHARE_PER_COUNT},
-        "ignore": {"ignored": IGNORED, "clear_shares": list(CLEAR_SHARES), "reach": REACH},
+        "ignore": {"ignored": IGNORED, "clear_shares": list(CLEAR_SHARES), "reach": EDGE_WIDTH},
         "scene": str(run.path),
     }
     if instrument_runs:
@@ -186,24 +195,23 @@ def _digest(run: GaussianRun) -> str:
 
 
 def check_output(output: Path, description: dict[str, Any], resume: bool) -> bool:
-    """Whether a data set was begun in `output` in the same way. Raises NeecoError when it may not be written to."""
+    """Return whether a data set was begun in `output` in the same way. Raises NeecoError when it may not be written
+    to."""
     begun = read_begun(output, INFO, resume, "a data set")
     if begun is None:
         return False
     if not isinstance(begun.get("settings"), dict):
         raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
     settings = begun["settings"]
-    if begun.get("version") in SAME_IMAGES:
-        begun["version"] = description["version"]
     compared = [(key, begun.get(key), description[key]) for key in ("schema", "version", "scene_sha256")]
-    # a version that wrote neither of these folders named neither: all its images are drawn anew
+    # a version that wrote neither of these folders named neither: all its images are rendered anew
     compared += [(key, begun[key], description[key]) for key in ("soft", "ignore") if begun.get(key) is not None]
     compared += [(f"settings.{key}", settings.get(key), value) for key, value in description["settings"].items()]
     require_same(str(output / INFO), compared)
     return True
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DataSetFolder:
     """The folder of a data set that is made now: what dataset.json says of the making (`info`), whether it was `begun`
     before, and what its index files need."""
@@ -306,7 +314,7 @@ def check_formats(formats: Sequence[str], settings: ImageSettings) -> None:
 
 
 def part_ids(names: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
-    """What part ids mean, for files; names: (instrument, part) of part id 1, 2, ..."""
+    """Return the meaning of part ids, for files; names: (instrument, part) of part id 1, 2, ..."""
     return [{"id": 0, "part": "tissue"}] + [
         {"id": k, "instrument": instrument, "part": part} for k, (instrument, part) in enumerate(names, 1)
     ]
@@ -323,7 +331,7 @@ def skipped(records: Iterable[Record]) -> list[int]:
 
 
 def refusals(records: Iterable[Record]) -> dict[str, int]:
-    """How many states were refused, by reason."""
+    """Count the refused states by reason."""
     refused: Counter[str] = Counter()
     for record in records:
         refused.update(record["refused"])

@@ -1,4 +1,4 @@
-"""What the recording of a still scope shows: the instruments' rough shapes, and the tissue behind them.
+"""The tissue behind the instruments of a still scope, their rough shapes, and a stereo scope's second camera.
 
 The world is the scope's own frame (OpenCV axes, mm), which for a stereo scope is its left camera's.
 """
@@ -14,46 +14,43 @@ import numpy as np
 import torch
 
 from neeco.capture.images import open_image, write_image, write_labels
-from neeco.capture.model import REFERENCE_PIXELS, Frame, evenly_spaced
+from neeco.capture.model import Frame, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
-from neeco.ingest.calibration.lens import BORDER_SAMPLES, find_border, visible_mask
+from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.calibration.stereo import read_stereo
-from neeco.ingest.cameras.still import Background, find_background, moving_masks
 from neeco.ingest.cameras.tissue_surface import TissueSurface, surface_behind, surface_from_stereo
-from neeco.ingest.foreground.motion import STEP, PosesAt, RoughShape, best_lag, carve_shape, project_mask
-from neeco.ingest.frames.views import SfmResult, StageProgress, reduced
+from neeco.ingest.foreground.background import Background, find_background
+from neeco.ingest.foreground.masks import moving_masks
+from neeco.ingest.foreground.residual_flow import STEP_PX
+from neeco.ingest.foreground.rough_shape import PosesAt, RoughShape, best_lag, carve_shape, project_mask
+from neeco.ingest.frames.views import SfmResult, StageProgress, Views, reduced
 from neeco.ingest.recording.model import IngestSettings, StereoPartner
 
-Load = Callable[[int], np.ndarray]  # row of the chosen frames -> image uint8 [H, W, 3], undistorted
 Tracked = Mapping[str, PosesAt]  # instrument -> camera_from_instrument [K, 4, 4] of the chosen frames
 
 
 @dataclass(frozen=True)
 class StillScene:
-    """points [P, 3] mm and colors uint8 [P, 3] of the tissue; shapes: of the instruments, by name; lags: by name, s at
-    which an instrument's poses fit what moves better (0: none); how: the tissue's depth was found, in words; notes: one
-    sentence each."""
+    """The tissue, the instruments and the remarks that a still scope's images give."""
 
-    points: np.ndarray
-    colors: np.ndarray
-    shapes: dict[str, RoughShape]
-    lags: dict[str, float]
-    how: str
-    notes: tuple[str, ...]
+    points: np.ndarray  # [P, 3] mm, of the tissue
+    colors: np.ndarray  # uint8 [P, 3]
+    shapes: dict[str, RoughShape]  # by instrument
+    lags: dict[str, float]  # by instrument, s at which its poses fit what moves better (0: none)
+    how: str  # the tissue's depth was found, in words
+    notes: tuple[str, ...]  # one sentence each
 
 
 @dataclass(frozen=True)
 class RightCamera:
-    """The second camera of a stereo scope. folder: of its images, `names` by row of the chosen frames (none: it took
-    none then); mask: where its border is masked."""
+    """The second camera of a stereo scope."""
 
     pinhole: Lens
-    world_from_camera: np.ndarray
-    folder: Path
-    names: Mapping[int, str]
-    visible: np.ndarray | None
-    mask: Path | None
+    world_from_camera: np.ndarray  # [4, 4]
+    folder: Path  # of its images
+    names: Mapping[int, str]  # of its images, by row of the chosen frames; none where it took none
+    mask: Path | None  # of its border
 
     def load(self, row: int) -> np.ndarray:
         """uint8 [H, W, 3]."""
@@ -71,7 +68,7 @@ def read_right_camera(
     """Write the right camera's images at the `selected` [K] video frames, called as `stems`, undistorted, into
     `folder`. times [V] s: of the left video's frames. The two videos begin together. Raises NeecoError."""
     _, lens, right_from_left = read_stereo(partner.calibration)
-    video = partner.open()
+    video = partner.source.open()
     lens.check_size(video.size, partner.calibration)
     rows = {_nearest(video.times, times, int(frame), len(times)): row for row, frame in enumerate(selected)}
     rows.pop(-1, None)
@@ -83,7 +80,7 @@ def read_right_camera(
     folder.mkdir(exist_ok=True)
     sample = sorted(rows)
     border = find_border(
-        image for _, image in video.read([sample[i] for i in evenly_spaced(len(rows), BORDER_SAMPLES)])
+        image for _, image in video.read([sample[i] for i in evenly_spaced(len(rows), MAX_BORDER_FRAMES)])
     )
     visible = None if border is None else lens.undistort_mask(visible_mask(border, video.size))
     mask = None if visible is None else folder / "visible.png"
@@ -95,11 +92,11 @@ def read_right_camera(
         row = rows[frame]
         names[row] = f"{stems[row]}_right.png"
         write_image(folder / names[row], torch.from_numpy(lens.undistort(image).astype(np.float32) / 255))
-    return RightCamera(lens.pinhole(video.size), np.linalg.inv(right_from_left), folder, names, visible, mask)
+    return RightCamera(lens.pinhole(video.size), np.linalg.inv(right_from_left), folder, names, mask)
 
 
-def seen_by(right: RightCamera, frames: tuple[Frame, ...], rows: list[int]) -> tuple[Frame, ...]:
-    """The training frames among `frames`, rows of the chosen ones, as the right camera saw them."""
+def right_frames(right: RightCamera, frames: tuple[Frame, ...], rows: list[int]) -> tuple[Frame, ...]:
+    """Return the training frames among `frames`, rows of the chosen ones, as taken by the right camera."""
     camera = right.pinhole.camera(right.world_from_camera)
     return tuple(
         replace(frame, image_path=right.folder / right.names[row], camera=camera, mask_path=right.mask)
@@ -109,7 +106,7 @@ def seen_by(right: RightCamera, frames: tuple[Frame, ...], rows: list[int]) -> t
 
 
 def _nearest(right: np.ndarray, left: np.ndarray, frame: int, count: int) -> int:
-    """The right video's frame that was taken with a frame of the left, whose times are given; -1: none was."""
+    """Return the right video's frame that was taken with a frame of the left, whose times are given; -1: none."""
     if len(right) == count:
         return frame
     found = int(np.abs(right - left[frame]).argmin())
@@ -118,32 +115,24 @@ def _nearest(right: np.ndarray, left: np.ndarray, frame: int, count: int) -> int
 
 
 def still_cameras(count: int) -> SfmResult:
-    """What structure from motion would say of `count` frames of a still scope, were there any parallax."""
+    """Return a reconstruction without points: all `count` cameras in one place."""
     return SfmResult(
-        np.arange(count), np.tile(np.eye(4), (count, 1, 1)), np.zeros((0, 3)), np.zeros((0, 3), np.uint8),
-        np.zeros(0), np.zeros(0), np.zeros((0, 5)), None, 0.0,
+        indices=np.arange(count), world_from_camera=np.tile(np.eye(4), (count, 1, 1)), points=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8), errors=np.zeros(0), lengths=np.zeros(0), observations=np.zeros((0, 5)),
+        lens=None, reprojection_px=0.0,
     )  # fmt: skip
 
 
 def look_behind(
-    load: Load,
-    count: int,
-    pinhole: Lens,
-    visible: np.ndarray | None,
-    tracked: Tracked,
-    length: float,
-    settings: IngestSettings,
-    right: RightCamera | None,
-    progress: StageProgress,
+    views: Views, tracked: Tracked, longest_lag: float, settings: IngestSettings, right: RightCamera | None
 ) -> StillScene:
-    """What `count` frames of a still scope show. tracked: instruments whose place before it is known; visible: bool
-    [H, W], the field of view; length: of the recording, s."""
-    progress("finding the instrument", 0, 0)
-    small = Lens.of(pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
-    shapes, lags = _rough_shapes(load, count, small, visible, tracked, length, settings)
-    placed_at = {name: poses_at(0.0) for name, poses_at in tracked.items()}
+    """Find the instruments' rough shapes in the views of a still scope, and the tissue behind them.
+
+    tracked: instruments whose poses in front of it are known; longest_lag: s that their logs may be off.
+    """
+    shapes, lags = _rough_shapes(views, tracked, longest_lag, settings.shape_frames)
+    poses = {name: poses_at(0.0) for name, poses_at in tracked.items()}
     notes = []
-    progress("finding the tissue behind it", 0, 0)
 
     def hidden_from(lens: Lens, world_from_camera: np.ndarray, rows: list[int]) -> Callable[[int], np.ndarray] | None:
         camera, camera_from_world = lens.camera(np.eye(4)), np.linalg.inv(world_from_camera)
@@ -152,61 +141,58 @@ def look_behind(
         def hidden(place: int) -> np.ndarray:
             row, found = rows[place], none
             for name, shape in shapes.items():
-                poses, known = placed_at[name]
+                placed, known = poses[name]
                 if known[row]:
-                    found = found | project_mask(shape, camera_from_world @ poses[row], camera)
+                    found = found | project_mask(shape, camera_from_world @ placed[row], camera)
             return found
 
         return hidden if shapes else None
 
-    every = list(range(count))
-    background = find_background(load, count, hidden_from(pinhole, np.eye(4), every))
+    count, pinhole, visible = len(views.times), views.pinhole, views.visible
+    background = find_background(views.load, count, hidden_from(pinhole, np.eye(4), list(range(count))))
     surface = None
     if right is not None:
         rows = sorted(right.names)
         hidden = hidden_from(right.pinhole, right.world_from_camera, rows)
         other = find_background(lambda place: right.load(rows[place]), len(rows), hidden)
-        surface = _by_stereo(background, other, pinhole, right, visible, small)
+        surface = _by_stereo(background, other, views, right)
         if surface is None:
             notes.append("the stereo partner's images match too little for depth; is its calibration this scope's?")
     if surface is None:
-        deepest = [float(poses[known, 2, 3].max()) for poses, known in placed_at.values() if known.any()]
-        placed = [(shape, placed_at[name][0][placed_at[name][1]]) for name, shape in shapes.items()]
-        surface = surface_behind(placed, small, max(deepest, default=None), settings.scene_distance_mm)
+        deepest = [float(placed[known, 2, 3].max()) for placed, known in poses.values() if known.any()]
+        swept = [(shape, poses[name][0][poses[name][1]]) for name, shape in shapes.items()]
+        small = views.reduced_pinhole
+        surface = surface_behind(swept, small, max(deepest, default=None), settings.scene_distance_mm)
     points, colors = surface.points(background.colors, pinhole, visible)
     return StillScene(points, colors, shapes, lags, surface.how, tuple(notes))
 
 
-def _by_stereo(
-    left: Background, right: Background, pinhole: Lens, other: RightCamera, visible: np.ndarray | None, small: Lens
-) -> TissueSurface | None:
-    seen = left.seen > 0 if visible is None else (left.seen > 0) & visible
-    colors = right.colors
-    if colors.shape != left.colors.shape:
+def _by_stereo(left: Background, right: Background, views: Views, other: RightCamera) -> TissueSurface | None:
+    """Return the surface from two cameras' backgrounds; None where they match too little or differ in size."""
+    shown = left.seen > 0 if views.visible is None else (left.seen > 0) & views.visible
+    if right.colors.shape != left.colors.shape:
         return None
-    assert small.size is not None
+    size = views.reduced_pinhole.size
+    assert size is not None
     right_from_left = np.linalg.inv(other.world_from_camera)
-    return surface_from_stereo(left.colors, colors, (pinhole, other.pinhole), right_from_left, seen, small.size)
+    lenses = (views.pinhole, other.pinhole)
+    return surface_from_stereo(left.colors, right.colors, lenses, right_from_left, shown, size)
 
 
 def _rough_shapes(
-    load: Load,
-    count: int,
-    small: Lens,
-    visible: np.ndarray | None,
-    tracked: Tracked,
-    length: float,
-    settings: IngestSettings,
+    views: Views, tracked: Tracked, longest_lag: float, n_frames: int
 ) -> tuple[dict[str, RoughShape], dict[str, float]]:
-    """The rough shape of every tracked instrument that moves in the images, and the lag of every one's poses."""
+    """Carve the rough shape of every tracked instrument that moves in the images; return the lag of every one's poses,
+    too."""
     if not tracked:
         return {}, {}
-    rows = np.unique(np.linspace(0, count - 1, settings.shape_frames).astype(int))
-    masks = moving_masks(load, count, rows, visible).astype(np.float32)  # [R, h, w]
-    size = -(-masks.shape[2] // STEP), -(-masks.shape[1] // STEP)
+    count, small = len(views.times), views.reduced_pinhole
+    rows = np.unique(np.linspace(0, count - 1, n_frames).astype(int))
+    masks = moving_masks(views.load, count, rows, views.visible).astype(np.float32)  # [R, h, w]
+    size = -(-masks.shape[2] // STEP_PX), -(-masks.shape[1] // STEP_PX)
     evidence = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) for mask in masks])
-    if visible is not None:
-        shown = cv2.resize(reduced(visible.astype(np.uint8) * 255), size, interpolation=cv2.INTER_AREA) == 255
+    if views.visible is not None:
+        shown = cv2.resize(reduced(views.visible.astype(np.uint8) * 255), size, interpolation=cv2.INTER_AREA) == 255
         evidence[:, ~shown] = np.nan
     shapes, lags = {}, {}
     for name, poses_at in tracked.items():
@@ -219,5 +205,5 @@ def _rough_shapes(
             poses, known = of(lag)
             return poses[rows], known[rows]
 
-        lags[name] = best_lag(evidence, at_rows, small, length)
+        lags[name] = best_lag(evidence, at_rows, small, longest_lag)
     return shapes, lags

@@ -1,11 +1,11 @@
-"""The chosen frames of a recording as images: chosen, written, undistorted once the lens is known, their dark border
-masked."""
+"""The chosen frames of a recording as images: written, undistorted once the lens is known, their dark border masked."""
 
 from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,105 +15,133 @@ from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Border, Lens
-from neeco.ingest.calibration.lens import BORDER_SAMPLES, find_border, visible_mask
+from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.frames.selection import choose_frames, describe_ranges, frame_features, frozen_frames
-from neeco.ingest.frames.views import StageProgress
+from neeco.ingest.frames.views import StageProgress, Views
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.timing.episodes import Episodes
 
-MIN_REPEATED = 5  # frames with the picture before them that are worth a note where no state tells that it is wrong
+MIN_REPEATED = 5  # frames with the picture before them that are worth a note where no state contradicts it
 ASPECT_TOLERANCE = 0.02  # of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ChosenImages:
-    """The frames of `data` that are kept, in `folder`/raw as PNG, and their border's masks in `folder`/visible.
+    """The video frames that are kept, in `folder`/raw as PNG, and their border's masks in `folder`/visible."""
 
-    `lens`: as it was given; None: not known yet. Raises NeecoError for a lens of another size of image, and where too
-    few frames can be used.
-    """
+    folder: Path
+    size: tuple[int, int]  # width, height px
+    lens: Lens | None  # None: not known yet
+    selected: np.ndarray  # [K] video frames
+    dropped: Mapping[int, str]  # of other video frames, why
+    border: Border | None  # the endoscope's, in the frames as recorded
 
-    def __init__(self, data: Episodes, folder: Path, progress: StageProgress) -> None:
-        self.data, self.folder, self.progress = data, folder, progress
-        self.size = data.video.size
-        self.lens = _read_lens(data)
-        self.selected, self.dropped = _choose(data, progress)  # [K] video frames; of others why not
-        self.names = [f"{frame:06d}.png" for frame in self.selected]
-        self._write()
-        self.border = self._find_border()
-        self.visible = self._write_visible()  # folder of masks, one file per frame as SfM wants them; None: no border
-
-    def know_lens(self, lens: Lens) -> None:
-        """Write all anew, undistorted."""
-        self.lens = lens
-        self._write()
-        self._write_visible()
+    @property
+    def names(self) -> list[str]:
+        """File names in `folder`/raw."""
+        return [f"{frame:06d}.png" for frame in self.selected]
 
     def load(self, row: int) -> np.ndarray:
-        """uint8 [H, W, 3], one of the chosen frames."""
-        return np.asarray(open_image(self.folder / "raw" / self.names[row]).convert("RGB"))
+        """Return one of the chosen frames, uint8 [H, W, 3]."""
+        return np.asarray(open_image(self.folder / "raw" / f"{self.selected[row]:06d}.png").convert("RGB"))
 
     def loader(self, rows: np.ndarray) -> Callable[[int], np.ndarray]:
-        """`load`, of some rows alone."""
+        """Return `load` for some rows alone."""
         return lambda place: self.load(int(rows[place]))
 
+    def views(self, data: Episodes, rows: np.ndarray, world_from_camera: np.ndarray) -> Views:
+        """Return the views of chosen frames `rows` [M] with cameras [M, 4, 4]. The lens has to be known."""
+        assert self.lens is not None
+        frames = self.selected[rows]
+        return Views(
+            rows=rows, frames=frames, times=data.times[frames], episodes=data.episode_of(frames),
+            world_from_camera=world_from_camera, load=self.loader(rows), pinhole=self.lens.pinhole(self.size),
+            visible=self.field_of_view,
+        )  # fmt: skip
+
+    @property
     def field_of_view(self) -> np.ndarray | None:
-        """bool [H, W]: what lies within the border, undistorted as the images are; None without a border."""
+        """bool [H, W] within the border, undistorted as the images are; None without a border."""
         if self.border is None:
             return None
-        seen = visible_mask(self.border, self.size)
-        return seen if self.lens is None else self.lens.undistort_mask(seen)
+        visible = visible_mask(self.border, self.size)
+        return visible if self.lens is None else self.lens.undistort_mask(visible)
 
-    def named(self, frame: int) -> Path:
-        """The image of a video frame, under the name that it has in the capture from now on."""
-        image = self.folder / "raw" / f"{frame:06d}.png"  # until now by number: SfM orders images by name
-        return image.rename(image.with_name(f"{self.data.frame_name(frame)}.png"))
+    @property
+    def masks(self) -> Path | None:
+        """Folder of the border's masks, one file per frame as pycolmap expects them; None without a border."""
+        return None if self.border is None else self.folder / "visible"
 
     def mask_of(self, frame: int) -> Path | None:
-        """The border's mask of a video frame; None without a border."""
-        return self.visible / f"{frame:06d}.png.png" if self.visible else None
+        """Return the border's mask of a video frame; None without a border."""
+        return None if self.masks is None else self.masks / f"{frame:06d}.png.png"
 
-    def _write(self) -> None:
-        folder = self.folder / "raw"
-        folder.mkdir(exist_ok=True)
-        frames = self.data.video.read(self.selected.tolist())
-        for done, (name, (_, image)) in enumerate(zip(self.names, frames, strict=True)):
-            self.progress("writing frames", done, len(self.names))
-            straight = self.lens.undistort(image) if self.lens else image
-            write_image(folder / name, torch.from_numpy(straight.astype(np.float32) / 255))
-
-    def _find_border(self) -> Border | None:
-        """The endoscope's dark border, in the frames as recorded."""
-        sample = self.selected[evenly_spaced(len(self.selected), BORDER_SAMPLES, floor=True)]
-        border = find_border(image for _, image in self.data.video.read(sample.tolist()))
-        if border is not None:
-            dark = 1 - visible_mask(border, self.size).mean()
-            self.data.note(f"the endoscope's dark border ({dark:.0%} of the image) is masked")
-        return border
-
-    def _write_visible(self) -> Path | None:
-        seen = self.field_of_view()
-        if seen is None:
-            return None
-        folder = self.folder / "visible"
-        folder.mkdir(exist_ok=True)
-        first, *others = (folder / f"{name}.png" for name in self.names)
-        write_labels(first, torch.from_numpy(seen.astype(np.uint8) * 255))
-        for other in others:
-            shutil.copyfile(first, other)
-        return folder
+    def rename(self, frame: int, name: str) -> Path:
+        """Give the image of a video frame the name that it has in the capture (until now by number: SfM orders images
+        by name); return its path."""
+        image = self.folder / "raw" / f"{frame:06d}.png"
+        return image.rename(image.with_name(f"{name}.png"))
 
 
-def _read_lens(data: Episodes) -> Lens | None:
-    """The lens given, checked against the video's size. Raises NeecoError naming where it was given."""
+def choose_images(data: Episodes, folder: Path, progress: StageProgress) -> ChosenImages:
+    """Choose the frames to keep and write them into `folder`, undistorted where the lens is given.
+
+    Raises NeecoError for a lens of another image size, and where too few frames can be used.
+    """
+    lens = read_lens(data)
+    selected, dropped = _choose(data, progress)
+    size = data.video.size
+    images = ChosenImages(folder=folder, size=size, lens=lens, selected=selected, dropped=dropped, border=None)
+    _write(images, data.video, progress)
+    sample = selected[evenly_spaced(len(selected), MAX_BORDER_FRAMES, floor=True)]
+    border = find_border(image for _, image in data.video.read(sample.tolist()))
+    if border is not None:
+        dark = 1 - visible_mask(border, size).mean()
+        data.notes.add(f"the endoscope's dark border ({dark:.0%} of the image) is masked")
+    images = replace(images, border=border)
+    _write_masks(images)
+    return images
+
+
+def undistort_images(images: ChosenImages, lens: Lens, video: VideoSource, progress: StageProgress) -> ChosenImages:
+    """Write images and masks anew, undistorted by a lens that was estimated."""
+    images = replace(images, lens=lens)
+    _write(images, video, progress)
+    _write_masks(images)
+    return images
+
+
+def _write(images: ChosenImages, video: VideoSource, progress: StageProgress) -> None:
+    folder, names = images.folder / "raw", images.names
+    folder.mkdir(exist_ok=True)
+    for done, (name, (_, image)) in enumerate(zip(names, video.read(images.selected.tolist()), strict=True)):
+        progress("writing frames", done, len(names))
+        straight = images.lens.undistort(image) if images.lens else image
+        write_image(folder / name, torch.from_numpy(straight.astype(np.float32) / 255))
+
+
+def _write_masks(images: ChosenImages) -> None:
+    visible, folder = images.field_of_view, images.masks
+    if visible is None or folder is None:
+        return
+    folder.mkdir(exist_ok=True)
+    first, *others = (folder / f"{name}.png" for name in images.names)
+    write_labels(first, torch.from_numpy(visible.astype(np.uint8) * 255))
+    for other in others:
+        shutil.copyfile(first, other)
+
+
+def read_lens(data: Episodes) -> Lens | None:
+    """Return the lens given, checked against the video's size. Raises NeecoError naming where it was given."""
     lens, where = data.recording.read_lens()
-    for video in [part.video for part in data.parts]:
-        _check_pixels(video, lens, where, data)
+    for part in data.parts:
+        _check_pixels(part.video, lens, where, data)
     if lens is not None:
         lens.check_size(data.video.size, where)
         try:
             lens.pinhole(data.video.size)
-        except NeecoError as error:  # it knows nothing of where it came from
+        except NeecoError as error:  # it does not know where it came from
             raise NeecoError(f"{where}: {str(error).removeprefix('lens: ')}") from error
     return lens
 
@@ -129,13 +157,13 @@ def _check_pixels(video: VideoSource, lens: Lens | None, where: str, data: Episo
     if lens is not None and video.pixel_aspect != 1:
         found, expected = lens.fl_x / lens.fl_y, 1 / video.pixel_aspect
         if abs(found / expected - 1) > ASPECT_TOLERANCE:
-            data.note(
+            data.notes.add(
                 f"{where}: fl_x / fl_y is {found:.3g}, the shape of {video.path.name}'s pixels says {expected:.3g}"
             )
 
 
 def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[int, str]]:
-    """Video frames to keep, and why others are not."""
+    """Return the video frames to keep, and why others are not."""
     count, recording = len(data.times), data.recording
     settings = recording.settings
 
@@ -153,11 +181,11 @@ def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[i
             "while the state changes; frozen, and left out" if known else "and are left out; is the video frozen there?"
         )
         share = f"{len(frozen)} of {count} frames ({len(frozen) / count:.0%}: {describe_ranges(frozen)})"
-        data.note(f"{data.video.path.name}: {share} repeat the picture before them {why}")
+        data.notes.add(f"{data.video.path.name}: {share} repeat the picture before them {why}")
     limit = recording.frames or settings.max_frames
     selected, dropped = choose_frames(features, usable, states, limit, settings.min_sharpness)
     if recording.frames is None and count > limit:
-        data.note(f"{limit} of {count} frames are kept; ask for more with --frames")
+        data.notes.add(f"{limit} of {count} frames are kept; ask for more with --frames")
     if len(selected) < MIN_FRAMES:
         reasons = Counter(why.split(":")[0] for why in dropped.values())
         why = reasons.most_common(1)[0][0] if reasons else "the video is short"

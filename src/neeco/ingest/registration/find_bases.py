@@ -1,31 +1,31 @@
-"""The bases of a recording's instruments: as the recording states them, or found from what moves before a scope."""
+"""The bases of a recording's instruments: as the recording states them, or found from what moves in the images."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
-from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
+from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
-from neeco.geometry.lens import Lens
-from neeco.ingest.frames.views import reduced
+from neeco.ingest.frames.views import Views, reduced
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.interpolate import poses_at, readings_at
+from neeco.ingest.readers.logs import ReadingLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
-from neeco.ingest.registration.base import FEWEST, BaseRegistration, base_from_layers, find_base
-from neeco.ingest.registration.base_fit import CLOCK_SD
-from neeco.ingest.registration.base_layers import covered_by, evenly_lit, fit_layers, line_through_trocar
-from neeco.ingest.registration.base_shape import SHIFTS
+from neeco.ingest.registration.base import MIN_FRAMES, BaseRegistration, base_from_layers, find_base
+from neeco.ingest.registration.layers import ArmImages, covered_by, evenly_lit, fit_layers, line_through_trocar
+from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, ClockOffset
-from neeco.ingest.timing.episodes import Episodes
+from neeco.ingest.timing.episodes import Episode, Episodes
 
-FRAMES = 140  # looked at, evenly spaced
-STRAIGHT_MM = 2.0  # from the root to the link that is logged: nearer, nothing bends there
-HARDLY_MM = 2.0  # root mean square, from which an arm counts as moving
+N_FRAMES = 140  # searched, evenly spaced
+MIN_BEND_MM = 2.0  # from the root to the logged link: nearer, nothing bends there
+MIN_TRAVEL_MM = 2.0  # root mean square, from which an arm counts as moving
 KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
 
 
@@ -39,10 +39,11 @@ class PlacedBase:
     found: BaseRegistration | None = None
 
 
-def refuse_frames(data: Episodes, *, moving: bool) -> None:
-    """Raise NeecoError for poses, or bases, that are stated to what does not stand still. moving: does the scope?"""
+def check_frames(data: Episodes, *, moving: bool) -> None:
+    """Raise NeecoError for poses, or bases, that are stated to what does not stand still. moving: whether the scope
+    does."""
     path = data.recording.path
-    for name, log in data.poses.items():
+    for name, log in data.parts[0].poses.items():
         if moving and log.frame == CAMERA:
             raise NeecoError(
                 f"{path}: instruments: {name}: poses in the camera's frame need a scope that stands still, and this "
@@ -63,7 +64,7 @@ def refuse_frames(data: Episodes, *, moving: bool) -> None:
 
 
 def require_no_base(data: Episodes) -> None:
-    """Raise NeecoError for a base before a scope that moves and is not registered."""
+    """Raise NeecoError for a base in front of a scope that moves and is not registered."""
     for item in data.recording.instruments:
         if item.base is not None:
             raise NeecoError(
@@ -72,107 +73,108 @@ def require_no_base(data: Episodes) -> None:
             )
 
 
-def take_bases(
-    data: Episodes,
-    times: np.ndarray,
-    cameras: np.ndarray,
-    pinhole: Lens,
-    load: Callable[[int], np.ndarray],
-    moving: Callable[[np.ndarray], np.ndarray],
-    hidden: np.ndarray | None,
-) -> dict[str, BaseRegistration]:
-    """`place_bases`, and from then on all poses and clocks are as these say. Returns those found."""
-    found = {}
-    for name, base in place_bases(data, times, cameras, pinhole, load, moving, hidden).items():
-        data.world_from_base[name] = base.world_from_base
+def find_bases(
+    data: Episodes, views: Views, moving: Callable[[np.ndarray], np.ndarray]
+) -> tuple[Episodes, dict[str, BaseRegistration]]:
+    """Return the episodes with all bases and the clocks that come with them (see `place_bases`), and those found."""
+    found, bases = {}, dict(data.world_from_base)
+    for name, base in place_bases(data, views, moving).items():
+        bases[name] = base.world_from_base
         if base.clock is not None:
-            data.move_clock(data.poses[name].clock, base.clock)
+            data = data.with_moved_clock(data.parts[0].poses[name].clock, base.clock)
         if base.found is not None:
             found[name] = base.found
-    return found
+    return replace(data, world_from_base=bases), found
 
 
-def place_bases(
-    data: Episodes,
-    times: np.ndarray,
-    cameras: np.ndarray,
-    pinhole: Lens,
-    load: Callable[[int], np.ndarray],
-    moving: Callable[[np.ndarray], np.ndarray],
-    hidden: np.ndarray | None = None,
-) -> dict[str, PlacedBase]:
-    """The bases of all instruments that say something of theirs.
+def place_bases(data: Episodes, views: Views, moving: Callable[[np.ndarray], np.ndarray]) -> dict[str, PlacedBase]:
+    """Find the bases of all instruments of which the recording states something.
 
-    times [M] s of the frames, cameras [M, 4, 4] world_from_camera; load(row): their image uint8 [H, W, 3], as `pinhole`
-    sees it; moving(rows): masks bool [R, h, w] of what moves in rows of them, reduced to REFERENCE_PIXELS; hidden: bool
-    [h, w] of these. Lengths of a robot are taken as they are. Notes what was found, how sure it is and what is open.
-    Raises NeecoError where nothing moves with an instrument.
+    moving(rows): masks bool [R, h, w] of what moves in rows of `views`, reduced to REFERENCE_PIXELS. Lengths of a robot
+    are taken as they are. Notes state what was found, its standard deviation and what stays undetermined. Raises
+    NeecoError where nothing moves with an instrument.
     """
     placed: dict[str, PlacedBase] = {}
     unknown = []
     for item in data.recording.instruments:
-        if item.base is None or item.name not in data.poses or data.poses[item.name].frame == CAMERA:
+        logs = data.parts[0].poses
+        if item.base is None or item.name not in logs or logs[item.name].frame == CAMERA:
             continue
         if item.base.exact:
-            placed[item.name] = PlacedBase(_in_world(item.base, cameras))
+            placed[item.name] = PlacedBase(_in_world(item.base, views.world_from_camera))
         else:
             unknown.append(item)
     if not unknown:
         return placed
-    rows = np.array(evenly_spaced(len(times), FRAMES))
-    images = np.stack([reduced(load(int(row))) for row in rows])
-    lens = Lens.of(pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
-    seen = _Seen(images, lens, times[rows], cameras[rows], hidden, lambda: moving(rows))
-    arms = [_arm(data, item, seen) for item in unknown]
+    observed = _Observed(views, np.array(evenly_spaced(len(views.times), N_FRAMES)), moving)
+    shape, hidden = observed.images.shape[:3], observed.hidden
+    usable = np.ones(shape, bool) if hidden is None else np.tile(~hidden, (shape[0], 1, 1))
+    arms = [_arm(data, item, observed) for item in unknown]
     # what moves most is found most easily, and then out of the way
     for arm in sorted(arms, key=lambda arm: -arm.travel):
-        registration, clock = _find(arm, seen, alone=len(arms) == 1), arm.clock
+        registration, covered = _find(arm, observed, usable, alone=len(arms) == 1)
+        usable, clock = usable & ~covered, arm.clock
         if registration is None:
             assert arm.prior is not None
             _, sd_mm, sd_deg = arm.prior
             placed[arm.item.name] = PlacedBase(arm.prior[0])
-            data.note(
+            data.notes.add(
                 f"instrument {arm.item.name!r}: it moves by {arm.travel:.1f} mm only, too little to find its base, "
-                f"which stays as given, sure to {sd_mm:.1f} mm and {sd_deg:.1f} deg"
+                f"which stays as given, with standard deviations {sd_mm:.1f} mm and {sd_deg:.1f} deg"
             )
             continue
         if clock.source not in KNOWN:
             clock = replace(clock.later(registration.clock_s), sd=registration.clock_sd_s, source=FOUND)
         placed[arm.item.name] = PlacedBase(registration.world_from_base, clock, registration)
-        data.note(describe(arm.item.name, registration))
+        data.notes.add(describe(arm.item.name, registration))
     return placed
 
 
-class _Seen:
-    """Images uint8 [F, h, w, 3] that bases are found from, with their times [F] s and cameras [F, 4, 4], what of them
-    lies beyond a round border, and, once it is asked for, what moves in them."""
+@dataclass(frozen=True, eq=False)
+class _Observed:
+    """Some rows [F] of the views, and what is derived from them once."""
 
-    def __init__(
-        self,
-        images: np.ndarray,
-        lens: Lens,
-        times: np.ndarray,
-        cameras: np.ndarray,
-        hidden: np.ndarray | None,
-        moving: Callable[[], np.ndarray],
-    ) -> None:
-        self.images, self.lens, self.times, self.cameras, self.hidden = images, lens, times, cameras, hidden
-        self.still = float(np.ptp(cameras, axis=0).max()) < 1e-6
-        self.usable = np.ones(images.shape[:3], bool) if hidden is None else np.tile(~hidden, (len(images), 1, 1))
-        self._moving = moving
+    views: Views
+    rows: np.ndarray
+    moving: Callable[[np.ndarray], np.ndarray]
+
+    @cached_property
+    def images(self) -> np.ndarray:
+        """uint8 [F, h, w, 3], reduced."""
+        return np.stack([reduced(self.views.load(int(row))) for row in self.rows])
 
     @cached_property
     def masks(self) -> np.ndarray:
-        return self._moving()
+        """bool [F, h, w] what moves."""
+        return self.moving(self.rows)
 
     @cached_property
     def lit(self) -> np.ndarray:
         return evenly_lit(self.images)
 
+    @cached_property
+    def hidden(self) -> np.ndarray | None:
+        """bool [h, w] beyond a round border."""
+        return self.views.reduced_border
 
-@dataclass(frozen=True, eq=False)
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """Of the reduced images."""
+        return self.views.reduced_pinhole.intrinsics
+
+    @property
+    def times(self) -> np.ndarray:
+        return self.views.times[self.rows]
+
+    @property
+    def cameras(self) -> np.ndarray:
+        """[F, 4, 4] world_from_camera."""
+        return self.views.world_from_camera[self.rows]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Arm:
-    """An instrument whose base is to be found, and what its log says."""
+    """An instrument whose base is to be found, and its log's poses and readings."""
 
     item: InstrumentLogs
     where: str
@@ -184,21 +186,26 @@ class _Arm:
 
     @property
     def travel(self) -> float:
-        """mm, the root mean square distance from where it is on average."""
+        """mm, root mean square distance from its mean place."""
         places = self.poses_at(0.0)[:, :3, 3]
         places = places[np.isfinite(places[:, 0])]
         return float(np.sqrt(places.var(0).sum())) if len(places) else 0.0
 
 
-def _arm(data: Episodes, item: InstrumentLogs, seen: _Seen) -> _Arm:
-    log, times, stated = data.poses[item.name], seen.times, item.base
+def _reading(part: Episode, name: str, joint: str) -> ReadingLog:
+    return part.joints[name][joint]
+
+
+def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
+    log, times, stated = data.joint_log(lambda part: part.poses[item.name]), observed.times, item.base
     assert stated is not None
-    clock = data.clocks.get(log.clock, ClockOffset(0.0, float("nan"), ASSUMED))
-    readings = {
-        joint: readings_at(reading, data.clocks.get(reading.clock, clock).at(times))[0]
-        for joint, reading in data.joints[item.name].items()
-    }
-    readings = {joint: values for joint, values in readings.items() if np.isfinite(values).all()}
+    clock = data.clock(log.clock) or ClockOffset(0.0, float("nan"), ASSUMED)
+    readings = {}
+    for joint in item.joints:
+        reading = data.joint_log(partial(_reading, name=item.name, joint=joint))
+        values, _ = readings_at(reading, (data.clock(reading.clock) or clock).at(times))
+        if np.isfinite(values).all():
+            readings[joint] = values
 
     tree = item.kinematics
     bends = tree is not None and tree.pose_of is not None and set(tree.readings) <= set(readings)
@@ -216,72 +223,89 @@ def _arm(data: Episodes, item: InstrumentLogs, seen: _Seen) -> _Arm:
         assert tree is not None
         assert tree.pose_of is not None
         wrists = np.stack([tree.poses(state)[tree.pose_of][:3, 3] for state in states])
-        wrists = wrists if np.linalg.norm(wrists, axis=1).min() > STRAIGHT_MM else None
+        wrists = wrists if np.linalg.norm(wrists, axis=1).min() > MIN_BEND_MM else None
     prior = None
     if stated.matrix is not None:
         assert stated.sd_mm is not None
         assert stated.sd_deg is not None
-        prior = (_in_world(stated, seen.cameras), stated.sd_mm, stated.sd_deg)
-    return _Arm(item, str(data.recording.path), clock, readings, prior, base_from_shaft, wrists)
+        prior = (_in_world(stated, observed.cameras), stated.sd_mm, stated.sd_deg)
+    return _Arm(
+        item=item, where=str(data.recording.path), clock=clock, readings=readings, prior=prior,
+        poses_at=base_from_shaft, wrists=wrists,
+    )  # fmt: skip
 
 
-def _find(arm: _Arm, seen: _Seen, *, alone: bool) -> BaseRegistration | None:
-    """From outlines of what moves, which are exact, where one arm is there and they show it; else from what stands
-    still behind. None for one of several arms that hardly moves: what is given has to do."""
-    if not alone and (found := _without_masks(arm, seen)) is not None:
+def _find(
+    arm: _Arm, observed: _Observed, usable: np.ndarray, *, alone: bool
+) -> tuple[BaseRegistration | None, np.ndarray]:
+    """Find a base from the outlines of what moves where one arm is there and they show it, else from the background.
+
+    Return it with the pixels bool [F, h, w] that belong to no other arm. None for one of several arms that hardly
+    moves: what is given has to do.
+    """
+    if not alone and (found := _without_masks(arm, observed, usable)) is not None:
         return found
     readings = np.stack(list(arm.readings.values()), -1) if arm.readings else None
     try:
-        return find_base(
-            arm.item.name, seen.masks, seen.lens.intrinsics, np.linalg.inv(seen.cameras), arm.poses_at, seen.times,
-            arm.prior, readings=readings, hidden=seen.hidden, images=seen.images, clock_known=arm.clock.source in KNOWN,
+        registration = find_base(
+            arm.item.name, observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), arm.poses_at,
+            observed.times, prior=arm.prior, readings=readings, hidden=observed.hidden, images=observed.images,
+            clock_known=arm.clock.source in KNOWN,
         )  # fmt: skip
     except NeecoError as error:
-        if alone and (found := _without_masks(arm, seen)) is not None:
+        if alone and (found := _without_masks(arm, observed, usable)) is not None:
             return found
-        if not alone and arm.prior is not None and arm.travel < HARDLY_MM:
-            return None
+        if not alone and arm.prior is not None and arm.travel < MIN_TRAVEL_MM:
+            return None, np.zeros_like(usable)
         raise NeecoError(f"{arm.where}: {error}") from error
+    return registration, np.zeros_like(usable)
 
 
-def _without_masks(arm: _Arm, seen: _Seen) -> BaseRegistration | None:
-    """The base by `base_layers`; from then on, what it covers is nobody else's. None where that cannot tell: the scope
-    moves, nothing is given, or no line goes through a trocar; or where other moments' poses explain the images as
-    well."""
-    if arm.prior is None or not seen.still:
+def _without_masks(arm: _Arm, observed: _Observed, usable: np.ndarray) -> tuple[BaseRegistration, np.ndarray] | None:
+    """Find a base by `fit_layers`, with the pixels that its arm covers.
+
+    None where that cannot determine it: the scope moves, nothing is given, no line goes through a trocar, or other
+    moments' poses explain the images as well.
+    """
+    cameras = observed.cameras
+    if arm.prior is None or float(np.ptp(cameras, axis=0).max()) >= 1e-6:
         return None
-    poses = np.stack([arm.poses_at(float(shift)) for shift in SHIFTS])
+    poses = np.stack([arm.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
     known = np.flatnonzero(np.isfinite(poses).all((0, 2, 3)))
     if arm.clock.source in KNOWN:  # no other clock is tried
-        poses = np.tile(arm.poses_at(0.0), (len(SHIFTS), 1, 1, 1))
+        poses = np.tile(arm.poses_at(0.0), (len(CLOCK_SHIFTS_S), 1, 1, 1))
         known = np.flatnonzero(np.isfinite(poses[0]).all((1, 2)))
-    line = line_through_trocar(poses[len(SHIFTS) // 2, known]) if len(known) >= FEWEST else None
+    line = line_through_trocar(poses[len(CLOCK_SHIFTS_S) // 2, known]) if len(known) >= MIN_FRAMES else None
     if line is None:
         return None
     wrists = None if arm.wrists is None else arm.wrists[known]
-    world_from_camera, (given, sd_mm, sd_deg) = seen.cameras[0], arm.prior
-    prior = (np.linalg.inv(world_from_camera) @ given, sd_mm, sd_deg)
-    sd_clock = 0.0 if arm.clock.source in KNOWN else CLOCK_SD
-    found = fit_layers(
-        seen.lit[known], seen.lens.intrinsics, poses[:, known], line, prior, sd_clock, seen.usable[known],
-        np.random.default_rng(0), wrists,
-    )  # fmt: skip
+    given, sd_mm, sd_deg = arm.prior
+    images = ArmImages(
+        images=observed.lit[known],
+        intrinsics=observed.intrinsics,
+        poses=poses[:, known],
+        line=line,
+        usable=usable[known],
+        wrists=wrists,
+    )
+    prior = np.linalg.inv(cameras[0]) @ given, sd_mm, sd_deg
+    sd_clock = 0.0 if arm.clock.source in KNOWN else CLOCK_SD_S
+    found = fit_layers(images, prior, sd_clock, np.random.default_rng(0))
     if not found.found:
         return None
-    seen.usable[known] &= ~covered_by(
-        found, seen.images.shape[1:3], seen.lens.intrinsics, poses[:, known], line, wrists
-    )
-    return base_from_layers(arm.prior, found, world_from_camera, poses[len(SHIFTS) // 2, known], line)
+    covered = np.zeros_like(usable)
+    covered[known] = covered_by(found, images)
+    return base_from_layers(arm.prior, found, cameras[0], images.poses[len(CLOCK_SHIFTS_S) // 2], line), covered
 
 
 def _in_world(stated: StatedBase, cameras: np.ndarray) -> np.ndarray:
-    """[4, 4] world_from_base: as stated, to the world or to the cameras, which then are all in one place."""
+    """Return world_from_base [4, 4] as stated: to the world, or to the cameras, which then are all in one place."""
     assert stated.matrix is not None
     return stated.matrix if stated.to_world else np.asarray(cameras[0] @ stated.matrix)
 
 
 def describe(name: str, found: BaseRegistration) -> str:
-    """What was found of a base, how sure that is, and what the recording leaves open, in one sentence."""
+    """Return a sentence on a base that was found: its standard deviations, and what the recording leaves open."""
 
     def listed(values: np.ndarray) -> str:
         return ", ".join("open" if not np.isfinite(value) else f"{value:.1f}" for value in values)
@@ -289,8 +313,11 @@ def describe(name: str, found: BaseRegistration) -> str:
     words = f"instrument {name!r}: its base was found from what moves in {found.frames} frames"
     if np.isfinite(found.moved_mm):
         words += f", {found.moved_mm:.1f} mm and {found.turned_deg:.1f} deg from what was given"
-    words += f"; sure to {listed(found.sd_mm)} mm and {listed(found.sd_deg)} deg (right, down, forward of the camera); "
-    if found.fit is None:
+    words += (
+        f"; standard deviations {listed(found.sd_mm)} mm and {listed(found.sd_deg)} deg (right, down, forward of the "
+        "camera); "
+    )
+    if not found.from_masks:
         words += f"without outlines: its shaft explains {found.explained:.0%} of what changes in the images"
     else:
         words += f"its outline and what moves overlap by {found.overlap:.2f}"

@@ -3,7 +3,6 @@ it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -11,8 +10,7 @@ import numpy as np
 
 from neeco.capture.model import FromVideo, Instrument, Uncertainty
 from neeco.errors import NeecoError
-from neeco.geometry.lens import Lens
-from neeco.ingest.frames.views import SfmResult, reduced
+from neeco.ingest.frames.views import SfmResult, Views, reduced
 from neeco.ingest.recording.model import InstrumentLogs, Recording
 from neeco.ingest.shaft.axis import ShaftVideo
 from neeco.ingest.shaft.from_video import MIN_SHARE, FoundShaft, find_shaft
@@ -24,38 +22,23 @@ READING_DEG = 1.0  # of a logged joint
 AROUND = 7  # px about what moves, in which features are not the tissue's
 
 
-def seen_in_video(data: Episodes) -> InstrumentLogs | None:
-    """The instrument that is to be found in the video."""
-    return next((item for item in data.recording.instruments if item.from_video is not None), None)
-
-
 def find_in_video(
-    data: Episodes,
-    item: InstrumentLogs,
-    load: Callable[[int], np.ndarray],
-    masks: np.ndarray,
-    world_from_camera: np.ndarray,
-    times: np.ndarray,
-    episodes: np.ndarray,
-    pinhole: Lens,
-    tissue: float | None,
-) -> FoundShaft:
-    """Find the instrument `item` in frames at times [F] s, of `episodes` [F], and place it in `data`.
+    data: Episodes, item: InstrumentLogs, views: Views, masks: np.ndarray, tissue: float | None
+) -> tuple[Episodes, FoundShaft]:
+    """Find the instrument `item` in the views; return the episodes that have its poses, and what was found.
 
-    load(row): a frame uint8 [H, W, 3]; masks bool [F, h, w] of the images reduced; world_from_camera [F, 4, 4], in mm
-    if `tissue` is None, else that is the tissue's distance in their unit; pinhole: that of the images reduced. Raises
-    NeecoError, naming the recording, when it is not seen well enough.
+    masks bool [M, h, w] of the images reduced; tissue: its distance in the unit of the views' cameras, None where that
+    is mm. Raises NeecoError, naming the recording, where too little of the instrument is observed.
     """
     asked = item.from_video
     assert asked is not None
-    images = np.stack([reduced(load(row)) for row in range(len(times))])
-    radius = asked.shaft_diameter_mm / 2
+    images = np.stack([reduced(views.load(row)) for row in range(len(views.times))])
     shared = ShaftVideo(
-        world_from_camera=world_from_camera,
-        times=times,
-        episodes=episodes,
-        radius=radius,
-        intrinsics=pinhole.intrinsics,
+        world_from_camera=views.world_from_camera,
+        times=views.times,
+        episodes=views.episodes,
+        radius=asked.shaft_diameter_mm / 2,
+        intrinsics=views.reduced_pinhole.intrinsics,
         trocar=True,
         scaled=tissue is None,
     )
@@ -63,16 +46,16 @@ def find_in_video(
         found = find_shaft(images, masks, shared, asked.working_length_mm, asked.fixed_trocar, tissue or np.inf)
     except NeecoError as error:
         raise NeecoError(f"{data.recording.path}: instrument {item.name!r}, from video: {error}") from error
-    data.place(item.name, times[found.known], found.poses[found.known])
-    data.note(_in_words(item.name, found))
+    data.notes.add(_in_words(item.name, found))
     for note in found.notes:
-        data.note(f"instrument {item.name!r}, from video: {note}")
+        data.notes.add(f"instrument {item.name!r}, from video: {note}")
     if item.roll is None:
-        data.note(
+        data.notes.add(
             f"instrument {item.name!r}: its roll is not known (180 degrees in every state's uncertainty); log it, or "
             "pose frames by hand (`neeco view CAPTURE --annotate`)"
         )
-    return found
+    poses = views.times[found.known], found.poses[found.known]
+    return replace(data, found={**data.found, item.name: poses}), found
 
 
 def _in_words(name: str, found: FoundShaft) -> str:

@@ -1,418 +1,496 @@
-"""Several recordings of one instrument (episodes) on one timeline: what an ingest reads as if it were one recording.
+"""Recordings of one instrument (episodes), read into memory and put on one timeline.
 
-Every episode keeps its own clocks. On the joint timeline one begins PAUSE_S after the one before has ended; frames are
-counted on from episode to episode. A single recording is an episode that keeps its own times and numbers.
+Every episode keeps its own clocks. On the joint timeline an episode begins PAUSE_S after the one before has ended;
+frames are counted on from episode to episode. A single recording is an episode with its own times and numbers. Later
+stages find clocks, robot bases and instruments; each returns an `Episodes` that knows them.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
-from neeco.ingest.readers import VideoSource, format_of
-from neeco.ingest.readers.logs import PoseLog, ReadingLog
-from neeco.ingest.recording.base import same_base
-from neeco.ingest.recording.model import MIN_FRAMES, IngestSettings, InstrumentLogs, Recording
-from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
-from neeco.ingest.timing.notes import Doubt
-from neeco.ingest.timing.synchronized import States, SynchronizedRecording
+from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_lengths
+from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
+from neeco.ingest.readers.interpolate import poses_at, readings_at
+from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
+from neeco.ingest.recording.model import InstrumentLogs, Recording
+from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, LONGEST, ClockOffset
+from neeco.ingest.timing.compatibility import check_recordings, episode_names, file_name, refusal
+from neeco.ingest.timing.notes import Notes
 
-PAUSE_S = 2.0  # longer than anything that is smooth in time looks beyond an instant
-NAME_TISSUES = "say in every recording over which `tissue` it was taken"
+PAUSE_S = 2.0  # longer than any smoothing over time reaches
+MIN_FPS, MAX_FPS = 0.01, 10_000.0
+SAME_INSTANT = 1e-6  # s
+MIN_SIDE_PX = 32  # smaller frames have too few features to find cameras
+LIMIT_SLACK = 0.03  # rad beyond a joint's limits that noise and calibration explain
+
+States = dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]  # instrument -> poses [N, 4, 4], readings [N] by joint
 Log = TypeVar("Log", PoseLog, ReadingLog)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Episode:
+    """One recording in memory, on its own timeline: that of its video."""
+
+    recording: Recording
+    video: VideoSource
+    poses: Mapping[str, PoseLog]  # by instrument, of those that were tracked
+    joints: Mapping[str, Mapping[str, ReadingLog]]  # by instrument and joint
+    rolls: Mapping[str, ReadingLog]
+    scope: PoseLog | None
+    clocks: Mapping[str, ClockOffset]  # of the logs, as far as they are known
+    start: float = 0.0  # s of the joint timeline at its own 0
+    first: int = 0  # frames before it
+
+    @property
+    def times(self) -> np.ndarray:
+        """[V] s of every frame."""
+        return self.video.times
+
+    def logged_poses(self, log: PoseLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return poses [N, 4, 4] in the tracker's frame at video times [N] s, and where they are known."""
+        return poses_at(log, self.clocks[log.clock].at(times))
+
+    def logged_readings(self, log: ReadingLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return readings [N] at video times [N] s, and where they are known."""
+        return readings_at(log, self.clocks[log.clock].at(times))
+
+
+@dataclass(frozen=True, eq=False)
 class Episodes:
-    """The recordings, read into memory, and all that is known of them on the joint timeline.
+    """All recordings of one world on the joint timeline. video: the frames of all; tissue: the world's, of several."""
 
-    Raises NeecoError for recordings that cannot be used, or that cannot be of one capture.
-    """
+    parts: tuple[Episode, ...]
+    video: VideoSource
+    notes: Notes
+    tissue: str | None = None
+    world_from_base: Mapping[str, np.ndarray] = field(default_factory=dict)  # [4, 4] mm of logs in another frame
+    found: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    # instruments found in the video: times [N] s of the joint timeline, poses [N, 4, 4]
 
-    def __init__(self, recordings: Sequence[Recording], tissue: str | None = None) -> None:
-        self.tissue = tissue  # of several that one capture holds, the one that these were taken over
-        self.parts = [SynchronizedRecording(recording) for recording in recordings]
-        self.recording = recordings[0]  # what is said once for all: lens, links, frames, splits, settings
-        self.names = episode_names(recordings)
-        check_alike(self.parts)
-        self._check_split_names()
-        times: list[np.ndarray] = []
-        starts: list[float] = []
-        first = [0]
-        for part in self.parts:
-            starts.append(times[-1][-1] + PAUSE_S - part.times[0] if times else 0.0)
-            times.append(part.times + starts[-1])
-            first.append(first[-1] + len(part.times))
-        self.times = np.concatenate(times)  # [V] s, every frame
-        self.starts = np.array(starts)  # [E] s of every episode's own 0
-        self.first = np.array(first)  # [E + 1] frames before every episode
-        videos = [part.video for part in self.parts]
-        self.video = videos[0] if self.single else _joined_videos(videos, self.times, self.first)
-        # by instrument, where its log is not in the world's frame: [4, 4] mm
-        self.world_from_base: dict[str, np.ndarray] = {}
-        for part in self.parts:
-            part.world_from_base = self.world_from_base
-        self._notes: list[str] = []
-        self._doubts: dict[tuple[str, int | None], Doubt] = {}
+    @property
+    def recording(self) -> Recording:
+        """The first recording, which states what holds for all: lens, links, frames, splits, settings."""
+        return self.parts[0].recording
 
     @property
     def single(self) -> bool:
         return len(self.parts) == 1
 
     @property
-    def notes(self) -> list[str]:
-        """What was lost or assumed, one sentence each; what is of one episode names it."""
-        if self.single:
-            return self.parts[0].notes
-        named = [(name, note) for name, part in zip(self.names, self.parts, strict=True) for note in part.notes]
-        everywhere = {note for _, note in named if all(note in part.notes for part in self.parts)}
-        own = [note if note in everywhere else f"{name}: {note}" for name, note in named]
-        return list(dict.fromkeys([*own, *self._notes]))
+    def in_video(self) -> InstrumentLogs | None:
+        """The instrument that is to be found in the video, if any."""
+        return next((item for item in self.recording.instruments if item.from_video is not None), None)
 
-    def note(self, note: str, episode: int | None = None) -> None:
-        """Add a note, once: of all of it, or of one episode."""
-        if self.single or episode is not None:
-            self.parts[episode or 0].note(note)
-        elif note not in self._notes:
-            self._notes.append(note)
+    # frames
 
     @property
-    def doubts(self) -> tuple[Doubt, ...]:
-        """What parts of the recordings contradict each other in."""
-        return tuple(self._doubts.values())
-
-    def is_doubted(self, subject: str) -> bool:
-        """Whether there is a doubt on a subject."""
-        return any(held == subject for held, _ in self._doubts)
-
-    def doubt(self, subject: str, sentence: str, *, severe: bool, episode: int | None = None) -> None:
-        """Set the doubt on a subject, of all of it or of one episode, in place of an earlier one; none where the
-        sentence is empty."""
-        if not sentence:
-            self._doubts.pop((subject, episode), None)
-        else:
-            named = sentence if self.single or episode is None else f"{self.names[episode]}: {sentence}"
-            self._doubts[subject, episode] = Doubt(named, severe)
+    def times(self) -> np.ndarray:
+        """[V] s of every frame."""
+        return self.video.times
 
     def episode_of(self, frames: np.ndarray) -> np.ndarray:
-        """[N] the episodes that frames [N] are of."""
-        return np.searchsorted(self.first, frames, side="right") - 1
-
-    def frame_name(self, frame: int) -> str:
-        """What the image of a frame is called in the capture: of several episodes, it begins with the episode's
-        name."""
-        of = "" if self.tissue is None else file_name(self.tissue) + "_"
-        if self.single:
-            return f"{of}{frame:06d}"
-        episode = int(self.episode_of(np.array([frame]))[0])
-        return f"{of}{self.names[episode]}_{frame - self.first[episode]:06d}"
-
-    def refuse_alone(self, placed: np.ndarray) -> None:
-        """Raise NeecoError for an episode that structure from motion did not join to the others. placed [M]: the frames
-        that got a camera."""
-        counts = np.bincount(self.episode_of(placed), minlength=len(self.parts))
-        for name, part, count in zip(self.names, self.parts, counts, strict=True):
-            if count < MIN_FRAMES and not self.single:
-                raise NeecoError(
-                    f"{part.recording.path}: {name} stands alone: {count} of its frames show enough of what the other "
-                    f"recordings show to find their cameras together (at least {MIN_FRAMES} are needed); where it "
-                    f"shows another tissue, {NAME_TISSUES}, else leave it out"
-                )
+        """Return the episode [N] of every frame [N]."""
+        return np.searchsorted([part.first for part in self.parts], frames, side="right") - 1
 
     @property
     def ranges(self) -> dict[str, tuple[int, int]]:
         """The frames (first, last) of each of several episodes, by its name."""
         if self.single:
             return {}
-        return {name: (int(self.first[i]), int(self.first[i + 1]) - 1) for i, name in enumerate(self.names)}
+        named = zip(self.notes.names, self.parts, strict=True)
+        return {name: (part.first, part.first + len(part.times) - 1) for name, part in named}
 
-    # logs on the joint timeline
-
-    @property
-    def clocks(self) -> dict[str, ClockOffset]:
-        """What is known of the clocks of the joint logs: of several episodes, these are on the joint timeline already
-        as far as their episodes' clocks are known, and a clock is here once it is known in all."""
+    def frame_name(self, frame: int) -> str:
+        """Return the name of a frame's image in the capture; of several episodes, it begins with the episode's."""
+        of = "" if self.tissue is None else file_name(self.tissue) + "_"
         if self.single:
-            return self.parts[0].clocks
-        names = {name for part in self.parts for name in part.clocks}
-        joint = {}
-        for name in names:
-            held = [part.clocks.get(name) for part in self.parts]
-            known = [clock for clock in held if clock is not None]
-            if len(known) == len(held):
-                source = next((clock.source for clock in known if clock.source != GIVEN), GIVEN)
-                joint[name] = ClockOffset(0.0, max(clock.sd for clock in known), source)
-        return joint
+            return f"{of}{frame:06d}"
+        episode = int(self.episode_of(np.array([frame]))[0])
+        return f"{of}{self.notes.names[episode]}_{frame - self.parts[episode].first:06d}"
 
-    @property
-    def found_clocks(self) -> dict[str, ClockOffset]:
-        """Every episode's clocks, by what a report calls them."""
-        if self.single:
-            return self.parts[0].clocks
-        return {
-            f"{clock} of {name}": offset
-            for name, part in zip(self.names, self.parts, strict=True)
-            for clock, offset in part.clocks.items()
-        }
+    # clocks
 
-    def move_clock(self, name: str, found: ClockOffset) -> None:
-        """Take a clock of the joint logs to be `found`: every episode's own moves by as much."""
-        before = self.clocks.get(name)
-        moved = found.seconds - (before.seconds if before is not None else 0.0)
-        for part in self.parts:
+    def with_clocks(self, episode: int, clocks: Mapping[str, ClockOffset]) -> Episodes:
+        """Return the episodes with some clocks of one of them set."""
+        parts = list(self.parts)
+        parts[episode] = replace(parts[episode], clocks={**parts[episode].clocks, **clocks})
+        return replace(self, parts=tuple(parts))
+
+    def with_moved_clock(self, name: str, found: ClockOffset) -> Episodes:
+        """Return the episodes with a clock of the joint logs at `found`: that of every episode moves by as much."""
+        before = self.clock(name)
+        moved, data = found.seconds - (before.seconds if before is not None else 0.0), self
+        for episode, part in enumerate(self.parts):
             held = part.clocks.get(name, ClockOffset(0.0, 0.0, GIVEN))
-            part.clocks[name] = replace(held, seconds=held.seconds + moved, sd=found.sd, source=found.source)
+            clock = replace(held, seconds=held.seconds + moved, sd=found.sd, source=found.source)
+            data = data.with_clocks(episode, {name: clock})
+        return data
+
+    def with_assumed_clocks(self) -> Episodes:
+        """Return the episodes with every clock of an instrument known: where motion did not give one, the video's.
+
+        Raises NeecoError for a log whose times then do not meet the video's.
+        """
+        data = self
+        for episode, part in enumerate(self.parts):
+            logs: list[PoseLog | ReadingLog] = []
+            for name in (*part.poses, *self.found):
+                logs += [log for log in (part.poses.get(name), part.rolls.get(name)) if log is not None]
+                logs += part.joints[name].values()
+            for log in logs:
+                if log.clock not in data.parts[episode].clocks:
+                    self.notes.add(
+                        f"the clock {log.clock!r} was not given and could not be found, and is taken to be the video's",
+                        episode,
+                    )
+                    data = data.with_clocks(episode, {log.clock: _assumed_clock(log, part.times)})
+        return data
 
     @property
-    def poses(self) -> dict[str, PoseLog]:
-        """Every tracked instrument's poses."""
-        return {name: self._joint([part.poses[name] for part in self.parts]) for name in self.parts[0].poses}
+    def reported_clocks(self) -> dict[str, ClockOffset]:
+        """The clocks of all episodes, by their names in a report."""
+        if self.single:
+            return dict(self.parts[0].clocks)
+        named = zip(self.notes.names, self.parts, strict=True)
+        return {f"{clock} of {name}": offset for name, part in named for clock, offset in part.clocks.items()}
 
-    @property
-    def joints(self) -> dict[str, dict[str, ReadingLog]]:
-        """Every instrument's readings, by joint."""
-        return {
-            name: {joint: self._joint([part.joints[name][joint] for part in self.parts]) for joint in joints}
-            for name, joints in self.parts[0].joints.items()
-        }
+    def clock(self, name: str) -> ClockOffset | None:
+        """Return a clock of the joint logs: of several episodes, known once it is known in each."""
+        held = [part.clocks.get(name) for part in self.parts]
+        known = [clock for clock in held if clock is not None]
+        if len(known) < len(held):
+            return None
+        if self.single:
+            return known[0]
+        source = next((clock.source for clock in known if clock.source != GIVEN), GIVEN)
+        return ClockOffset(0.0, max(clock.sd for clock in known), source)
 
-    @property
-    def scope(self) -> PoseLog | None:
-        """The laparoscope's poses."""
-        logs = [part.scope for part in self.parts if part.scope is not None]
-        return self._joint(logs) if logs else None
-
-    def _joint(self, logs: list[Log]) -> Log:
-        """Logs of one body, or joint, as one on the joint timeline; what reaches into another episode is cut off."""
+    def joint_log(self, of: Callable[[Episode], Log]) -> Log:
+        """Return one log of every episode as one on the joint timeline, cut off where it reaches into another."""
+        logs = [of(part) for part in self.parts]
         if self.single:
             return logs[0]
         inner, times, rows = [], [], []
-        for part, log, start in zip(self.parts, logs, self.starts, strict=True):
+        for part, log in zip(self.parts, logs, strict=True):
             known = part.clocks.get(log.clock, ClockOffset(0.0, 0.0, GIVEN))
-            own = part.times + start
-            moved = known.video_times(log.times) + start
+            own = part.times + part.start
+            moved = known.video_times(log.times) + part.start
             rows.append((moved > own[0] - PAUSE_S / 2) & (moved < own[-1] + PAUSE_S / 2))
             times.append(moved[rows[-1]])
-            inner += [tuple(known.video_times(np.array(gap)) + start) for gap in log.gaps]
+            inner += [tuple(known.video_times(np.array(gap)) + part.start) for gap in log.gaps]
         joint = np.concatenate(times)
         gaps = {(before, after) for before, after in inner if before >= joint[0] and after <= joint[-1]}
         gaps |= {(float(before[-1]), float(after[0])) for before, after in pairwise(times)}
-
-        def joined(arrays: list[np.ndarray]) -> np.ndarray:
-            return np.concatenate([values[inside] for values, inside in zip(arrays, rows, strict=True)])
-
         held: dict[str, Any] = {"times": joint, "gaps": tuple(sorted(gaps))}
         for name in ("values",) if isinstance(logs[0], ReadingLog) else ("positions", "quats"):
-            held[name] = joined([getattr(log, name) for log in logs])
+            columns = [getattr(log, name)[inside] for log, inside in zip(logs, rows, strict=True)]
+            held[name] = np.concatenate(columns)
         return replace(logs[0], **held)
 
-    # states at video times, each from its episode's own logs
+    # states at times [N] s of the joint timeline, each from its episode's own logs
 
-    def logged_scope(self, times: np.ndarray) -> np.ndarray:
-        """The laparoscope's poses [N, 4, 4] in its tracker's frame at times [N] of the joint timeline."""
+    def scope_poses(self, times: np.ndarray) -> np.ndarray:
+        """Return the laparoscope's poses [N, 4, 4] in its tracker's frame."""
 
-        def of(part: SynchronizedRecording, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def of(part: Episode, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             assert part.scope is not None
             return part.logged_poses(part.scope, own)
 
-        return self._posed(of, times)[0]
+        return self._gathered(times, of, (4, 4))[0]
 
     def instrument_poses(self, name: str, times: np.ndarray, lag: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """As `SynchronizedRecording.instrument_poses`, at times [N] of the joint timeline."""
-        return self._posed(lambda part, own: part.instrument_poses(name, own, lag), times)
+        """Return poses [N, 4, 4] of an instrument, logged `lag` s later, and where they are known.
 
-    def place(self, name: str, times: np.ndarray, poses: np.ndarray) -> None:
-        """Take an instrument to be where it was found in the video: poses [N, 4, 4] at times [N] of the joint
-        timeline."""
-        for part in self.parts:
-            part.found[name] = np.zeros(0), np.zeros((0, 4, 4))
-        for part, rows, own in self._each(times):
-            part.found[name] = own, poses[rows]
+        They are in the world's frame as far as that is known, else in the tracker's.
+        """
+        if name in self.found:
+            return self._found_poses(name, times)
+        poses, known = self._gathered(times, lambda part, own: part.logged_poses(part.poses[name], own + lag), (4, 4))
+        return (self.world_from_base[name] @ poses if name in self.world_from_base else poses), known
 
-    def _posed(
-        self, of: Callable[[SynchronizedRecording, np.ndarray], tuple[np.ndarray, np.ndarray]], times: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        poses, known = np.full((len(times), 4, 4), np.nan), np.zeros(len(times), dtype=bool)
-        for part, rows, own in self._each(times):
-            poses[rows], known[rows] = of(part, own)
-        return poses, known
+    def _found_poses(self, name: str, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`instrument_poses` of one found in the video, with its roll where that is logged."""
+        held, poses = self.found[name]
+        if not len(held):
+            return np.full((len(times), 4, 4), np.nan), np.zeros(len(times), dtype=bool)
+        row = np.abs(times[:, None] - held).argmin(1)
+        known = np.abs(times - held[row]) < SAME_INSTANT
+        found = np.where(known[:, None, None], poses[row], np.nan)
+        if name in self.parts[0].rolls:
+            roll, logged = self._gathered(times, lambda part, own: part.logged_readings(part.rolls[name], own), ())
+            found, known = with_roll(found, np.nan_to_num(roll)), known & logged
+        return found, known
 
     def states_at(self, times: np.ndarray) -> tuple[States, np.ndarray]:
-        """As `SynchronizedRecording.states_at`, at times [N] of the joint timeline."""
+        """Return every instrument's states, and where all of them are known. All clocks have to be known.
+
+        Raises NeecoError for an episode of which no state is known, and for readings far beyond their limits.
+        """
         states: States = {}
-        usable = np.zeros(len(times), dtype=bool)
-        for part, rows, own in self._each(times):
-            found, usable[rows] = part.states_at(own)
-            for name, (poses, readings) in found.items():
-                empty = np.full((len(times), 4, 4), np.nan), {joint: np.full(len(times), np.nan) for joint in readings}
-                held_poses, held_readings = states.setdefault(name, empty)
-                held_poses[rows] = poses
-                for joint, values in readings.items():
-                    held_readings[joint][rows] = values
+        usable = np.ones(len(times), dtype=bool)
+        limits = {item.name: {j: log.limits for j, log in item.joints.items()} for item in self.recording.instruments}
+        for name in (*self.parts[0].poses, *self.found):
+            poses, known = self.instrument_poses(name, times)
+            usable &= known
+            readings = {}
+            for joint in self.parts[0].joints[name]:
+
+                def of(part: Episode, own: np.ndarray, name: str = name, joint: str = joint) -> Any:
+                    log = part.joints[name][joint]
+                    values, known = part.logged_readings(log, own)
+                    return self._within_limits(part, log, limits[name][joint], values), known
+
+                readings[joint], known = self._gathered(times, of, ())
+                usable &= known
+            states[name] = (poses, readings)
+        for part, rows, _ in self._each(times):
+            if not usable[rows].any():
+                raise NeecoError(
+                    f"{part.recording.path}: no frame has a state of every instrument; check the clocks, `sync`"
+                )
         return states, usable
 
     def coverage_states(self) -> tuple[np.ndarray, np.ndarray]:
-        """As `SynchronizedRecording.coverage_states`, of all frames."""
-        states, usable = zip(*(part.coverage_states() for part in self.parts), strict=True)
+        """Return states [V, 6 * instruments + joints] to choose frames by, and where they are known; zeros while a
+        clock is unknown. Raises NeecoError when a log has no sample for any video frame."""
+        states, usable = zip(*(_coverage(part) for part in self.parts), strict=True)
         if len({columns.shape[1] for columns in states}) > 1:  # a clock is known in some of them
             return np.zeros((len(self.times), 6)), np.concatenate(usable)
         return np.concatenate(states), np.concatenate(usable)
 
-    def _each(self, times: np.ndarray) -> Iterator[tuple[SynchronizedRecording, np.ndarray, np.ndarray]]:
-        """Every episode that times [N] fall into: which of them, and their seconds on its own timeline."""
-        ends = self.times[self.first[1:] - 1] + PAUSE_S / 2
-        of = np.searchsorted(ends[:-1], times)
+    def _each(self, times: np.ndarray) -> Iterator[tuple[Episode, np.ndarray, np.ndarray]]:
+        """Yield every episode that times [N] fall into, their rows, and their seconds on its own timeline."""
+        ends = np.array([part.start + part.times[-1] + PAUSE_S / 2 for part in self.parts[:-1]])
+        of = np.searchsorted(ends, times)
         for episode in np.unique(of):
             rows = np.flatnonzero(of == episode)
-            yield self.parts[episode], rows, times[rows] - self.starts[episode]
+            yield self.parts[episode], rows, times[rows] - self.parts[episode].start
 
-    def _check_split_names(self) -> None:
-        """Raise NeecoError for splits that name what is no episode."""
-        first, known = self.recording, set(self.names)
-        for episode in first.splits.test_episodes + first.splits.unseen_episodes if first.splits else ():
-            if self.single or episode not in known:
-                listed = "one recording has none" if self.single else f"they are {', '.join(self.names)}"
-                raise NeecoError(f"{first.path}: splits: no episode is called {episode!r}; {listed}")
-        if not self.single and first.splits and (first.splits.test or first.splits.unseen):
+    def _gathered(
+        self,
+        times: np.ndarray,
+        of: Callable[[Episode, np.ndarray], tuple[np.ndarray, np.ndarray]],
+        shape: tuple[int, ...],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return values [N, *shape] that `of` gives for an episode at times of its own, and where they are known."""
+        values, known = np.full((len(times), *shape), np.nan), np.zeros(len(times), dtype=bool)
+        for part, rows, own in self._each(times):
+            values[rows], known[rows] = of(part, own)
+        return values, known
+
+    def _within_limits(
+        self, part: Episode, log: ReadingLog, limits: tuple[float, float] | None, values: np.ndarray
+    ) -> np.ndarray:
+        """Return readings [N] rad clipped to the joint's stated limits. Raises NeecoError where more than noise
+        exceeds them."""
+        if limits is None:
+            return values
+        held = np.clip(values, *limits)
+        excess = float(np.nanmax(np.abs(values - held), initial=0.0))
+        if excess > LIMIT_SLACK:
             raise NeecoError(
-                f"{first.path}: splits: test and unseen count one video's frames, and there are {len(self.parts)} "
-                "recordings; name test_episodes and unseen_episodes"
+                f"{log.path}: readings go {np.degrees(excess):.1f} deg beyond the joint's limits {limits[0]:g} .. "
+                f"{limits[1]:g} rad; correct `limits` in the recording, or the calibration"
             )
+        if excess > 0:
+            self.notes.add(
+                f"{log.path.name}: readings up to {np.degrees(excess):.1f} deg beyond the limits are held at them",
+                self.parts.index(part),
+            )
+        return held
 
 
-def check_alike(parts: Sequence[SynchronizedRecording], worlds: bool = False) -> None:
-    """Raise NeecoError for recordings that one capture cannot hold together. worlds: each is of a world of its own."""
-    first = parts[0].recording
-    lens, where = first.read_lens()
+def with_roll(poses: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """Return poses [F, 4, 4] turned about their own z axis by roll [F] rad."""
+    turned = np.tile(np.eye(4), (len(poses), 1, 1))
+    turned[:, :3, :3] = Rotation.from_rotvec(roll[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    return np.asarray(poses @ turned)
+
+
+def read_episodes(recordings: Sequence[Recording], tissue: str | None = None) -> Episodes:
+    """Read logs and videos, and put them on one timeline, with the clocks that are given.
+
+    Raises NeecoError for recordings that cannot be used, or that one capture cannot hold.
+    """
+    notes = Notes(episode_names(recordings))
+    parts: list[Episode] = []
+    for episode, recording in enumerate(recordings):
+        part = _read(recording, notes, episode)
+        if parts:
+            before = parts[-1]
+            start = before.start + before.times[-1] + PAUSE_S - part.times[0]
+            part = replace(part, start=start, first=before.first + len(before.times))
+        parts.append(part)
+    check_episodes(parts)
+    _check_split_names(recordings[0], notes.names)
+    return Episodes(tuple(parts), parts[0].video if len(parts) == 1 else _joined_video(parts), notes, tissue)
+
+
+def check_episodes(parts: Sequence[Episode], *, tissues: bool = False) -> None:
+    """Raise NeecoError for recordings that one capture cannot hold. tissues: each may be of another one."""
+    first = parts[0]
     for part in parts[1:]:
-        other = part.recording
-
-        def refuse(what: str, path: object = other.path) -> NeecoError:
-            return _refusal(path, what, first)
-
-        size, own = part.video.size, parts[0].video.size
-        if size != own:
-            raise refuse(f"images: are {size[0]}x{size[1]}, not {own[0]}x{own[1]} as")
-        if other.read_lens()[0] != lens:
-            raise refuse(f"intrinsics: are others than {where} gives")
-        for key in ("camera", "laparoscope", "stereo"):
-            mine, theirs = getattr(other, key), getattr(first, key)
-            if (mine is None) != (theirs is None) or (key == "camera" and mine != theirs):
-                raise refuse(f"{key}: is not as")
-        names = [item.name for item in other.instruments]
-        if names != [item.name for item in first.instruments]:
-            raise refuse(f"instruments: {', '.join(names) or 'none'} are not those")
-        for mine, theirs in zip(other.instruments, first.instruments, strict=True):
-            if fault := _unlike(mine, theirs, worlds):
-                raise refuse(f"instruments: {mine.name}: {fault} not as")
-            if mine.poses is not None and part.poses[mine.name].frame != parts[0].poses[mine.name].frame:
-                raise refuse(f"instruments: {mine.name}: poses are in another frame than")
-        refuse_other_words(other, first)
+        if part.video.size != first.video.size:
+            sizes = [f"{width}x{height}" for width, height in (part.video.size, first.video.size)]
+            raise refusal(part.recording, f"images: are {sizes[0]}, not {sizes[1]} as", first.recording)
+    check_recordings([part.recording for part in parts], tissues=tissues)
+    for part in parts[1:]:
+        for name, log in part.poses.items():
+            if log.frame != first.poses[name].frame:
+                raise refusal(part.recording, f"instruments: {name}: poses are in another frame than", first.recording)
 
 
-def refuse_other_words(other: Recording, first: Recording) -> None:
-    """Raise NeecoError where a recording says another thing of all than the first."""
-    for key, default in (("frames", None), ("splits", None), ("settings", IngestSettings())):
-        if getattr(other, key) not in (default, getattr(first, key)):
-            raise _refusal(other.path, f"{key}: says another than", first)
-
-
-def _refusal(path: object, what: str, first: Recording) -> NeecoError:
-    return NeecoError(
-        f"{path}: {what} in {first.path}: recordings of one capture have the same; correct it, or ingest it alone"
+def _read(recording: Recording, notes: Notes, episode: int) -> Episode:
+    """Read one recording. Raises NeecoError for logs and videos that cannot be used."""
+    # logs are quick to read: wrong ones are found before the video is touched
+    items = recording.instruments
+    poses = {item.name: read_pose_log(item.poses) for item in items if item.poses is not None}
+    joints = {item.name: {joint: read_reading_log(source) for joint, source in item.joints.items()} for item in items}
+    rolls = {item.name: read_reading_log(item.roll) for item in items if item.roll is not None}
+    scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
+    _check_bases(recording, scope, poses)
+    video = recording.source.open()
+    logs: list[PoseLog | ReadingLog] = [*poses.values(), *([scope] if scope else [])]
+    logs += [log for held in joints.values() for log in held.values()] + [*rolls.values()]
+    for note in (*recording.notes, *(note for log in logs for note in log.notes), *video.notes):
+        notes.add(note, episode)
+    for item in items:
+        if not item.placed:
+            notes.add(f"instrument {item.name!r} was not tracked: it is left out of the capture's states", episode)
+    placed = [item.name for item in items if item.placed]
+    if not placed:
+        notes.add("no instrument was tracked: the capture has cameras and images only (method 3dgs trains)", episode)
+    _check_video(recording, video)
+    for note in _length_notes(recording, video, logs):
+        notes.add(note, episode)
+    clocks = {name: ClockOffset(float(seconds), 0.0, GIVEN) for name, seconds in recording.sync.items()}
+    if VIDEO_CLOCK in recording.clocks:
+        clocks[VIDEO_CLOCK] = ClockOffset(0.0, 0.0, "the images' own")
+    # joints' clocks that nothing gives are the video's: images tell them to some 20 ms at best. Trackers' clocks, and
+    # those of joints on one of them, are found later, from motion
+    found_later = {log.clock for log in (*poses.values(), *([scope] if scope else []))}
+    for joint, log in ((joint, log) for name in placed for joint, log in joints[name].items()):
+        if log.clock not in clocks and log.clock not in found_later:
+            clocks[log.clock] = _assumed_clock(log, video.times)
+            notes.add(
+                f"the clock of joint {joint!r} was not given and is taken to be the video's: at 1 rad/s, 20 ms off are "
+                "1.1 deg",
+                episode,
+            )
+    return Episode(
+        recording=recording, video=video, poses=poses, joints=joints, rolls=rolls, scope=scope, clocks=clocks
     )
 
 
-def separate(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
-    """One recording for each of the episodes that a recording lists. Raises NeecoError."""
-    found: list[Recording] = []
-    for recording in recordings:
-        found += [_of_episode(recording, number) for number in recording.episodes] or [recording]
-    return tuple(found)
-
-
-def _of_episode(recording: Recording, episode: int) -> Recording:
-    """The recording with all its streams of one episode of the data set that holds them."""
-    moved = 0
-
-    def stream_of(path: Path | None, stream: str | None, key: str) -> str | None:
-        nonlocal moved
-        known = None if path is None else format_of(path)
-        if known is None or known.of_episode("", episode) is None:
-            return stream
-        if stream is None:
-            raise NeecoError(f"{recording.path}: {key}: stream: missing; name the feature, as in observation.state")
-        moved += 1
-        return known.of_episode(stream, episode)
-
-    instruments = []
-    for item in recording.instruments:
-        poses = item.poses and replace(item.poses, stream=stream_of(item.poses.path, item.poses.stream, "poses"))
-        joints = {
-            name: replace(log, stream=stream_of(log.path, log.stream, f"joints: {name}"))
-            for name, log in item.joints.items()
-        }
-        roll = item.roll and replace(item.roll, stream=stream_of(item.roll.path, item.roll.stream, "roll"))
-        instruments.append(replace(item, poses=poses, joints=joints, roll=roll))
-    scope, partner = recording.laparoscope, recording.stereo
-    stream = stream_of(recording.video, recording.stream, "video")
-    changed = replace(
-        recording, stream=stream, instruments=tuple(instruments),
-        laparoscope=scope and replace(scope, stream=stream_of(scope.path, scope.stream, "laparoscope")),
-        stereo=partner and replace(partner, stream=stream_of(partner.video, partner.stream, "stereo")),
-        episode=f"episode_{episode}",
-    )  # fmt: skip
-    if not moved:
+def _assumed_clock(log: PoseLog | ReadingLog, times: np.ndarray) -> ClockOffset:
+    """Return the video's clock for a log. Raises NeecoError where its times do not meet the video's [V] s."""
+    if log.times[-1] < times[0] or log.times[0] > times[-1]:
         raise NeecoError(
-            f"{recording.path}: episodes: no file named here holds several; leave it out, and give several recordings "
-            "as `neeco ingest A/recording.yaml B/recording.yaml`"
+            f"{log.path}: its times ({log.times[0]:g} to {log.times[-1]:g} s) do not meet the video's "
+            f"({times[0]:g} to {times[-1]:g} s), and nothing ties the clocks; give the offset: "
+            f"sync: {{{log.clock}: seconds}}"
         )
-    return changed
+    return ClockOffset(0.0, float("nan"), ASSUMED)
 
 
-def episode_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """What each of several recordings is called: as it says itself, else by its file, or its folder where the files
-    are all called alike; different from all others."""
-    stems = {recording.path.stem for recording in recordings}
-    names: list[str] = []
-    for recording in recordings:
-        of_file = recording.path.stem if len(stems) > 1 else recording.path.resolve().parent.name
-        name = file_name(recording.episode or of_file) or "recording"
-        number = 2
-        while name in names:
-            name, number = f"{name.removesuffix(f'_{number - 1}')}_{number}", number + 1
-        names.append(name)
-    return tuple(names)
+def _coverage(part: Episode) -> tuple[np.ndarray, np.ndarray]:
+    """`Episodes.coverage_states` of one episode, [V] its frames."""
+    columns, usable = [], np.ones(len(part.times), dtype=bool)
+    for log in part.poses.values():
+        if log.clock in part.clocks:
+            poses, valid = part.logged_poses(log, part.times)
+            usable &= valid
+            columns.append(np.where(valid[:, None], poses[:, :3, 3], 0.0))
+            columns.append(np.where(valid[:, None], poses[:, :3, :3].reshape(-1, 9)[:, :3], 0.0))
+            _check_overlap(part, log, valid)
+    placed = [item.name for item in part.recording.instruments if item.placed]
+    for reading in (log for name in placed for log in part.joints[name].values()):
+        if reading.clock in part.clocks:
+            values, valid = part.logged_readings(reading, part.times)
+            usable &= valid
+            columns.append(np.where(valid, values, 0.0)[:, None])
+            _check_overlap(part, reading, valid)
+    return np.concatenate(columns or [np.zeros((len(part.times), 6))], 1), usable
 
 
-def file_name(text: str) -> str:
-    """As files of a capture may be called."""
-    return re.sub(r"[^A-Za-z0-9.-]+", "_", text).strip("_.")
+def _check_overlap(part: Episode, log: PoseLog | ReadingLog, valid: np.ndarray) -> None:
+    if not valid.any():
+        first, last = part.clocks[log.clock].video_times(log.times[[0, -1]])
+        raise NeecoError(
+            f"{log.path}: has no sample for any video frame: by the video's clock it covers {first:g} to {last:g} "
+            f"s, the video {part.times[0]:g} to {part.times[-1]:g} s; correct the offset of its clock, sync: "
+            f"{log.clock}"
+        )
 
 
-def _unlike(mine: InstrumentLogs, theirs: InstrumentLogs, worlds: bool) -> str | None:
-    """In what an instrument differs from that of another recording; None: in nothing that a capture states once, or
-    `worlds`, each once."""
-    if (mine.poses is None) != (theirs.poses is None) or mine.from_video != theirs.from_video:
-        return "poses are"
-    if (mine.roll is None) != (theirs.roll is None):
-        return "roll is"
-    limits = [{name: source.limits for name, source in item.joints.items()} for item in (mine, theirs)]
-    if limits[0].keys() != limits[1].keys():
-        return f"joints ({', '.join(limits[0]) or 'none'}) are"
-    if limits[0] != limits[1]:
-        return "limits of its joints are"
-    if mine.kinematics != theirs.kinematics:
-        return "kinematics are"
-    if not worlds and not same_base(mine.base, theirs.base):
-        return "the place of its base is"
-    return None
+def _check_bases(recording: Recording, scope: PoseLog | None, poses: Mapping[str, PoseLog]) -> None:
+    """Raise NeecoError where the scope's poses and an instrument's are stated in bases of different names: nothing
+    would register them."""
+    stated = None if scope is None else scope.stated_in
+    placed = {item.name for item in recording.instruments if item.base is not None}
+    for name, log in poses.items():
+        if stated is not None and name not in placed and log.stated_in not in (None, stated) and log.frame == BASE:
+            raise NeecoError(
+                f"{recording.path}: laparoscope: its poses are stated in {stated}, those of {name} in "
+                f"{log.stated_in}; where these are one frame say `frame: base` for both, else say how they stand "
+                "(world_from_base)"
+            )
+
+
+def _check_video(recording: Recording, video: VideoSource) -> None:
+    """Raise NeecoError for times that no recording has, and for frames too small."""
+    rate, length = 1 / float(np.median(np.diff(video.times))), video.times[-1] - video.times[0]
+    if not (MIN_FPS < rate < MAX_FPS and length < LONGEST):
+        raise NeecoError(
+            f"{video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
+            "cannot be; correct fps or the times' unit"
+        )
+    if min(video.size) < MIN_SIDE_PX:
+        width, height = video.size
+        raise NeecoError(f"{video.path}: its frames are {width}x{height} pixels; give {MIN_SIDE_PX} or more each way")
+
+
+def _length_notes(recording: Recording, video: VideoSource, logs: Sequence[PoseLog | ReadingLog]) -> list[str]:
+    """Return notes on logs on the video's clock that are longer than the video, and on those whose rows belong to
+    images one by one and are not as many. Raises NeecoError where these differ by far."""
+    notes: list[str] = []
+    times = video.times
+    for log in logs:
+        if log.clock != VIDEO_CLOCK or log.path == recording.video:
+            continue
+        if log.image_hz is not None:
+            rows = round(float(log.times[-1]) * log.image_hz) + 1
+            notes += compare_lengths(video.path, video, rows, log.image_hz)
+            continue
+        beyond = max(0.0, log.times[-1] - times[-1]) + max(0.0, times[0] - log.times[0])
+        if beyond > MAX_UNLIKE * (times[-1] - times[0]):
+            notes.append(
+                f"{log.path.name}: goes from {log.times[0]:.1f} to {log.times[-1]:.1f} s on the video's clock, the "
+                f"video from {times[0]:.1f} to {times[-1]:.1f} s: are they of one recording?"
+            )
+    return notes
+
+
+def _check_split_names(first: Recording, names: tuple[str, ...]) -> None:
+    """Raise NeecoError for splits that name no episode."""
+    single, splits = len(names) == 1, first.splits
+    for episode in splits.test_episodes + splits.unseen_episodes if splits else ():
+        if single or episode not in names:
+            listed = "one recording has none" if single else f"they are {', '.join(names)}"
+            raise NeecoError(f"{first.path}: splits: no episode is called {episode!r}; {listed}")
+    if not single and splits and (splits.test or splits.unseen):
+        raise NeecoError(
+            f"{first.path}: splits: test and unseen count one video's frames, and there are {len(names)} "
+            "recordings; name test_episodes and unseen_episodes"
+        )
 
 
 @dataclass(frozen=True)
@@ -431,6 +509,7 @@ class _JoinedVideo(VideoSource):
                     yield index + before, image
 
 
-def _joined_videos(videos: list[VideoSource], times: np.ndarray, first: np.ndarray) -> VideoSource:
-    size = videos[0].size
-    return _JoinedVideo(videos[0].path, size, (), times, tuple(videos), tuple(first.tolist()))
+def _joined_video(parts: Sequence[Episode]) -> VideoSource:
+    videos, first = tuple(part.video for part in parts), tuple(part.first for part in parts)
+    times = np.concatenate([part.times + part.start for part in parts])
+    return _JoinedVideo(videos[0].path, videos[0].size, (), times, videos, (*first, len(times)))

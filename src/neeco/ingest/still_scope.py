@@ -1,0 +1,151 @@
+"""The world of a scope that stands still: its own frame, in which robot bases and the tissue are found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from neeco.capture.model import PointCloud, evenly_spaced
+from neeco.errors import NeecoError
+from neeco.ingest.cameras.still import N_FRAMES, same_place, stands_still
+from neeco.ingest.cameras.still_scene import RightCamera, look_behind, read_right_camera, still_cameras
+from neeco.ingest.foreground.background import find_background
+from neeco.ingest.foreground.masks import moving_masks
+from neeco.ingest.frames.images import ChosenImages
+from neeco.ingest.frames.views import StageProgress
+from neeco.ingest.readers.columns import CAMERA
+from neeco.ingest.recording.model import STILL
+from neeco.ingest.registration.find_bases import check_frames
+from neeco.ingest.shaft.video_instruments import find_in_video
+from neeco.ingest.timing.episodes import Episodes
+from neeco.ingest.world import (
+    NAME_TISSUES,
+    World,
+    check_motion,
+    longest_lag,
+    residual_flow,
+    with_bases,
+    with_instrument_clocks,
+)
+
+SAME_PLACE = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
+MOSTLY_SIMILAR = 0.7  # less is worth a note
+
+
+def is_still(data: Episodes, images: ChosenImages, progress: StageProgress) -> bool:
+    """Return whether the scope stands still: as the recording states, else as its images show."""
+    if data.recording.camera is not None:
+        return data.recording.camera == STILL
+    if data.recording.stereo is not None:
+        return True
+    progress("looking whether the scope moves", 0, 0)
+    still = all(stands_still(images.loader(rows), len(rows)) for rows in _rows_by_episode(data, images).values())
+    if still:
+        data.notes.add("the scope stands still: nothing but what passes before it moves in the images")
+    return still
+
+
+def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progress: StageProgress) -> World:
+    """Find clocks, bases, instruments and tissue in front of a scope whose frame is the world.
+
+    folder: for temporary files. Raises NeecoError for an unknown lens.
+    """
+    if images.lens is None:
+        raise NeecoError(
+            f"{data.recording.path}: intrinsics: missing; images of a scope that stands still do not tell its "
+            "lens; give fl_x, fl_y, cx, cy or a calibration"
+        )
+    if data.parts[0].scope is not None:
+        data.notes.add(
+            "the scope stands still: the laparoscope's log tells nothing that its images do not, and is ignored"
+        )
+    check_frames(data, moving=False)
+    _check_one_place(data, images, progress)
+    right = _right_camera(data, images, folder, progress)
+    count = len(images.selected)
+    cameras = still_cameras(count)
+    views = images.views(data, cameras.indices, cameras.world_from_camera)
+
+    def moving(rows: np.ndarray) -> np.ndarray:
+        return moving_masks(views.load, count, rows, views.visible)
+
+    data = with_instrument_clocks(data, residual_flow(cameras, views), views, progress)
+    in_camera = [name for name, log in data.parts[0].poses.items() if log.frame == CAMERA]
+    data = replace(data, world_from_base={name: np.eye(4) for name in in_camera})
+    data, bases = with_bases(data, views, moving, progress)
+    if unplaced := [name for name in data.parts[0].poses if name not in data.world_from_base]:
+        data.notes.add(
+            f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}, "
+            "or camera_from_base): they stay in their own frame (unregistered)"
+        )
+    shaft = masks = None
+    if data.in_video is not None:
+        progress("finding what moves", 0, 0)
+        masks = moving(cameras.indices)
+        progress("finding the shaft", 0, 0)
+        data, shaft = find_in_video(data, data.in_video, views, masks, None)
+    data = data.with_assumed_clocks()
+    names = (*data.world_from_base, *data.found)
+    tracked = {name: partial(data.instrument_poses, name, views.times) for name in names}
+    progress("finding the tissue behind the instrument", 0, 0)
+    behind = look_behind(views, tracked, longest_lag(data), data.recording.settings, right)
+    for note in behind.notes:
+        data.notes.add(note)
+    for name, lag in behind.lags.items():
+        check_motion(data, name, name in behind.shapes, lag)
+    states, usable = data.states_at(views.times)
+    return World(
+        data=data, images=images, views=views, states=states, usable=usable,
+        tissue=PointCloud(behind.points.astype(np.float32), (behind.colors / 255).astype(np.float32)),
+        shapes=behind.shapes, bases=bases, shaft=shaft, masks=masks, tissue_depth=behind.how, right=right,
+    )  # fmt: skip
+
+
+def _rows_by_episode(data: Episodes, images: ChosenImages) -> dict[int, np.ndarray]:
+    """Return the rows of the chosen frames, by episode, of those that have some."""
+    episodes = data.episode_of(images.selected)
+    return {int(episode): np.flatnonzero(episodes == episode) for episode in np.unique(episodes)}
+
+
+def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgress) -> None:
+    """Raise NeecoError for an episode in which a still scope looked at something else than in the first."""
+    if data.single:
+        return
+    progress("comparing what the recordings show", 0, 0)
+    backgrounds = {}
+    for episode, rows in _rows_by_episode(data, images).items():
+        load = images.loader(rows[evenly_spaced(len(rows), N_FRAMES)])
+        found = find_background(load, min(len(rows), N_FRAMES))
+        backgrounds[episode] = np.clip(found.colors, 0, 255).astype(np.uint8)
+    first, *others = backgrounds
+    for episode in others:
+        share = same_place(backgrounds[first], backgrounds[episode])
+        name, before = data.notes.names[episode], data.notes.names[first]
+        if share is not None and share < SAME_PLACE:
+            raise NeecoError(
+                f"{data.parts[episode].recording.path}: {name} shows another place than {before}: {share:.0%} of "
+                f"the background is where it was; where that is another tissue, or the scope stands elsewhere, "
+                f"{NAME_TISSUES}"
+            )
+        if share is not None and share < MOSTLY_SIMILAR:
+            data.notes.add(
+                f"{1 - share:.0%} of the background is not where it was in {before}: what changed is blurred", episode
+            )
+
+
+def _right_camera(data: Episodes, images: ChosenImages, folder: Path, progress: StageProgress) -> RightCamera | None:
+    """Write the right camera's images of all episodes into `folder`."""
+    if data.recording.stereo is None:
+        return None
+    names = [data.frame_name(int(frame)) for frame in images.selected]
+    cameras = []
+    for episode, rows in _rows_by_episode(data, images).items():
+        part = data.parts[episode]
+        assert part.recording.stereo is not None
+        own, stems = images.selected[rows] - part.first, [names[row] for row in rows]
+        found = read_right_camera(part.recording.stereo, own, part.times, stems, folder / "right", progress)
+        cameras.append(replace(found, names={int(rows[row]): name for row, name in found.names.items()}))
+    return replace(cameras[0], names={row: name for camera in cameras for row, name in camera.names.items()})

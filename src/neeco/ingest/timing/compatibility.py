@@ -1,0 +1,134 @@
+"""Which recordings make one capture, and what each is called in it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from neeco.errors import NeecoError
+from neeco.ingest.readers import format_of
+from neeco.ingest.recording.base import same_base
+from neeco.ingest.recording.model import ImageFolder, IngestSettings, InstrumentLogs, Recording, VideoFile
+
+
+def separate(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
+    """Return one recording for each of the episodes that a recording lists. Raises NeecoError."""
+    found: list[Recording] = []
+    for recording in recordings:
+        found += [_of_episode(recording, number) for number in recording.episodes] or [recording]
+    return tuple(found)
+
+
+def _of_episode(recording: Recording, episode: int) -> Recording:
+    """Return the recording with all its streams of one episode of the data set that holds them."""
+    moved = 0
+
+    def stream_of(path: Path | None, stream: str | None, key: str) -> str | None:
+        nonlocal moved
+        known = None if path is None else format_of(path)
+        if known is None or known.of_episode("", episode) is None:
+            return stream
+        if stream is None:
+            raise NeecoError(f"{recording.path}: {key}: stream: missing; name the feature, as in observation.state")
+        moved += 1
+        return known.of_episode(stream, episode)
+
+    def source_of(source: VideoFile | ImageFolder, key: str) -> VideoFile | ImageFolder:
+        if isinstance(source, ImageFolder):
+            return source
+        return replace(source, stream=stream_of(source.file, source.stream, key))
+
+    instruments = []
+    for item in recording.instruments:
+        poses = item.poses and replace(item.poses, stream=stream_of(item.poses.path, item.poses.stream, "poses"))
+        joints = {
+            name: replace(log, stream=stream_of(log.path, log.stream, f"joints: {name}"))
+            for name, log in item.joints.items()
+        }
+        roll = item.roll and replace(item.roll, stream=stream_of(item.roll.path, item.roll.stream, "roll"))
+        instruments.append(replace(item, poses=poses, joints=joints, roll=roll))
+    scope, partner = recording.laparoscope, recording.stereo
+    changed = replace(
+        recording, source=source_of(recording.source, "video"), instruments=tuple(instruments),
+        laparoscope=scope and replace(scope, stream=stream_of(scope.path, scope.stream, "laparoscope")),
+        stereo=partner and replace(partner, source=source_of(partner.source, "stereo")),
+        episode=f"episode_{episode}",
+    )  # fmt: skip
+    if not moved:
+        raise NeecoError(
+            f"{recording.path}: episodes: no file named here holds several; leave it out, and give several recordings "
+            "as `neeco ingest A/recording.yaml B/recording.yaml`"
+        )
+    return changed
+
+
+def episode_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Return distinct names: a recording's own, else its file's, or its folder's where all files have one name."""
+    stems = {recording.path.stem for recording in recordings}
+    names: list[str] = []
+    for recording in recordings:
+        of_file = recording.path.stem if len(stems) > 1 else recording.path.resolve().parent.name
+        name = file_name(recording.episode or of_file) or "recording"
+        number = 2
+        while name in names:
+            name, number = f"{name.removesuffix(f'_{number - 1}')}_{number}", number + 1
+        names.append(name)
+    return tuple(names)
+
+
+def file_name(text: str) -> str:
+    """Return a text with only the characters that file names in a capture have."""
+    return re.sub(r"[^A-Za-z0-9.-]+", "_", text).strip("_.")
+
+
+def check_recordings(recordings: Sequence[Recording], *, tissues: bool = False) -> None:
+    """Raise NeecoError for recordings that one capture cannot hold. tissues: each may be of another one."""
+    first = recordings[0]
+    lens, where = first.read_lens()
+    for other in recordings[1:]:
+        if other.read_lens()[0] != lens:
+            raise refusal(other, f"intrinsics: are others than {where} gives", first)
+        for key in ("camera", "laparoscope", "stereo"):
+            mine, theirs = getattr(other, key), getattr(first, key)
+            if (mine is None) != (theirs is None) or (key == "camera" and mine != theirs):
+                raise refusal(other, f"{key}: is not as", first)
+        names = [item.name for item in other.instruments]
+        if names != [item.name for item in first.instruments]:
+            raise refusal(other, f"instruments: {', '.join(names) or 'none'} are not those", first)
+        for mine, theirs in zip(other.instruments, first.instruments, strict=True):
+            if fault := _difference(mine, theirs, tissues):
+                raise refusal(other, f"instruments: {mine.name}: {fault} not as", first)
+        check_shared_settings(other, first)
+
+
+def check_shared_settings(other: Recording, first: Recording) -> None:
+    """Raise NeecoError where a recording states a setting of the whole capture otherwise than the first."""
+    for key, default in (("frames", None), ("splits", None), ("settings", IngestSettings())):
+        if getattr(other, key) not in (default, getattr(first, key)):
+            raise refusal(other, f"{key}: says another than", first)
+
+
+def refusal(other: Recording, what: str, first: Recording) -> NeecoError:
+    return NeecoError(
+        f"{other.path}: {what} in {first.path}: recordings of one capture have the same; correct it, or ingest it alone"
+    )
+
+
+def _difference(mine: InstrumentLogs, theirs: InstrumentLogs, tissues: bool) -> str | None:
+    """Return in words what a capture states once and two recordings of an instrument state differently, if anything."""
+    if (mine.poses is None) != (theirs.poses is None) or mine.from_video != theirs.from_video:
+        return "poses are"
+    if (mine.roll is None) != (theirs.roll is None):
+        return "roll is"
+    limits = [{name: source.limits for name, source in item.joints.items()} for item in (mine, theirs)]
+    if limits[0].keys() != limits[1].keys():
+        return f"joints ({', '.join(limits[0]) or 'none'}) are"
+    if limits[0] != limits[1]:
+        return "limits of its joints are"
+    if mine.kinematics != theirs.kinematics:
+        return "kinematics are"
+    if not tissues and not same_base(mine.base, theirs.base):
+        return "the place of its base is"
+    return None
