@@ -16,6 +16,7 @@ from rod_world import CAMERA, FakeRun, rod_state
 
 from neeco.capture.model import State
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene import GaussianScene
@@ -39,7 +40,6 @@ from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import SampleGenerator
 from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.settings import Settings
-from neeco.synthesis.states import rigid
 
 SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0)
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from neeco.errors import NeecoError
-from neeco.geometry.rotations import rigid_fault, rotation_from_vector
+from neeco.geometry.rotations import rigid, rigid_fault, rotation_from_vector
 
 FIXED, REVOLUTE, PRISMATIC = "fixed", "revolute", "prismatic"
 JOINT_TYPES = (FIXED, REVOLUTE, PRISMATIC)
@@ -49,13 +49,11 @@ class Link:
         """[4, 4] mm at a state's readings."""
         if self.type == FIXED:
             return self.origin
-        value, moved = self.joint_value(readings), np.eye(4)
+        motion = self.joint_value(readings) * self.axis
         if self.type == PRISMATIC:
-            moved[:3, 3] = value * self.axis
-            return moved @ self.origin
-        moved[:3, :3] = rotation_from_vector(torch.from_numpy(value * self.axis)).numpy()
-        moved[:3, 3] = self.origin[:3, 3] - moved[:3, :3] @ self.origin[:3, 3]
-        return moved @ self.origin
+            return rigid(np.eye(3), motion) @ self.origin
+        turn = rotation_from_vector(torch.from_numpy(motion)).numpy()
+        return rigid(turn, self.origin[:3, 3] - turn @ self.origin[:3, 3]) @ self.origin
 
 
 @dataclass(frozen=True, eq=False)

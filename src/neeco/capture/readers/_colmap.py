@@ -24,7 +24,7 @@ from neeco.errors import NeecoError
 from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import COLMAP
-from neeco.geometry.rotations import quat_to_matrix
+from neeco.geometry.rotations import quat_to_matrix, rigid
 from neeco.plausible import center_fault, focal_fault, size_fault
 
 _MODELS = {
@@ -151,10 +151,7 @@ def _world_from_camera(image: _Image) -> np.ndarray:
     if not (0.99 < norm < 1.01 and np.abs(translation).max() < 1e9):  # nor when NaN
         raise NeecoError("its pose is not a finite unit quaternion and translation; drop it")
     rotation = quat_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ translation
-    return COLMAP.camera_to_opencv(pose)
+    return COLMAP.camera_to_opencv(rigid(rotation.T, -rotation.T @ translation))
 
 
 def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:

@@ -15,7 +15,7 @@ from neeco.capture.documents import Node, as_float, printable
 from neeco.capture.images import image_size
 from neeco.capture.readers.parsed import Parsed
 from neeco.errors import NeecoError
-from neeco.geometry.camera import COEFFICIENTS, Camera
+from neeco.geometry.camera import COEFFICIENT_COUNTS, Camera
 from neeco.geometry.lens import BORDER, COEFFICIENT_NAMES, INTRINSICS, Border, Lens
 from neeco.plausible import LARGEST_SIZE, focal_fault, size_fault
 
@@ -195,7 +195,7 @@ def _distortion(node: Node) -> tuple[float, ...] | None:
     """The coefficients up to the last that is given, as many as one of OpenCV's models has."""
     given = [node.has(name) for name in COEFFICIENT_NAMES]
     last = len(given) - given[::-1].index(True) if any(given) else 0
-    names = COEFFICIENT_NAMES[: min(count for count in COEFFICIENTS if count >= last)]
+    names = COEFFICIENT_NAMES[: min(count for count in COEFFICIENT_COUNTS if count >= last)]
     read = [node.child(name).number(above=-MOST_BENT, below=MOST_BENT) if node.has(name) else 0.0 for name in names]
     known = tuple(value for value in read if value is not None)
     return known if len(known) == len(read) else None
