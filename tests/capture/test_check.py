@@ -386,7 +386,7 @@ def told(folder, field: str) -> list[str]:
         (_head("fl_x", -1), "fl_x", "is -1, must be positive, for 8 of 8 frames"),
         (_head("cy", "x"), "cy", "expected a number, found 'x', for 8 of 8 frames"),
         (_head("k1", 0.1), "k1", "the images are distorted, for 8 of 8 frames"),
-        (_head("camera_model", "FISHEYE"), "camera_model", "only PINHOLE is drawn"),
+        (_head("camera_model", "FISHEYE"), "camera_model", "cameras must be PINHOLE"),
     ],
 )
 def test_a_mistake_at_the_top_level_is_told_once_and_hides_nothing(folder, edit, field, words):

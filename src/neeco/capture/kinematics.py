@@ -139,14 +139,14 @@ class KinematicTree:
         return np.array(rows, np.float64).reshape(len(self.joints), len(self.bodies))
 
     def carries(self, joint: Link, body: Link) -> bool:
-        """Whether `body` moves with the joint of `joint`."""
+        """Return True if `body` moves with the joint of `joint`."""
         link: Link | None = body
         while link is not None and link.name != joint.name:
             link = None if link.parent is None else self.links[self._index[link.parent]]
         return link is not None
 
     def to_json(self) -> dict[str, Any]:
-        """What `neeco.capture.readers.kinematics` reads."""
+        """The `kinematics` block that `neeco.capture.readers.kinematics` reads."""
         written: dict[str, Any] = {"links": [_link_to_json(link) for link in self.links]}
         return written if self.pose_of is None else {"pose_of": self.pose_of} | written
 

@@ -67,7 +67,7 @@ def find_model(root: Path) -> Path | None:
 def parse_colmap(model: Path, root: Path, report: ProblemReport, *, as_source: bool = False) -> Parsed:
     """Read a COLMAP model; problems go to `report`. Lengths are in the model's own unit. as_source: see `Parsed`.
 
-    Images lie in `images/` beside it; sorted by name, every 8th is a test frame, and time is the order.
+    Images are in the capture's `images/`; sorted by name, every 8th is a test frame, and time is the order.
     """
     parsed = Parsed(root, timed=False, as_source=as_source)
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"

@@ -68,7 +68,7 @@ class Parsed:
         return replace(self, frames=frames, places=places, without_camera=set())
 
     def by_tissue(self) -> list[Parsed]:
-        """What is of each tissue, whose world is its own, and has frames; all of it where there is one."""
+        """The parts of several tissues that have frames, each with a world of its own; the whole where there is one."""
         if not self.tissues:
             return [self]
         parts = []

@@ -65,11 +65,11 @@ def read_urdf(
     for given in names:
         if given not in moving:
             raise NeecoError(f"{path}: readings: {given!r} is no joint that moves; it has {', '.join(sorted(moving))}")
-    seen = {name for name, _ in reached if known[name].visuals}
+    visible = {name for name, _ in reached if known[name].visuals}
     reached_joints = {joint.name: joint for _, joint in reached if joint is not None}
     links = []
     for name, joint in reached:
-        body = name in seen or not seen
+        body = name in visible or not visible
         links.append(Link(name, body=body) if joint is None else _link(joint, reached_joints, names, body, path))
     try:
         return KinematicTree(tuple(links), pose_of)
