@@ -96,8 +96,8 @@ def limits_fault(limits: tuple[float, float], slides: bool) -> Fault | None:
 
 
 def mask_fault(pixels: float, points: float | None) -> Fault | None:
-    """Check loss masks by the shares that they hide: of the lit pixels in most images, and of the projected sparse points
-    (None: there are none)."""
+    """Check loss masks by the shares that they hide: of the lit pixels in most images, and of the projected sparse
+    points (None: there are none)."""
     hides = []
     if pixels > MAX_HIDDEN:
         hides.append(f"{pixels:.0%} of most images")

@@ -285,8 +285,8 @@ def _is_readable(value: object, only_cheaply: bool) -> bool:
 
 
 def share_lamps(cameras: Sequence[Camera], states: Sequence[State]) -> tuple[Camera, ...]:
-    """Give the cameras of a still scope the lamps of the first one over each tissue: the second camera of a stereo scope
-    has none of its own."""
+    """Give the cameras of a still scope the lamps of the first one over each tissue: the second camera of a stereo
+    scope has none of its own."""
     shared = []
     firsts: dict[str | None, Tensor] = {}
     for camera, state in zip(cameras, states, strict=True):

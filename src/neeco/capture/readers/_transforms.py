@@ -57,7 +57,7 @@ def parse_transforms(
 
 
 def is_blender(document: Node) -> bool:
-    """Return True if a transforms file has the field of view in place of intrinsics and no states, as Blender writes."""
+    """Return True if a transforms file has the field of view for intrinsics and no states, as Blender writes."""
     value = document.value
     return "camera_angle_x" in value and "fl_x" not in value and not _lists_states(document)
 
