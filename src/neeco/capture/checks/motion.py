@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.checks._mistakes import placement_mistakes, rotation_mistakes
-from neeco.capture.checks.motion_evidence import MotionEvidence, Timeline
+from neeco.capture.checks.motion_evidence import MotionEvidence, TimeSteps
 from neeco.capture.documents import printable
 from neeco.capture.model import Instrument, InstrumentState
 from neeco.capture.readers.parsed import Parsed
@@ -264,7 +264,7 @@ class _Shifts:
 
     def __init__(self, judged: _Judged) -> None:
         self.judged, self.poses, self.rows = judged, judged.poses, judged.rows
-        self.timeline = Timeline(np.array([frame.state.time for frame in judged.parsed.frames]))
+        self.timeline = TimeSteps(np.array([frame.state.time for frame in judged.parsed.frames]))
         self.longest = int(self.timeline.longest * MAX_SHIFT)
 
     def likeliest(self, few: MotionEvidence) -> list[_Hypothesis]:

@@ -35,7 +35,7 @@ COMPARED_RAYS = 0.4  # share of the rays: those which some poses explain best
 MIN_EVIDENCE = 0.1  # of a ray that some poses explain
 
 
-class Timeline:
+class TimeSteps:
     """Frames in steps of time: frames of one time (several cameras) are one step; where time goes back, another
     recording begins."""
 

@@ -35,8 +35,6 @@ def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
         value = read_json(file)
     except NeecoError as error:
         report.error(name, "", str(error).removeprefix(f"{file}: "))
-    except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels
-        report.error(name, "", "not usable JSON: a number or the nesting is too large")
     node = Node(value, name, "", report)
     return node if node.is_object() else Node({}, name, "", report)
 
