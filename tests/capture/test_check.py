@@ -116,7 +116,7 @@ EDITS = [
     (_from_video({"shaft_diameter_mm": 5}), "instruments[0].from_video.working_length_mm", "expected a number"),
     (_head("cx", 900), "cx", "outside the image"),
     (_head("fl_x", 0), "fl_x", "positive"),
-    (_head("camera_model", "OPENCV_FISHEYE"), "camera_model", "only PINHOLE"),
+    (_head("camera_model", "OPENCV_FISHEYE"), "camera_model", "must be PINHOLE"),
     (_head("units", "m"), "units", "must be mm"),
     (_head("instrument_frame", "moon"), "instrument_frame", "'moon'"),
     (_head("ply_file_path", "../sparse.ply"), "ply_file_path", "leaves the capture's folder"),
