@@ -78,13 +78,13 @@ class Camera:
             )
         if not shown or (self.border is not None and self.border[2] <= 0):
             raise NeecoError("Camera: distortion, border: must be finite, the radius positive; correct them")
+        object.__setattr__(self, "width", int(self.width))
+        object.__setattr__(self, "height", int(self.height))
 
     def __repr__(self) -> str:
         lens = ", distorted" if self.distortion else ""
         size = f"{self.width}x{self.height} px, fx={number_text(self.fx)}, fy={number_text(self.fy)}"
         return f"Camera({size}, at {position_text(self.world_from_camera)}{lens})"
-        object.__setattr__(self, "width", int(self.width))
-        object.__setattr__(self, "height", int(self.height))
 
     def to(self, device: torch.device | str) -> Camera:
         """The same camera, its pose and that of its lamps on `device`."""
