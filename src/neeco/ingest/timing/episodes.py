@@ -116,6 +116,10 @@ class Episodes:
         episode = int(self.episode_of(np.array([frame]))[0])
         return f"{of}{self.notes.names[episode]}_{frame - self.parts[episode].first:06d}"
 
+    def with_base(self, name: str, world_from_base: np.ndarray) -> Episodes:
+        """Return the episodes with the base [4, 4] mm of an instrument's log."""
+        return replace(self, world_from_base={**self.world_from_base, name: world_from_base})
+
     # clocks
 
     def with_clocks(self, episode: int, clocks: Mapping[str, ClockOffset]) -> Episodes:
