@@ -220,7 +220,13 @@ def train_both(
         with tempfile.TemporaryDirectory() as folder:
             config = training_config("kinematic", {}, settings)
             job = TrainingJob(
-                "kinematic", 0, capture, Path(folder) / "run", config, Budget(None, iterations), device=where
+                name="kinematic",
+                seed=0,
+                capture=capture,
+                folder=Path(folder) / "run",
+                config=config,
+                budget=Budget(None, iterations),
+                device=where,
             )
             done = job.run()
         scores = {name: {k: values[k] for k in ("psnr", "mask_iou")} for name, values in done["splits"].items()}

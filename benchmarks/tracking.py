@@ -280,7 +280,7 @@ def single(given: argparse.Namespace) -> None:
             began = time.process_time()
             step = follower.find(k)
             seconds += time.process_time() - began
-            state = next(iter(step.moving.state.instruments.values()))
+            state = next(iter(step.motion.state.instruments.values()))
             rows.append(compared(frame, state, step.trust.value, truth, (given.capture, given.capture)))
     print_tables(rows, truth)
     print(f"{seconds / len(rows):.2f} s of processor time a frame")

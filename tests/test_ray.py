@@ -1,4 +1,4 @@
-"""A Ray that neeco starts itself is this machine's own; on a cluster, nodes are asked before there is work for them."""
+"""On a cluster, nodes are asked before there is work for them; neeco starts no Ray of its own."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from neeco.cluster import _probe, cpu_share, joined, require_shared
 from neeco.errors import NeecoError
+from neeco.workers import cpu_share, joined, node_problem, require_shared
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 @pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_every_node_is_asked_whether_it_sees_the_folders(cluster: Any, tmp_path: Path) -> None:
-    with joined(1) as ray:
+    with joined() as ray:
         assert cpu_share(ray.nodes(), 2) == 1
         require_shared(ray, tmp_path / "new" / "out" / "probe", [tmp_path])
         with pytest.raises(NeecoError, match=r"RAY_ADDRESS: node \S+ \(\S+\) does not see \S+/away; mount it there"):
@@ -46,9 +46,9 @@ def test_a_node_that_has_another_folder_in_the_same_place_is_told_apart(tmp_path
     for content in (None, "another's"):
         if content is not None:
             file.write_text(content)
-        assert f"does not see {tmp_path} as this machine has it" in str(_probe(file, "ours", ()))
+        assert f"does not see {tmp_path} as this machine has it" in str(node_problem(file, "ours", ()))
     file.write_text("ours")
-    assert _probe(file, "ours", (tmp_path,)) is None
+    assert node_problem(file, "ours", (tmp_path,)) is None
 
 
 @pytest.mark.parametrize(
@@ -59,12 +59,3 @@ def test_workers_share_the_cpus_of_the_nodes(cpus: tuple[int, ...], workers: int
     nodes = [{"Alive": True, "Resources": {"CPU": float(count)}} for count in cpus]
     gone = {"Alive": False, "Resources": {"CPU": 64.0}}
     assert cpu_share([*nodes, gone, {"Alive": True, "Resources": {}}], workers) == share
-
-
-def test_what_is_started_here_listens_on_loopback_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("ray")
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    with joined(1) as ray:
-        [node] = ray.nodes()
-        assert node["NodeManagerAddress"] == "127.0.0.1"
-        assert ray.get_runtime_context().gcs_address.startswith("127.0.0.1:")

@@ -25,7 +25,7 @@ ROOMS = (  # from the top down; rooms of one line do not know each other
     ("capture",),
     ("raster",),
     ("geometry",),
-    ("cluster", "files", "registry", "settings"),
+    ("files", "registry", "settings", "workers"),
     ("errors", "plausible"),
 )
 LEVELS = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}

@@ -361,11 +361,13 @@ def _unfolded(value: Any, known: dict[int, int]) -> int:
     return known[id(value)]
 
 
-def read_begun(output: Path, name: str, resume: bool, work: str) -> dict[str, Any] | None:
-    """What file `name` in folder `output` says of the `work` (a noun) begun there; None where the folder is vacant.
+def read_begun(
+    output: Path, name: str, resume: bool, work: str, read: Callable[[Path], Any] | None = None
+) -> dict[str, Any] | None:
+    """Return what file `name` in folder `output` says of the `work` (a noun) begun there; None for a vacant folder.
 
-    Raises NeecoError where `output` may not be written to: it is a file, is not empty (without `resume`), or holds
-    something else.
+    read: reads it from the folder; None: the file is JSON. Raises NeecoError where `output` may not be written to: it
+    is a file, is not empty (without `resume`), or holds something else.
     """
     file = output / name
     if output.exists() and not output.is_dir():
@@ -376,18 +378,19 @@ def read_begun(output: Path, name: str, resume: bool, work: str) -> dict[str, An
         raise NeecoError(f"{output}: not empty; give another folder, or --resume to continue {work} begun there")
     if not file.exists():
         raise NeecoError(f"{output}: not empty and no {name} in it; --resume continues only {work} begun by neeco")
-    begun = read_json(require_inside(file, output))
+    require_inside(file, output)
+    begun = read_json(file) if read is None else read(output)
     if not isinstance(begun, dict):
         raise NeecoError(f"{file}: not as neeco writes it; use a new folder")
     return begun
 
 
-def require_same(place: str, pairs: Iterable[tuple[str, Any, Any]]) -> None:
-    """Raise NeecoError for the first field (name, value begun with, value now) of work to be continued, which `place`
-    describes, that is not as it was."""
+def require_same(place: str, pairs: Iterable[tuple[str, Any, Any]], remedy: str = "use a new folder") -> None:
+    """Raise NeecoError for the first field (name, value begun with, value now) that differs, of work to be continued
+    that `place` describes."""
     for name, begun, now in pairs:
         if begun != now:
-            raise NeecoError(f"{place}: {name}: begun with {begun!r}, now {now!r}; use a new folder")
+            raise NeecoError(f"{place}: {name}: begun with {begun!r}, now {now!r}; {remedy}")
 
 
 def require_like(value: Any, like: Any, place: str, remedy: str) -> Any:

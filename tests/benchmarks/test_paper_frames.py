@@ -42,7 +42,14 @@ def compared(benchmarks: ModuleType, world: ModuleType, tmp_path_factory: pytest
     splits = ("train",) * 4 + ("test", "unseen", "train", "test")
     write_capture(world.make_capture(folder / "capture", world.TinyScene(), splits), folder / "capture")
     methods = ("3dgs", "neeco")
-    spec = ComparisonSpec(folder / "capture", folder / "c5", methods, Budget(None, 8), assignments=SMALL, device="cpu")
+    spec = ComparisonSpec(
+        capture=folder / "capture",
+        output=folder / "c5",
+        methods=methods,
+        budget=Budget(None, 8),
+        assignments=SMALL,
+        device="cpu",
+    )
     with pytest.MonkeyPatch.context() as patched:
         patched.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
         compare(plan_comparison(spec))

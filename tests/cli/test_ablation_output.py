@@ -16,11 +16,30 @@ MEASURES = ["psnr.test", "psnr.unseen", "mask_iou.test", "mask_iou.unseen"]
 def _row(label: str, reference: bool, psnr: float | None, agrees: dict[str, str | None] | None = None) -> AblationRow:
     values = {} if psnr is None else dict(zip(MEASURES, (psnr, psnr - 2, 0.7, 0.5), strict=True))
     difference = {} if reference else dict.fromkeys(values, 0.25)
-    return AblationRow("c", label, reference, "run", values, {}, "", difference, agrees or {})
+    return AblationRow(
+        comparison="c",
+        label=label,
+        reference=reference,
+        run="run",
+        values=values,
+        paper={},
+        paper_direction="",
+        difference=difference,
+        agrees=agrees or {},
+    )
 
 
 def _table(title: str, judged: list[str], rows: list[AblationRow]) -> AblationTable:
-    return AblationTable("name", "group", title, "", judged, [] if judged else MEASURES, rows, [])
+    return AblationTable(
+        name="name",
+        group="group",
+        title=title,
+        question="",
+        judged=judged,
+        measures=[] if judged else MEASURES,
+        rows=rows,
+        curves=[],
+    )
 
 
 @pytest.mark.parametrize("width", [50, 160])
@@ -30,7 +49,20 @@ def test_own_tables_are_printed_whole_and_the_papers_as_their_verdict(width: int
         _table("The paper's", ["psnr.test"], [_row("x", False, 1.0, {"psnr.test": "yes"})]),
         _table("Joints, taken away one after another from a hand", [], rows),
     ]
-    ablation = AblationResult("", "", "", 0, {}, {}, [], [], tables, [], [], ["[few] steps"])
+    ablation = AblationResult(
+        schema="",
+        version="",
+        capture="",
+        seed=0,
+        iterations={},
+        machine={},
+        settings=[],
+        splits=[],
+        tables=tables,
+        runs=[],
+        failures=[],
+        notes=["[few] steps"],
+    )
     console = Console(width=width, record=True, file=io.StringIO())
     _print_tables(console, ablation)
     shown = console.export_text()

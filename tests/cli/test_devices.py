@@ -99,7 +99,13 @@ def test_a_job_opens_its_device_where_it_runs(made, tmp_path: Path, monkeypatch:
     asked = noted_words(monkeypatch)
     config = training_config("3dgs", {})
     job = training_job.TrainingJob(
-        "3dgs", 0, Path(made["train"]), tmp_path / "job", config, training_job.Budget(None, 3), device="cpu"
+        name="3dgs",
+        seed=0,
+        capture=Path(made["train"]),
+        folder=tmp_path / "job",
+        config=config,
+        budget=training_job.Budget(None, 3),
+        device="cpu",
     )
     job.run()
     assert asked == ["cpu"]

@@ -35,6 +35,8 @@ def make_job(capture: Path, tmp_path: Path):
         folder = changes.pop("folder", tmp_path / "runs" / f"{name}-seed{seed}")
         config = changes.pop("config", training_config("3dgs", {}))
         budget = changes.pop("budget", Budget(None, 12))
-        return TrainingJob(name, seed, capture, folder, config, budget, device="cpu", **changes)
+        return TrainingJob(
+            name=name, seed=seed, capture=capture, folder=folder, config=config, budget=budget, device="cpu", **changes
+        )
 
     return make

@@ -48,7 +48,13 @@ def no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
 def plan(capture: Path, tmp_path: Path) -> AblationPlan:
     settings = (*SMALL, "log_interval=2")
     return AblationPlan(
-        capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=settings, device="cpu"
+        capture=capture,
+        output=tmp_path / "out",
+        tables=("uniform-motion", "density-off"),
+        iterations=12,
+        kinematic_iterations=12,
+        settings=settings,
+        device="cpu",
     )
 
 
@@ -120,7 +126,15 @@ def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch
         asked.append(run.path.name)
         return {way: dict.fromkeys(splits, value) for way, value in (("composited", 0.9), ("threshold", 0.6))}
 
-    labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL, device="cpu")
+    labels = AblationPlan(
+        capture=plan.capture,
+        output=plan.output,
+        tables=("labels",),
+        iterations=12,
+        kinematic_iterations=12,
+        settings=SMALL,
+        device="cpu",
+    )
     monkeypatch.setattr(ablation_study, "run_jobs", lambda made, *_: [job.run() for job in made if _neeco(job)])
     monkeypatch.setattr(ablation_study, "distinct_variants", lambda chosen: [Variant("neeco")])
     monkeypatch.setattr(ablation_study, "score_label_ways", score)

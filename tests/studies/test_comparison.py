@@ -10,13 +10,13 @@ import re
 import shutil
 import signal
 import statistics
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
 
+from neeco import workers
 from neeco.capture import read_capture
 from neeco.cli import main
 from neeco.errors import NeecoError
@@ -39,7 +39,14 @@ TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb", "speed", "mach
 
 @pytest.fixture
 def spec(capture: Path, tmp_path: Path) -> ComparisonSpec:
-    return ComparisonSpec(capture, tmp_path / "out", ("3dgs", "3dgs+dta"), Budget(None, 10), seeds=2, device="cpu")
+    return ComparisonSpec(
+        capture=capture,
+        output=tmp_path / "out",
+        methods=("3dgs", "3dgs+dta"),
+        budget=Budget(None, 10),
+        seeds=2,
+        device="cpu",
+    )
 
 
 def compared(spec: ComparisonSpec, **reported):
@@ -281,8 +288,9 @@ def test_a_setting_that_cannot_be_shared_is_refused(spec: ComparisonSpec, given:
     assert not spec.output.exists()
 
 
-def test_workers_without_ray_are_refused_before_anything_is_written(spec: ComparisonSpec, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
+def test_a_cluster_without_ray_is_refused_before_anything_is_written(spec: ComparisonSpec, monkeypatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
+    monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(NeecoError, match=r"neeco\[cluster\]"):
         compared(replace(spec, workers=2))
     assert not spec.output.exists()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
 import os
 import re
 import signal
@@ -11,16 +12,18 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from worker_tasks import seen_gpu
 
-from neeco import cluster
+from neeco import workers
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.raster.native import set_threads
 from neeco.settings import with_fields
 from neeco.studies import study
 from neeco.studies import training_job as module
@@ -297,8 +300,9 @@ def test_budgets_that_cannot_be_spent_are_refused(budget: Budget, reported: str,
         run_jobs([make_job(budget=budget)])
 
 
-def test_several_workers_without_ray_are_refused_with_the_remedy(make_job, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
+def test_a_cluster_without_ray_is_refused_with_the_remedy(make_job, monkeypatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
+    monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(NeecoError, match=r"install neeco\[cluster\]"):
         run_jobs([make_job()], workers=2)
 
@@ -306,7 +310,7 @@ def test_several_workers_without_ray_are_refused_with_the_remedy(make_job, monke
 def test_a_cluster_that_does_not_answer_is_reported_at_once(make_job, monkeypatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         closed = server.getsockname()[1]
-    monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: object())
     monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{closed}")
     with pytest.raises(NeecoError, match=f"RAY_ADDRESS: no Ray cluster answers at 127.0.0.1:{closed}"):
         run_jobs([make_job()], workers=2)
@@ -321,7 +325,6 @@ def test_a_cluster_that_does_not_answer_is_reported_at_once(make_job, monkeypatc
     ],
 )
 def test_workers_have_a_gpu_each(workers: int, device: str, reported: str, monkeypatch) -> None:
-    monkeypatch.setattr(study, "require_ray", lambda: None)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     check_workers(workers, torch.device("cpu"))
@@ -334,10 +337,7 @@ def test_workers_have_a_gpu_each(workers: int, device: str, reported: str, monke
 
 
 class FakeRay:
-    """Two GPUs, and the one that a job was given."""
-
-    def cluster_resources(self) -> dict[str, float]:
-        return {"CPU": 4.0, "GPU": 2.0}
+    """The GPU that a task was given."""
 
     def get_runtime_context(self) -> FakeRay:
         return self
@@ -346,28 +346,33 @@ class FakeRay:
         return {"GPU": ["1"]}
 
 
-def test_a_job_in_a_worker_sees_the_gpu_it_was_given(make_job, monkeypatch) -> None:
+def test_a_task_on_a_node_sees_the_gpu_it_was_given(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", FakeRay())
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
-    monkeypatch.setattr(study, "attempt_job", lambda job: {"seen": os.environ["CUDA_VISIBLE_DEVICES"]})
-    threads = torch.get_num_threads()
-    try:
-        assert study._run_in_worker(make_job(), 1, os.getcwd()) == {"seen": "1"}
-    finally:
-        set_threads(0)
-        torch.set_num_threads(threads)
+    assert workers.work_on_node(seen_gpu, None, None, 1, os.getcwd()) == "1"
+
+
+@pytest.mark.parametrize("visible", ["", "4,5"])
+def test_tasks_here_see_a_gpu_each(visible: str, monkeypatch) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    how = workers.Workers(count=2, threads=1, fresh=True, gpu=True)
+    events = workers.run_tasks(seen_gpu, None, range(4), how)
+    found = [event.value for event in events if event.stage == "done"]
+    assert len(found) == 4
+    assert set(found) == set((visible or "0,1").split(","))
 
 
 def test_gpus_are_asked_for_where_jobs_compute_on_them(make_job, monkeypatch) -> None:
     here, there = ([replace(make_job(), device=word)] for word in ("cpu", "auto"))
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cpu"))
-    assert [study._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 0]
+    assert [study.wants_gpus(jobs) for jobs in (here, there)] == [False, False]
     monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cuda"))
-    assert [study._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 2]
+    assert [study.wants_gpus(jobs) for jobs in (here, there)] == [False, True]
     monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cpu"))
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")  # whose machines may have what this one has not
-    assert [study._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 2]
+    assert [study.wants_gpus(jobs) for jobs in (here, there)] == [False, True]
 
 
 def test_workers_share_the_cores() -> None:
@@ -390,9 +395,7 @@ def test_peak_memory_is_of_the_work_since_the_reset() -> None:
     assert after < during - 50
 
 
-@pytest.mark.slow
-def test_ray_gives_the_same_numbers(make_job, tmp_path) -> None:
-    pytest.importorskip("ray")
+def test_workers_give_the_same_numbers(make_job, tmp_path) -> None:
     here = [make_job(seed=seed, folder=tmp_path / "here" / str(seed)) for seed in (0, 1)]
     there = [make_job(seed=seed, folder=tmp_path / "there" / str(seed)) for seed in (0, 1)]
     assert without_times(run_jobs(there, workers=2)) == without_times(run_jobs(here))
@@ -401,43 +404,76 @@ def test_ray_gives_the_same_numbers(make_job, tmp_path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(240)
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers in /proc")
-def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(make_job, tmp_path, monkeypatch) -> None:
-    pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+@pytest.mark.parametrize("where", ["this machine", "a cluster"])
+def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(where, make_job, tmp_path, monkeypatch) -> None:
     config, budget = replace(training_config("3dgs", {}), checkpoint_interval=20), Budget(None, 300)
     here, there = (
-        make_job(config=config, budget=budget, folder=tmp_path / where / "run") for where in ("here", "there")
+        make_job(config=config, budget=budget, folder=tmp_path / place / "run") for place in ("here", "there")
     )
     expected = without_times(run_jobs([here]))
     events, killed = [], []
-    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
-    try:
-        for _ in range(2):
-            nodes.add_node(num_cpus=1)
-        monkeypatch.setenv("RAY_ADDRESS", nodes.address)
-        watcher = threading.Thread(
-            target=kill_when, args=(checkpoint_path(there.folder), "ray::_run_in_worker", killed)
-        )
+    with contextlib.ExitStack() as stack:
+        count, names = 2, lambda: [process.pid for process in multiprocessing.active_children()]
+        if where == "a cluster":
+            nodes = ray_nodes(2, monkeypatch)
+            stack.callback(nodes.shutdown)
+            count, names = 1, ray_workers
+        watcher = threading.Thread(target=kill_when, args=(checkpoint_path(there.folder), names, killed))
         watcher.start()
-        assert without_times(run_jobs([there], progress=events.append)) == expected  # one worker, and on the cluster
+        assert without_times(run_jobs([there], count, progress=events.append)) == expected
         watcher.join()
-    finally:
-        nodes.shutdown()
     assert killed
     assert any("its worker died" in event.text and event.stage == "training" for event in events)
 
 
-def kill_when(file: Path, name: str, killed: list[int]) -> None:
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="a worker's checkpoint is waited for")
+def test_interrupted_workers_leave_their_checkpoints(make_job, tmp_path, monkeypatch) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    config, budget = replace(training_config("3dgs", {}), checkpoint_interval=10**6), Budget(None, 5000)
+    jobs = [make_job(seed=seed, config=config, budget=budget, folder=tmp_path / str(seed)) for seed in (0, 1)]
+
+    def interrupt() -> None:
+        while not all((job.folder / "metrics.jsonl").exists() for job in jobs):
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt, match=r"while running 3dgs, seed 0; 3dgs, seed 1; run the same"):
+        run_jobs(jobs, workers=2)
+    assert all(checkpoint_path(job.folder).exists() for job in jobs)
+    assert not multiprocessing.active_children()
+
+
+def ray_nodes(count: int, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A head and so many nodes of one CPU; RAY_ADDRESS names them."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    for _ in range(count):
+        nodes.add_node(num_cpus=1)
+    monkeypatch.setenv("RAY_ADDRESS", nodes.address)
+    return nodes
+
+
+def ray_workers() -> list[int]:
+    """Processes of the cluster that do a task now."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            if path.read_bytes().startswith(b"ray::work_on_node"):
+                found.append(int(path.parent.name))
+    return found
+
+
+def kill_when(file: Path, processes: Callable[[], list[int]], killed: list[int]) -> None:
     """Kill a process once a file is there."""
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline and not killed:
-        for path in Path("/proc").glob("[0-9]*/cmdline") if file.exists() else ():
-            with contextlib.suppress(OSError):
-                if path.read_bytes().startswith(name.encode()):
-                    os.kill(int(path.parent.name), signal.SIGKILL)
-                    killed.append(int(path.parent.name))
+        for number in processes() if file.exists() else ():
+            os.kill(number, signal.SIGKILL)
+            killed.append(number)
         time.sleep(0.05)
 
 

@@ -55,7 +55,7 @@ def drawing_processes() -> list[int]:
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
-            if path.read_bytes().startswith(b"ray::_draw_remotely"):
+            if path.read_bytes().startswith(b"ray::work_on_node"):
                 found.append(int(path.parent.name))
     return found
 
@@ -106,7 +106,7 @@ def test_a_cluster_of_which_a_worker_is_killed_makes_the_same_bytes(tmp_path: Pa
     assert contents(tmp_path / "there") == contents(tmp_path / "here")
 
 
-def test_a_cluster_that_does_not_answer_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_that_does_not_answer_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ray")
     run = run_of(ball_scene("ball", [(-8, 0, 55), (4, 2, 60)]), tmp_path / "run")
     monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{free_port()}")

@@ -12,9 +12,9 @@ from ball_world import ball_scene, run_of
 
 from neeco.errors import NeecoError
 from neeco.raster.native import torch_threads
-from neeco.synthesis import workers
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
+from neeco.workers import Processes
 
 SETTINGS = Settings(count=10, seed=1, tissue_tolerance_mm=2.0)
 
@@ -38,18 +38,18 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_a_killed_worker_costs_only_its_images(ball_run, alone: Path, tmp_path: Path, monkeypatch) -> None:
     started = []
-    real = workers._Pool.start_worker
+    real = Processes.start_worker
 
-    def start(pool) -> None:
-        real(pool)
-        started.append(pool.workers[-1])
+    def start(pool):
+        started.append(real(pool))
+        return started[-1]
 
     def kill_the_first(done: int) -> None:
         if done == 2:
             os.kill(started[0].process.pid, signal.SIGKILL)
             (tmp_path / "set/images/.unfinished-killed.png").write_bytes(b"half")  # as a killed worker may leave it
 
-    monkeypatch.setattr(workers._Pool, "start_worker", start)
+    monkeypatch.setattr(Processes, "start_worker", start)
     with torch_threads(1):
         made = synthesize(ball_run, tmp_path / "set", SETTINGS, on_progress=kill_the_first, workers=2)
     assert len(started) == 3
@@ -59,17 +59,18 @@ def test_a_killed_worker_costs_only_its_images(ball_run, alone: Path, tmp_path: 
 
 def test_interrupted_it_stops_its_workers_and_goes_on(ball_run, alone: Path, tmp_path: Path, monkeypatch) -> None:
     started = []
-    real = workers._Pool.start_worker
+    real = Processes.start_worker
 
-    def start(pool) -> None:
-        real(pool)
-        started.append(pool.workers[-1].process)
+    def start(pool):
+        worker = real(pool)
+        started.append(worker.process)
+        return worker
 
     def interrupt(done: int) -> None:
         if done == 3:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(workers._Pool, "start_worker", start)
+    monkeypatch.setattr(Processes, "start_worker", start)
     with torch_threads(1), pytest.raises(KeyboardInterrupt):
         synthesize(ball_run, tmp_path / "set", SETTINGS, on_progress=interrupt, workers=2)
     assert not any(process.is_alive() for process in started)
@@ -79,7 +80,7 @@ def test_interrupted_it_stops_its_workers_and_goes_on(ball_run, alone: Path, tmp
     assert contents(tmp_path / "set") == contents(alone)
 
 
-def test_what_a_worker_meets_is_told_in_a_line(ball_run, tmp_path: Path) -> None:
+def test_the_error_of_a_worker_is_reported_in_a_line(ball_run, tmp_path: Path) -> None:
     settings = replace(SETTINGS, min_share=0.9, max_attempts=2)
     with torch_threads(1), pytest.raises(NeecoError, match=r"image \d: no acceptable state in 2 attempts") as error:
         synthesize(ball_run, tmp_path / "set", settings, workers=2)
@@ -88,14 +89,15 @@ def test_what_a_worker_meets_is_told_in_a_line(ball_run, tmp_path: Path) -> None
 
 
 def test_workers_that_keep_dying_end_it(ball_run, tmp_path: Path, monkeypatch) -> None:
-    real = workers._Pool.start_worker
+    real = Processes.start_worker
 
-    def start(pool) -> None:
-        real(pool)
-        os.kill(pool.workers[-1].process.pid, signal.SIGKILL)
+    def start(pool):
+        worker = real(pool)
+        os.kill(worker.process.pid, signal.SIGKILL)
+        return worker
 
-    monkeypatch.setattr(workers._Pool, "start_worker", start)
-    with pytest.raises(NeecoError, match=r"--workers: 3 processes died over image 0 \(exit status -9\)"):
+    monkeypatch.setattr(Processes, "start_worker", start)
+    with pytest.raises(NeecoError, match=r"--workers: workers keep dying over image 0 \(exit status -9\)"):
         synthesize(ball_run, tmp_path / "set", replace(SETTINGS, count=2), workers=2)
 
 

@@ -21,11 +21,11 @@ from neeco.fitting.parameters import DEG
 from neeco.geometry.camera import Camera
 from neeco.ingest.footage_video import read_footage
 from neeco.scene import GaussianScene
-from neeco.tracking import footage_again, footage_scene, footage_tissue
+from neeco.tracking import footage_scene, footage_tissue
 from neeco.tracking.follow import Step
 from neeco.tracking.footage_scene import Colors, over_tissue
-from neeco.tracking.footage_tissue import passing
-from neeco.tracking.motion import Motion
+from neeco.tracking.footage_tissue import foreground
+from neeco.tracking.motion import MotionModel
 from neeco.tracking.parameters import TrackedParameters
 from neeco.tracking.track import state_of, track_footage
 from neeco.tracking.trust import TrackTrust
@@ -71,9 +71,9 @@ def other_footage(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 @pytest.fixture
 def short_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(footage_tissue, "ROUNDS", (100, 250))
-    monkeypatch.setattr(footage_scene, "FRAMES", 2)
-    monkeypatch.setattr(footage_again, "ITERATIONS", 60)
+    monkeypatch.setattr(footage_tissue, "ROUND_ITERATIONS", (100, 250))
+    monkeypatch.setattr(footage_scene, "N_FRAMES", 2)
+    monkeypatch.setattr(footage_tissue, "AGAIN_ITERATIONS", 60)
 
 
 def in_camera(state: State, camera: Camera) -> Tensor:
@@ -95,8 +95,8 @@ def test_no_colours_to_compare_change_nothing() -> None:
 
 def test_recoloured_instruments_look_so_and_tissue_stays() -> None:
     scene, colors = make_scene(), Colors((0.8, 0.9, 1.1), 1.2)
-    before = InstrumentRenderer(scene).draw(grasper_state(), CAMERA)
-    after = InstrumentRenderer(colors.of(scene)).draw(grasper_state(), CAMERA)
+    before = InstrumentRenderer(scene).render(grasper_state(), CAMERA)
+    after = InstrumentRenderer(colors.of(scene)).render(grasper_state(), CAMERA)
     solid = before[1] > 0.99
     expected = torch.tensor(colors.gain) * (before[0] / before[1][..., None])[solid] ** colors.gamma
     seen = (after[0] / after[1][..., None])[solid]
@@ -110,7 +110,7 @@ def test_instruments_stand_before_the_tissue_of_another_scene() -> None:
     own, other = make_scene(), other_wall()
     joined = over_tissue(own, other)
     state = grasper_state()
-    (color, alpha), (expected, opacity) = (InstrumentRenderer(scene).draw(state, CAMERA) for scene in (joined, own))
+    (color, alpha), (expected, opacity) = (InstrumentRenderer(scene).render(state, CAMERA) for scene in (joined, own))
     assert torch.equal(color, expected)
     assert torch.equal(alpha, opacity)
     rows = ~joined.canonical.of_instruments
@@ -120,8 +120,8 @@ def test_instruments_stand_before_the_tissue_of_another_scene() -> None:
 def test_what_passes_before_the_tissue_is_masked_with_a_rim(tmp_path: Path) -> None:
     scene = make_scene()
     frame = record(scene, tmp_path, [grasper_state()], "train").frames[0]
-    mask = passing(frame, TissueRenderer(scene))
-    label = InstrumentRenderer(scene).draw(grasper_state(), CAMERA)[1].numpy() > 0.5
+    mask = foreground(frame, TissueRenderer(scene))
+    label = InstrumentRenderer(scene).render(grasper_state(), CAMERA)[1].numpy() > 0.5
     assert mask[label].mean() > 0.95
     assert mask.mean() < 0.5
 
@@ -172,28 +172,38 @@ def test_another_tissue_broken_off_goes_on_to_the_same_bytes(
 
 
 def test_tissue_alone_is_learned_again(other_footage: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(footage_again, "ITERATIONS", 60)
+    monkeypatch.setattr(footage_tissue, "AGAIN_ITERATIONS", 60)
     scene, trust = make_scene(), TrackTrust(0.9, 1.0, 1.0, 1.0)
     parameters = TrackedParameters.of(scene)
-    motion = Motion.of(parameters, scene.recorded.states)
+    motion = MotionModel.of(parameters, scene.recorded.states)
     frames = [replace(f, camera=CAMERA) for f in other_footage.frames]
     steps = [
-        Step(k, "followed", motion.begin(moving(1.2 * k)), 0.2, 1.0, trust, (), 0.0, 0.0) for k in range(len(frames))
+        Step(
+            frame=k,
+            how="followed",
+            motion=motion.begin(moving(1.2 * k)),
+            misfit=0.2,
+            gain=1.0,
+            trust=trust,
+            found_at=0.0,
+            searched_at=0.0,
+        )
+        for k in range(len(frames))
     ]
     before = {name: tensor.clone() for name, tensor in scene.canonical.tensors().items()}
-    footage_again.learned_again(scene, frames, steps, lambda what, done, total: None)
+    footage_tissue.learn_again(scene, frames, steps, lambda what, done, total: None)
     rows, after = scene.canonical.of_instruments, scene.canonical.tensors()
     assert all(torch.equal(after[name][rows], tensor[rows]) for name, tensor in before.items())
     assert not torch.equal(after["sh_dc"][~rows], before["sh_dc"][~rows])
     lost = [replace(step, how="lost") for step in steps]
-    assert footage_again.usable(lost) == []
+    assert footage_tissue.usable(lost) == []
 
 
 @pytest.mark.parametrize("what", ["no instrument", "black"])
 def test_footage_without_the_instrument_is_trusted_nowhere(
     tracked_run: RecordedRun, other_footage: Capture, tmp_path: Path, short_rounds: None, what: str
 ) -> None:
-    wall = TissueRenderer(other_wall()).draw(CAMERA, None)
+    wall = TissueRenderer(other_wall()).render(CAMERA, None)
     frames = []
     for frame in other_footage.frames[:2]:
         path = tmp_path / f"{frame.name}.png"
@@ -203,11 +213,11 @@ def test_footage_without_the_instrument_is_trusted_nowhere(
     tracked = track_footage(tracked_run, footage, tmp_path / "out", tissue="footage")
     assert tracked.written == 0
     assert max(rec["trust"]["value"] for rec in tracked.records) < 0.5
-    with pytest.raises(NeecoError, match=r"no frame is trusted"):
+    with pytest.raises(NeecoError, match=r"no frame has a trust of"):
         tracked.require_trusted()
 
 
-def test_one_frame_does_not_tell_tissue_from_what_passes(
+def test_one_frame_does_not_tell_tissue_from_foreground(
     tracked_run: RecordedRun, other_footage: Capture, tmp_path: Path
 ) -> None:
     footage = replace(other_footage, frames=other_footage.frames[:1])

@@ -24,10 +24,10 @@ from neeco.fitting.fitter import loose_prior
 from neeco.fitting.layers import FrameView, InstrumentRenderer, TissueRenderer, color_matched, view_of
 from neeco.fitting.parameters import DEG
 from neeco.report.track_page import write_track_page
-from neeco.tracking.follow import LOOK_EVERY, Follower, Step
-from neeco.tracking.motion import Motion
+from neeco.tracking.follow import SEARCH_ROLLS_EVERY, Follower, Step
+from neeco.tracking.motion import MotionModel
 from neeco.tracking.parameters import TrackedParameters, fitter_of
-from neeco.tracking.track import Tracked, _Work, _write, state_of, track_footage
+from neeco.tracking.track import StepFiles, Tracked, state_of, track_footage, write_tracked
 from neeco.tracking.trust import Reference, TrackTrust
 
 
@@ -60,8 +60,8 @@ def test_an_increment_leads_from_one_state_to_another(tracked_run: RecordedRun) 
 def test_a_stretch_of_little_trust_is_gone_through_backwards_looking_for_other_rolls_in_every_frame(
     tmp_path: Path, tracked_run: RecordedRun
 ) -> None:
-    motion = Motion.of(TrackedParameters.of(tracked_run.scene), tracked_run.scene.recorded.states)
-    moving = motion.begin(grasper_state())
+    motion = MotionModel.of(TrackedParameters.of(tracked_run.scene), tracked_run.scene.recorded.states)
+    estimate = motion.begin(grasper_state())
     asked = []
 
     class Follower:
@@ -75,15 +75,26 @@ def test_a_stretch_of_little_trust_is_gone_through_backwards_looking_for_other_r
 
         def follow(self, before: Step, frame: int) -> Step:
             back = frame < before.frame
-            asked.extend([before.unlooked] if back else [])
+            asked.extend([before.unsearched] if back else [])
             return step(frame, 0.9 if back else (0.5 if 1 < frame < 5 else 1.0))
 
     def step(frame: int, single: float) -> Step:
         trust = TrackTrust(1.0, 1.0, 1.0, single)
-        return Step(frame, "followed", moving, 0.01, 1.0, trust, (0.01,), 0.0, 0.0, unlooked=1)
+        return Step(
+            frame=frame,
+            how="followed",
+            motion=estimate,
+            misfit=0.01,
+            gain=1.0,
+            trust=trust,
+            recent=(0.01,),
+            found_at=0.0,
+            searched_at=0.0,
+            unsearched=1,
+        )
 
-    steps = _Work(tmp_path, Follower(), lambda done, total: None).all_steps(grasper_state())
-    assert asked == [LOOK_EVERY] * 3
+    steps = StepFiles(tmp_path, Follower(), lambda done, total: None).all_steps(grasper_state())
+    assert asked == [SEARCH_ROLLS_EVERY] * 3
     assert [one.trust.value for one in steps] == [1.0, 1.0, 0.9, 0.9, 0.9, 1.0]
 
 
@@ -200,8 +211,12 @@ def test_what_is_known_of_the_footage_and_every_joint_that_was_found_are_written
     )
     trained_on = tracked_run.capture()
     for still, registered in ((True, False), (False, True)):
-        output, given = tmp_path / str(still), replace(footage, still=still)
-        _write(output, given, scene, trained_on, footage.frames, tracked.records, 0.5, registered)
+        frames = [replace(f, state=state_of(rec)) for f, rec in zip(footage.frames, tracked.records, strict=True)]
+        output, given = (
+            tmp_path / str(still),
+            replace(footage, frames=tuple(frames), still=still, registered=registered),
+        )
+        write_tracked(given, output, scene, trained_on)
         made = read_capture(output)
         assert (made.still, made.registered) == (still, registered)
         for frame, rec in zip(made.frames, tracked.records, strict=True):
@@ -242,7 +257,7 @@ def test_footage_without_the_instrument_is_trusted_nowhere(
     assert tracked.written == 0
     assert max(rec["trust"]["value"] for rec in tracked.records) < 0.2
     assert not (tmp_path / "out" / "transforms.json").exists()
-    with pytest.raises(NeecoError, match=r"no frame is trusted by 0\.5"):
+    with pytest.raises(NeecoError, match=r"no frame has a trust of 0\.5"):
         tracked.require_trusted()
 
 
@@ -316,7 +331,7 @@ def test_an_opening_that_the_image_does_not_show_is_not_trusted(
 
 def test_the_longer_it_is_unseen_the_less_is_known(tracked_run: RecordedRun) -> None:
     parameters = TrackedParameters.of(tracked_run.scene)
-    motion = Motion.of(parameters, tracked_run.scene.recorded.states)
+    motion = MotionModel.of(parameters, tracked_run.scene.recorded.states)
     begun = motion.begin(moving(0))
     soon, late = motion.predict(begun, 1 / 25), motion.predict(begun, 6 / 25)
     assert bool((late.covariance.diagonal()[:7] > soon.covariance.diagonal()[:7]).all())
@@ -324,7 +339,7 @@ def test_the_longer_it_is_unseen_the_less_is_known(tracked_run: RecordedRun) -> 
 
 
 def test_the_recorded_pace_is_what_is_expected(tracked_run: RecordedRun) -> None:
-    motion = Motion.of(TrackedParameters.of(tracked_run.scene), tracked_run.scene.recorded.states)
+    motion = MotionModel.of(TrackedParameters.of(tracked_run.scene), tracked_run.scene.recorded.states)
     assert motion.interval == pytest.approx(1 / 25)
     jaw = float(motion.velocities[6, 6].sqrt())  # opens by 0.04 rad a frame
     assert jaw == pytest.approx(0.04 * 25, rel=0.2)

@@ -34,7 +34,15 @@ def steep(canonical: CanonicalGaussians, *rows: int) -> GradientStatistics:
 def change(canonical, statistics, most=(100, 100), threshold=1.0, adam=None, unsupported=None):
     generator = torch.Generator().manual_seed(0)
     return control_density(
-        canonical, adam or Adam(), statistics, most, 1.0, threshold, generator, DensityConfig(), unsupported
+        canonical,
+        adam or Adam(),
+        statistics,
+        max_gaussians=most,
+        dense_size=1.0,
+        threshold=threshold,
+        generator=generator,
+        config=DensityConfig(),
+        unsupported=unsupported,
     )
 
 

@@ -88,14 +88,14 @@ def session_on_meta(method: str, batch_size: int) -> GaussianSession:
     refine = [f"refine.{part}=true" for part in ("registration", "latency", "frame_poses", "cameras")]
     config = training_config(method, {"iterations": 20_000, "batch_size": batch_size}, refine)
     session = GaussianSession(
-        scene,
-        config.length,
-        torch.Generator(),  # "meta" has none of its own
-        TrainingViews(frames, (image,) * len(frames), (mask,) * len(frames)),
-        print,
-        batch_size,
-        config,
-        50.0,
+        scene=scene,
+        length=config.length,
+        generator=torch.Generator(),  # "meta" has none of its own
+        views=TrainingViews(frames, (image,) * len(frames), (mask,) * len(frames)),
+        report=print,
+        batch_size=batch_size,
+        config=config,
+        extent=50.0,
     )
     session.start()
     session.iteration = 5_000

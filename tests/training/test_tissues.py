@@ -82,7 +82,9 @@ def test_a_run_over_two_tissues_is_scored_and_draws_data_sets_over_both(
     numbers = evaluate_run(load_run(run), read_checked(capture))["given"]["test"]
     assert numbers["frames"] == 6
     assert numbers["psnr"] > 15
-    synthesize(load_run(run), tmp_path / "set", Settings(4, min_share=1e-4, tissue_check=False, max_unobserved=1.0))
+    synthesize(
+        load_run(run), tmp_path / "set", Settings(count=4, min_share=1e-4, tissue_check=False, max_unobserved=1.0)
+    )
     lines = [json.loads(line) for line in (tmp_path / "set" / "states.jsonl").read_text().splitlines()]
     assert [line["tissue"] for line in lines] == ["red", "green", "red", "green"]
     assert json.loads((tmp_path / "set" / "dataset.json").read_text())["tissues"] == ["red", "green"]
@@ -109,7 +111,7 @@ def test_several_tissues_are_neither_tracked_nor_mixed(run: Path, capture: Path,
     with pytest.raises(NeecoError, match=r"track: the scene has several tissues \(red, green\)"):
         track_footage(trained, read_checked(capture), tmp_path / "tracked")
     with pytest.raises(NeecoError, match=r"--tissue: the scene has several tissues \(red, green\)"):
-        synthesize(trained, tmp_path / "mixed", Settings(2), instrument_runs=[trained])
+        synthesize(trained, tmp_path / "mixed", Settings(count=2), instrument_runs=[trained])
 
 
 def test_a_state_must_name_one_of_the_tissues(run: Path) -> None:

@@ -44,7 +44,7 @@ class Compare:
     masks: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """NAME=FOLDER: masks that something else made of the same frames, scored in the same table; repeatable."""
     workers: int = 1
-    """Runs at once, by Ray (install neeco[cluster]); each gets its share of the cores. RAY_ADDRESS names a cluster."""
+    """Runs at once; each gets its share of the cores. RAY_ADDRESS names a Ray cluster (install neeco[cluster])."""
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()

@@ -58,7 +58,7 @@ class Downstream:
     weights: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """MODEL=FILE.safetensors to begin from instead of from scratch; repeatable."""
     workers: int = 1
-    """Trainings at once, by Ray (install neeco[cluster]); RAY_ADDRESS names a cluster."""
+    """Trainings at once; RAY_ADDRESS names a Ray cluster (install neeco[cluster])."""
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     device: Device = "auto"

@@ -1,8 +1,8 @@
-"""How far a recorded image supports a label that was drawn for it.
+"""Trust in a rendered label: the overlap (IoU) with the instrument that the recorded image supports.
 
-It goes by the image alone; every pixel votes. Inside the label the tissue alone may explain a pixel better than the
-instrument does, or neither does (something else is in front): it votes against the label. Beside the label a pixel may
-look as no tissue did in training frames: the label misses it. Trust is the overlap (IoU) that is left.
+Every pixel votes. A pixel inside the label votes against it where the tissue alone explains the image better, or
+neither does (something else is in front). A pixel next to the label is missed where the image looks as no tissue did in
+training frames.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import numpy as np
 from scipy.ndimage import binary_opening, distance_transform_edt, uniform_filter
 from torch import Tensor
 
-BESIDE = 0.03  # of the image's diagonal: how far from the label a pixel is looked at that it may miss
-USUAL = 0.99  # share of the pixels of training frames that are explained as well
-HALF = 0.5  # of the error that the tissue alone would have: an instrument that explains more is there, if blurred
-SMOOTH = 3  # px, side of the square over which a pixel's error is averaged
+NEIGHBOURHOOD = 0.03  # of the image's diagonal: how far from the label pixels may be missed
+TYPICAL_QUANTILE = 0.99  # of the errors in training frames
+MAX_SHARE = 0.5  # of the tissue's error: an instrument with a smaller one is there, if blurred
+WINDOW_PX = 3  # side of the square over which a pixel's error is averaged
 
 
-class Labelled(Protocol):
-    """A drawing with its label, such as a `LayeredDrawing`."""
+class LabelledRendering(Protocol):
+    """A rendering with its label, such as a `LayeredDrawing`."""
 
     @property
     def image(self) -> Tensor:
@@ -34,34 +34,33 @@ class Labelled(Protocol):
 
     @property
     def tissue_image(self) -> Tensor | None:
-        """[H, W, 3] in [0, 1] of the tissue drawn alone, which has to be there."""
+        """[H, W, 3] in [0, 1] of the tissue rendered alone, which is required."""
 
 
 @dataclass(frozen=True)
 class TypicalErrors:
-    """How well pixels of training frames are explained: USUAL of them have a smaller error (mean over colours) than
-    these, inside the label and beside it."""
+    """The TYPICAL_QUANTILE of pixels' errors (mean over colours) in training frames."""
 
-    inside: float
-    beside: float
+    inside: float  # the label
+    beside: float  # in its neighbourhood
 
 
 @dataclass(frozen=True)
 class Trust:
-    """How far the recorded image supports a label."""
+    """The support of a label by the recorded image."""
 
     value: float  # in [0, 1]: the overlap that the votes leave
     against: float  # share of the label's pixels that vote against it
-    missed: float  # pixels beside the label that it misses, as a share of the label's
+    missed: float  # missed pixels next to the label, as a share of the label's
 
     def to_json(self) -> dict[str, float]:
-        """As plain values, for files."""
+        """Return plain values for files."""
         return {name: round(number, 4) for name, number in asdict(self).items()}
 
 
 @dataclass(frozen=True)
 class _Errors:
-    """Of every pixel [H, W]: in the label, beside it, and how far the drawing and the tissue alone are off."""
+    """Pixels [H, W] of the label and its neighbourhood, and errors of the rendering and of the tissue alone."""
 
     label: np.ndarray
     beside: np.ndarray
@@ -69,41 +68,48 @@ class _Errors:
     tissue: np.ndarray
 
 
-def typical_errors_of(drawings: Sequence[tuple[Labelled, Tensor, Tensor | None]]) -> TypicalErrors:
-    """From drawings of frames trained on, each with its image [H, W, 3] and loss mask."""
+def typical_errors_of(drawings: Sequence[tuple[LabelledRendering, Tensor, Tensor | None]]) -> TypicalErrors:
+    """Return the typical errors of renderings of training frames, each with its image [H, W, 3] and loss mask."""
     errors = [_errors(*drawing) for drawing in drawings]
     inside = np.concatenate([frame.whole[frame.label] for frame in errors])
     beside = np.concatenate([frame.whole[frame.beside] for frame in errors])
-    return TypicalErrors(
-        *(round(float(np.quantile(values, USUAL)), 5) if len(values) else 1.0 for values in (inside, beside))
+    inside_error, beside_error = (
+        round(float(np.quantile(values, TYPICAL_QUANTILE)), 5) if len(values) else 1.0 for values in (inside, beside)
     )
+    return TypicalErrors(inside_error, beside_error)
 
 
 def estimate_trust(
-    drawing: Labelled, image: Tensor, mask: Tensor | None, typical: TypicalErrors, beside: float = BESIDE
+    drawing: LabelledRendering,
+    image: Tensor,
+    mask: Tensor | None,
+    typical: TypicalErrors,
+    neighbourhood: float = NEIGHBOURHOOD,
 ) -> Trust:
-    """How far the label of `drawing` can be trusted as that of `image` [H, W, 3]; 0 where there is no label.
+    """Return the trust in the label of `drawing` as that of `image` [H, W, 3]; 0 where there is no label.
 
-    Pixels that the frame's loss mask leaves out do not vote; beside the label, those up to `beside` of the image's
+    Pixels outside the frame's loss mask do not vote; next to the label, those up to `neighbourhood` of the image's
     diagonal away do.
     """
-    errors = _errors(drawing, image, mask, beside)
-    unexplained = (errors.whole > typical.inside) & (errors.whole > HALF * errors.tissue)
+    errors = _errors(drawing, image, mask, neighbourhood)
+    unexplained = (errors.whole > typical.inside) & (errors.whole > MAX_SHARE * errors.tissue)
     against = errors.label & ((errors.whole > errors.tissue) | unexplained)
     missed = errors.beside & (errors.whole > typical.beside)
     size = max(1, int(errors.label.sum()))
-    left_out, added = (int(binary_opening(votes).sum()) for votes in (against, missed))  # no single pixels
-    return Trust((int(errors.label.sum()) - left_out) / (size + added), left_out / size, added / size)
+    n_against, n_missed = (int(binary_opening(votes).sum()) for votes in (against, missed))  # no single pixels
+    return Trust((int(errors.label.sum()) - n_against) / (size + n_missed), n_against / size, n_missed / size)
 
 
-def _errors(drawing: Labelled, image: Tensor, mask: Tensor | None, beside: float = BESIDE) -> _Errors:
+def _errors(
+    drawing: LabelledRendering, image: Tensor, mask: Tensor | None, neighbourhood: float = NEIGHBOURHOOD
+) -> _Errors:
     votes = np.ones(drawing.parts.shape, dtype=bool) if mask is None else mask.numpy()
     label = drawing.parts.numpy() > 0
-    away = distance_transform_edt(~label) if label.any() else np.full(label.shape, np.inf)
-    near = ~label & (away <= beside * float(np.hypot(*label.shape)))
+    distance = distance_transform_edt(~label) if label.any() else np.full(label.shape, np.inf)
+    near = ~label & (distance <= neighbourhood * float(np.hypot(*label.shape)))
     assert drawing.tissue_image is not None
     whole, tissue = (
-        uniform_filter((rendered - image).abs().mean(2).numpy(), SMOOTH)
+        uniform_filter((rendered - image).abs().mean(2).numpy(), WINDOW_PX)
         for rendered in (drawing.image, drawing.tissue_image)
     )
     return _Errors(label & votes, near & votes, whole, tissue)

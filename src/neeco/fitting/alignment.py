@@ -102,7 +102,7 @@ def align_frame(
     """
     config = config or AlignConfig()
     instruments = [item for item in scene.instruments if item.name in frame.state.instruments]
-    parameters = StateParameters(tuple(map(_parameters_of, instruments)), joints_last=True, camera=True)
+    parameters = StateParameters(tuple(map(InstrumentParameters.of, instruments)), joints_last=True, camera=True)
     mask, precision = frame.load_mask(), precision_of(_deviations(parameters, instruments, config))
     counted = torch.ones(frame.camera.height, frame.camera.width) if mask is None else mask.float()
     radians = config.step_deg * torch.pi / 180
@@ -135,12 +135,6 @@ def _camera_at(camera: Camera, at: Tensor) -> Camera:
     """Return the camera moved by the last six parameters, its pose as precise as before."""
     moved = moved_camera(camera, at[-6:])
     return replace(moved, world_from_camera=moved.world_from_camera.to(camera.world_from_camera))
-
-
-def _parameters_of(instrument: Instrument) -> InstrumentParameters:
-    """Return the parameters of an instrument: pose, and joints in stated kinematics."""
-    joints = () if instrument.kinematics is None else tuple(instrument.kinematics.readings)
-    return InstrumentParameters(name=instrument.name, joints=joints, slides=tuple(map(instrument.slides, joints)))
 
 
 def _deviations(parameters: StateParameters, instruments: list[Instrument], config: AlignConfig) -> Tensor:

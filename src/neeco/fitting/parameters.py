@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neeco.capture.model import InstrumentState, State
+from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 
@@ -52,6 +52,12 @@ class InstrumentParameters:
     pivot: Tensor | None = None  # [3] mm, instrument frame, about which rotations turn; None: the origin
     low: Tensor | None = None  # [J] rad or mm, bounds of the joints' values; None: unbounded
     high: Tensor | None = None
+
+    @classmethod
+    def of(cls, instrument: Instrument) -> InstrumentParameters:
+        """Return the parameters of an instrument's pose and of its joints in stated kinematics."""
+        joints = () if instrument.kinematics is None else tuple(instrument.kinematics.readings)
+        return cls(name=instrument.name, joints=joints, slides=tuple(map(instrument.slides, joints)))
 
     def within_bounds(self, joint: int, value: Any) -> Any:
         """Return the value of joint number `joint`, clamped to its bounds."""

@@ -77,7 +77,7 @@ HEADINGS = {
 Values = dict[str, float | None]  # by measure; empty where the run failed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AblationRow:
     """One setting of a table: its numbers by measure, the paper's, and how both differ from the reference's."""
 
@@ -92,7 +92,7 @@ class AblationRow:
     agrees: dict[str, str | None]  # of each judged measure: do ours and the paper's differ in the same direction
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AblationTable:
     """A table with its numbers. `judged`, `measures`: those compared with the paper, and all that are shown."""
 
@@ -106,7 +106,7 @@ class AblationTable:
     curves: list[dict[str, Any]]  # held-out PSNR over the run: {comparison, label, iteration, progress, psnr}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AblationResult:
     """What ablation.json holds."""
 
@@ -223,7 +223,15 @@ def _job(plan: AblationPlan, variant: Variant) -> TrainingJob:
         capture = plan.output / "captures" / variant.derived.name
         config = replace(config, transforms="transforms.json")
     folder = plan.output / "runs" / variant.name
-    return TrainingJob(variant.name, plan.seed, capture, folder, config, Budget(None, steps), device=plan.device)
+    return TrainingJob(
+        name=variant.name,
+        seed=plan.seed,
+        capture=capture,
+        folder=folder,
+        config=config,
+        budget=Budget(None, steps),
+        device=plan.device,
+    )
 
 
 def _paper_settings(iterations: int) -> tuple[str, ...]:
@@ -319,7 +327,16 @@ def table_of(
     final = ("psnr",) if table.group == "paper" else FINAL_SCORES
     known = dict.fromkeys(key for row in rows for key, value in row.values.items() if value is not None)
     shown = [key for key in known if key not in judged and key.partition(".")[0] in final]
-    return AblationTable(table.name, table.group, table.title, table.question, judged, [*judged, *shown], rows, curves)
+    return AblationTable(
+        name=table.name,
+        group=table.group,
+        title=table.title,
+        question=table.question,
+        judged=judged,
+        measures=[*judged, *shown],
+        rows=rows,
+        curves=curves,
+    )
 
 
 def primary_split(splits: Sequence[str]) -> str:
@@ -343,15 +360,15 @@ def _row(
             expected = paper[key] - paper_base[key] if key in paper else float(entry.expected)
             agrees[key] = direction(difference.get(key), expected)
     return AblationRow(
-        comparison.title,
-        entry.label,
-        entry is reference,
-        entry.variant.name,
-        ours,
-        paper,
-        "worse" if entry.expected and entry is not reference else "",
-        difference,
-        agrees,
+        comparison=comparison.title,
+        label=entry.label,
+        reference=entry is reference,
+        run=entry.variant.name,
+        values=ours,
+        paper=paper,
+        paper_direction="worse" if entry.expected and entry is not reference else "",
+        difference=difference,
+        agrees=agrees,
     )
 
 

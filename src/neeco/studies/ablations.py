@@ -20,7 +20,7 @@ PHASE_1_STEPS = 8_000
 PHASE_1_SHARE = PHASE_1_STEPS / PUBLISHED_STEPS
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AblationPlan:
     """Take parts of the methods away one by one, as the paper does and beyond; tables, figures and a page of both.
 
@@ -42,7 +42,7 @@ class AblationPlan:
     seed: int = 0
     """Of every run, and of the noise put on tracker poses."""
     workers: int = 1
-    """Runs at once (more than one needs neeco[cluster])."""
+    """Runs at once, in processes of their own, here or on RAY_ADDRESS's cluster."""
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     settings: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set")] = ()
@@ -103,7 +103,7 @@ class Comparison:
     entries: tuple[Entry, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Ablation:
     """A table. `judged`: the measures whose direction is compared with the paper's (none in our own tables); {split} in
     them is the first held-out split, `test` where there is one. phase_1_psnr is of training frames, as in the paper.

@@ -85,7 +85,7 @@ ABSENT = {  # why nobody has a number
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ComparisonSpec:
     """What to compare. `seeds`: how many, from 0. `splits` None: all but `train`. `masks`: folders of masks by name.
     `assignments`: NAME=VALUE, fields of the training config that are changed for every method."""
@@ -121,7 +121,7 @@ class ComparisonPlan:
         return list(dict.fromkeys([*self.spec.methods, *self.spec.masks]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ComparisonResult:
     """What comparison.json holds, valid at every moment."""
 
@@ -171,15 +171,15 @@ def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
     _check_output(spec)
     jobs = tuple(
         TrainingJob(
-            name,
-            seed,
-            spec.capture,
-            job_folder(spec.output, name, seed),
-            config,
-            spec.budget,
-            spec.splits,
-            spec.lpips_weights,
-            spec.device,
+            name=name,
+            seed=seed,
+            capture=spec.capture,
+            folder=job_folder(spec.output, name, seed),
+            config=config,
+            budget=spec.budget,
+            splits=spec.splits,
+            lpips_weights=spec.lpips_weights,
+            device=spec.device,
         )
         for seed in range(spec.seeds)  # every method's first seed comes first: half of the runs show them all
         for name, config in configs.items()

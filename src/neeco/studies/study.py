@@ -3,8 +3,8 @@
 A study is a list of jobs (`Job`), each with a folder of its own, and one JSON file that is valid at every moment.
 
 - `check_output` tells whether the output folder is free, or holds the same study begun earlier.
-- `run_jobs` runs all jobs, in this process or by Ray, and returns their results in order; `run_and_record` also writes
-  the JSON file after each job. A job that fails does not stop the others: its result has an "error".
+- `run_jobs` runs all jobs, in this process or in workers, and returns their results in order; `run_and_record` also
+  writes the JSON file after each job. A job that fails does not stop the others: its result has an "error".
 - `spread` is mean, standard deviation and count over repetitions (seeds, folds).
 
 Results become tables in `neeco.studies.tables` and a page in `neeco.report.study_pages`.
@@ -17,7 +17,6 @@ import math
 import os
 import statistics
 import traceback
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,14 +25,15 @@ from typing import Any, Protocol
 import torch
 
 from neeco.capture import Capture
-from neeco.cluster import address, cpu_share, joined, require_ray, require_shared
 from neeco.errors import NeecoError
 from neeco.files import TEMPORARY, is_vacant, read_json, require_inside, write_text
 from neeco.raster.devices import device_of, readable_failures
-from neeco.studies.machine import threads_per_worker, usable_cores
+from neeco.raster.native import keep_freed_memory, set_threads
+from neeco.studies.machine import threads_per_worker
+from neeco.workers import Workers, address, check_gpus, run_tasks
+from neeco.workers import check_workers as check_reachable
 
-RETRIES = 3  # of a job whose worker died, each from its last checkpoint
-GRACE = 60.0  # s that interrupted workers get to write their checkpoints
+CHECKPOINT_S = 60.0  # that interrupted jobs get to write their checkpoints
 
 JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], what is going on
 Result = dict[str, Any]  # what a job returns and writes; of a failed one its identity, "error" and empty "splits"
@@ -71,7 +71,7 @@ class Job(Protocol):
         """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class JobEvent:
     """Progress of one job: `stage` is training, evaluating, done or failed, `share` in [0, 1] of that stage; `result`
     is set once the job is done or has failed."""
@@ -137,18 +137,18 @@ def run_jobs(
 ) -> list[Result]:
     """Run every job and return their results, in their order.
 
-    workers 1: in this process, one after another; more, or where RAY_ADDRESS names a cluster: so many at once by Ray, a
-    job whose worker dies again from its checkpoint. captures: those of the jobs that are
-    read already, by path, for this process; jobs read the others. A failed job writes no job.json, so that the next
-    start tries again. Raises NeecoError before any work when a job's folder is another job's or Ray is not there, and
-    KeyboardInterrupt saying which job was stopped.
+    workers 1: in this process, one after another; more, or where RAY_ADDRESS names a cluster: so many at once in
+    processes of their own (so that a script needs `if __name__ == "__main__"`), a job whose worker dies again from its
+    checkpoint. captures: those of the jobs that are read already, by path, for this process; jobs read the others. A
+    failed job writes no job.json, so that the next start tries again. Raises NeecoError before any work when a job's
+    folder is another job's or the cluster does not answer, and KeyboardInterrupt saying which job was stopped.
     """
     check_workers(workers, _device_of(jobs))
     report = progress or (lambda event: None)
     for job in jobs:
         job.check()
     if workers > 1 or address():
-        return _run_on_cluster(jobs, workers, report)
+        return _run_in_workers(jobs, workers, report)
     return [_run_here(place, jobs, (captures or {}).get(job.capture), report) for place, job in enumerate(jobs)]
 
 
@@ -169,16 +169,13 @@ def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture 
 
 
 def check_workers(workers: int, device: torch.device) -> None:
-    """Raises NeecoError for fewer than one, where Ray is needed and cannot be had, or for more than have a GPU of this
-    machine each, where `device` is one."""
-    if workers < 1:
-        raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
-    if workers > 1 or address():
-        require_ray()
+    """Raises NeecoError for fewer than one, where a cluster is named and cannot be reached, or for more than have a GPU
+    of this machine each, where `device` is one."""
+    check_reachable(workers)
     if workers > 1 and device.type == "cuda" and not address():
         if device.index is not None:
             raise NeecoError(f"--device: {device}: of several --workers each has a GPU of its own; give --device cuda")
-        _check_gpus(workers, torch.cuda.device_count())
+        check_gpus(workers, torch.cuda.device_count())
 
 
 def spread(values: Iterable[float | None]) -> dict[str, Any]:
@@ -199,14 +196,20 @@ def _failed(job: Job, error: str) -> Result:
 def _end(index: int, total: int, job: Job, result: Result) -> JobEvent:
     """The event that a job is done or has failed."""
     failure = result.get("error", "")
-    return JobEvent(index, total, job, "failed" if failure else "done", 1.0, failure, result)
+    return JobEvent(
+        index=index, total=total, job=job, stage="failed" if failure else "done", share=1.0, text=failure, result=result
+    )
 
 
 def _run_here(index: int, jobs: Sequence[Job], capture: Capture | None, report: Callable[[JobEvent], None]) -> Result:
     """One of the jobs in this process."""
     job, total = jobs[index], len(jobs)
+
+    def progress(stage: str, share: float, text: str) -> None:
+        report(JobEvent(index=index, total=total, job=job, stage=stage, share=share, text=text))
+
     try:
-        result = attempt_job(job, lambda *news: report(JobEvent(index, total, job, *news)), capture)
+        result = attempt_job(job, progress, capture)
     except KeyboardInterrupt as interrupt:
         moment = " ".join(map(str, interrupt.args)).split(";")[0]
         where = f"job {index + 1} of {total} ({job.title}){', ' + moment if moment else ''}"
@@ -219,93 +222,55 @@ def _interrupted(where: str) -> KeyboardInterrupt:
     return KeyboardInterrupt(f"{where}; run the same command again to go on, nothing finished is lost")
 
 
-def _check_gpus(workers: int, gpus: int) -> None:
-    """Each job has one to itself: two would share its memory and its time."""
-    if workers > gpus:
-        raise NeecoError(f"--workers: {workers} for {gpus} GPU(s); give at most {gpus}, or --device cpu")
-
-
 def _device_of(jobs: Sequence[Job]) -> torch.device:
     """The device of the jobs, who share it, as this machine understands its word."""
     return device_of(jobs[0].device if jobs else "cpu", drawing=False)
 
 
-def _gpus(ray: Any, jobs: Sequence[Job]) -> int:
-    """How many GPUs there are for jobs that compute on one; 0: they do not."""
-    if not jobs or jobs[0].device == "cpu" or (not address() and _device_of(jobs).type == "cpu"):
-        return 0
-    return int(ray.cluster_resources().get("GPU", 0))
+def wants_gpus(jobs: Sequence[Job]) -> bool:
+    """Return whether the jobs compute on GPUs, where the workers' machines have some."""
+    if not jobs or jobs[0].device == "cpu":
+        return False
+    return bool(address()) or _device_of(jobs).type != "cpu"
 
 
-def _run_on_cluster(jobs: Sequence[Job], workers: int, report: Callable[[JobEvent], None]) -> list[Result]:
+def _run_in_workers(jobs: Sequence[Job], workers: int, report: Callable[[JobEvent], None]) -> list[Result]:
     """`run_jobs` with `workers` jobs at once, each in a process of its own.
 
     With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
     device is opened in its worker, who sees one GPU, that no other has.
     """
-    with joined(max(workers, usable_cores())) as ray:
-        threads = cpu_share(ray.nodes(), workers) if address() else threads_per_worker(workers)
-        if address() and jobs:
-            folder = Path(os.path.commonpath([job.folder.absolute().parent for job in jobs]))
-            require_shared(ray, folder / f"{TEMPORARY}probe", {job.capture.absolute() for job in jobs})
-        gpus = _gpus(ray, jobs)
-        if gpus:
-            _check_gpus(workers, gpus)
-        # a process serves one job: its peak memory is the job's own, and no thread setting outlives it. Ray would
-        # retry for ever where memory runs out: `_run_remotely` does it
-        options = {"num_cpus": threads, "num_gpus": min(gpus, 1), "max_calls": 1, "max_retries": 0}
-        remote = ray.remote(**options)(_run_in_worker)
-        return _run_remotely(ray, remote, jobs, workers, threads, report)
-
-
-def _run_remotely(
-    ray: Any, remote: Any, jobs: Sequence[Job], workers: int, threads: int, report: Callable[[JobEvent], None]
-) -> list[Result]:
-    """Keep `workers` jobs going until all are done; one whose worker dies is begun again, at most RETRIES times."""
-    deaths: Counter[int] = Counter()
+    folders = [job.folder.absolute().parent for job in jobs]
+    how = Workers(
+        count=workers,
+        threads=None if address() else threads_per_worker(workers),
+        fresh=True,
+        gpu=wants_gpus(jobs),
+        stop_s=CHECKPOINT_S,
+        writes=Path(os.path.commonpath(folders)) / f"{TEMPORARY}probe" if folders else None,
+        reads=frozenset(job.capture.absolute() for job in jobs),
+    )
     results: dict[int, Result] = {}
-    waiting = list(range(len(jobs)))
-    running: dict[Any, int] = {}
+    running: set[int] = set()
     try:
-        while waiting or running:
-            while waiting and len(running) < workers:
-                index = waiting.pop(0)
-                running[remote.remote(jobs[index], threads, os.getcwd())] = index
-                report(JobEvent(index, len(jobs), jobs[index], "training"))
-            for reference in ray.wait(list(running), timeout=1.0)[0]:
-                index = running.pop(reference)
-                try:
-                    results[index] = dict(ray.get(reference))
-                except ray.exceptions.RayError as error:  # a failure of this job alone
-                    reason = str(error).strip().splitlines()[0]
-                    deaths[index] += 1
-                    if deaths[index] <= RETRIES and not isinstance(error, ray.exceptions.RayTaskError):
-                        waiting.insert(0, index)
-                        text = f"its worker died ({reason}); it goes on from its checkpoint"
-                        report(JobEvent(index, len(jobs), jobs[index], "training", text=text))
-                        continue
-                    results[index] = _failed(jobs[index], f"its worker died: {reason}")
-                report(_end(index, len(jobs), jobs[index], results[index]))
+        with contextlib.closing(run_tasks(_run_in_worker, None, jobs, how)) as events:
+            for event in events:
+                index, job, reason = event.index, jobs[event.index], event.value
+                running.add(index)
+                if event.stage in ("started", "died"):
+                    text = f"its worker died ({reason}); it goes on from its checkpoint" if reason else ""
+                    report(JobEvent(index=index, total=len(jobs), job=job, stage="training", text=text))
+                    continue
+                running.remove(index)
+                results[index] = reason if event.stage == "done" else _failed(job, f"its worker died: {reason}")
+                report(_end(index, len(jobs), job, results[index]))
     except KeyboardInterrupt:
-        with contextlib.suppress(KeyboardInterrupt):  # a second one ends the waiting
-            for reference in running:
-                ray.cancel(reference, force=False)
-            ray.wait(list(running), num_returns=len(running), timeout=GRACE)
-        raise _interrupted(f"while running {'; '.join(jobs[index].title for index in running.values())}") from None
+        raise _interrupted(f"while running {'; '.join(jobs[index].title for index in sorted(running))}") from None
     return [results[index] for index in range(len(jobs))]
 
 
-def _run_in_worker(job: Job, threads: int, folder: str) -> Result:
-    """Use no more than the worker's share of cores and GPUs, then run the job, whose paths may be relative to
-    `folder`."""
-    import ray
-
-    from neeco.raster.native import keep_freed_memory, set_threads
-
-    if own := ray.get_runtime_context().get_accelerator_ids().get("GPU"):
-        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(own)  # before PyTorch looks for the first time
-    with contextlib.suppress(OSError):  # where a node has no such folder, all paths are absolute
-        os.chdir(folder)
+def _run_in_worker(_: None, job: Job, threads: int) -> Result:
+    """In a worker: run the job with so many threads."""
     set_threads(threads)
     torch.set_num_threads(threads)
     keep_freed_memory()

@@ -91,7 +91,7 @@ class Budget:
         return amount + (", CPU time" if self.clock == "processor" else "")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainingJob:
     """One run to train and score. `config`'s seed, minutes and iterations are replaced by the job's.
 

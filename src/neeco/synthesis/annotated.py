@@ -91,11 +91,27 @@ def annotate_capture(
     output = Path(output)
     info = description(run, settings)
     begun = check_output(output, info, resume)
-    folder = DataSetFolder(output, len(capture.frames), begun, info, scene, labeller, formats)
+    folder = DataSetFolder(
+        output=output,
+        count=len(capture.frames),
+        begun=begun,
+        info=info,
+        scene=scene,
+        labeller=labeller,
+        formats=formats,
+    )
     with folder.being_written() as records:
         typical = typical_errors(scene, labeller, trained_on)
         info["usual_errors"] = asdict(typical)
-        annotator = _Annotator(scene, labeller, typical, min_trust, output, images, cameras)
+        annotator = _Annotator(
+            scene=scene,
+            labeller=labeller,
+            typical=typical,
+            min_trust=min_trust,
+            output=output,
+            images=images,
+            cameras=cameras,
+        )
         start: Tensor | None = None  # each fit starts from that of the frame before it in time
         in_time = sorted(range(len(capture.frames)), key=lambda k: capture.frames[k].state.time)
         for done, index in enumerate(in_time, 1):
@@ -111,7 +127,7 @@ def annotate_capture(
     return Annotated(output, capture, [records[index] for index in sorted(records)])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Annotator:
     """Fits, draws, judges and writes frames."""
 
@@ -145,7 +161,7 @@ class _Annotator:
         labels = annotate(self.scene, drawing, self.labeller.names)
         if missing is not None:
             labels = [_without_keypoints_in(missing, label) for label in labels]
-        return write_sample(self.output, index, drawing, labels, {}, facts, self.images.jpeg_quality)
+        return write_sample(self.output, index, drawing, labels, facts=facts, quality=self.images.jpeg_quality)
 
     def _as_written(self, drawing: LayeredDrawing, image: Tensor) -> tuple[LayeredDrawing, Tensor | None]:
         """The recorded `image` with the labels of `drawing`, as the images asked for, and where it shows nothing of a

@@ -17,13 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import neeco
-from neeco import cluster
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_begun, read_bytes, require_same, write_json
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.drawing import REACH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels
-from neeco.raster.native import threads
 from neeco.registry import plugins
 from neeco.synthesis.camera_effects import read_effects
 from neeco.synthesis.card import write_card
@@ -37,10 +35,10 @@ from neeco.synthesis.generator import (
     draw_to_folder,
     format_counts,
 )
+from neeco.synthesis.parallel import draw_in_workers
 from neeco.synthesis.preview import write_preview
 from neeco.synthesis.samplers import SIMILAR, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names
-from neeco.synthesis.workers import draw_in_processes, draw_on_cluster
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import (
     DEPTH_MM_PER_COUNT,
@@ -52,6 +50,7 @@ from neeco.synthesis.writers.folder import (
     record_path,
     write_states,
 )
+from neeco.workers import address, check_workers
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
@@ -102,10 +101,7 @@ def synthesize(
     was made with other settings, and when no acceptable state is found.
     """
     settings.check()
-    if workers < 1:
-        raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
-    if cluster.address():
-        cluster.require_ray()
+    check_workers(workers)
     output = Path(output)
     runs = (run, *instrument_runs)
     scene, *instrument_scenes = (given.scene for given in runs)
@@ -130,7 +126,15 @@ def synthesize(
         info["tissues"] = list(scene.recorded.tissues)
     if generator.gains:
         info["color_gains"] = [[round(value, 4) for value in gain] for gain in generator.gains]
-    folder = DataSetFolder(output, settings.count, begun, info, generator.scene, generator.labeller, formats)
+    folder = DataSetFolder(
+        output=output,
+        count=settings.count,
+        begun=begun,
+        info=info,
+        scene=generator.scene,
+        labeller=generator.labeller,
+        formats=formats,
+    )
     with folder.being_written() as records:
         if records:
             on_progress(len(records))
@@ -153,10 +157,8 @@ def _draw_all(
     generator: SampleGenerator, spec: GeneratorSpec, output: Path, missing: list[int], workers: int
 ) -> Iterator[Record]:
     """The records of the missing images, as they are drawn."""
-    if cluster.address():
-        return draw_on_cluster(spec, output, missing, workers)
-    if workers > 1:
-        return draw_in_processes(spec, output, missing, workers, max(1, threads() // workers))
+    if missing and (workers > 1 or address()):
+        return draw_in_workers(spec, output, missing, workers)
     return (draw_to_folder(generator, output, index) for index in missing)
 
 
@@ -203,7 +205,7 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
     return True
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DataSetFolder:
     """The folder of a data set that is made now: what dataset.json says of the making (`info`), whether it was `begun`
     before, and what its index files need."""

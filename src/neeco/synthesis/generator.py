@@ -111,7 +111,7 @@ class Acceptance:
         return None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SampleGenerator:
     """Draws the samples of one data set; writes nothing."""
 
@@ -156,7 +156,17 @@ class SampleGenerator:
         if settings.tissue_check and tolerance is None:
             tolerance = find_tolerance(scene, labeller)
         acceptance = Acceptance(settings.min_share, tolerance, settings.max_unobserved, groups)
-        return cls(scene, labeller, sampler, acceptance, settings, effects, motion, gains, cameras)
+        return cls(
+            scene=scene,
+            labeller=labeller,
+            sampler=sampler,
+            acceptance=acceptance,
+            settings=settings,
+            effects=effects,
+            motion=motion,
+            gains=gains,
+            cameras=cameras,
+        )
 
     def draw(self, index: int) -> LabelledSample:
         """Draw sample `index`.
@@ -254,7 +264,9 @@ def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Reco
             return write_skipped(output, index, error.refused)
         raise NeecoError(f"{output}: {error}") from None
     quality = generator.settings.jpeg_quality
-    return write_sample(output, index, sample.drawing, sample.labels, sample.refused, sample.facts, quality)
+    return write_sample(
+        output, index, sample.drawing, sample.labels, refused=sample.refused, facts=sample.facts, quality=quality
+    )
 
 
 def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:

@@ -41,7 +41,7 @@ GAINS = (0.6, 1.6)  # range of the change of colours: beyond that, the shafts di
 SOLID = 0.5  # least opacity of Gaussians that tell a shaft's colour
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Mixture:
     """A scene of one run's tissue and other runs' instruments, with a way to place them."""
 
@@ -78,13 +78,13 @@ class Mixture:
             raise NeecoError("--tissue: a run remembers no recorded frame; train it again with this version")
         gains = tuple(_gain(tissue, scene) for scene in instrument_scenes)
         mixture = cls(
-            _merged(tissue, instrument_scenes, gains),
-            tissue,
-            tuple(instrument_scenes),
-            gains,
-            {item.name: _min_depth(scene) for scene in instrument_scenes for item in scene.instruments},
-            tissue_gaussians(tissue),
-            tuple(tissue_gaussians(scene) for scene in instrument_scenes),
+            scene=_merged(tissue, instrument_scenes, gains),
+            tissue=tissue,
+            instrument_scenes=tuple(instrument_scenes),
+            gains=gains,
+            min_depth={item.name: _min_depth(scene) for scene in instrument_scenes for item in scene.instruments},
+            tissue_alone=tissue_gaussians(tissue),
+            own_tissue_alone=tuple(tissue_gaussians(scene) for scene in instrument_scenes),
         )
         mixture.scene.recorded = mixture._recorded()
         return mixture

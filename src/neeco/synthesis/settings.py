@@ -116,7 +116,7 @@ def formats_help() -> str:
 RECORDED_SIZE, AS_RECORDED = SizeSettings(), ImageSettings()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Settings(ImageSettings):
     """What decides the pixels and labels of a data set, apart from the scene. Every field goes into dataset.json."""
 

@@ -55,9 +55,9 @@ from neeco.scene.io import load_gaussians, save_scene
 from neeco.settings import with_fields
 from neeco.synthesis.dataset import INFO, SCENE_FILE
 from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, StatesRefused, limit_threads
+from neeco.synthesis.parallel import PackedSpec
 from neeco.synthesis.samplers import make_sampler
 from neeco.synthesis.settings import PATH_PREFIX, LabelWay, Settings, Views
-from neeco.synthesis.workers import PackedSpec
 from neeco.synthesis.writers.folder import read_public_records, stem
 from neeco.training.run import TrainedRun, load_run
 
@@ -105,7 +105,7 @@ def sample_states(
         for state, camera in neeco.sample_states("runs/sample", 3, states="extrapolate"):
             print(state.instruments["maryland"].joints, camera.width, camera.height)
     """
-    settings = Settings(count, seed, states, margin, views)
+    settings = Settings(count=count, seed=seed, states=states, margin=margin, views=views)
     settings.check()
     sampler = make_sampler(_opened(scene)[0], settings.states, margin, views, count)
     return [sampler(index, np.random.default_rng(np.random.SeedSequence([seed, index]))) for index in range(count)]
@@ -299,11 +299,11 @@ class StoredImages(Dataset[Sample]):
         labelled = LabelledImage.of(
             read_image(image, size),
             torch.from_numpy(depth),
-            read_labels(files["parts"], size),
-            read_labels(files["ignore"], size) == self._ignored,
-            record["labels"],
-            self.part_names,
-            self.keypoint_names,
+            parts=read_labels(files["parts"], size),
+            ignore=read_labels(files["ignore"], size) == self._ignored,
+            labels=record["labels"],
+            part_names=self.part_names,
+            keypoint_names=self.keypoint_names,
         )
         state = State(
             {i["name"]: InstrumentState(i["pose"], i["joints"]) for i in record["instruments"]},
@@ -337,7 +337,7 @@ def _opened(given: SceneLike) -> tuple[GaussianScene, Path | None]:
 def _settings(count: int, seed: int, camera_effects: str | Path | None, **given: Any) -> Settings:
     """The settings of a data set, `given` by the names of their fields."""
     effects = None if camera_effects is None else str(camera_effects)
-    return with_fields(Settings(count, seed), {"camera_effects": effects} | given)
+    return with_fields(Settings(count=count, seed=seed), {"camera_effects": effects} | given)
 
 
 def _spec(opened: Sequence[tuple[GaussianScene, Path | None]], settings: Settings) -> GeneratorSpec | PackedSpec:

@@ -1,94 +1,78 @@
-"""Frames one after the other: predicted, fitted, judged; looked for beside, then anywhere, where that fails."""
+"""Frames followed one after the other: predicted, fitted and judged; searched near the prediction, then anywhere."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cache
 from statistics import median
 from typing import Any, Literal
 
 import torch
 
-from neeco.capture.model import Frame, InstrumentState, State
+from neeco.capture.model import Frame, State
+from neeco.errors import NeecoError
 from neeco.fitting.fitter import StateFit, loose_prior
 from neeco.fitting.layers import FrameView
-from neeco.tracking.motion import LONGEST, Motion, Moving
-from neeco.tracking.parameters import TrackedParameters, TrackingFitter
+from neeco.tracking.motion import MAX_GAP_S, MotionModel, MotionState
+from neeco.tracking.parameters import TrackingFitter
 from neeco.tracking.search import Search
-from neeco.tracking.trust import NONE, WRONG_DEG, Judge, Reference, TrackTrust
+from neeco.tracking.trust import NO_TRUST, WRONG_DEG, Judge, Reference, TrackTrust
 
-UNUSUAL = 1.3  # times the usual misfit: from there on a fit is doubted
-BETTER = 0.85  # of a doubted fit's misfit: what another has to have
-RECENT = 10  # frames that tell what is usual here
-LOST = 0.5  # of the label's overlap: less, and the instruments are lost
-LOOK_EVERY = 6  # frames between those in which another roll is looked for, doubted or not: drifts look well explained
-GIVEN = (4.0, 4.0, 8.0)  # deg, mm, deg of joints: how far off a given state may be
-SEARCH_EVERY = 0.2  # s between searches anywhere
-POOR, POOR_EVERY = 0.5, 0.4  # trust of what is followed, below which it is looked for anywhere, too; s between
+UNUSUAL = 1.3  # times the usual misfit, above which another state is searched for
+BETTER = 0.85  # of such a fit's misfit, that the other must be below
+N_RECENT = 10  # frames whose median misfit is usual
+MIN_OVERLAP = 0.5  # of the label; below, the instruments are lost
+SEARCH_ROLLS_EVERY = 6  # frames between searches for other rolls, since drifting states may have small misfits
+GIVEN_PRIOR = (4.0, 4.0, 8.0)  # deg, mm, deg of joints: standard deviations of a given state
+SEARCH_EVERY_S = 0.2  # between searches anywhere
+LOW_TRUST, LOW_TRUST_SEARCH_EVERY_S = 0.5, 0.4  # trust below which a followed state is searched anywhere; between these
 
 NEVER = -1e9  # s
 
 How = Literal["begun", "followed", "beside", "found", "lost"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Step:
-    """What was found in one frame, and all that the next one needs."""
+    """The result for one frame, with all that the next one needs."""
 
     frame: int
     how: How
-    moving: Moving  # where lost: as it was last seen
-    misfit: float
-    gain: float
-    trust: TrackTrust
-    recent: tuple[float, ...]  # misfits of frames before
-    seen_at: float  # s, when the instruments were last seen
-    searched_at: float  # s, when they were last looked for anywhere
-    unlooked: int = 0  # frames since another roll was looked for
+    motion: MotionState  # where lost: the last estimate
+    misfit: float = 0.0
+    gain: float = 0.0
+    trust: TrackTrust = NO_TRUST
+    recent: tuple[float, ...] = ()  # misfits of frames before
+    found_at: float  # s, when the instruments were last found
+    searched_at: float  # s, of the last search anywhere
+    unsearched: int = 0  # frames since other rolls were searched for
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as plain values, which read back exactly."""
-        state = self.moving.state
-        return {
-            "frame": self.frame,
-            "how": self.how,
-            "instruments": {
-                name: {"pose": given.pose.tolist(), "joints": dict(given.joints)}
-                for name, given in state.instruments.items()
-            },
-            "time": state.time,
-            "velocity": self.moving.velocity.tolist(),
-            "covariance": self.moving.covariance.tolist(),
-            "misfit": self.misfit,
-            "gain": self.gain,
-            "trust": astuple(self.trust),
-            "recent": list(self.recent),
-            "seen_at": self.seen_at,
-            "searched_at": self.searched_at,
-            "unlooked": self.unlooked,
-        }
+        """Return plain values, which `from_json` reads back exactly."""
+        values: dict[str, Any] = _converter().unstructure(self)
+        return values
 
     @classmethod
-    def from_json(cls, stored: dict[str, Any]) -> Step:
-        """The inverse of `to_json`."""
-        instruments = {
-            name: InstrumentState(torch.tensor(given["pose"], dtype=torch.float64), given["joints"])
-            for name, given in stored["instruments"].items()
-        }
-        velocity, covariance = (torch.tensor(stored[key], dtype=torch.float64) for key in ("velocity", "covariance"))
-        return cls(
-            stored["frame"],
-            stored["how"],
-            Moving(State(instruments, stored["time"]), velocity, covariance),
-            stored["misfit"],
-            stored["gain"],
-            TrackTrust(*stored["trust"]),
-            tuple(stored["recent"]),
-            stored["seen_at"],
-            stored["searched_at"],
-            stored["unlooked"],
-        )
+    def from_json(cls, stored: Any, place: str) -> Step:
+        """Return what `to_json` wrote into the file `place`. Raises NeecoError for anything else."""
+        from cattrs.errors import BaseValidationError
+
+        try:
+            return _converter().structure(stored, cls)
+        except (BaseValidationError, TypeError, ValueError, KeyError):
+            raise NeecoError(f"{place}: is not as neeco writes it; remove the output folder and track again") from None
+
+
+@cache
+def _converter() -> Any:
+    """Return the converter of steps; tensors are lists of float64."""
+    import cattrs
+
+    converter = cattrs.Converter(forbid_extra_keys=True)
+    converter.register_unstructure_hook(torch.Tensor, torch.Tensor.tolist)
+    converter.register_structure_hook(torch.Tensor, lambda values, _: torch.tensor(values, dtype=torch.float64))
+    return converter
 
 
 @dataclass(frozen=True)
@@ -97,7 +81,7 @@ class Follower:
 
     frames: Sequence[Frame]
     fitter: TrackingFitter
-    motion: Motion
+    motion: MotionModel
     search: Search
     judge: Judge
 
@@ -105,100 +89,123 @@ class Follower:
     def of(
         cls, frames: Sequence[Frame], fitter: TrackingFitter, reference: Reference, allowance: float = 1.0
     ) -> Follower:
-        """Of the instruments that the fitter draws; `allowance` as `Judge` has it."""
+        """Return the follower of the fitter's instruments; `allowance`: see `Judge`."""
         search = Search.of(fitter)
         return cls(frames, fitter, search.motion, search, Judge(fitter, search, reference, allowance))
 
-    @cached_property
-    def parameters(self) -> TrackedParameters:
-        """Of the states."""
-        return self.fitter.parameters
-
     def begin(self, frame: int, given: State) -> Step:
-        """From a state that is about known."""
-        view, time = self._view(frame, given), self.frames[frame].state.time
-        near = loose_prior(self.parameters, *GIVEN)
-        fit = self.fitter.fit(view, given, near, levels=(0.125, 0.25, 0.5, 1.0), steps=(3, 3, 3, 4))
+        """Return the first step from a state that is approximately known."""
+        prior = loose_prior(self.fitter.parameters, *GIVEN_PRIOR)
+        fit = self.fitter.fit(
+            self._view(frame, given), given, prior, levels=(0.125, 0.25, 0.5, 1.0), steps=(3, 3, 3, 4)
+        )
         if fit is None:
-            return self._lost(frame, self.motion.begin(given), (), time, time)
+            time = self.frames[frame].state.time
+            return Step(frame=frame, how="lost", motion=self.motion.begin(given), found_at=time, searched_at=time)
         return self._begun(frame, "begun", fit)
 
     def find(self, frame: int) -> Step:
-        """Nothing known."""
+        """Return the first step of instruments whose state is not known."""
         view, time = self._view(frame, None), self.frames[frame].state.time
         best = self.search.anywhere(view)
         if best is None:
-            return self._lost(frame, self.motion.begin(self.search.bank(view.camera)[0]), (), NEVER, time)
+            motion = self.motion.begin(self.search.recorded_states(view.camera)[0])
+            return Step(frame=frame, how="lost", motion=motion, found_at=NEVER, searched_at=time)
         return self._begun(frame, "found", best)
 
     def follow(self, before: Step, frame: int) -> Step:
-        """The frame beside that of `before` in time."""
+        """Return the step of a frame next in time to that of `before`."""
         time = self.frames[frame].state.time
-        if before.how == "lost" and abs(time - before.seen_at) > LONGEST:
-            return self._look_again(before, frame, None)
-        moving = self.motion.predict(before.moving, time - before.moving.state.time)
-        predicted = replace(moving, state=replace(moving.state, time=time))
+        if before.how == "lost" and abs(time - before.found_at) > MAX_GAP_S:
+            return self._searched(before, frame, None)
+        motion = self.motion.predict(before.motion, time - before.motion.state.time)
+        predicted = replace(motion, state=replace(motion.state, time=time))
         view = self._view(frame, predicted.state)
         fit = self.fitter.fit(view, predicted.state, self.motion.precision(predicted), steps=(2, 4))
-        usual = self._usual(before)
+        unusual = UNUSUAL * self._usual_misfit(before)
         how: How = "followed"
-        if fit is None or fit.misfit > UNUSUAL * usual:
-            other = self.search.beside(view, predicted, [before.moving.state], UNUSUAL * usual)
+        if fit is None or fit.misfit > unusual:
+            other = self.search.near(view, predicted, [before.motion.state], unusual)
             if other is not None and (fit is None or other.misfit < BETTER * fit.misfit):
-                fit, how, predicted = other, "beside", self.motion.freed(predicted)
+                fit, how, predicted = other, "beside", self.motion.released(predicted)
         if fit is None:
-            return self._look_again(before, frame, view)
-        trust, other = self.judge.judge(fit, before.unlooked >= LOOK_EVERY)
+            return self._searched(before, frame, view)
+        search_rolls = before.unsearched >= SEARCH_ROLLS_EVERY
+        trust, other = self.judge.judge(fit, search_rolls)
         if is_lost(trust):
-            return self._look_again(before, frame, view)
-        unlooked = 0 if trust.single < 1 or other is not None or before.unlooked >= LOOK_EVERY else before.unlooked + 1
+            return self._searched(before, frame, view)
+        unsearched = 0 if trust.single < 1 or other is not None or search_rolls else before.unsearched + 1
         if other is not None and other.gain > fit.gain:
-            free = loose_prior(self.parameters, *GIVEN)
-            better = self.fitter.fit(view, other.state, free, levels=(0.5, 1.0), steps=(3, 4))
+            prior = loose_prior(self.fitter.parameters, *GIVEN_PRIOR)
+            better = self.fitter.fit(view, other.state, prior, levels=(0.5, 1.0), steps=(3, 4))
             if better is not None and better.gain > fit.gain:
-                fit, how, predicted = better, "beside", self.motion.freed(predicted)
+                fit, how, predicted = better, "beside", self.motion.released(predicted)
                 trust, _ = self.judge.judge(fit)
-        elif unlooked > 0:  # until it is looked for anew
+        elif unsearched > 0:  # until the next search
             trust = replace(trust, single=before.trust.single)
-        searched_at, moving = before.searched_at, self.motion.update(predicted, fit)
-        if trust.value < POOR and abs(time - searched_at) >= POOR_EVERY:
+        searched_at, motion = before.searched_at, self.motion.update(predicted, fit)
+        if trust.value < LOW_TRUST and abs(time - searched_at) >= LOW_TRUST_SEARCH_EVERY_S:
             best, searched_at = self.search.anywhere(view), time
             if best is not None and best.misfit < BETTER * fit.misfit:
-                fit, how, moving = best, "found", self.motion.begin(replace(best.state, time=time), best.information)
+                fit, how, motion = best, "found", self.motion.begin(replace(best.state, time=time), best.information)
                 trust, _ = self.judge.judge(fit)
-        trust = replace(trust, determined=self.motion.likely_within(moving, WRONG_DEG))
-        recent = (*before.recent, fit.misfit)[-RECENT:]
-        return Step(frame, how, moving, fit.misfit, fit.gain, trust, recent, time, searched_at, unlooked)
+        return Step(
+            frame=frame,
+            how=how,
+            motion=motion,
+            misfit=fit.misfit,
+            gain=fit.gain,
+            trust=replace(trust, determined=self.motion.probability_within(motion, WRONG_DEG)),
+            recent=(*before.recent, fit.misfit)[-N_RECENT:],
+            found_at=time,
+            searched_at=searched_at,
+            unsearched=unsearched,
+        )
 
-    def _look_again(self, before: Step, frame: int, view: FrameView | None) -> Step:
-        """Anywhere, unless that was done a moment ago."""
-        time = self.frames[frame].state.time
-        if abs(time - before.searched_at) < SEARCH_EVERY:
-            return self._lost(frame, before.moving, before.recent, before.seen_at, before.searched_at)
-        view = self._view(frame, None) if view is None else view
-        best = self.search.anywhere(view)
-        if best is not None and not is_lost(self.judge.judge(best)[0]):
-            return self._begun(frame, "found", best)
-        return self._lost(frame, before.moving, before.recent, before.seen_at, time)
+    def _searched(self, before: Step, frame: int, view: FrameView | None) -> Step:
+        """Return the step after a search anywhere; lost where that fails, or the last one was a moment ago."""
+        time, searched_at = self.frames[frame].state.time, before.searched_at
+        if abs(time - searched_at) >= SEARCH_EVERY_S:
+            best, searched_at = self.search.anywhere(self._view(frame, None) if view is None else view), time
+            if best is not None and (step := self._begun(frame, "found", best)).how != "lost":
+                return step
+        return Step(
+            frame=frame,
+            how="lost",
+            motion=before.motion,
+            recent=before.recent,
+            found_at=before.found_at,
+            searched_at=searched_at,
+        )
 
     def _begun(self, frame: int, how: How, fit: StateFit) -> Step:
+        """Return the step of a state just found."""
         time = self.frames[frame].state.time
         trust, _ = self.judge.judge(fit)
-        moving = self.motion.begin(replace(fit.state, time=time), fit.information)
+        motion = self.motion.begin(replace(fit.state, time=time), fit.information)
         if is_lost(trust):
-            return self._lost(frame, moving, (), NEVER, time)
-        trust = replace(trust, determined=self.motion.likely_within(moving, WRONG_DEG))
-        return Step(frame, how, moving, fit.misfit, fit.gain, trust, (fit.misfit,), time, time)
+            return Step(frame=frame, how="lost", motion=motion, found_at=NEVER, searched_at=time)
+        return Step(
+            frame=frame,
+            how=how,
+            motion=motion,
+            misfit=fit.misfit,
+            gain=fit.gain,
+            trust=replace(trust, determined=self.motion.probability_within(motion, WRONG_DEG)),
+            recent=(fit.misfit,),
+            found_at=time,
+            searched_at=time,
+        )
 
-    def _lost(self, frame: int, moving: Moving, recent: tuple[float, ...], seen_at: float, searched_at: float) -> Step:
-        return Step(frame, "lost", moving, 0.0, 0.0, NONE, recent, seen_at, searched_at)
+    def _usual_misfit(self, before: Step) -> float:
+        """Return the misfit that a followed frame may have.
 
-    def _usual(self, before: Step) -> float:
-        """Misfit that a followed frame may have: a rise is looked into once, and again when another roll is."""
+        A rise leads to a search once, and again when other rolls are searched for.
+        """
         usual = [self.judge.reference.misfit]
         if before.recent:
             usual.append(median(before.recent))
-            usual += [before.misfit] if before.unlooked < LOOK_EVERY else []
+            usual += [before.misfit] if before.unsearched < SEARCH_ROLLS_EVERY else []
         return max(usual)
 
     def _view(self, frame: int, state: State | None) -> FrameView:
@@ -206,5 +213,5 @@ class Follower:
 
 
 def is_lost(trust: TrackTrust) -> bool:
-    """Whether what was found is not the instruments."""
-    return trust.overlap < LOST
+    """Return whether a state is not that of the instruments."""
+    return trust.overlap < MIN_OVERLAP

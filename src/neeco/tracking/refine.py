@@ -1,7 +1,7 @@
-"""Tracked frames are training frames: a run is trained again with them, so that sides only they show become known.
+"""Training again on tracked frames, which show sides of the instruments that the run's own frames do not.
 
-States of the run's own frames are fitted to their images first, as tracked ones were: both then stand as the scene
-that was learned says, free of a tracker's latency and noise. Trust weighs frames in the loss.
+States of the run's own frames are first fitted to their images, as tracked ones were, so that both are free of a
+tracker's latency and noise. Trust weighs frames in the loss.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from neeco.scene import GaussianScene
 from neeco.scene.gaussian_scene import one_tissue
 from neeco.settings import with_fields
 from neeco.tracking.parameters import fitter_of
-from neeco.tracking.track import INFO
+from neeco.tracking.track import INFO, scene_digest
 from neeco.training.run import stored_config
 from neeco.training.train import ShowRow, train
 
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 SCHEMA = "neeco-refined/1"
 CAPTURE, RUN = "capture", "run"  # folders of the output
-BEGUN = "refined.json"  # in it: what is refined by what
-NEAR = (2.0, 2.0, 4.0)  # deg, mm, deg of joints: how far recorded states may be off
+BEGUN = "refined.json"  # in it: run and captures
+RECORDED_PRIOR = (2.0, 2.0, 4.0)  # deg, mm, deg of joints: standard deviations of recorded states
 STAGING = "images"
 
 
@@ -49,17 +49,16 @@ def refine_run(
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     on_row: ShowRow | None = None,
 ) -> Path:
-    """Train again on the run's own frames and on those of captures that `track` made over its tissue; returns the run.
+    """Train again on the run's own frames and on those of captures that `track` made over its tissue; return the run.
 
-    Writes `CAPTURE`, all these frames, and `RUN`, trained on it as the run was, into the folder `output`. Raises
+    Writes into the folder `output`: `CAPTURE`, all these frames, and `RUN`, trained on it as the run was. Raises
     NeecoError for captures of other instruments or tissue, and an `output` that is not empty (without `resume`) or was
     begun otherwise.
     """
     folder = output / CAPTURE
-    content = read_bytes(Path(run.path) / "scene.safetensors", "a learned scene", "no such file; train the run first")
     info: dict[str, Any] = {
         "schema": SCHEMA,
-        "scene_sha256": hashlib.sha256(content).hexdigest(),
+        "scene_sha256": scene_digest(run),
         "captures_sha256": [fingerprint(read_capture(path)) for path in tracked],
     }
     if (begun := read_begun(output, BEGUN, resume, "a refinement")) is not None:
@@ -83,7 +82,7 @@ def refine_run(
 
 
 def _tracked_frames(path: Path, scene: GaussianScene) -> list[Frame]:
-    """The frames of a tracked capture, to train on. Raises NeecoError where they do not belong to the scene."""
+    """Return the frames of a tracked capture, to train on. Raises NeecoError where they do not fit the scene."""
     capture = read_capture(path)
     info = read_json(path / INFO) if (path / INFO).exists() else {}
     if isinstance(info, dict) and info.get("tissue") == "footage":
@@ -100,8 +99,11 @@ def _tracked_frames(path: Path, scene: GaussianScene) -> list[Frame]:
 
 
 def without_twice(own: Capture, tracked: Sequence[Frame]) -> tuple[Capture, list[Frame]]:
-    """Both without images that both have: what is trained on stays as recorded; what was withheld and then tracked is
-    trained on as tracked, and tests no more. Raises NeecoError when an image cannot be read."""
+    """Return both without images that both have.
+
+    Training frames stay as recorded. Withheld frames that were tracked are trained on as tracked, and are no longer
+    test frames. Raises NeecoError when an image cannot be read.
+    """
     images = {_digest(frame): frame for frame in own.frames}
     again = {digest: frame for frame in tracked if (digest := _digest(frame)) in images}
     withheld = {images[digest].image_path for digest in again if images[digest].split != "train"}
@@ -115,7 +117,7 @@ def _digest(frame: Frame) -> bytes:
 
 
 def _named_apart(frames: Sequence[Frame], folder: Path) -> list[Frame]:
-    """The frames, their images under names that the run's own do not have."""
+    """Return the frames with their images copied under names that the run's own do not have."""
     folder.mkdir(parents=True, exist_ok=True)
     named = []
     for k, frame in enumerate(frames):
@@ -126,14 +128,13 @@ def _named_apart(frames: Sequence[Frame], folder: Path) -> list[Frame]:
 
 
 def fitted(scene: GaussianScene, capture: Capture, on_progress: Callable[[int, int], None]) -> list[Frame]:
-    """The frames of a capture; those trained on with states as the scene explains their images best, near the recorded
-    ones."""
+    """Return the frames of a capture, the states of training frames fitted to their images near the recorded ones."""
     fitter = fitter_of(scene)
-    near, frames = loose_prior(fitter.parameters, *NEAR), []
+    prior, frames = loose_prior(fitter.parameters, *RECORDED_PRIOR), []
     for done, frame in enumerate(capture.frames):
         on_progress(done, len(capture.frames))
         if frame.split == "train":
-            fit = fitter.fit(fitter.view(frame, frame.state), frame.state, near)
+            fit = fitter.fit(fitter.view(frame, frame.state), frame.state, prior)
             if fit is not None:
                 frame = replace(frame, state=fit.state)
         frames.append(frame)

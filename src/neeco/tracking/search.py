@@ -1,4 +1,4 @@
-"""States looked for where a fit from near does not get: beside what was expected, or anywhere, nothing known."""
+"""Searches for states where a fit from the prediction fails: near it, or anywhere."""
 
 from __future__ import annotations
 
@@ -14,92 +14,94 @@ from neeco.fitting.layers import FrameView
 from neeco.fitting.parameters import DEG
 from neeco.geometry.camera import Camera
 from neeco.scene import Recorded
-from neeco.tracking.motion import Motion, Moving
+from neeco.tracking.motion import MotionModel, MotionState
 from neeco.tracking.parameters import TrackedParameters, TrackingFitter
 
-ALONG_MM = (-5.0, -2.5, 0.0, 2.5, 5.0)  # along the shaft: teeth, rings and its end hold a fit where it was
-ROLL_DEG = (-8.0, 0.0, 8.0)  # about it
-SAMPLES = 48  # of what is expected
-SLACK = 3.0  # times what is expected: how far those beside may be from it
-FOLLOWED = 3  # of those beside, that are fitted
-FAR = (30.0, 30.0, 40.0)  # deg, mm, deg of joints: prior of a search anywhere
+SHIFTS_MM = (-5.0, -2.5, 0.0, 2.5, 5.0)  # along the shaft: its teeth, rings and end hold a fit where it was
+ROLLS_DEG = (-8.0, 0.0, 8.0)
+N_SAMPLES = 48  # of the prediction
+PRIOR_SCALE = 3.0  # by which the prediction's standard deviations are widened
+N_FITTED_NEAR = 3  # starts near the prediction that are fitted
+ANYWHERE_PRIOR = (30.0, 30.0, 40.0)  # deg, mm, deg of joints
 
-BANK = 96  # recorded states tried
-STARTS = 6  # of them fitted
-TURNED = 3  # of the best one turned and opened otherwise
-FINALISTS = 2  # fitted at full size
-APART_MM, APART_DEG, APART_JOINT_DEG = 8.0, 15.0, 15.0  # states nearer than this lead to the same
-OTHER_ROLLS = (-90.0, -60.0, -40.0, -25.0, 25.0, 40.0, 60.0, 90.0, 180.0)  # deg
-OTHER_JOINTS = (-15.0, 15.0)  # deg, or as many quarters of a mm
-QUARTER_MM = 0.25
+N_RECORDED = 96  # recorded states tried
+N_STARTS = 6  # of them fitted
+N_TURNED = 3  # of the best one with other rolls and joints
+N_FINALISTS = 2  # fitted at full size
+APART_MM, APART_DEG, APART_JOINT_DEG = 8.0, 15.0, 15.0  # closer states lead to the same fit
+OTHER_ROLLS_DEG = (-90.0, -60.0, -40.0, -25.0, 25.0, 40.0, 60.0, 90.0, 180.0)
+OTHER_JOINTS_DEG = (-15.0, 15.0)
+MM_PER_DEG = 0.25  # of prismatic joints, wherever a number of degrees is asked for
 
 
 @dataclass(frozen=True)
 class Search:
-    """Looks for the instruments in single frames."""
+    """Searches for the instruments in single frames."""
 
     fitter: TrackingFitter
-    motion: Motion
+    motion: MotionModel
     recorded: Recorded
 
     @classmethod
     def of(cls, fitter: TrackingFitter) -> Search:
-        """By what was recorded of the scene that the fitter draws."""
+        """Return the search among the recorded states of the fitter's scene."""
         recorded = fitter.instruments.scene.recorded
-        return cls(fitter, Motion.of(fitter.parameters, recorded.states), recorded)
+        return cls(fitter, MotionModel.of(fitter.parameters, recorded.states), recorded)
 
-    @property
-    def parameters(self) -> TrackedParameters:
-        return self.fitter.parameters
+    def near(
+        self, view: FrameView, predicted: MotionState, others: Sequence[State], usual_misfit: float
+    ) -> StateFit | None:
+        """Return the best fit begun from states along the shaft, at other rolls, and sampled from the prediction.
 
-    def beside(self, view: FrameView, predicted: Moving, others: Sequence[State], usual: float) -> StateFit | None:
-        """The best fit begun along the shaft, at other rolls, and where else the state may be by its covariance, from
-        what is predicted and from `others`; the first whose misfit is `usual`."""
-        parameters, tried = self.parameters, []
+        Starts are taken about the prediction and `others`. The first fit with at most `usual_misfit` ends the search.
+        """
+        parameters, tried = self.fitter.parameters, []
         for base in (predicted.state, *others):
             for k in range(len(parameters.instruments)):
                 tried += [
-                    parameters.moved(base, parameters.along(k, along, roll * DEG))
-                    for along in ALONG_MM
-                    for roll in ROLL_DEG
+                    parameters.moved(base, parameters.along(k, shift, roll * DEG))
+                    for shift in SHIFTS_MM
+                    for roll in ROLLS_DEG
                 ]
         size, generator = parameters.size, torch.Generator().manual_seed(0)
         root = torch.linalg.cholesky(predicted.covariance[:size, :size])
-        normal = torch.randn(SAMPLES, size, generator=generator, dtype=torch.float64)
+        normal = torch.randn(N_SAMPLES, size, generator=generator, dtype=torch.float64)
         tried += [parameters.moved(predicted.state, increments) for increments in normal @ root.T]
-        precision = self.motion.precision(predicted) / SLACK**2
+        precision = self.motion.precision(predicted) / PRIOR_SCALE**2
         best: StateFit | None = None
         about = self.fitter.about(view, predicted.state, 2 * MARGIN_PX)
-        for start in self.fitter.ranked(view if about is None else about, tried, 0.25)[:FOLLOWED]:
+        for start in self.fitter.ranked(view if about is None else about, tried, 0.25)[:N_FITTED_NEAR]:
             fit = self.fitter.fit(view, predicted.state, precision, start, levels=(0.25, 0.5), steps=(4, 4))
             if fit is not None and (best is None or fit.gain > best.gain):
                 best = fit
-                if fit.misfit <= usual:
+                if fit.misfit <= usual_misfit:
                     break
         if best is None:
             return None
         return self.fitter.fit(view, predicted.state, precision, best.state, levels=(1.0,), steps=(4,))
 
     def anywhere(self, view: FrameView) -> StateFit | None:
-        """The best fit, nothing else known: from recorded states, then from the best one turned and opened otherwise.
-        None where none explains the image better than the tissue alone."""
-        fitter, far = self.fitter, loose_prior(self.parameters, *FAR)
-        starts = self._different(self.fitter.ranked(view, self.bank(view.camera), 0.125), STARTS)
-        fits = [fitter.fit(view, state, far, levels=(0.125, 0.25), steps=(6, 4)) for state in starts]
+        """Return the best fit begun from recorded states, then from the best one with other rolls and joints.
+
+        None where no state explains the image better than the tissue alone.
+        """
+        fitter, prior = self.fitter, loose_prior(self.fitter.parameters, *ANYWHERE_PRIOR)
+        starts = self._different(fitter.ranked(view, self.recorded_states(view.camera), 0.125), N_STARTS)
+        fits = [fitter.fit(view, state, prior, levels=(0.125, 0.25), steps=(6, 4)) for state in starts]
         found = _by_gain(fits)
         if found:
-            others = self._different(self.fitter.ranked(view, self.turned(found[0].state), 0.25), TURNED)
-            fits = [fitter.fit(view, state, far, levels=(0.25,), steps=(6,)) for state in others]
+            others = self._different(fitter.ranked(view, self.turned(found[0].state), 0.25), N_TURNED)
+            fits = [fitter.fit(view, state, prior, levels=(0.25,), steps=(6,)) for state in others]
             found = _by_gain([*found, *fits])
-        last = [fitter.fit(view, fit.state, far, levels=(0.5, 1.0), steps=(4, 4)) for fit in found[:FINALISTS]]
+        last = [fitter.fit(view, fit.state, prior, levels=(0.5, 1.0), steps=(4, 4)) for fit in found[:N_FINALISTS]]
         best = _by_gain(last)
         return best[0] if best and best[0].gain > 0 else None
 
-    def bank(self, camera: Camera) -> list[State]:
-        """Recorded states as they were before their cameras, before `camera`."""
+    def recorded_states(self, camera: Camera) -> list[State]:
+        """Return recorded states, moved so that `camera` observes them as their own cameras did."""
         recorded, world = self.recorded, camera.world_from_camera.double().cpu()
         states = []
-        for k in evenly_spaced(len(recorded.states), BANK):
+        for k in evenly_spaced(len(recorded.states), N_RECORDED):
             carry = world @ torch.linalg.inv(recorded.cameras[k].world_from_camera.double().cpu())
             instruments = {
                 name: InstrumentState(carry @ given.pose.double().cpu(), given.joints)
@@ -109,26 +111,27 @@ class Search:
         return states
 
     def turned(self, state: State) -> list[State]:
-        """One instrument after the other at other rolls, with its joints as they are and otherwise."""
-        parameters, found = self.parameters, []
+        """Return variants of a state: each instrument in turn at other rolls, with its joints as they are and moved."""
+        parameters, found = self.fitter.parameters, []
         for k, item in enumerate(parameters.instruments):
             given = state.instruments[item.name].joints
             values = [given[name] for name in item.joints]
-            for roll in (0.0, *OTHER_ROLLS):
+            for roll in (0.0, *OTHER_ROLLS_DEG):
                 rolled = parameters.moved(state, parameters.along(k, roll=roll * DEG))
                 found += [rolled] if roll else []
                 for j, slides in enumerate(item.slides):
-                    for change in OTHER_JOINTS:
+                    for change in OTHER_JOINTS_DEG:
                         moved = [*values]
-                        moved[j] += change * (QUARTER_MM if slides else DEG)
+                        moved[j] += change * (MM_PER_DEG if slides else DEG)
                         found.append(parameters.with_joints(rolled, k, moved))
         return found
 
     def _different(self, states: Sequence[State], count: int) -> list[State]:
-        """The first few that differ in place, turn or joints."""
+        """Return the first `count` states that lead to different fits."""
         chosen: list[State] = []
         for state in states:
-            if all(differ(self.parameters, state, other, APART_DEG, APART_JOINT_DEG, APART_MM) for other in chosen):
+            limits = APART_DEG, APART_JOINT_DEG, APART_MM
+            if all(differ(self.fitter.parameters, state, other, *limits) for other in chosen):
                 chosen.append(state)
             if len(chosen) == count:
                 break
@@ -147,13 +150,11 @@ def differ(
     joint_degrees: float,
     millimetres: float = math.inf,
 ) -> bool:
-    """Return whether two states differ by more than `degrees` of rotation, `millimetres`, or `joint_degrees` of a joint
-    (0.25 mm per degree where it is prismatic)."""
+    """Return whether two states differ by more than `degrees` of rotation, `millimetres`, or `joint_degrees`."""
     apart = parameters.between(one, other)
     for item, (pose, rows) in zip(parameters.instruments, parameters.rows, strict=True):
-        own = apart[pose]
-        units = torch.tensor([QUARTER_MM if slides else DEG for slides in item.slides], dtype=torch.float64)
-        turned, shifted = float(own[:3].norm()) / DEG, float(own[3:].norm())
+        units = torch.tensor([MM_PER_DEG if slides else DEG for slides in item.slides], dtype=torch.float64)
+        turned, shifted = float(apart[pose][:3].norm()) / DEG, float(apart[pose][3:].norm())
         if turned > degrees or shifted > millimetres or bool((apart[rows].abs() > joint_degrees * units).any()):
             return True
     return False

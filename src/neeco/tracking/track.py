@@ -1,8 +1,8 @@
-"""`neeco track`: footage whose states are not known becomes a capture, each state with how far to trust it.
+"""`neeco track`: footage without states becomes a capture, with the trust in each state.
 
-Frames are followed forwards from where the instruments were first found, backwards to the beginning, and once more
-backwards through every stretch of little trust from the frame beyond it; of two results the more trusted is kept.
-Every step is written beside the output as it is made, so that work that was broken off goes on to the same bytes.
+Frames are followed forwards from where the instruments were first found, then backwards to the beginning. Stretches of
+low trust are followed once more, backwards from the frame after them; the more trusted result is kept. Every step is
+written into the output as it is made, so that interrupted work continues to the same bytes.
 """
 
 from __future__ import annotations
@@ -25,14 +25,13 @@ from neeco.capture.model import Capture, Frame, InstrumentState, State
 from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
-from neeco.files import LOCK, own_folder, read_begun, read_bytes, read_json, require_like, require_same, write_json
+from neeco.files import LOCK, own_folder, read_begun, read_bytes, read_json, require_same, write_json
 from neeco.scene import Recorded
 from neeco.scene.gaussian_scene import one_tissue
 from neeco.scene.io import load_gaussians, save_scene
-from neeco.tracking.follow import LOOK_EVERY, Follower, Step
-from neeco.tracking.footage_again import learned_again
+from neeco.tracking.follow import SEARCH_ROLLS_EVERY, Follower, Step
 from neeco.tracking.footage_scene import adapted, over_tissue
-from neeco.tracking.footage_tissue import Report, learn_tissue
+from neeco.tracking.footage_tissue import Report, learn_again, learn_tissue
 from neeco.tracking.parameters import TrackedParameters, fitter_of
 from neeco.tracking.trust import Reference
 from neeco.training.run import stored_config, write_config
@@ -43,16 +42,16 @@ if TYPE_CHECKING:
 
 SCHEMA = "neeco-track/1"
 INFO = "track.json"
-STEPS = "steps"  # the folder of what is done, gone at the end
-SECOND = "second"  # in it: steps by tissue and light that were learned again
+STEPS = "steps"  # the folder of finished steps, removed at the end
+SECOND = "second"  # in it: steps with tissue and light that were learned again
 FOOTAGE = "footage"  # the folder of the output in which `neeco track` keeps a video as a capture
-RUN = "run"  # the folder of the scene by which footage over another tissue was tracked: a run
-OTHER_TISSUE = 3.0  # times the misfit over the own tissue that instruments have over tissue learned from footage
+RUN = "run"  # the folder of the run with which footage over another tissue was tracked
+OTHER_TISSUE_MISFIT = 3.0  # of instruments over tissue learned from footage, times that over their own
 MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
-MOSTLY_TRUSTED = 0.5  # of the frames: with fewer the footage is doubtful
-SURE = 0.8  # trust with which instruments are begun to be followed at once
-BEGINNINGS = 8  # frames in which the instruments are looked for, until one is SURE
-TOGETHER = 0.7  # trust below which a stretch is followed once more, from its far end
+MIN_TRUSTED_SHARE = 0.5  # of the frames, below which the result is doubtful
+CERTAIN = 0.8  # trust with which following begins at once
+N_BEGINNINGS = 8  # frames in which the instruments are searched for, until one is CERTAIN
+FOLLOW_AGAIN = 0.7  # trust below which a stretch is followed once more, from its far end
 
 Start = Literal["first", "none"]
 TissueOf = Literal["run", "footage"]
@@ -60,7 +59,7 @@ TissueOf = Literal["run", "footage"]
 
 @dataclass(frozen=True)
 class Tracked:
-    """What was found: a record of every frame, in order of time, and the capture of those that are trusted."""
+    """The result: a record of every frame, in order of time, and the capture of those that are trusted."""
 
     output: Path
     footage: Capture
@@ -71,11 +70,11 @@ class Tracked:
 
     @property
     def verdict(self) -> str:
-        """How far the states can be trusted, in one sentence; a doubtful verdict in capitals."""
+        """One sentence on the trust in the states; a doubtful verdict is in capitals."""
         count, missing = len(self.records), sum(record["how"] == "lost" for record in self.records)
         typical = median(record["trust"]["value"] for record in self.records)
         found = f"trust is {typical:.2f} in the median, and in {missing} of {count} frames nothing was found"
-        if self.written < MOSTLY_TRUSTED * count:
+        if self.written < MIN_TRUSTED_SHARE * count:
             return f"DOUBTFUL: {found}; is it the run's instrument, over its tissue?"
         return f"{'good' if self.written == count else 'usable'}: {found}"
 
@@ -84,8 +83,8 @@ class Tracked:
         if not self.written:
             best = max(record["trust"]["value"] for record in self.records)
             raise NeecoError(
-                f"{self.footage.root}: no frame is trusted by {self.min_trust:g}, the best is by {best:.2f}; is it the "
-                f"run's instrument, over its tissue (if not: --tissue footage)? {self.output} shows what was found"
+                f"{self.footage.root}: no frame has a trust of {self.min_trust:g}, the highest is {best:.2f}; is it "
+                f"the run's instrument, over its tissue (if not: --tissue footage)? {self.output} shows what was found"
             )
 
 
@@ -104,13 +103,13 @@ def track_footage(
     """Find the states of the run's instruments in every frame of `footage`, and write those that are trusted as a
     capture.
 
-    `tissue`: "run", the footage shows the run's tissue, its cameras are in the run's world; "footage", any other, in
-    any world: it is learned from the footage, and the scene that is tracked by becomes the output's own run (`RUN`).
+    tissue: "run" where the footage shows the run's tissue and its cameras are in the run's world. "footage" for any
+    other: the tissue is learned from the footage, and the scene used for tracking becomes the output's own run (`RUN`).
 
-    States that the footage has are not looked at, but for that of its first frame where `start` is "first". Interrupted
-    (Ctrl-C) or failing, it keeps what is done, for `resume`. How many threads torch takes is the caller's to set
-    (`open_run`). Raises NeecoError for a run that cannot be followed by, footage without the state that is asked for, a
-    share that is none, and an `output` that is not empty (without `resume`) or was begun otherwise.
+    States of the footage are ignored, except that of its first frame where `start` is "first". Interrupted (Ctrl-C) or
+    failing, it keeps finished steps for `resume`. The caller sets the number of torch threads (`open_run`). Raises
+    NeecoError for a run that cannot track, footage without the state that is asked for, a `min_trust` outside [0, 1],
+    and an `output` that is not empty (without `resume`) or was begun otherwise.
     """
     if not 0 <= min_trust <= 1:
         raise NeecoError(f"--min-trust: {min_trust} is not a share; give 0 to 1")
@@ -122,8 +121,7 @@ def track_footage(
     frames = sorted(footage.frames, key=lambda frame: frame.state.time)
     given = _first_state(footage, frames[0], scene) if start == "first" else None
     trained_on = run.capture()
-    scene_file = Path(run.path) / "scene.safetensors"
-    digest = hashlib.sha256(read_bytes(scene_file, "a learned scene", "no such file; train the run first")).hexdigest()
+    digest = scene_digest(run)
     info: dict[str, Any] = {
         "schema": SCHEMA,
         "version": neeco.__version__,
@@ -140,18 +138,17 @@ def track_footage(
         stored = read_json(output / INFO) if (output / INFO).exists() else {}
         if not stored.get("complete"):
             write_json(output / INFO, info | {"complete": False})
-            fitter = fitter_of(scene)
+            fitter, allowance = fitter_of(scene), 1.0
             reference = Reference.of(fitter, trained_on.split("train"))
-            if tissue == "run":
-                follower = Follower.of(frames, fitter, reference)
-                steps = _Work(output / STEPS, follower, on_progress).all_steps(given)
-            else:
+            if tissue == "footage":
                 scene, info["light"] = _over_footage(scene, footage, output / STEPS, on_stage)
-                follower = Follower.of(frames, fitter_of(scene), reference, OTHER_TISSUE)
-                steps = _Work(output / STEPS, follower, on_progress).all_steps(given)
+                fitter, allowance = fitter_of(scene), OTHER_TISSUE_MISFIT
+            follower = Follower.of(frames, fitter, reference, allowance)
+            steps = StepFiles(output / STEPS, follower, on_progress).all_steps(given)
+            if tissue == "footage":
                 scene = _learned_again(scene, frames, steps, output / STEPS, on_stage)
-                follower = Follower.of(frames, fitter_of(scene), reference, OTHER_TISSUE)
-                steps = _Work(output / STEPS / SECOND, follower, on_progress).all_steps(given)
+                follower = Follower.of(frames, fitter_of(scene), reference, allowance)
+                steps = StepFiles(output / STEPS / SECOND, follower, on_progress).all_steps(given)
             records = [_record(frames[k], step, parameters) for k, step in enumerate(steps)]
             info |= {"complete": True, "reference": reference.to_json(), "frames": records}
         else:
@@ -159,29 +156,37 @@ def track_footage(
             if tissue == "footage":
                 scene = load_gaussians(output / RUN / "scene.safetensors", "track", scene.center.device)
         registered = trained_on.registered or tissue == "footage"
-        written = _write(output, footage, scene, trained_on, frames, info["frames"], min_trust, registered)
+        trusted = replace(footage, frames=_with_trust(frames, info["frames"], min_trust), registered=registered)
+        if trusted.frames:
+            write_tracked(trusted, output, scene, trained_on)
         if tissue == "footage" and not stored.get("complete"):
             _write_run(output, run, scene)
         write_json(output / INFO, info)
         if (output / STEPS).exists():
             shutil.rmtree(output / STEPS)
-    return Tracked(output, footage, info["frames"], written, min_trust, scene)
+    return Tracked(output, footage, info["frames"], len(trusted.frames), min_trust, scene)
+
+
+def scene_digest(run: GaussianRun) -> str:
+    """Return the SHA-256 of a run's scene. Raises NeecoError for an unfinished run."""
+    file = Path(run.path) / "scene.safetensors"
+    return hashlib.sha256(read_bytes(file, "a learned scene", "no such file; train the run first")).hexdigest()
 
 
 def _learned_again(
     scene: GaussianScene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Report
 ) -> GaussianScene:
-    """Tissue and light learned again from what was tracked; kept in `folder`."""
+    """Return the scene with tissue and light learned again from the tracked frames; kept in `folder`."""
     file = folder / "scene-2.safetensors"
     if not file.exists():
-        save_scene(learned_again(scene, frames, steps, report), file)
+        save_scene(learn_again(scene, frames, steps, report), file)
     return load_gaussians(file, "track", scene.center.device)
 
 
 def _over_footage(
     instruments: GaussianScene, footage: Capture, folder: Path, report: Report
 ) -> tuple[GaussianScene, dict[str, Any]]:
-    """The instruments over the footage's tissue, in its light; and what that light is. Kept in `folder`."""
+    """Return the instruments over the footage's tissue in its light, and that light; kept in `folder`."""
     file, light = folder / "scene.safetensors", folder / "light.json"
     if not light.exists():
         ground = learn_tissue(footage, folder / "tissue", instruments.center.device, report)
@@ -192,7 +197,7 @@ def _over_footage(
 
 
 def _write_run(output: Path, run: GaussianRun, scene: GaussianScene) -> None:
-    """The scene that was tracked by as a run of its own, trained on the capture at `output`, where there is one."""
+    """Write the scene used for tracking as a run of its own, trained on the capture at `output`, where there is one."""
     folder, digest = output / RUN, ""
     if (output / "transforms.json").exists():
         capture = read_capture(output)
@@ -205,8 +210,8 @@ def _write_run(output: Path, run: GaussianRun, scene: GaussianScene) -> None:
 
 
 @dataclass
-class _Work:
-    """Steps that were made or are read back, each in a file of its own."""
+class StepFiles:
+    """Steps, each in a file of its own: computed once, then read back."""
 
     folder: Path
     follower: Follower
@@ -214,7 +219,7 @@ class _Work:
     done: int = 0
 
     def all_steps(self, given: State | None) -> list[Step]:
-        """The best step of every frame, in order of time."""
+        """Return the best step of every frame, in order of time."""
         count = len(self.follower.frames)
         if given is None:
             first = self._beginning()
@@ -231,29 +236,30 @@ class _Work:
         return [steps[frame] for frame in range(count)]
 
     def _beginning(self) -> Step:
-        """Where the instruments are found first, of a few frames spread over the footage."""
+        """Return the first step: the most trusted of a few frames spread over the footage."""
         count, found = len(self.follower.frames), []
-        spread = [k * count // BEGINNINGS for k in range(BEGINNINGS)]
+        spread = [k * count // N_BEGINNINGS for k in range(N_BEGINNINGS)]
         for frame in dict.fromkeys(spread):
             found.append(self._step(f"find-{frame}", partial(self.follower.find, frame)))
-            if found[-1].trust.value >= SURE:
+            if found[-1].trust.value >= CERTAIN:
                 break
         return max(found, key=lambda step: step.trust.value)
 
     def _again(self, steps: dict[int, Step]) -> None:
-        """Go backwards through every stretch of little trust that a trusted frame follows; other rolls are looked for
-        in every frame of it, so that what comes from beyond is doubted as what came before was."""
+        """Follow backwards through every stretch of low trust that a trusted frame follows.
+
+        Other rolls are searched for in every frame of it, so that both results are judged alike.
+        """
         before: Step | None = None
         for frame in range(len(steps) - 1, -1, -1):
-            if steps[frame].trust.value >= TOGETHER:
+            if steps[frame].trust.value >= FOLLOW_AGAIN:
                 before = steps[frame]
                 continue
             if before is None:
                 continue
             if before is steps.get(frame + 1):  # its motion was learned the other way
-                turned = self.follower.motion.begin(before.moving.state)
-                before = replace(before, moving=turned)
-            before = self._follow("again", replace(before, unlooked=LOOK_EVERY), frame)
+                before = replace(before, motion=self.follower.motion.begin(before.motion.state))
+            before = self._follow("again", replace(before, unsearched=SEARCH_ROLLS_EVERY), frame)
             if before.trust.value > steps[frame].trust.value:
                 steps[frame] = before
 
@@ -261,42 +267,24 @@ class _Work:
         return self._step(f"{name}-{frame}", lambda: self.follower.follow(before, frame))
 
     def _step(self, name: str, make: Callable[[], Step]) -> Step:
-        """One step, always as its file says."""
+        """Return one step as its file says, which is written first where there is none."""
         path = self.folder / f"{name}.json"
         if not path.exists():
             write_json(path, make().to_json())
-        stored = require_like(read_json(path), STEP, str(path), "remove the output folder and track again")
-        return Step.from_json(stored)
+        return Step.from_json(read_json(path), str(path))
 
     def _count(self, total: int) -> None:
         self.done += 1
         self.on_progress(self.done, total)
 
 
-STEP = {
-    "frame": int,
-    "how": str,
-    "instruments": {str: {"pose": [[float]], "joints": {str: float}}},
-    "time": float,
-    "velocity": [float],
-    "covariance": [[float]],
-    "misfit": float,
-    "gain": float,
-    "trust": [float],
-    "recent": [float],
-    "seen_at": float,
-    "searched_at": float,
-    "unlooked": int,
-}
-
-
 def _record(frame: Frame, step: Step, parameters: TrackedParameters) -> dict[str, Any]:
-    """What track.json says of a frame. `deviation`: of rotation (rad), place (mm) and every joint, one standard
-    deviation."""
+    """Return what track.json says of a frame; `deviation`: standard deviations of rotation (rad), place (mm) and every
+    joint."""
     instruments = {}
-    variance = step.moving.covariance.diagonal()
+    variance = step.motion.covariance.diagonal()
     for item, (pose, rows) in zip(parameters.instruments, parameters.rows, strict=True):
-        state, own = step.moving.state.instruments[item.name], variance[pose].clamp_min(0)
+        state, own = step.motion.state.instruments[item.name], variance[pose].clamp_min(0)
         deviation = {"rotation": float(own[:3].sum().sqrt()), "place": float(own[3:].sum().sqrt())}
         most = (item.high - item.low) / math.sqrt(12)  # of a joint that may be anywhere between its bounds
         joints = torch.minimum(variance[rows].clamp_min(0).sqrt(), most).tolist()
@@ -318,7 +306,7 @@ def _record(frame: Frame, step: Step, parameters: TrackedParameters) -> dict[str
 
 
 def state_of(record: dict[str, Any]) -> State:
-    """The state that a record of track.json tells."""
+    """Return the state in a record of track.json."""
     trust = record["trust"]["value"]
     instruments = {
         name: InstrumentState(torch.tensor(given["pose"], dtype=torch.float64), given["joints"], trust)
@@ -327,33 +315,27 @@ def state_of(record: dict[str, Any]) -> State:
     return State(instruments, record["time"])
 
 
-def _write(
-    output: Path,
-    footage: Capture,
-    scene: GaussianScene,
-    trained_on: Capture,
-    frames: Sequence[Frame],
-    records: Sequence[dict[str, Any]],
-    min_trust: float,
-    registered: bool,
-) -> int:
-    """Write the trusted frames as a capture, whose states tell every joint; how many there are."""
-    chosen = tuple(
+def _with_trust(frames: Sequence[Frame], records: Sequence[dict[str, Any]], min_trust: float) -> tuple[Frame, ...]:
+    """Return the frames of enough trust, with their states."""
+    return tuple(
         replace(frame, state=state_of(record))
         for frame, record in zip(frames, records, strict=True)
         if record["trust"]["value"] >= min_trust
     )
-    if chosen:
-        points = footage.points if footage.points.measured else trained_on.points
-        instruments = tuple(replace(item, unrecorded=()) for item in scene.instruments)
-        # whatever else is known of the footage (its lens, a scope that stands still) holds for what is kept of it
-        made = replace(footage, frames=chosen, instruments=instruments, points=points, registered=registered)
-        write_capture(made, output, overwrite=True)
-    return len(chosen)
+
+
+def write_tracked(trusted: Capture, output: Path, scene: GaussianScene, trained_on: Capture) -> None:
+    """Write tracked frames as a capture, whose states tell every joint.
+
+    All else that is known of the footage (its lens, a still scope) holds for them.
+    """
+    points = trusted.points if trusted.points.measured else trained_on.points
+    instruments = tuple(replace(item, unrecorded=()) for item in scene.instruments)
+    write_capture(replace(trusted, instruments=instruments, points=points), output, overwrite=True)
 
 
 def _first_state(footage: Capture, frame: Frame, scene: GaussianScene) -> State:
-    """What the footage says of its first frame. Raises NeecoError where it says nothing of an instrument or joint."""
+    """Return the stated state of the first frame. Raises NeecoError where it lacks an instrument or joint."""
     states = {}
     for item in scene.instruments:
         given = frame.state.instruments.get(item.name)
@@ -369,7 +351,7 @@ def _first_state(footage: Capture, frame: Frame, scene: GaussianScene) -> State:
 
 
 def _check_output(output: Path, info: dict[str, Any], resume: bool) -> None:
-    """Raises NeecoError when `output` may not be written to."""
+    """Raise NeecoError when `output` may not be written to."""
     if output.is_dir() and {entry.name for entry in output.iterdir()} <= {FOOTAGE, LOCK}:
         return
     begun = read_begun(output, INFO, resume, "tracked footage")

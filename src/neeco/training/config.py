@@ -1,5 +1,4 @@
-"""Settings of a training run: the dataclasses, what each method sets differently, and their reading from command-line
-values and config.yaml."""
+"""Settings of a training run: dataclasses, defaults per method, and parsing of command-line values and config.yaml."""
 
 from __future__ import annotations
 
@@ -39,9 +38,9 @@ REMOVED_GROUPS = ("search",)  # of settings that config.yaml of version 0.2 and 
 TISSUE_GAUSSIANS, INSTRUMENT_GAUSSIANS = 20_000, 4_000  # at most, for images of 320x256
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class OptimizerConfig:
-    """Adam's learning rates, but for those of the deformation's own parameters."""
+    """Adam's learning rates, except those of the deformation's own parameters."""
 
     position_rate: float = 1.6e-4  # of means, times the scene's extent (3DGS); falls log-linearly
     rotation_rate: float = 1e-3  # of quaternions
@@ -50,14 +49,14 @@ class OptimizerConfig:
     color_rate: float = 2.5e-3  # of the spherical harmonics' constant term
     sh_rate: float = 1.25e-4  # of the others
     light_rate: float = 3e-3  # of falloff and vignette
-    shadow_offset_rate: float = 3e-2  # mm, of each lamp's place beside the lens
+    shadow_offset_rate: float = 3e-2  # mm, of each lamp's position relative to the lens
     shadow_strength_rate: float = 2e-3
     shadow_width_rate: float = 2e-5  # slope
 
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """Density control beside what the schedule says of its intervals and thresholds."""
+    """Density control, except its intervals and thresholds, which the schedule sets."""
 
     min_opacity: float = 0.005  # Gaussians below are pruned
     dense_size: float = 0.01  # times the scene's extent: smaller Gaussians are cloned, larger ones split
@@ -67,7 +66,7 @@ class DensityConfig:
     prune_stop: float = 0.95  # share of the run
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """Settings of one run."""
 
@@ -99,36 +98,36 @@ class TrainConfig:
             object.__setattr__(self, "deformation", method_class(self.method).Settings())
 
     def gaussian_limits(self, pixels: float) -> tuple[int, int]:
-        """The most Gaussians of the tissue and of each instrument, for images of so many pixels."""
+        """Return the largest numbers of Gaussians of the tissue and of each instrument, for images of `pixels`."""
         factor = size_factor(pixels, self.resolution)
         tissue, instrument = self.max_tissue_gaussians, self.max_instrument_gaussians
         return tissue or round(TISSUE_GAUSSIANS * factor), instrument or round(INSTRUMENT_GAUSSIANS * factor)
 
     @property
     def growth_stop(self) -> float:
-        """Share of the run from which Gaussians are no longer cloned or split."""
+        """Share of the run after which Gaussians are no longer cloned or split."""
         return (1 + self.resolution.full_size_at) / 2 if self.density_stop is None else self.density_stop
 
     @property
     def length(self) -> RunLength:
-        """When the run ends."""
+        """The end of the run, in iterations or minutes."""
         return RunLength(self.iterations, self.minutes)
 
 
 def method_defaults(method: str) -> TrainConfig:
-    """The config a method starts from: the paper's, changed as the method says. Raises NeecoError for an unknown
-    method."""
+    """Return the config that a method starts from: the paper's, with the method's changes. Raises NeecoError for an
+    unknown method."""
     config: TrainConfig = with_fields(TrainConfig(method=method), method_class(method).training_defaults)
     return config
 
 
 def config_to_dict(config: TrainConfig) -> dict[str, Any]:
-    """Plain dicts, lists and scalars; `config_from_dict` is the inverse."""
+    """Return plain dicts, lists and scalars; `config_from_dict` is the inverse."""
     return plain(config)
 
 
 def config_from_dict(values: Mapping[str, Any]) -> TrainConfig:
-    """The TrainConfig that `config_to_dict` wrote. Raises NeecoError naming a field that is unknown or does not fit."""
+    """Return the TrainConfig that `config_to_dict` wrote. Raises NeecoError naming a field that does not fit."""
     method = values.get("method", DEFAULT)
     if not isinstance(own := values.get("deformation") or {}, Mapping):
         raise NeecoError(f"deformation: {own!r} is not a group of fields")
@@ -139,8 +138,11 @@ def config_from_dict(values: Mapping[str, Any]) -> TrainConfig:
 
 
 def _variant_defaults(name: str) -> TrainConfig:
-    """The config that METHOD or METHOD+dta starts from: with +dta every part of the paper's dynamic training adjustment
-    is on. A part that does not apply to the method (noise, where nothing is encoded) has no effect."""
+    """Return the config that METHOD or METHOD+dta starts from.
+
+    With +dta every part of the paper's dynamic training adjustment is on; one that does not apply to the method (noise,
+    where nothing is encoded) has no effect.
+    """
     method, plus, _ = name.partition("+")
     base = method_defaults(method)
     if not plus:
@@ -158,20 +160,19 @@ def _variant_defaults(name: str) -> TrainConfig:
 
 
 def schedule_parts() -> tuple[str, ...]:
-    """Names of the schedule's fields that are parts of the dynamic training adjustment."""
+    """Return the names of the schedule's fields that are parts of the dynamic training adjustment."""
     return tuple(name for name, kind in typing.get_type_hints(ScheduleConfig).items() if kind == Part)
 
 
 def training_config(
     name: str | None, values: Mapping[str, Any], assignments: Sequence[str] = (), begun: TrainConfig | None = None
 ) -> TrainConfig:
-    """The defaults of a method or of its variant METHOD+dta (with the paper's dynamic training adjustment; None: the
-    default method), changed by `values` that are not None, then by NAME=VALUE `assignments` (dots reach nested fields).
-    A preset of the method that `assignments` name comes before all of them. begun: the settings of a run to be resumed,
-    which then stand in place of the defaults.
+    """Return the settings of a run.
 
-    Raises NeecoError naming the option when a name is unknown or a value does not fit, and for an unknown method or
-    variant, or one that is the method itself.
+    name: METHOD or METHOD+dta, whose defaults are changed; None: the default method. values: those that are not None
+    replace defaults. assignments: NAME=VALUE, applied last (dots reach nested fields); a preset that they name comes
+    before all. begun: settings of a run to be resumed, in place of the defaults. Raises NeecoError naming the option
+    for an unknown name, a value that does not fit, and an unknown method or variant.
     """
     given = {field: value for field, value in values.items() if value is not None}
     base = _variant_defaults(name or DEFAULT) if begun is None else _resumed(begun, name)
@@ -189,7 +190,7 @@ def training_config(
 
 
 def _resumed(begun: TrainConfig, name: str | None) -> TrainConfig:
-    """The settings of a run that was `begun`, or where they contradict the method called `name`, that method's."""
+    """Return the settings of a run that was `begun`, or those of method `name` where they contradict it."""
     if name is None:
         return begun
     defaults = _variant_defaults(name)
@@ -220,7 +221,7 @@ def require_begun_with(begun: TrainConfig, now: TrainConfig, output: Path) -> No
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested dicts as one, by dotted names."""
+    """Return nested dicts as one, by dotted names."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
         flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
@@ -228,8 +229,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _with_preset(config: TrainConfig, assignments: Sequence[str]) -> TrainConfig:
-    """`config` with the fields of the preset that `assignments` name; one that the method does not have is refused
-    where the others are read."""
+    """Return `config` with the fields of the preset that `assignments` name; an unknown one is refused later."""
     named = (assignment.partition("=") for assignment in assignments)
     chosen = [value for name, _, value in named if name == "deformation.preset"]
     presets = method_class(config.method).presets
@@ -238,7 +238,7 @@ def _with_preset(config: TrainConfig, assignments: Sequence[str]) -> TrainConfig
 
 
 def check_ranges(config: TrainConfig) -> None:
-    """Raise NeecoError naming the option of a number that nothing can be trained with."""
+    """Raise NeecoError naming the option of a number that is out of range."""
     _check_length(config)
     schedule, density, resolution = config.schedule, config.density, config.resolution
     if (steps := schedule.published_steps) is not None and steps < 1:
@@ -287,8 +287,7 @@ def _check_length(config: TrainConfig) -> None:
 
 
 def _assign(values: dict[str, Any], config: TrainConfig, assignment: str) -> None:
-    """Set what NAME=VALUE says in `values`, those of `config` as plain dicts; whether the value fits its type is
-    checked later."""
+    """Set NAME=VALUE in `values`, the plain dicts of `config`; the value's type is checked later."""
     name, text = name_and_value("--set", assignment, "ssim_weight=0.2")
     *path, last = name.split(".")
     target: Any = values

@@ -29,7 +29,7 @@ class GradientStatistics:
         self.seen += norm > 0
 
     def mean(self) -> Tensor:
-        """[N]."""
+        """Return the mean [N]."""
         return self.total / self.seen.clamp_min(1)
 
 
@@ -38,6 +38,7 @@ def control_density(
     canonical: CanonicalGaussians,
     adam: Adam,
     statistics: GradientStatistics,
+    *,
     max_gaussians: Sequence[int],
     dense_size: float,
     threshold: float,

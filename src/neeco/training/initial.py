@@ -1,4 +1,4 @@
-"""The session before its first step, and its initial scene."""
+"""The session before its first step, with its initial scene."""
 
 from __future__ import annotations
 
@@ -26,8 +26,10 @@ MAX_POSE_EXPLAINED = 0.98  # share of a joint's variance that its instrument's p
 def begin_session(
     capture: Capture, views: TrainingViews, config: TrainConfig, report: Report, scene: DrawableScene | None = None
 ) -> Session:
-    """A session at iteration 0, of any method, on the device of the views: around `scene`, which a checkpoint held, or
-    around a new one, for which the method's `begin` is called."""
+    """Return a session of any method at iteration 0, on the device of the views.
+
+    scene: from a checkpoint; None: a new one, for which the method's `begin` is called.
+    """
     method = method_class(config.method)
     if not method.has_gaussians:
         return method.session(capture, views, config.deformation, config.length, config.seed, scene)
@@ -44,13 +46,14 @@ def begin_session(
 
 
 def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig, report: Report) -> GaussianScene:
-    """Seed the tissue's Gaussians and the deformation of the method from the sparse points and the training frames
-    alone. Raises NeecoError when `config.joints` has an unknown one, or an image cannot be read."""
-    # first, as files may be deleted once training has begun: the grey behind transparent images, which need not be
-    # learned then; black for opaque images
+    """Seed the tissue's Gaussians and the method's deformation from the sparse points and the training frames.
+
+    Raises NeecoError when `config.joints` has an unknown one, or an image cannot be read.
+    """
+    # the grey behind transparent images, which need not be learned; read first, as files may go once training has begun
     background = next((frame.background for frame in frames if has_alpha(frame.image_path)), 0.0)
     instruments = tuple(_learned_instrument(item, frames, config, report) for item in capture.instruments)
-    # at their recorded size, whatever is learned from
+    # at their recorded size, whatever size is learned from
     recorded = Recorded.of(
         capture.split("train"), instruments, capture.lens, config.scale, capture.still, capture.tissues
     )
@@ -68,8 +71,7 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
 
 
 def _seed_tissue(clouds: Sequence[tuple[np.ndarray, np.ndarray]]) -> CanonicalGaussians:
-    """The first Gaussians of the tissue, or of several in one body, from positions [P, 3] mm and colours [P, 3] of
-    each."""
+    """Return the first Gaussians of all tissues in one body, from positions [P, 3] mm and colours [P, 3] of each."""
     seeded = [
         seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
         for positions, colors in clouds
@@ -84,8 +86,8 @@ def _seed_tissue(clouds: Sequence[tuple[np.ndarray, np.ndarray]]) -> CanonicalGa
 def _thinned_points(
     points: PointCloud, frames: tuple[Frame, ...], config: TrainConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [P, 3] mm and colours [P, 3] of at most `config.initial_points` sparse points, and at most as many as
-    the tissue may have Gaussians."""
+    """Return positions [P, 3] mm and colours [P, 3] of at most `config.initial_points` sparse points, and at most as
+    many as the tissue may have Gaussians."""
     positions, colors = points.positions, points.colors
     limit, _ = config.gaussian_limits(mean_pixels(frames))
     most = min(limit, config.initial_points or limit)
@@ -98,8 +100,11 @@ def _thinned_points(
 def _learned_instrument(
     instrument: Instrument, frames: tuple[Frame, ...], config: TrainConfig, report: Report
 ) -> Instrument:
-    """The instrument with the joints that are learned: `config.joints`; else those of its stated kinematics, where the
-    method moves such links; else those that may move something (`moving_joints`) and that the method can learn."""
+    """Return the instrument with the joints that are learned.
+
+    These are `config.joints`; else those of its stated kinematics, where the method moves such links; else those that
+    may move something (`moving_joints`) and that the method can learn.
+    """
     method, tree = method_class(config.method), instrument.kinematics
     if config.joints is None and tree is not None and method.moves_stated_links(config.deformation):
         if missing := [reading for reading in tree.readings if reading not in instrument.joints]:
@@ -121,7 +126,7 @@ def _learned_instrument(
 def moving_joints(
     instrument: Instrument, frames: tuple[Frame, ...], config: TrainConfig, report: Report
 ) -> tuple[str, ...]:
-    """Joints that may move parts of the tracked body: `config.joints`, or those its pose does not already explain.
+    """Return joints that may move parts of the tracked body: `config.joints`, or those that its pose does not explain.
 
     A robot arm's joints upstream of the tracked frame are a function of its pose; a jaw angle is not.
     Raises NeecoError for an unknown name.

@@ -1,8 +1,7 @@
-"""Coarse to fine: at which share of their size images are drawn and compared, and how many Gaussians there may be.
+"""Coarse to fine: the size of rendered images and the number of Gaussians over a run.
 
-Early steps settle what small images show as well as large ones, at a fraction of the cost. As in DashGaussian (Chen et
-al., CVPR 2025) the images' spectrum says how much of the run each size is worth, and the number of Gaussians follows
-the size.
+Early steps learn what small images show, at a fraction of the cost. As in DashGaussian (Chen et al., CVPR 2025) the
+images' spectrum determines the share of the run for each size, and the number of Gaussians follows the size.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ import numpy as np
 from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
 from neeco.scene.training_views import TrainingViews, mean_pixels
 
-SPECTRUM_FRAMES = 12  # whose spectra are looked at
+N_SPECTRUM_FRAMES = 12  # whose spectra are averaged
 
 
 @dataclass(frozen=True)
 class ResolutionConfig:
-    """Sizes of the images that are drawn and compared over the run, and numbers of Gaussians that follow them."""
+    """Sizes of rendered images over the run, and numbers of Gaussians that follow them."""
 
     min_side: int = 90  # px, of the shorter side where the run begins; images as small are never reduced
     step: float = 1.414  # between a size and the next
@@ -32,8 +31,11 @@ class ResolutionConfig:
 
 
 class Resolution:
-    """Image sizes over one run: a size is drawn until the share of the run is done that it keeps of the amplitudes in
-    the spectrum of the images, as a share of the coarse part of the run."""
+    """Image sizes over one run.
+
+    The share of amplitudes in the images' spectrum that a size keeps is the share of the run's coarse part at which
+    that size ends.
+    """
 
     def __init__(self, config: ResolutionConfig, views: TrainingViews) -> None:
         self.config = config
@@ -47,12 +49,12 @@ class Resolution:
         ]  # progress at which each scale ends
 
     def scale(self, progress: float) -> float:
-        """Share of the images' size at `progress` in [0, 1] of the run."""
+        """Return the share of the images' size at `progress` in [0, 1] of the run."""
         return next((scale for scale, end in zip(self.scales, self.ends, strict=True) if progress < end), 1.0)
 
     def rendered_share(self, progress: float) -> float:
-        """Share of the run's pixels that are rendered by `progress`: how much of it has been learned, which is less
-        than `progress` while images are reduced."""
+        """Return the share of the run's pixels that are rendered by `progress`; less than that while images are
+        reduced."""
         scales, ends = [*self.scales, 1.0], [*self.ends, 1.0]
         spans = list(zip(scales, [0.0, *self.ends], ends, strict=True))
 
@@ -62,11 +64,11 @@ class Resolution:
         return pixels(progress) / pixels(1.0)
 
     def limit_at(self, progress: float, limit: int) -> int:
-        """How many Gaussians a body may have at `progress`, of at most `limit`."""
+        """Return the largest number of Gaussians of a body at `progress`, of at most `limit`."""
         return math.ceil(limit * self.scale(progress) ** self.config.growth_power)
 
     def threshold_at(self, progress: float, threshold: float) -> float:
-        """The gradient above which Gaussians grow at `progress`, of `threshold` for images of 320x256.
+        """Return the gradient above which Gaussians grow at `progress`, given the `threshold` for images of 320x256.
 
         The gradient (NDC) of a Gaussian whose error stays the same is proportional to its radius as a share of the
         image, so that n times as many grow from thresholds of 1 / sqrt(n).
@@ -75,22 +77,22 @@ class Resolution:
 
 
 def size_factor(pixels: float, config: ResolutionConfig) -> float:
-    """How many times as many Gaussians images of so many pixels take as those of 320x256; at least 1."""
+    """Return the factor on numbers of Gaussians for images of so many pixels, compared with 320x256; at least 1."""
     return max(1.0, pixels / REFERENCE_PIXELS) ** config.limit_power
 
 
 def reduced_scales(side: int, config: ResolutionConfig) -> list[float]:
-    """Shares below 1 of the images' size, rising, from the smallest at which their shorter side of `side` px still has
+    """Return rising shares below 1 of the images' size, from the smallest at which their shorter side of `side` px has
     `config.min_side` px."""
     count = max(0, math.floor(math.log(side / config.min_side) / math.log(config.step) + 1e-9))
     return [config.step**-k for k in range(count, 0, -1)]
 
 
 def amplitude_shares(views: TrainingViews, scales: Sequence[float]) -> list[float]:
-    """The share of all amplitudes in the images' spectrum, their means left out, that images reduced to each of
-    `scales` keep."""
+    """Return the share of amplitudes in the images' spectrum, without their means, that images of each of `scales`
+    keep."""
     retained = np.zeros(len(scales))
-    frames = evenly_spaced(len(views), SPECTRUM_FRAMES) if len(scales) else []
+    frames = evenly_spaced(len(views), N_SPECTRUM_FRAMES) if len(scales) else []
     for index in frames:
         grey = views.target(index).mean(-1).cpu().numpy()
         amplitudes = np.abs(np.fft.rfft2(grey - grey.mean()))

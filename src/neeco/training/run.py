@@ -36,6 +36,7 @@ from neeco.scene.training_session import Session, StepResult, members
 from neeco.training.config import TrainConfig, check_ranges, config_from_dict, config_to_dict
 
 SCHEMA = "neeco-run/1"
+CONFIG_FILE = "config.yaml"
 CAPTURE_DIGEST = "capture_sha256"
 CHECKPOINT_SCHEMA = "neeco-checkpoint/1"
 CHECKPOINT_HEADER = {"schema": str, "scene": {}, "iteration": int, "seconds": float}
@@ -50,11 +51,11 @@ class TrainedRun:
     config: dict[str, Any]
 
     def capture(self) -> Capture:
-        """The capture it was trained on; joints that nobody recorded are as training found them (`Recorded.completed`).
+        """Return the capture it was trained on, unrecorded joints as training estimated them (`Recorded.completed`).
         Raises NeecoError when it has moved."""
         root = Path(self.config["capture"])
         if not root.exists():
-            config = self.path / "config.yaml"
+            config = self.path / CONFIG_FILE
             raise NeecoError(f"{config}: capture: {root} no longer exists; put it back, or write there where it is")
         return self.scene.recorded.completed(read_capture(root, self.config["transforms"]), self.scene.instruments)
 
@@ -99,10 +100,10 @@ def open_gaussian_run(path: Path, asked_by: str, device: torch.device | None = N
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """config.yaml of run folder `path`, checked."""
+    """Return config.yaml of run folder `path`, checked. Raises NeecoError."""
     path = Path(path)
     require_utf8(path)
-    file = path / "config.yaml"
+    file = path / CONFIG_FILE
     if not path.is_dir():
         raise NeecoError(f"{path}: no such run folder; make one with `neeco train CAPTURE --output {path}`")
     for entry in path.glob("*"):
@@ -123,12 +124,12 @@ def write_config(path: Path, capture: Path, config: TrainConfig, fingerprint: st
     values = {"schema": SCHEMA, "version": __version__, "capture": os.path.abspath(capture)}
     values |= {CAPTURE_DIGEST: fingerprint}
     values |= config_to_dict(config)
-    write_text(path / "config.yaml", yaml.dump(values, Dumper=YamlDumper, sort_keys=False))
+    write_text(path / CONFIG_FILE, yaml.dump(values, Dumper=YamlDumper, sort_keys=False))
 
 
 def require_same_capture(path: Path, root: Path, fingerprint: str) -> None:
     """Raise NeecoError when a run was begun in `path` on the capture at `root` before it had this `fingerprint`."""
-    file = path / "config.yaml"
+    file = path / CONFIG_FILE
     if not file.exists():
         return
     if read_config(path).get(CAPTURE_DIGEST, fingerprint) != fingerprint:  # older versions noted none
@@ -139,24 +140,24 @@ def require_same_capture(path: Path, root: Path, fingerprint: str) -> None:
 
 
 def begun_config(path: Path) -> TrainConfig | None:
-    """The settings of the run that was begun in `path`, finished or not; None where none was. Raises NeecoError."""
-    return stored_config(path, read_config(path)) if (path / "config.yaml").exists() else None
+    """Return the settings of the run begun in `path`, finished or not; None where none was. Raises NeecoError."""
+    return stored_config(path, read_config(path)) if (path / CONFIG_FILE).exists() else None
 
 
 def stored_config(path: Path, stored: Mapping[str, Any]) -> TrainConfig:
-    """The settings that the run in `path` was started with, of what `read_config` read there. Raises NeecoError for a
-    field that is unknown or does not fit, or a number that nothing is trained with."""
+    """Return the settings in `stored`, which `read_config` read from run folder `path`. Raises NeecoError for a field
+    that is unknown or does not fit, or a number out of range."""
     known = {key: value for key, value in stored.items() if key not in ("schema", "version", "capture", CAPTURE_DIGEST)}
     try:
         config = config_from_dict(known)
         check_ranges(config)
     except NeecoError as error:
-        raise NeecoError(f"{path / 'config.yaml'}: {error}; train again") from None
+        raise NeecoError(f"{path / CONFIG_FILE}: {error}; train again") from None
     return config
 
 
 def checkpoint_path(run: Path) -> Path:
-    """Where a run keeps its checkpoint."""
+    """Return the path of a run's checkpoint."""
     return run / "checkpoint" / "session.safetensors"
 
 
@@ -186,7 +187,7 @@ def save_checkpoint(session: Session, run: Path) -> None:
 
 
 def read_checkpoint(run: Path) -> tuple[DrawableScene, dict[str, Any], dict[str, Tensor]]:
-    """(scene, header, other tensors) of a run's checkpoint. Raises NeecoError when damaged or of another version."""
+    """Return (scene, header, other tensors) of a run's checkpoint. Raises NeecoError for a damaged or unknown one."""
     path = checkpoint_path(run)
     require_file(path, "a checkpoint of `neeco train`")
     with reporting_damage(path):
@@ -206,7 +207,7 @@ def read_checkpoint(run: Path) -> tuple[DrawableScene, dict[str, Any], dict[str,
 
 @contextmanager
 def reporting_damage(path: Path) -> Iterator[None]:
-    """For a block that reads the checkpoint in `path`: raises NeecoError where its content does not fit."""
+    """Raise NeecoError where the block, which reads the checkpoint in `path`, finds content that does not fit."""
     try:
         yield
     except DAMAGED as error:

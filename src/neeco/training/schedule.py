@@ -18,12 +18,11 @@ Part = Literal["on", "off", "inverse"]
 
 @dataclass(frozen=True)
 class DensityPhase:
-    """When density control acts: every `interval` iterations on mean image-space gradients above `threshold` (NDC).
-    `opacity_reset`: iterations between opacity resets; 0: none."""
+    """Settings of density control in one phase."""
 
-    interval: int
-    opacity_reset: int
-    threshold: float
+    interval: int  # iterations between its actions
+    opacity_reset: int  # iterations between opacity resets; 0: none
+    threshold: float  # NDC, of mean image-space gradients above which Gaussians grow
 
 
 # Iterations. Opacity, at its learning rate, is back about 150 steps after a reset. Rates do not scale with the run's
@@ -32,9 +31,9 @@ class DensityPhase:
 MIN_RESET_INTERVAL = 300
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ScheduleConfig:
-    """Which parts of the adjustment act, and the choices where the paper is silent."""
+    """Parts of the adjustment, and choices that the paper leaves open."""
 
     density_interval: Part = "on"  # the paper's P_di
     opacity_reset: Part = "on"  # P_oi
@@ -59,7 +58,7 @@ class ScheduleConfig:
 
 
 class Schedule:
-    """What to do at each iteration of a run of `iterations` steps. Call `observe` after every step."""
+    """Settings at each iteration of a run of `iterations` steps. Call `observe` after every step."""
 
     def __init__(self, config: ScheduleConfig, iterations: int | None = None) -> None:
         if config.published_steps is not None and iterations is None:
@@ -73,7 +72,7 @@ class Schedule:
         self.history: deque[tuple[float, float]] = deque(maxlen=2 * self.window)
 
     def scaled(self, iterations: int) -> int:
-        """A number of iterations of the published run as one of this run; at least 1, but none (0) stays none."""
+        """Scale a number of iterations of the published run to this run; at least 1, but 0 stays 0."""
         return max(1, round(iterations * self.scale)) if iterations else 0
 
     def observe(self, iteration: int, loss: float, psnr: float, progress: float) -> None:
@@ -87,7 +86,7 @@ class Schedule:
             self.phase, self.phase_started, self.forced = 2, iteration, not ready
 
     def _settled(self) -> bool:
-        """PSNR's moving average is above the threshold and the loss fell from one window to the next."""
+        """Return whether PSNR's moving average is above the threshold and the loss fell between two windows."""
         window = self.window
         if len(self.history) < 2 * window:
             return False
@@ -96,11 +95,11 @@ class Schedule:
         return bool(values[window:, 1].mean() > self.config.psnr_threshold and loss_now < loss_before)
 
     def _acting_phase(self, part: Part) -> int:
-        """The phase whose settings of `part` are in force; 0: off, as in 3DGS."""
+        """Return the phase whose settings of `part` are in force; 0: off, as in 3DGS."""
         return {"off": 0, "on": self.phase, "inverse": 3 - self.phase}[part]
 
     def density(self) -> DensityPhase:
-        """The density settings in force, in iterations of this run."""
+        """Return the density settings in force, in iterations of this run."""
         config = self.config
         return DensityPhase(
             self.scaled(self._density_of(config.density_interval).interval),
@@ -116,8 +115,7 @@ class Schedule:
         return (self.config.plain_density, self.config.phase_1, self.config.phase_2)[self._acting_phase(part)]
 
     def sh_degree(self, iteration: int) -> int:
-        """Order 0 in phase 1, then one more every `sh_interval`; off: one more every `sh_interval` from the start
-        (3DGS)."""
+        """Return the SH order: 0 in phase 1, then one more every `sh_interval`; where off, from the start (3DGS)."""
         config, acting = self.config, self._acting_phase(self.config.sh_order)
         if acting == 1:
             return 0
@@ -125,21 +123,21 @@ class Schedule:
         return min(config.max_sh_degree, (iteration - since) // self.scaled(config.sh_interval))
 
     def state_noise(self, progress: float) -> float:
-        """Standard deviation of the compensation Delta = N(0, sigma^2) * beta * t_phase, t_phase falling from 1 to 0 in
-        its phase."""
+        """Return the standard deviation of the compensation Delta = N(0, sigma^2) * beta * t_phase, where t_phase falls
+        from 1 to 0 in its phase."""
         config = self.config
         if self._acting_phase(config.compensation) != 1:
             return 0.0
         return config.sigma * config.beta * max(0.0, 1.0 - progress)
 
     def frames(self, pose_order: np.ndarray, rng: np.random.Generator) -> list[int]:
-        """One epoch of frame indices: sorted by instrument pose (either way round), or at random."""
+        """Return one epoch of frame indices: sorted by instrument pose (in either direction), or at random."""
         if self._acting_phase(self.config.frame_order) == 1:
             return list(map(int, pose_order if rng.random() < 0.5 else pose_order[::-1]))
         return list(map(int, rng.permutation(len(pose_order))))
 
     def state_dict(self) -> dict[str, object]:
-        """JSON-able; restores an interrupted run exactly."""
+        """Return a JSON-able state that restores an interrupted run exactly."""
         return {
             "phase": self.phase,
             "phase_started": self.phase_started,
@@ -148,18 +146,18 @@ class Schedule:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """The inverse of `state_dict`."""
+        """Restore what `state_dict` returned."""
         self.phase, self.phase_started, self.forced = state["phase"], state["phase_started"], state["forced"]
         self.history = deque((tuple(pair) for pair in state["history"]), maxlen=2 * self.window)
 
 
 def due(interval: int, before: int, now: int) -> bool:
-    """Whether a multiple of `interval` iterations has been reached since iteration `before`."""
+    """Return whether a multiple of `interval` iterations was reached after iteration `before`."""
     return now // interval > before // interval
 
 
 def order_by_pose(states: np.ndarray) -> np.ndarray:
-    """Indices [F] of a walk through states [F, S] that always steps to the nearest one left (the paper's uniform
+    """Return indices [F] of a walk through states [F, S] that always steps to the nearest one left (the paper's uniform
     motion).
 
     Starts at the state of smallest first principal coordinate, so that the walk sweeps the range once.

@@ -1,4 +1,4 @@
-"""The training session of methods that deform Gaussians: what changes while training, and how one step changes it."""
+"""The training session of methods that deform Gaussians: the state of a run in memory, and one step of it."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from neeco.training.resolution import Resolution
 from neeco.training.schedule import Schedule, due, order_by_pose
 
 
-@dataclass
+@dataclass(kw_only=True)
 class GaussianSession(GaussianTraining):
-    """One training run in memory, of any method that deforms Gaussians. Its hooks are `Deformation`'s."""
+    """One training run of any method that deforms Gaussians. Its hooks are `Deformation`'s."""
 
     scene: GaussianScene
     config: TrainConfig
@@ -42,7 +42,7 @@ class GaussianSession(GaussianTraining):
     rng: np.random.Generator = field(init=False)
     schedule: Schedule = field(init=False)
     resolution: Resolution = field(init=False)
-    full_views: TrainingViews = field(init=False)  # at full size; `views` are those drawn now
+    full_views: TrainingViews = field(init=False)  # at full size; `views` are those in use
     scale: float = field(init=False)  # of `views`
     limits: tuple[int, int] = field(init=False)  # most Gaussians of the tissue, and of each instrument
     given: list[tuple[State, Camera]] = field(init=False)  # of every frame of `views`, as recorded, on their device
@@ -64,14 +64,16 @@ class GaussianSession(GaussianTraining):
         self._use_views(self.full_views, 1.0)
 
     def _use_views(self, views: TrainingViews, scale: float) -> None:
-        """Draw and compare these from now on, whose images have `scale` times their full size."""
+        """Render and compare these views from now on, whose images have `scale` times their full size."""
         self.views, self.scale = views, scale
         self.given = [(frame.state.to(views.device), frame.camera.to(views.device)) for frame in views.frames]
 
     @contextmanager
     def searching(self, as_learned: bool = False) -> Iterator[None]:
-        """Within the block, `views` have the size at which instruments, joints and shadows are searched; `as_learned`:
-        at most the size learned from so far, where what the scene cannot draw yet would hide what is searched."""
+        """Give `views` the size at which instruments, joints and shadows are searched, within the block.
+
+        as_learned: at most the size learned from so far, where detail that the scene lacks would hide what is searched.
+        """
         views, scale = self.views, self.scale
         if not (as_learned and scale < self.resolution.search_scale):
             self._use_views(self.search_views, self.resolution.search_scale)
@@ -82,11 +84,11 @@ class GaussianSession(GaussianTraining):
 
     @cached_property
     def search_views(self) -> TrainingViews:
-        """The views of the size that searches take; made once, as a run searches some ten times."""
+        """The views of the size for searches; made once, as a run searches about ten times."""
         return self.full_views.scaled(self.resolution.search_scale)
 
     def start(self) -> None:
-        """Make the scene's tensors leaves of autograd and clear the statistics; once the canonical Gaussians exist."""
+        """Make the scene's tensors leaves of autograd and clear the statistics, once the canonical Gaussians exist."""
         scene = self.scene
         self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
         scene.requires_grad_(True)
@@ -101,7 +103,7 @@ class GaussianSession(GaussianTraining):
 
     @property
     def gaussian_rates(self) -> dict[str, float]:
-        """Adam's learning rate of every canonical tensor but the means, by name."""
+        """Adam's learning rates of the canonical tensors except the means, by name."""
         optimizer, extras = self.config.optimizer, self.scene.deformation.extra_rates
         return {
             "quats": optimizer.rotation_rate,
@@ -146,7 +148,7 @@ class GaussianSession(GaussianTraining):
         return StepResult.mean(results)
 
     def _accumulate(self, index: int, progress: float, following: int | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Add one frame's share to all gradients; returns the minimised total, the image's loss and squared error.
+        """Add one frame's share to all gradients; return the minimised total, the image's loss and squared error.
 
         The pixels of the `following` frame are prefetched.
         """
@@ -168,11 +170,11 @@ class GaussianSession(GaussianTraining):
         return total, loss, _squared_error(rendering.color.detach(), target, mask)
 
     def corrected(self, index: int) -> tuple[State, Camera]:
-        """The state and camera of training frame `index` as refined so far."""
+        """Return the state and camera of training frame `index` as refined so far."""
         return self.refinement.apply(index, *self.given[index], self.iteration)[:2]
 
     def frames_along_poses(self, count: int) -> list[int]:
-        """Indices of at most `count` training frames, evenly spaced in the order of poses."""
+        """Return indices of at most `count` training frames, evenly spaced in the order of poses."""
         order = self.pose_order
         # float32 and rounded down: other roundings choose other frames, and runs would not stay the same
         return [int(order[int(place)]) for place in torch.linspace(0, len(order) - 1, min(count, len(order)))]
@@ -189,7 +191,7 @@ class GaussianSession(GaussianTraining):
         return self.scene.deformation.perturb(noise, self.iteration, progress, self.rng)
 
     def _regularisation(self, rendering: Rendering, penalty: Tensor | None) -> Tensor | float:
-        """The prior on corrected poses, and the method's own term."""
+        """Return the prior on corrected poses plus the method's own term."""
         deformation = self.scene.deformation
         terms = [penalty]
         if not deformation.warming_up:
@@ -197,7 +199,7 @@ class GaussianSession(GaussianTraining):
         return sum(term for term in terms if term is not None)
 
     def _update(self, progress: float) -> None:
-        """One optimiser step on everything that has a gradient; shadows have none until one was found."""
+        """Take an optimiser step on all that has a gradient; shadows have none until one was found."""
         scene, optimizer = self.scene, self.config.optimizer
         # by progress alone positions would be stiff before there is detail to fit
         done = self.resolution.rendered_share(progress)
@@ -250,16 +252,17 @@ class GaussianSession(GaussianTraining):
         if grows or (prunes and progress < config.density.prune_stop):
             instruments = len(scene.canonical.counts) - 1
             tissue, instrument = self.limits
+            limits = [self.resolution.limit_at(progress, limit) for limit in (tissue, *[instrument] * instruments)]
             scene.canonical = control_density(
                 scene.canonical,
                 self.adam,
                 self.statistics,
-                [self.resolution.limit_at(progress, limit) for limit in (tissue, *[instrument] * instruments)],
-                config.density.dense_size * self.extent,
-                self.resolution.threshold_at(progress, settings.threshold) if grows else math.inf,
-                self.generator,
-                config.density,
-                self._unsupported(),
+                max_gaussians=limits,
+                dense_size=config.density.dense_size * self.extent,
+                threshold=self.resolution.threshold_at(progress, settings.threshold) if grows else math.inf,
+                generator=self.generator,
+                config=config.density,
+                unsupported=self._unsupported(),
             )
             self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
             self.watch_gradients()
@@ -267,8 +270,8 @@ class GaussianSession(GaussianTraining):
             reset_opacity(scene.canonical, self.adam, config.density.reset_opacity)
 
     def _unsupported(self) -> Tensor | None:
-        """[N] bool: what the method prunes whatever its opacity, of each tissue by the cameras that see it; None:
-        nothing."""
+        """Return [N] bool: Gaussians that the method prunes whatever their opacity, of each tissue by the cameras that
+        observe it; None: none."""
         canonical, names = self.scene.canonical, self.scene.recorded.tissues
         found: Tensor | None = None
         for index, name in enumerate(names or (None,)):
@@ -280,7 +283,7 @@ class GaussianSession(GaussianTraining):
         return found
 
     def _due(self, interval: int) -> bool:
-        """Whether this step reached a multiple of `interval` iterations."""
+        """Return whether this step reached a multiple of `interval` iterations."""
         return due(interval, self.iteration - self.batch_size, self.iteration)
 
     def between_steps(self, before: float) -> None:
@@ -288,7 +291,7 @@ class GaussianSession(GaussianTraining):
         self.scene.deformation.between_steps(self, before)
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """What a checkpoint needs beside scene, optimiser and random numbers."""
+        """Return what a checkpoint needs besides scene, optimiser and random numbers."""
         statistics = {"statistics/total": self.statistics.total, "statistics/seen": self.statistics.seen}
         refinement = {f"refinement/{name}": tensor for name, tensor in self.refinement.tensors().items()}
         return refinement | statistics, {
@@ -299,7 +302,7 @@ class GaussianSession(GaussianTraining):
         }
 
     def restore(self, tensors: Mapping[str, Tensor], fields: Mapping[str, Any]) -> None:
-        """The inverse of `pack`."""
+        """Restore what `pack` returned."""
         self.refinement.restore(members(tensors, "refinement"))
         self.statistics.total, self.statistics.seen = tensors["statistics/total"], tensors["statistics/seen"]
         self.schedule.load_state_dict(fields["schedule"])
@@ -324,7 +327,7 @@ class GaussianSession(GaussianTraining):
 
 
 def gaussian_session(training: GaussianTraining) -> GaussianSession:
-    """What a deformation's hooks are given, as the session that it is."""
+    """Return the session that a deformation's hooks are given, with its own type."""
     assert isinstance(training, GaussianSession)
     return training
 
@@ -332,7 +335,7 @@ def gaussian_session(training: GaussianTraining) -> GaussianSession:
 def new_session(
     scene: GaussianScene, views: TrainingViews, config: TrainConfig, report: Report = lambda text: None
 ) -> GaussianSession:
-    """A session at iteration 0, on the device of the views; `start` it before the first step."""
+    """Return a session at iteration 0, on the device of the views; `start` it before the first step."""
     generator = torch.Generator(views.device).manual_seed(config.seed)
     centers, tissues = scene.center.cpu().view(-1, 3), scene.recorded.tissues
     distances = []
@@ -340,11 +343,20 @@ def new_session(
         center = centers[tissues.index(frame.state.tissue) if len(centers) > 1 else 0]
         distances.append(float((frame.camera.world_from_camera[:3, 3].float() - center).norm()))
     extent = 0.5 * float(np.median(distances))
-    return GaussianSession(scene, config.length, generator, views, report, config.batch_size, config, extent)
+    return GaussianSession(
+        scene=scene,
+        length=config.length,
+        generator=generator,
+        views=views,
+        report=report,
+        batch_size=config.batch_size,
+        config=config,
+        extent=extent,
+    )
 
 
 def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.ndarray:
-    """Frames in the order of a walk through instrument positions and directions (see `order_by_pose`)."""
+    """Return frames in the order of a walk through instrument positions and directions (see `order_by_pose`)."""
     if not instruments:
         return np.arange(len(frames))
     rows = [
@@ -355,7 +367,7 @@ def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.nd
 
 
 def trust_of(state: State) -> float:
-    """How far a frame counts: by the least trusted of its instruments' states; recorded ones are trusted wholly."""
+    """Return the weight of a frame in the loss: the least trust of its states, 1 for recorded ones."""
     return min((1.0 if given.trust is None else given.trust for given in state.instruments.values()), default=1.0)
 
 

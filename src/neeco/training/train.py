@@ -20,7 +20,7 @@ from neeco.capture.checks import read_checked
 from neeco.capture.model import Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError, memory_failure
-from neeco.files import is_vacant, own_folder, read_text, write_text
+from neeco.files import own_folder, read_begun, read_text, require_same, write_text
 from neeco.scene.io import pack_scene, save_scene
 from neeco.scene.method_registry import method_class, unmet_need
 from neeco.scene.training_session import Session, StepResult
@@ -28,6 +28,7 @@ from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig, require_begun_with
 from neeco.training.initial import begin_session
 from neeco.training.run import (
+    CONFIG_FILE,
     checkpoint_path,
     read_checkpoint,
     read_config,
@@ -41,21 +42,21 @@ from neeco.training.run import (
 from neeco.training.schedule import due
 
 CPU = torch.device("cpu")
-BASE_BYTES, WORKING_BYTES = 0.6e9, 300  # of a process; of one pixel while it is drawn and compared
+BASE_BYTES, PIXEL_BYTES = 0.6e9, 300  # of memory for a process, and for one pixel while it is rendered and compared
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ProgressRow:
-    """One row of metrics.jsonl, and what a progress bar shows. `progress` in [0, 1]; `note` is a line for the user."""
+    """One row of metrics.jsonl, as progress bars show it."""
 
-    iteration: int
-    loss: float
-    psnr: float
-    num_gaussians: int | None  # None: the method has no Gaussians
-    phase: int
-    seconds: float
-    progress: float
-    note: str = ""
+    iteration: int = 0
+    loss: float = 0.0
+    psnr: float = 0.0
+    num_gaussians: int | None = 0  # None: the method has no Gaussians
+    phase: int = 1
+    seconds: float = 0.0
+    progress: float = 0.0  # in [0, 1]
+    note: str = ""  # a line for the user
 
 
 ShowRow = Callable[[ProgressRow], None]
@@ -74,32 +75,32 @@ def train(
     watch: Watch | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Path:
-    """Learn a scene from the `train` split of a capture; returns the run folder.
+    """Learn a scene from the `train` split of a capture; return the run folder.
 
-    `capture`: what `read_checked` returned for the path, where it was read already. A run must be resumed on the kind
-    of device it was begun on. Writes config.yaml, metrics.jsonl, checkpoint/ while running and scene.safetensors at the
-    end. `resume` continues an interrupted run under the settings it was started with, which `config` must not
-    contradict. The same seed gives the same scene on a CPU, interrupted or not, unless `minutes` is set: minutes of
-    `clock` (s; time.process_time counts CPU time), without the time of `watch`. Raises NeecoError for a capture that
-    `neeco check` refuses, a non-empty `output` without `resume`, other settings or another capture than the run was
-    begun with, or a loss that is not finite.
+    Writes config.yaml, metrics.jsonl and checkpoint/ while running, and scene.safetensors at the end. capture: what
+    `read_checked` returned for the path, where it was read already. resume: continue an interrupted run under the
+    settings it was begun with, which `config` must not contradict, on the same kind of device. clock: seconds that
+    `minutes` counts (time.process_time: CPU time), without those of `watch`. The same seed gives the same scene on a
+    CPU, interrupted or not, unless `minutes` is set.
 
-    SIGINT or SIGTERM ends the run between two steps with a checkpoint, a second one at once; either way the message of
-    KeyboardInterrupt says how to resume. A failure before the first step leaves no run folder behind.
+    SIGINT or SIGTERM ends the run between two steps with a checkpoint, a second one at once; the message of
+    KeyboardInterrupt says how to resume. A failure before the first step leaves no run folder behind. Raises NeecoError
+    for a capture that `neeco check` refuses, a non-empty `output` without `resume`, other settings or another capture
+    than the run was begun with, or a loss that is not finite.
     """
     capture_path, output = Path(capture_path), Path(output)
-    if resume and (output / "config.yaml").exists():
-        begun = _stored_config(output, capture_path)
+    if (stored := read_begun(output, CONFIG_FILE, resume, "a run", read_config)) is not None:
+        place, now = str(output / CONFIG_FILE), str(capture_path.absolute())
+        require_same(place, [("capture", stored["capture"], now)], f"resume with {stored['capture']}")
+        begun = stored_config(output, stored)
         require_begun_with(begun, config, output)
         config = begun
-    elif not is_vacant(output):
-        raise NeecoError(f"{output}: not empty; give another --output, or --resume to continue the run in it")
     config = replace(config, deformation=method_class(config.method).resolved(config.deformation))
     contradicted: list[str] = []
     if capture is None:
         capture = read_checked(capture_path, config.transforms, None if resume else contradicted.append)
     digest = fingerprint(capture)
-    if resume:
+    if stored is not None:
         require_same_capture(output, capture.root, digest)
         if (output / "scene.safetensors").exists():
             with own_folder(output):  # removes temporary files of a process killed after its last step
@@ -107,12 +108,14 @@ def train(
     frames = _training_frames(capture, capture_path, config)
     log = _Log(output / "metrics.jsonl", progress, watch, clock)
     go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
-    with own_folder(output), method_class(config.method).torch_threads(), _saying_what_is_needed(frames, config):
+    with own_folder(output), method_class(config.method).torch_threads(), _stating_memory(frames, config):
         try:
-            session = _begin(capture, frames, output, config, device, resume, log)
+            views = TrainingViews.read(frames, config.scale).to(device)
+            session = _begin(capture, views, output if resume else None, config, log)
+            log.truncate(session.iteration)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("before the first step; run the same command again") from None
-        if not (output / "config.yaml").exists():
+        if not (output / CONFIG_FILE).exists():
             write_config(output, capture_path, config, digest)
         for problem in contradicted:
             log.note(f"warning: {problem}")
@@ -129,58 +132,37 @@ def train(
     return output
 
 
-def _stored_config(output: Path, capture_path: Path) -> TrainConfig:
-    """The settings that the run in `output` was started with. Raises NeecoError when it was started on another
-    capture."""
-    stored = read_config(output)
-    if Path(stored["capture"]) != capture_path.absolute():
-        raise NeecoError(
-            f"{output / 'config.yaml'}: capture: this run was started on {stored['capture']}; resume with that"
-        )
-    return stored_config(output, stored)
-
-
-def _begin(
-    capture: Capture,
-    frames: tuple[Frame, ...],
-    output: Path,
-    config: TrainConfig,
-    device: torch.device,
-    resume: bool,
-    log: _Log,
-) -> Session:
-    """The session before its first step, or as the checkpoint in `output` holds it."""
-    views = TrainingViews.read(frames, config.scale).to(device)
+def _begin(capture: Capture, views: TrainingViews, resumed: Path | None, config: TrainConfig, log: _Log) -> Session:
+    """Return the session before its first step, or as the checkpoint of the run `resumed` holds it."""
     started = log.clock()
     torch.manual_seed(config.seed)
-    if resume and checkpoint_path(output).exists():
-        scene, header, tensors = read_checkpoint(output)
-        with reporting_damage(checkpoint_path(output)):
+    if resumed is None or not checkpoint_path(resumed).exists():  # or interrupted before its first checkpoint
+        session = begin_session(capture, views, config, log.note)
+    else:
+        scene, header, tensors = read_checkpoint(resumed)
+        with reporting_damage(checkpoint_path(resumed)):
             session = begin_session(capture, views, config, log.note, scene)
             restore_session(session, header, tensors)
-    else:  # a run interrupted before its first checkpoint begins again
-        session = begin_session(capture, views, config, log.note)
-    log.truncate(session.iteration)
     session.seconds += log.clock() - started
     return session
 
 
 @contextmanager
-def _saying_what_is_needed(frames: tuple[Frame, ...], config: TrainConfig) -> Iterator[None]:
-    """Raise NeecoError with the memory that training takes where the block finds too little."""
+def _stating_memory(frames: tuple[Frame, ...], config: TrainConfig) -> Iterator[None]:
+    """Raise NeecoError with the memory that training takes where the block runs out of it."""
     try:
         yield
     except Exception as error:
         if (failure := memory_failure(error)) is None:
             raise
-        raise NeecoError(f"{failure}; this training is of {_size_note(frames, config)}") from error
+        raise NeecoError(f"{failure}; training takes {_size_note(frames, config)}") from error
 
 
 def _size_note(frames: tuple[Frame, ...], config: TrainConfig) -> str:
-    """What will be learned from, and about how much memory that takes."""
+    """Return the size of the training data, and about how much memory training takes."""
     camera, pixels = frames[0].camera, config.scale**2 * mean_pixels(frames)
     tissue, instrument = config.gaussian_limits(pixels)
-    stored, working = 1.5 * 3 * pixels * len(frames), WORKING_BYTES * pixels  # full images and those half their size
+    stored, working = 1.5 * 3 * pixels * len(frames), PIXEL_BYTES * pixels  # full images and those half their size
     width, height = round(config.scale * camera.width), round(config.scale * camera.height)
     each = "each " if len({frame.state.tissue for frame in frames}) > 1 else ""
     return (
@@ -190,7 +172,7 @@ def _size_note(frames: tuple[Frame, ...], config: TrainConfig) -> str:
 
 
 def _training_frames(capture: Capture, path: Path, config: TrainConfig) -> tuple[Frame, ...]:
-    """The frames to learn from. Raises NeecoError where the capture lacks what the method needs."""
+    """Return the training frames. Raises NeecoError where the capture lacks what the method needs."""
     if method_class(config.method).needs_instruments and not capture.instruments:
         raise NeecoError(
             f"{path}: instruments: no states are recorded; method {config.method} needs them, 3dgs does not"
@@ -240,20 +222,20 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
 
 
 def _check_finite(session: Session) -> None:
-    """Raises NeecoError when a learned number is not finite."""
+    """Raise NeecoError when a learned number is not finite."""
     # buffers may be infinite: an unknown wrist starts at minus infinity
     buffers = {f"module.{name}" for name, _ in session.scene.named_buffers()}
     tensors = pack_scene(session.scene)[0]
     if not all(bool(torch.isfinite(tensor).all()) for name, tensor in tensors.items() if name not in buffers):
         raise NeecoError(
-            f"training: the scene holds numbers that are not finite after {session.iteration} iterations: it diverged, "
-            "though its image did not tell; train anew with another --seed or a milder schedule"
+            f"training: the scene diverged: it holds numbers that are not finite after {session.iteration} iterations; "
+            "train anew with another --seed or a milder schedule"
         )
 
 
 @contextmanager
 def deferred_interrupts() -> Iterator[threading.Event]:
-    """Until the end of the block, the first SIGINT or SIGTERM only sets the event; a second raises KeyboardInterrupt.
+    """Turn the first SIGINT or SIGTERM in the block into an event; a second raises KeyboardInterrupt.
 
     Signals that are ignored (a background job of a script) stay ignored. Outside the main thread, where Python allows
     no handlers, signals are not caught.
@@ -287,20 +269,20 @@ class _Log:
         self.progress = progress
         self.watch = watch
         self.clock = clock
-        self.last = ProgressRow(0, 0.0, 0.0, 0, 1, 0.0, 0.0)
+        self.last = ProgressRow()
 
     def row(self, session: Session) -> None:
         """Write the means over the session's window, and empty it."""
         mean = StepResult.mean(session.window)
         session.window.clear()
         self.last = ProgressRow(
-            session.iteration,
-            round(mean.loss, 6),
-            round(mean.psnr, 3),
-            session.scene.num_gaussians,
-            session.phase,
-            round(session.seconds, 2),
-            round(session.progress, 4),
+            iteration=session.iteration,
+            loss=round(mean.loss, 6),
+            psnr=round(mean.psnr, 3),
+            num_gaussians=session.scene.num_gaussians,
+            phase=session.phase,
+            seconds=round(session.seconds, 2),
+            progress=round(session.progress, 4),
         )
         entry = {key: value for key, value in vars(self.last).items() if key != "note"}
         try:
@@ -323,7 +305,7 @@ class _Log:
 
 
 def _iteration(line: str) -> float:
-    """Of a row of metrics.jsonl; infinite where it is damaged, as the last one may be after a full disk."""
+    """Return the iteration of a row of metrics.jsonl; infinity for a damaged row, such as the last on a full disk."""
     try:
         row = json.loads(line)
     except (ValueError, RecursionError):

@@ -75,7 +75,7 @@ class SavedStates:
             index = 0
             while record_path(root, index).exists() and load_record(root, index) is not None:
                 index += 1
-            record = write_sample(root, index, drawing, labels, {})
+            record = write_sample(root, index, drawing, labels)
         return root / record["image"]
 
     def _lines(self, loaded: LoadedRun) -> list[str]:

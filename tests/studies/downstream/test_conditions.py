@@ -23,7 +23,7 @@ from neeco.studies.downstream.job import (
 from neeco.studies.downstream.samples import DataSet
 
 SETS = ("kin", "other")
-SETTINGS = DownstreamSettings(Path("capture"), Path("out"))
+SETTINGS = DownstreamSettings(capture=Path("capture"), output=Path("out"))
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import json
 import os
 import re
@@ -52,9 +51,9 @@ def small_models(monkeypatch: pytest.MonkeyPatch) -> None:
 def spec(recorded: Path, drawn: Path, tmp_path: Path) -> DownstreamSettings:
     """Eight jobs of a fraction of a second: two folds of real, set and both."""
     return DownstreamSettings(
-        recorded,
-        tmp_path / "out",
-        (DataSet("kin", drawn),),
+        capture=recorded,
+        output=tmp_path / "out",
+        sets=(DataSet("kin", drawn),),
         models=("pixels",),
         num_real=("0", "6", "all"),
         folds=2,
@@ -563,7 +562,6 @@ def test_a_set_of_others_is_no_less_a_set(spec: DownstreamSettings, tmp_path: Pa
     assert "error" not in result["jobs"][0]
 
 
-@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray")
 def test_two_workers_give_the_same_numbers(spec: DownstreamSettings, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.undo()
     small = replace(replace(spec, models=("unet",), conditions=("kin", "real"), num_real=("0", "6"), folds=1), steps=3)

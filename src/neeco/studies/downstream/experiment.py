@@ -42,7 +42,7 @@ SCHEMA = "neeco-downstream/1"
 FILE = "downstream.json"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DownstreamPlan:
     """A study whose settings are checked, ready to run."""
 
@@ -84,7 +84,15 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
         raise NeecoError("--num-real: leaves nothing to train; add 0 for sets alone, or a number of labelled frames")
     for job in jobs:
         job.check()
-    return DownstreamPlan(settings, capture, jobs, images, labelled, size, tuple(_notes(settings, counts)))
+    return DownstreamPlan(
+        settings=settings,
+        capture=capture,
+        jobs=jobs,
+        images=images,
+        labelled=labelled,
+        frame_size=size,
+        notes=tuple(_notes(settings, counts)),
+    )
 
 
 def _check_models(settings: DownstreamSettings) -> None:

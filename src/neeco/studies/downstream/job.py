@@ -114,7 +114,7 @@ def labelled_frames(frames: int, count: int, fold: int, selection: FrameSelectio
     return chosen
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DownstreamSettings:
     """A study: which models learn from what, how long, and what they are tested on. None: the usual, or the model's."""
 

@@ -31,7 +31,7 @@ PREDICTION_BATCH = 16  # images
 REPORT_EVERY = 10  # steps
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainingTask:
     """What a model is to learn, and within which limits."""
 

@@ -90,7 +90,8 @@ def _masks(images: WrittenImages, folder: Path, record: Record) -> list[dict[str
     assert depth is not None
     given = {item["name"]: InstrumentState(item["pose"], item["joints"]) for item in record["instruments"]}
     fx, fy, cx, cy = (record["intrinsics"][key] for key in INTRINSICS)
-    camera = Camera(swap_camera_axes(np.array(record["camera"])), fx, fy, cx, cy, width, height)
+    pose = swap_camera_axes(np.array(record["camera"]))
+    camera = Camera(pose, fx, fy, cx, cy, width=width, height=height)
     extended = extended_silhouettes(images.scene, labeller, State(given, record["time"], record.get("tissue")), camera)
     infos = []
     for place, label in enumerate(record["labels"]):

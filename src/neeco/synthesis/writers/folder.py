@@ -60,7 +60,8 @@ def write_sample(
     index: int,
     drawing: LayeredDrawing,
     labels: list[InstrumentLabel],
-    refused: Mapping[str, int],
+    *,
+    refused: Mapping[str, int] = MappingProxyType({}),
     facts: Mapping[str, Any] = MappingProxyType({}),
     quality: int | None = None,
 ) -> Record:

@@ -1,0 +1,127 @@
+"""The images of a data set, rendered by several processes of this machine or on a Ray cluster.
+
+Each worker opens the scene anew. On a machine the workers map the same file and write to the same folder. A cluster
+needs nothing but neeco installed: the scene files go out with the tasks, the files of the images come back and are
+written here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+from neeco.errors import NeecoError
+from neeco.files import read_bytes, sweep_unfinished, write_atomically
+from neeco.raster.devices import readable_failures
+from neeco.raster.native import threads
+from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_to_folder, limit_threads
+from neeco.synthesis.samplers import states_file
+from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS
+from neeco.synthesis.writers.folder import Record, files_of, load_record, record_path
+from neeco.workers import Workers, address, run_tasks
+
+TASK_SIZE = 8  # images of a cluster's task
+
+
+@dataclass(frozen=True)
+class PackedSpec:
+    """A generator's spec with the content of its files, by name. Equal, by its key, where the content is equal."""
+
+    spec: GeneratorSpec = field(compare=False)
+    files: Mapping[str, bytes] = field(compare=False)
+    key: str
+
+    @classmethod
+    def of(cls, spec: GeneratorSpec) -> PackedSpec:
+        """Raises NeecoError where a file cannot be read."""
+        paths = {f"scene{k}.safetensors": path for k, path in enumerate((spec.scene, *spec.instrument_scenes))}
+        if spec.settings.camera_effects is not None:
+            paths["effects.yaml"] = Path(spec.settings.camera_effects)
+        if spec.settings.states not in SAMPLERS:
+            paths["states.jsonl"] = states_file(spec.settings.states)
+        files = {name: read_bytes(path, "a file of what is drawn") for name, path in paths.items()}
+        content = b"".join(hashlib.sha256(files[name]).digest() for name in sorted(files))
+        return cls(spec, files, hashlib.sha256(content + repr(spec.settings).encode()).hexdigest())
+
+    def open(self) -> SampleGenerator:
+        """The generator, from the files' content."""
+        with tempfile.TemporaryDirectory() as folder:
+            return self._unpacked(Path(folder)).open()
+
+    def _unpacked(self, folder: Path) -> GeneratorSpec:
+        """The same spec, its files in `folder`."""
+        for name, content in self.files.items():
+            (folder / name).write_bytes(content)
+        settings = self.spec.settings
+        if "effects.yaml" in self.files:
+            settings = replace(settings, camera_effects=str(folder / "effects.yaml"))
+        if "states.jsonl" in self.files:
+            prefix = PATH_PREFIX if settings.states.startswith(PATH_PREFIX) else ""
+            settings = replace(settings, states=f"{prefix}{folder / 'states.jsonl'}")
+        scene, *others = (folder / f"scene{k}.safetensors" for k in range(1 + len(self.spec.instrument_scenes)))
+        return replace(self.spec, scene=scene, instrument_scenes=tuple(others), settings=settings)
+
+
+def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], workers: int) -> Iterator[Record]:
+    """Yield the records of these images as they are rendered, in any order; the images are written to `output`.
+
+    Raises NeecoError with what a worker met, and where workers keep dying.
+    """
+    shared: tuple[GeneratorSpec | PackedSpec, Path | None] = (spec, output)
+    size, each = 1, max(1, threads() // workers)
+    if address():
+        shared, size, each = (PackedSpec.of(spec), None), TASK_SIZE, 1
+    tasks = [tuple(indices[k : k + size]) for k in range(0, len(indices), size)]
+    try:
+        with contextlib.closing(run_tasks(_draw, shared, tasks, Workers(count=workers, threads=each))) as events:
+            for event in events:
+                if event.stage == "failed":
+                    raise NeecoError(event.value)
+                if event.stage == "abandoned":
+                    raise NeecoError(
+                        f"--workers: workers keep dying over image {tasks[event.index][0]} ({event.value}); is there "
+                        "memory enough? use fewer workers and --resume"
+                    )
+                for record, files in event.value if event.stage == "done" else ():
+                    place = record_path(Path(), record["index"]).as_posix()
+                    for name in sorted(files, key=lambda name: name == place):  # the record last
+                        write_atomically(output / name, partial(_write_bytes, files[name]))
+                    yield record
+    finally:
+        sweep_unfinished(output)  # what a worker had half written
+
+
+def _write_bytes(content: bytes, path: Path) -> None:
+    path.write_bytes(content)
+
+
+def _draw(
+    shared: tuple[GeneratorSpec | PackedSpec, Path | None], indices: tuple[int, ...], threads: int
+) -> list[tuple[Record, dict[str, bytes]]]:
+    """In a worker: render these images; returns their records, and their files unless it wrote them to the output."""
+    spec, output = shared
+    with readable_failures():
+        generator = _opened(spec, threads)
+        if output is not None:
+            return [(draw_to_folder(generator, output, index), {}) for index in indices]
+        samples = []
+        with tempfile.TemporaryDirectory() as folder:
+            for index in indices:
+                draw_to_folder(generator, Path(folder), index)
+                record = load_record(Path(folder), index)
+                assert record is not None
+                names = [record_path(Path(), index).as_posix(), *(() if record.get("skipped") else files_of(record))]
+                samples.append((record, {name: (Path(folder) / name).read_bytes() for name in names}))
+        return samples
+
+
+@lru_cache(maxsize=1)
+def _opened(spec: GeneratorSpec | PackedSpec, threads: int) -> SampleGenerator:
+    """The generator, opened once in a worker, whatever number of tasks it gets."""
+    limit_threads(threads)
+    return spec.open()
