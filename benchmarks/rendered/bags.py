@@ -33,7 +33,7 @@ def write_bags(folder: Path, clocks_s: Mapping[str, float]) -> None:
     joints = {name: read_reading_log(source) for name, source in instrument.joints.items()}
     lens, _ = recording.read_lens()
     assert lens is not None
-    film = recording.open()
+    film = recording.source.open()
     for name, (kind, packed, ending) in LAYOUTS.items():
         (folder / "bags" / name).mkdir(parents=True)
         with BagWriter(folder / "bags" / name, kind, packed=packed) as bag:

@@ -29,7 +29,7 @@ def write_data_sets(folder: Path, clocks_s: Mapping[str, float]) -> None:
     a data set has the states at its images, NaN where a log has none."""
     recording = read_recording(folder / "recording.yaml")
     instrument, scope = recording.instruments[0], recording.laparoscope
-    film = recording.open()
+    film = recording.source.open()
     states, names = [], []
     for body, source in (("psm1", instrument.poses), ("ecm", scope)):
         if source is None:

@@ -28,7 +28,7 @@ def write_plus(folder: Path, clocks_s: Mapping[str, float]) -> None:
     instrument, scope = recording.instruments[0], recording.laparoscope
     assert instrument.poses is not None
     bodies = {"Instrument": instrument.poses} | ({} if scope is None else {"Endoscope": scope})
-    film = recording.open()
+    film = recording.source.open()
     transforms, statuses = {}, {}
     for body, source in bodies.items():
         log, name = read_pose_log(source), f"{body}ToTracker"

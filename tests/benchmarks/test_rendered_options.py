@@ -192,7 +192,7 @@ def test_the_recording_holds_the_same_frames_and_states(capture: Path) -> None:
     recording = read_recording(capture / "recording" / "recording.yaml")
     truth = json.loads((capture / "truth" / "transforms.json").read_text())["frames"]
     unknown = json.loads((capture / "truth" / "recording.json").read_text())
-    source = recording.open()
+    source = recording.source.open()
     assert len(source.times) == len(truth)
     log = read_pose_log(recording.instruments[0].poses)
     offset = unknown["clocks_s"]["em"]

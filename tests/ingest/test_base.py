@@ -9,7 +9,7 @@ from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, disturbed, errors, make_
 from neeco.errors import NeecoError
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
 from neeco.ingest.registration.base import find_base
-from neeco.ingest.registration.base_search import Seen, search, uniform_rotations
+from neeco.ingest.registration.silhouette_search import ShaftViews, search, uniform_rotations
 
 FRAMES = 44
 ROUGH = (5.0, 3.0)  # sd mm, deg of the prior: errors of 8 mm and 5 degrees are within
@@ -64,9 +64,12 @@ def test_masks_without_a_shaft_end_in_one_line():
 
 def test_lines_and_tips_alone_tell_the_rotation_of_a_base_of_which_nothing_is_known():
     world = make_world(FRAMES)
-    seen = Seen(shaft_lines(world.masks), INTRINSICS, world.camera_from_world, world.poses_at(TRUE_CLOCK_S))
+    views = ShaftViews(
+        lines=shaft_lines(world.masks), intrinsics=INTRINSICS, camera_from_world=world.camera_from_world,
+        base_from_instrument=world.poses_at(TRUE_CLOCK_S), center=np.array([0.0, 0.0, 90.0]), sd_mm=90.0, distance=90.0,
+    )  # fmt: skip
     generator = np.random.default_rng(3)
-    found = search(seen, uniform_rotations(2000, generator), np.array([0.0, 0.0, 90.0]), 90.0, 90.0, generator, 0.2)
+    found = search(views, uniform_rotations(2000, generator), generator, 0.2)
     assert min(errors(base, world.poses_at(TRUE_CLOCK_S))[2] for base in found.world_from_base) < 12
 
 
@@ -74,6 +77,6 @@ def test_distances_to_outlines_know_no_outline_beyond_the_border():
     masks = np.zeros((1, 40, 60), dtype=bool)
     masks[0, :, 20:40] = True
     seen = silhouettes_of(masks, (50.0, 50.0, 30.0, 20.0))
-    inside, gradient = seen.look_up(np.array([[23.0, 17.0, 23.0]]), np.array([[20.0, 20.0, 2.0]]))
+    inside, gradient = seen.look_up(np.array([[[23.0, 20.0], [17.0, 20.0], [23.0, 2.0]]]))
     assert np.allclose(inside, [[3.0, -3.0, 3.0]], atol=0.05)
     assert np.allclose(gradient[0, :, 0], 1.0, atol=0.05)

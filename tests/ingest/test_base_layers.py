@@ -16,9 +16,15 @@ from neeco.geometry.lens import Lens
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
-from neeco.ingest.registration.base_layers import Layers, evenly_lit, fit_layers, line_through_trocar
-from neeco.ingest.registration.base_shape import SHIFTS
 from neeco.ingest.registration.find_bases import find_bases
+from neeco.ingest.registration.layers import (
+    ArmImages,
+    LayerModel,
+    evenly_lit,
+    fit_layers,
+    line_through_trocar,
+)
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
 from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
 from neeco.ingest.timing.episodes import Episodes
 
@@ -125,14 +131,15 @@ def test_a_wrist_that_bends_behind_what_is_logged_leaves_no_line():
 
 
 def test_a_dark_shaft_is_found_before_a_dark_clamp_without_masks_while_another_arm_moves():
-    images, poses = evenly_lit(_images(LEFT, RIGHT)), np.tile(LEFT.poses_at(TIMES), (len(SHIFTS), 1, 1, 1))
+    images, poses = evenly_lit(_images(LEFT, RIGHT)), np.tile(LEFT.poses_at(TIMES), (len(CLOCK_SHIFTS_S), 1, 1, 1))
     line, given = line_through_trocar(poses[0]), LEFT.wrong(6, 4)
     assert line is not None
     usable = np.ones(images.shape[:3], bool)
-    layers = Layers(images, INTRINSICS, poses, line, usable, WIDTH)
+    arm = ArmImages(images=images, intrinsics=INTRINSICS, poses=poses, line=line, usable=usable)
+    layers = LayerModel(arm, WIDTH)
     right, wrong = (layers.losses(base, 0.0, RADIUS, 0.0).mean() for base in (LEFT.camera_from_base, given))
     assert right < 0.8 * wrong
-    found = fit_layers(images, INTRINSICS, poses, line, (given, 5.0, 3.0), 0.0, usable, np.random.default_rng(0))
+    found = fit_layers(arm, (given, 5.0, 3.0), 0.0, np.random.default_rng(0))
     assert LEFT.beside(given) > 4
     assert LEFT.beside(found.camera_from_base) < 1.0
     assert found.found

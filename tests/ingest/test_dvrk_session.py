@@ -122,7 +122,7 @@ def test_a_template_of_a_session_is_complete(world, session):
         assert joint.clock == "video"
         assert len(read_reading_log(joint).times) == len(TICKS)
     assert "setpoint_cp" in text
-    assert len(recording.open().times) == COUNT
+    assert len(recording.source.open().times) == COUNT
 
 
 def test_poses_in_the_endoscope_s_frame_say_so(world, session):

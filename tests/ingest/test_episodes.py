@@ -142,7 +142,7 @@ def test_splits_name_what_there_is(tmp_path: Path, splits: dict[str, object], wo
 
 def test_names_come_from_files_or_from_their_folders_and_differ() -> None:
     def named(*paths: str) -> tuple[str, ...]:
-        return episode_names([Recording(Path(path)) for path in paths])
+        return episode_names([Recording(Path(path), None) for path in paths])
 
     assert named("a/one.yaml", "a/two.yaml") == ("one", "two")
     assert named("/day 1/recording.yaml", "/day2/recording.yaml") == ("day_1", "day2")

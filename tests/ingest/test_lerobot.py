@@ -252,7 +252,7 @@ def test_a_camera_that_was_not_downloaded_hides_no_other(tmp_path, version):
     assert re.match(rf".*: episode 0/{wrist}: .*\.mp4: no such file", problems[0])
     recording = read_recording(place)
     assert recording.stream == f"episode 0/{CAMERA}"
-    assert len(recording.open().times) == len(EPISODES[0][STATE])
+    assert len(recording.source.open().times) == len(EPISODES[0][STATE])
     with pytest.raises(NeecoError, match=r"wrist.*\.mp4: no such file"):
         format_of(path).open_images(path, f"episode 0/{wrist}")
     shutil.rmtree(path / "videos")
@@ -426,13 +426,14 @@ def test_only_the_rows_of_the_episode_are_read(tmp_path, monkeypatch):
     states = [{STATE: arm(20, number)} for number in range(40)]
     path = data_set(tmp_path, states=states, names={}, cameras=(), group=20)
     asked: list[list[int]] = []
-    own = ParquetFile._groups
+    own = ParquetFile.groups
 
-    def note(self: ParquetFile, columns: Any, number: int | None) -> list[int]:
-        asked.append(own(self, columns, number))
-        return asked[-1]
+    def note(self: ParquetFile, columns: Any, wanted: Any) -> Any:
+        part = own(self, columns, wanted)
+        asked.append([group.id for group in part.row_groups])
+        return part
 
-    monkeypatch.setattr(ParquetFile, "_groups", note)
+    monkeypatch.setattr(ParquetFile, "groups", note)
     assert len(read(path, f"episode 33/{STATE}").rows) == 20
     assert [33] in asked
     assert all(len(groups) == 1 for groups in asked)

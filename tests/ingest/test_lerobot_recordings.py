@@ -33,7 +33,7 @@ def sets(recorded, benchmarks):  # noqa: F811
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_states_and_images_read_back(recorded, sets, version):
     original = read_recording(recorded.folder / "recording.yaml")
-    film, instrument = original.open(), original.instruments[0]
+    film, instrument = original.source.open(), original.instruments[0]
     path = recorded.folder / "lerobot" / version / "set"
     poses, _ = poses_at(read_pose_log(instrument.poses), film.times + CLOCKS["em"])
     jaw, _ = readings_at(read_reading_log(instrument.joints["jaw_angle"]), film.times + CLOCKS["jaw_angle"])

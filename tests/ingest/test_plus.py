@@ -148,7 +148,7 @@ def test_a_template_of_a_sequence_is_complete(world, transforms):
     assert instrument.name == "Stylus"
     assert "ImageToProbe" in text
     assert len(read_pose_log(instrument.poses).times) == COUNT
-    assert recording.open().size == (16, 12)
+    assert recording.source.open().size == (16, 12)
 
 
 def changed(path, old, new):

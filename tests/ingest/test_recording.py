@@ -101,7 +101,7 @@ def test_inits_lines_on_a_still_scope_and_its_second_camera_are_right_once_they_
     recording = read_recording(world.folder / "recording.yaml")
     assert recording.camera == "still"
     assert recording.video == world.folder / "left.mp4"
-    assert recording.stereo.video == world.folder / "right.mp4"
+    assert recording.stereo.source.file == world.folder / "right.mp4"
     assert recording.stereo.calibration == world.folder / "stereo.yaml"
 
 
@@ -112,9 +112,9 @@ def test_init_of_images_alone(world):
         Image.new("RGB", (8, 6)).save(path)
     (world.folder / "recording.yaml").write_text(write_template(world.folder))
     recording = read_recording(world.folder / "recording.yaml")
-    assert (recording.images, recording.fps) == (world.folder / "frames", 25)
+    assert (recording.source.folder, recording.source.fps) == (world.folder / "frames", 25)
     assert recording.instruments == ()
-    assert len(recording.open().times) == 12
+    assert len(recording.source.open().times) == 12
 
 
 def test_init_of_a_folder_without_frames(world):
@@ -144,7 +144,7 @@ settings: {shape_frames: 20, tracker_noise_mm: 1}
 
 def test_everything_at_once(world, folder):
     recording = read_recording(world.text(FULL, "recording.yaml"))
-    assert recording.fps == 50
+    assert recording.source.fps == 50
     [instrument] = recording.instruments
     assert instrument.poses.form == "quaternion_wxyz"
     assert instrument.poses.units == Units(length="mm")

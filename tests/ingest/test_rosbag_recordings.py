@@ -310,7 +310,7 @@ def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path, monkeypa
     """The limit is lowered: a bomb of its real size would take seconds to make."""
     from neeco.ingest.readers import _bagfile
 
-    monkeypatch.setattr(_bagfile, "LARGEST_CHUNK", 60_000)
+    monkeypatch.setattr(_bagfile, "MAX_CHUNK_BYTES", 60_000)
     for kind, packed in (("a.bag", "bz2"), ("b.bag", "lz4"), ("c.bag", None), ("d-mcap", "zstd"), ("e-db3", "zstd")):
         with BagWriter(tmp_path, kind, packed=packed) as bag:
             for time in range(4):
@@ -324,7 +324,7 @@ def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path, monkeypa
 def test_packed_bytes_are_unpacked_up_to_a_limit_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
     from neeco.ingest.readers import _bagfile
 
-    monkeypatch.setattr(_bagfile, "LARGEST_CHUNK", 1000)
+    monkeypatch.setattr(_bagfile, "MAX_CHUNK_BYTES", 1000)
     assert _bagfile.unpack(bz2.compress(bytes(1000)), "bz2") == bytes(1000)
     for data in (bz2.compress(bytes(1001)), bz2.compress(bytes(900))[:-5], b"BZh"):
         with pytest.raises((OSError, _bagfile.ReaderError)):

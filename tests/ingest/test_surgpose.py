@@ -68,7 +68,7 @@ def test_a_template_of_the_folder_is_complete(world, trajectory):
         assert len(read_pose_log(instrument.poses).times) == COUNT
         for joint in instrument.joints.values():
             assert len(read_reading_log(joint).times) == COUNT
-    assert len(recording.open().times) == COUNT
+    assert len(recording.source.open().times) == COUNT
     assert recording.read_lens()[0].size == (640, 480)
 
 

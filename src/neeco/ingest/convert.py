@@ -24,11 +24,11 @@ from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY, new_folder, own_folder
 from neeco.geometry.lens import Border, Lens
-from neeco.ingest.calibration.lens import BORDER_SAMPLES, find_border, visible_mask
+from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 
 
 def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
-    """Write `folder` as a neeco-capture/1 at `output` and say what it lacks, one sentence each.
+    """Write `folder` as a neeco-capture/1 at `output`; return what it lacks, one sentence each.
 
     Images are copied bit by bit; distorted ones are undistorted, and their lens is kept. Frames without an image are
     left out. EndoNeRF's tool masks become loss masks that ignore the tool; where no frame has a mask, an endoscope's
@@ -59,7 +59,7 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
         undistorted = undistort_frames(frames, work / "undistorted", border)
         notes += undistorted.notes
         capture = replace(capture, frames=undistorted.frames, lens=undistorted.lens or capture.lens)
-        notes += _doubtful_masks(capture)
+        notes += _inverted_masks(capture)
         write_capture(capture, work / "capture")
     settled = ("instruments", "units")  # warnings that `_lacking` says; converting settles those of masks
     warnings = [problem for problem in report.problems if problem.severity == "warning" and problem.file != f"{MASKS}/"]
@@ -68,18 +68,18 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
 
 
 def _absent_images(parsed: Parsed) -> list[str]:
-    """What to say of frames whose images are not there."""
+    """Return notes on frames whose images are missing."""
     if not (count := len(parsed.absent)):
         return []
     total, first = count + len(parsed.frames), parsed.absent[0]
     return [f"Left out: {count} of {total} frames, which have no image ({first.field}: {first.message})."]
 
 
-def _doubtful_masks(capture: Capture) -> list[str]:
-    """What to say of loss masks that may be inverted."""
+def _inverted_masks(capture: Capture) -> list[str]:
+    """Return notes on loss masks that may be inverted."""
     masked = [frame for frame in capture.frames if frame.mask_path is not None]
     found = []
-    for index in evenly_spaced(len(masked), BORDER_SAMPLES, floor=True):
+    for index in evenly_spaced(len(masked), MAX_BORDER_FRAMES, floor=True):
         frame, mask = masked[index], masked[index].load_mask()
         points = {tissue.name: tissue.points for tissue in capture.tissues}.get(str(frame.state.tissue), capture.points)
         assert mask is not None
@@ -89,16 +89,16 @@ def _doubtful_masks(capture: Capture) -> list[str]:
 
 
 def _shared_border(frames: Sequence[Frame]) -> Border | None:
-    """The endoscope's dark border that all frames share; None where there is none or they differ in size. Raises
+    """Return the endoscope's dark border that all frames share; None without one, or where they differ in size. Raises
     NeecoError when an image cannot be read."""
     if len({(frame.camera.width, frame.camera.height) for frame in frames}) != 1:
         return None
-    chosen = evenly_spaced(len(frames), BORDER_SAMPLES, floor=True)
+    chosen = evenly_spaced(len(frames), MAX_BORDER_FRAMES, floor=True)
     return find_border(frames[index].load_image_bytes().numpy() for index in chosen)
 
 
 def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
-    """Each frame's tool mask, in the order of the sorted names; [] where there are none."""
+    """Return each frame's tool mask, in the order of the sorted names; [] without any."""
     paths = folder_images(parsed.root, MASKS, report)
     if paths and len(paths) != len(parsed.frames):
         message = f"has {len(paths)} masks for {len(parsed.frames)} images"
@@ -107,14 +107,14 @@ def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
 
 
 def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path) -> tuple[list[Frame], list[str]]:
-    """The frames with loss masks that ignore the tool, and notes on the masks.
+    """Return the frames with loss masks that ignore the tool, and notes on the masks.
 
     White is the tool, as EndoNeRF writes it, unless that would be more than MOST_HIDDEN of the lit pixels of most
     images: then black is the tool, as in StereoMIS. Raises NeecoError for a damaged mask.
     """
     sizes = [(frame.camera.width, frame.camera.height) for frame in frames]
     white = []
-    for index in evenly_spaced(len(frames), BORDER_SAMPLES, floor=True):
+    for index in evenly_spaced(len(frames), MAX_BORDER_FRAMES, floor=True):
         tool = read_mask(masks[index], sizes[index])
         white.append(measure_hidden(frames[index].load_image(), ~tool, None, np.zeros((0, 3))))
     fault = masks_fault(white)
@@ -134,7 +134,7 @@ def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path)
 
 
 def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:
-    """What the capture lacks, and what that costs."""
+    """Return notes on what the capture lacks, and what that costs."""
     sentences = []
     if not parsed.instruments:
         sentences.append(
@@ -157,7 +157,7 @@ def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:
     if masked:
         sentences.append("Tool masks became loss masks: the tool's pixels are ignored, so the tool is not learned.")
     if all(frame.split != "test" for frame in parsed.frames):
-        sentences.append("No test frames: nothing will tell how good the scene is.")
+        sentences.append("No test frames: nothing measures how good the scene is.")
     return sentences
 
 
@@ -171,7 +171,7 @@ class Undistorted:
 
 
 def undistort_frames(frames: Sequence[Frame], folder: Path, border: Border | None) -> Undistorted:
-    """The frames, those whose cameras are distorted undistorted into `folder`, as PNG.
+    """Undistort the frames whose cameras are distorted into `folder`, as PNG; return all.
 
     border: of the round field of view in the images as recorded. Raises NeecoError for an image that cannot be read and
     a distortion that folds the image over, naming the image.
@@ -209,8 +209,9 @@ def _undistort(frame: Frame, folder: Path) -> Frame:
 
 @contextmanager
 def staged(output: Path) -> Iterator[Path]:
-    """A temporary folder beside `output`, on the same disk, gone afterwards whatever happens (after SIGKILL: when
-    the same `output` is asked for again). What the block leaves in its `capture` becomes `output`.
+    """Yield a temporary folder on the disk of `output`, whose `capture` becomes `output` after the block.
+
+    It is removed whatever happens (after SIGKILL: when the same `output` is asked for again).
 
     Raises NeecoError when something other than an empty folder is at `output`, when another process is making it, and
     when the disk refuses.
@@ -234,7 +235,7 @@ def staged(output: Path) -> Iterator[Path]:
 
 @contextmanager
 def _emptied(folder: Path, place: Path) -> Iterator[None]:
-    """An empty folder of this process's own, gone afterwards, to make `place` in."""
+    """Hold an empty folder of this process's own, to make `place` in; remove it afterwards."""
     try:
         with own_folder(folder, place):
             _clear(folder)

@@ -1,6 +1,6 @@
-"""What calibration files say of one camera or of two, in the names of OpenCV, ROS, Kalibr, ORB-SLAM and their like.
+"""Calibrations of one camera or of two, in the keys of OpenCV, ROS, Kalibr, ORB-SLAM and similar tools.
 
-All of them name what OpenCV does: a principal point that counts from the first pixel's centre, and its distortion.
+All of them state what OpenCV does: a principal point that counts from the first pixel's centre, and its distortion.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def read_calibration(path: Path) -> Any:
-    """What a calibration file holds: JSON, YAML, or OpenCV's own dialects of YAML and XML.
+    """Return the document of a calibration file: JSON, YAML, or OpenCV's own dialects of YAML and XML.
 
     YAML is read by PyYAML, which unlike cv2.FileStorage reads ROS's files and plain lists, and names a bad line; by
     cv2.FileStorage what only OpenCV takes for YAML, as `data:[1, 2]` and `%PATH`. Raises NeecoError.
@@ -98,7 +98,7 @@ def read_calibration(path: Path) -> Any:
 
 
 def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
-    """The camera that a document describes, or the left one and the right one; () where it describes none. `where`
+    """Return the camera of a document, or the left one and the right one; () where it has none. `where`
     begins messages. Raises NeecoError for numbers that cannot be."""
     if not isinstance(document, dict):
         return ()
@@ -116,7 +116,7 @@ def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
 
 
 def first_of(document: Mapping[Any, Any], names: Sequence[str]) -> Any:
-    """What the first of these names holds; None where there is none."""
+    """Return the value of the first of these names; None where there is none."""
     return next((document[name] for name in names if document.get(name) is not None), None)
 
 
@@ -146,7 +146,7 @@ def matrix_numbers(where: Path | str, value: Any, field: str) -> list[float]:
 
 
 def _by_opencv(text: str) -> Any:
-    """What cv2.FileStorage reads of a text; None where it does not take it for one of its own."""
+    """Return the document that cv2.FileStorage reads from a text; None where it is none of its own."""
     depths = accumulate(1 if token in "[{<" else -1 for token in re.findall(r"[\[{]|[\]}]|<(?![/?!])|</", text))
     indent = max((len(line) - len(line.lstrip()) for line in text.splitlines()), default=0)
     if max(depths, default=0) > MAX_DEPTH or indent > MAX_INDENT or not text.startswith(("%YAML", "<?xml")):
@@ -172,13 +172,13 @@ def _value(node: Any) -> Any:
 
 
 def _plain(document: Mapping[Any, Any]) -> dict[str, Any]:
-    """By names of small letters and digits."""
+    """Return the document by names of small letters and digits."""
     return {word(str(name)): value for name, value in document.items()}
 
 
 def _side(keys: Mapping[str, Any], side: str) -> dict[str, Any]:
-    """What a document says of one camera: in a section of its own, or by keys that begin or end with its name; of
-    images' size and model, what it says of both."""
+    """Return the keys of one camera: in a section of its own, or those that begin or end with its name; the images'
+    size and model may be stated for both."""
     section = keys.get(side)
     if isinstance(section, dict) and "data" not in section:
         return _plain(section)
@@ -203,7 +203,7 @@ def _has_camera(keys: Mapping[str, Any]) -> bool:
 
 
 def _camera(where: Path | str, keys: Mapping[str, Any], pair_of: bool = False) -> CameraNumbers:
-    """What keys that have a camera say of it."""
+    """Return the camera of keys that have one. Raises NeecoError."""
     models = {word(str(keys[name])) for name in _MODELS if name in keys}
     if unread := models & OTHER_MODELS:
         raise NeecoError(
@@ -236,7 +236,7 @@ def _camera(where: Path | str, keys: Mapping[str, Any], pair_of: bool = False) -
 
 
 def _distortion(where: Path | str, keys: Mapping[str, Any], fisheye: bool) -> list[float]:
-    """Coefficients: of a vector, or by name, among all keys or in a section of their own."""
+    """Return the coefficients of a vector, or by name, among all keys or in a section of their own."""
     vector = first_of(keys, _DISTORTION)
     if vector is not None:
         return matrix_numbers(where, vector, "distortion_coefficients")

@@ -1,4 +1,4 @@
-"""What the optics do to the images: the lens, as a calibration has it, and the round field of view."""
+"""The optics of the images: the lens of a calibration file, and the round field of view."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from neeco.plausible import size_fault
 
 FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
 FISHEYE_MODEL = "OPENCV_FISHEYE"
-LARGEST = 1e9  # of any of a lens's numbers
+MAX_NUMBER = 1e9  # of any of a lens's numbers
 
 # The dark border around a round field of view.
-BORDER_SAMPLES = 48  # frames looked at
-DARK = 40.0  # of 255; a border brighter than this in most frames is no border
-MARGIN = 0.015  # of the radius taken off: the border's edge is blurred
-MISFIT = 0.015  # of the radius: how far the edge may be off a circle
-CLEAN = 0.9  # share of the pixels outside the circle that must be dark, of those inside that must not be
-SHARP = 0.6  # share of the brightness inside the edge that must be gone right outside
+MAX_BORDER_FRAMES = 48  # used
+MAX_BLACK = 40.0  # of 255; a border brighter than this in most frames is no border
+EDGE_MARGIN = 0.015  # of the radius, left out: the border's edge is blurred
+MAX_MISFIT = 0.015  # of the radius: distance of the edge from a circle
+MIN_CLEAN = 0.9  # share of the pixels outside the circle that must be dark, of those inside that must not be
+MIN_EDGE_DROP = 0.6  # share of the brightness inside the edge that must be gone right outside
 
 
 def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
-    """A lens from a calibration in OpenCV's names (YAML, XML, JSON; of two cameras, the left one's), the fields of a
-    nerfstudio JSON, or (fl_x, fl_y, cx, cy) px.
+    """Return a lens from a calibration in OpenCV's names (YAML, XML, JSON; of two cameras, the left one's), the fields
+    of a nerfstudio JSON, or (fl_x, fl_y, cx, cy) px.
 
     None: to be estimated. OpenCV's principal point counts from the first pixel's centre, ours from its corner: half a
     pixel is added. A fisheye lens becomes one of OpenCV's rational model. Raises NeecoError naming file, field and
@@ -75,7 +75,7 @@ def _nerfstudio(path: Path, document: Any) -> Lens:
 
 
 def opencv_lens(where: Path | str, document: Any) -> Lens:
-    """From what a calibration says of its camera, or of the left one of two; `where` begins messages. Raises
+    """Return the lens of a calibration's camera, or of the left one of two; `where` begins messages. Raises
     NeecoError."""
     cameras = cameras_in(where, document)
     if not cameras:
@@ -103,7 +103,7 @@ def checked_lens(
     for field, given in (("fl_x, fl_y, cx, cy", values), ("distortion", distortion)):
         for value in given:
             number = as_float(value)
-            if number is None or not abs(number) < LARGEST:  # NaN compares false
+            if number is None or not abs(number) < MAX_NUMBER:  # NaN compares false
                 raise NeecoError(f"{source}: {field}: {printable(value)} is not a usable number; calibrate again")
     if len(values) != 4 or min(values[:2]) <= 0:
         raise NeecoError(f"{source}: fl_x, fl_y: must be two positive focal lengths in pixels; correct them")
@@ -147,10 +147,9 @@ def _rational(
 def find_border(images: Iterable[np.ndarray]) -> Border | None:
     """The dark border around a round field of view; None when the images have no such border.
 
-    images: uint8 [H, W, 3], frames spread over the recording (10 or more; at most BORDER_SAMPLES are used). The border
-    stays at the black level although the scene lights up pixels beside it. Only one with a circular edge, sharp all
-    along, counts: dark corners of a dim scene are none.
-    """
+    images: uint8 [H, W, 3], frames spread over the recording (10 or more; at most MAX_BORDER_FRAMES are used). The
+    border stays at the black level although the scene lights up pixels beside it. Only one with a circular edge, sharp
+    all along, counts: dark corners of a dim scene are none."""
     brightness = _brightest(images)
     if brightness is None or min(brightness.shape) < 32:
         return None
@@ -172,12 +171,12 @@ def visible_mask(border: Border, size: tuple[int, int]) -> np.ndarray:
     """bool [H, W] of images of `size` (width, height): False on the border and on its blurred edge."""
     x, y, radius = border
     rows, columns = np.indices(size[::-1])
-    return np.hypot(columns + 0.5 - x, rows + 0.5 - y) < radius * (1 - MARGIN) - 0.5
+    return np.hypot(columns + 0.5 - x, rows + 0.5 - y) < radius * (1 - EDGE_MARGIN) - 0.5
 
 
 def _brightest(images: Iterable[np.ndarray]) -> np.ndarray | None:
-    """float [H, W]: how bright each pixel gets in its brightest frames, noise smoothed out."""
-    stack = [image.max(axis=2).astype(np.float32) for image in islice(images, BORDER_SAMPLES)]
+    """Return float [H, W], the brightness of each pixel in its brightest frames, smoothed."""
+    stack = [image.max(axis=2).astype(np.float32) for image in islice(images, MAX_BORDER_FRAMES)]
     if not stack:
         return None
     # the second brightest of ten, so that one flash or one damaged frame does not light up the border
@@ -194,7 +193,7 @@ def _dark_threshold(brightness: np.ndarray) -> float | None:
     black, spread = levels[1], float(np.median([np.std(corner) for corner in corners]))
     middle = brightness[height // 4 : -height // 4, width // 4 : -width // 4]
     scene = float(np.percentile(middle, 25))
-    if black > DARK or scene < black + 6 * max(spread, 0.5) + 4:
+    if black > MAX_BLACK or scene < black + 6 * max(spread, 0.5) + 4:
         return None
     return black + max(0.15 * (scene - black), 4 * max(spread, 0.5))
 
@@ -207,7 +206,7 @@ def _touching_corners(dark: np.ndarray) -> np.ndarray:
 
 
 def _border_edge(outside: np.ndarray) -> np.ndarray:
-    """Pixels [M, 2] (x, y) of the scene beside the dark region, not those cut off by the image's edge."""
+    """Return the pixels [M, 2] (x, y) of the scene next to the dark region, without those at the image's edge."""
     edge = ndimage.binary_dilation(outside) & ~outside
     edge[:2] = edge[-2:] = False
     edge[:, :2] = edge[:, -2:] = False
@@ -230,7 +229,7 @@ def _fit_circle(points: np.ndarray) -> tuple[float, float, float] | None:
         residuals = np.hypot(local[:, 0] - a, local[:, 1] - b) - radius
         scale = max(1.48 * float(np.median(np.abs(residuals))), 0.3)
         weights = 1 / (1 + (residuals / (2 * scale)) ** 2) ** 2
-    if np.median(np.abs(residuals)) > max(MISFIT * radius, 1.0):
+    if np.median(np.abs(residuals)) > max(MAX_MISFIT * radius, 1.0):
         return None
     return float(center[0] + a), float(center[1] + b), radius
 
@@ -238,7 +237,7 @@ def _fit_circle(points: np.ndarray) -> tuple[float, float, float] | None:
 def _divides_dark_from_bright(
     circle: tuple[float, float, float], outside: np.ndarray, brightness: np.ndarray, threshold: float
 ) -> bool:
-    """Whether the circle is a plausible edge of the field of view, and divides dark from bright cleanly."""
+    """Return whether the circle is a plausible edge of the field of view, and divides dark from bright."""
     x, y, radius = circle
     height, width = outside.shape
     if not (0.25 * min(width, height) < radius < 0.75 * max(width, height)):
@@ -247,15 +246,15 @@ def _divides_dark_from_bright(
         return False
     rows, columns = np.indices(outside.shape)
     distance = np.hypot(columns - x, rows - y)
-    beyond, within = distance > radius * (1 + 2 * MISFIT) + 1, distance < radius * (1 - 2 * MISFIT) - 1
+    beyond, within = distance > radius * (1 + 2 * MAX_MISFIT) + 1, distance < radius * (1 - 2 * MAX_MISFIT) - 1
     if beyond.sum() < 0.01 * beyond.size:
         return False
     ring = within & (distance > 0.9 * radius)
     bright = np.mean(brightness[ring] >= threshold) if ring.any() else 0.0
-    if np.mean(outside[beyond]) <= CLEAN or np.mean(outside[within]) >= 1 - CLEAN or bright <= CLEAN:
+    if np.mean(outside[beyond]) <= MIN_CLEAN or np.mean(outside[within]) >= 1 - MIN_CLEAN or bright <= MIN_CLEAN:
         return False
     # a vignette darkens slowly; an edge does it within a few pixels
     black = float(np.percentile(brightness[beyond], 10))
     inner = float(np.median(brightness[(distance > 0.94 * radius) & (distance < 0.98 * radius)]))
     outer = float(np.median(brightness[(distance > 1.02 * radius) & (distance < 1.06 * radius)]))
-    return inner - outer > SHARP * (inner - black)
+    return inner - outer > MIN_EDGE_DROP * (inner - black)

@@ -1,10 +1,13 @@
-"""Calibrations of stereo scopes: both lenses, and where the right camera is seen from the left one."""
+"""Calibrations of stereo scopes: both lenses, and the right camera's pose relative to the left one.
+
+Every dialect becomes a document in the keys that `camera_fields.py` knows."""
 
 from __future__ import annotations
 
 import configparser
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +28,7 @@ from neeco.ingest.calibration.camera_fields import (
     read_calibration,
     word,
 )
-from neeco.ingest.calibration.lens import checked_lens, image_size, lens_of
+from neeco.ingest.calibration.lens import lens_of
 
 EXPECTED = (
     "OpenCV's stereo YAML (M1, D1, M2, D2, R, T), a camchain of Kalibr, settings of ORB-SLAM, a StereoCalibration.ini, "
@@ -34,37 +37,34 @@ EXPECTED = (
 _TURNS, _SHIFTS = ("r", "rotation", "rotationmatrix"), ("t", "translation", "translationvector", "tvec")
 _RECTIFICATION, _PROJECTION = ("rectificationmatrix", "r"), ("projectionmatrix", "p")
 _RIGHT_FROM_LEFT, _LEFT_FROM_RIGHT = ("tcncnm1",), ("stereotc1c2", "tc1c2")  # 4x4: of Kalibr, of ORB-SLAM
-METRES = (5e-4, 0.2)  # how far apart the cameras of a stereo scope or rig are
-MILLIMETRES = (1.0, 200.0)
-WIDEST_TURN = math.radians(30)  # of one camera against the other
-NOT_ROTATED = 1e-3  # of R^T R - I: files round to four decimals
+BASELINE_M, BASELINE_MM = (5e-4, 0.2), (1.0, 200.0)  # of a stereo scope or rig, in either unit
+MAX_TURN = math.radians(30)  # of one camera relative to the other
+ROTATION_TOLERANCE = 1e-3  # of R^T R - I: files round to four decimals
 
 
 def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
-    """The left lens, the right lens, and right_from_left [4, 4] mm, which maps points of the left camera's frame to the
-    right one's (OpenCV axes).
+    """Return the left lens, the right lens, and right_from_left [4, 4] mm, which maps points of the left camera's frame
+    to the right one's (OpenCV axes).
 
     Read are OpenCV's stereo YAML or XML (`M1 D1 M2 D2 R T`, or `K1 ...`; R and T may stand in `extrinsics.yml` beside
     `intrinsics.yml`), Kalibr's camchain, settings of ORB-SLAM (`LEFT.K ...`, `Camera1.fx ...`), ROS's camera_info of
     two cameras (a folder with a left and a right file, or the left file, the right one beside it), the da Vinci's
-    `.ini` ([StereoLeft], [StereoRight]) and JSON (`intrinsics`, `extrinsics`, or `KL DL KR DR R T`). T is in mm or m:
-    which, its length says, and is refused where both could be. Raises NeecoError naming file, field and remedy.
+    `.ini` ([StereoLeft], [StereoRight]) and JSON (`intrinsics`, `extrinsics`, or `KL DL KR DR R T`). T is in mm or m,
+    by its length, and is refused where both could be. Raises NeecoError naming file, field and remedy.
     """
     path = Path(path)
     if path.is_dir():
         left, right = _pair_of_files(path)
         return _rectified((left, _one_camera(left)), (right, _one_camera(right)))
     require_file(path, EXPECTED)
-    if path.suffix.lower() == ".ini":
-        return _ini(path)
-    document = read_calibration(path)
+    document = _of_ini(path) if path.suffix.lower() == ".ini" else read_calibration(path)
     if not isinstance(document, dict):
         raise NeecoError(f"{path}: holds no keys; expected {EXPECTED}")
     for key in ("data", "camera-calibration"):
         if isinstance(document.get(key), dict):
             document = document[key]
     if "intrinsics" in document and "extrinsics" in document:
-        return _two_intrinsics(path, document)
+        document = _of_intuitive(path, document)
     cameras = cameras_in(path, document)
     if len(cameras) == 2:
         return _two_cameras(path, document, *cameras)
@@ -77,17 +77,15 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
 def _two_cameras(
     path: Path, document: dict[Any, Any], left: CameraNumbers, right: CameraNumbers
 ) -> tuple[Lens, Lens, np.ndarray]:
-    """From what one file says of both, and of how the right one stands."""
-    lenses = [
-        _lens(path, camera.intrinsics, camera.distortion, camera.size, camera.fisheye) for camera in (left, right)
-    ]
+    """Return the lenses and the pose that one file states of both cameras."""
+    lenses = (_lens(path, left), _lens(path, right))
     keys = {word(str(name)): value for name, value in document.items()}
     of_pair = {**right.keys, **keys}
     for names, turned_back in ((_RIGHT_FROM_LEFT, False), (_LEFT_FROM_RIGHT, True)):
         if first_of(of_pair, names) is not None:
             matrix = _numbers(path, of_pair, names, 16).reshape(4, 4)
             matrix = np.linalg.inv(matrix) if turned_back and np.linalg.det(matrix) else matrix
-            return (lenses[0], lenses[1], _pose(path, matrix[:3, :3].ravel(), matrix[:3, 3]))
+            return *lenses, _pose(path, matrix[:3, :3].ravel(), matrix[:3, 3])
     source, turn, shift = path, first_of(keys, _TURNS), first_of(keys, _SHIFTS)
     if turn is None and first_of(right.keys, _PROJECTION) is not None:
         return _rectified((path, left), (path, right))
@@ -100,61 +98,66 @@ def _two_cameras(
         turn, shift = first_of(keys, _TURNS), first_of(keys, _SHIFTS)
     if turn is None or shift is None:
         raise NeecoError(f"{source}: R, T: missing; give the right camera's rotation and translation, as OpenCV does")
-    pose = _pose(source, matrix_numbers(source, turn, "R"), matrix_numbers(source, shift, "T"))
-    return (lenses[0], lenses[1], pose)
+    return *lenses, _pose(source, matrix_numbers(source, turn, "R"), matrix_numbers(source, shift, "T"))
 
 
-def _two_intrinsics(path: Path, document: dict[Any, Any]) -> tuple[Lens, Lens, np.ndarray]:
-    """From `intrinsics: [{f, c, k}, {f, c, k}]` and `extrinsics: {om, T}`, as the da Vinci's calibrations have them."""
+def _camera_keys(
+    focal: Sequence[Any], center: Sequence[Any], bends: Sequence[Any], size: Sequence[Any]
+) -> dict[str, Any]:
+    """Return a camera in the keys of ORB-SLAM."""
+    return dict(zip(("fx", "fy", "cx", "cy", "width", "height"), (*focal, *center, *size), strict=True)) | {"d": bends}
+
+
+def _of_intuitive(path: Path, document: dict[Any, Any]) -> dict[str, Any]:
+    """Return `intrinsics: [{f, c, k}, {f, c, k}]` and `extrinsics: {om, T}` of the da Vinci's calibrations, in the keys
+    of OpenCV."""
     cameras, extrinsics = document["intrinsics"], document["extrinsics"]
     if not isinstance(cameras, list) or len(cameras) != 2 or not all(isinstance(camera, dict) for camera in cameras):
         raise NeecoError(f"{path}: intrinsics: expected two cameras, left and right, each with f, c and k; write them")
     if not isinstance(extrinsics, dict):
         raise NeecoError(f"{path}: extrinsics: expected om and T; write them")
-    lenses = []
-    for number, camera in enumerate(cameras):
+    found: dict[str, Any] = {"R": extrinsics.get("om"), "T": extrinsics.get("T")}
+    for number, (side, camera) in enumerate(zip(("left", "right"), cameras, strict=True)):
         f, c = (matrix_numbers(path, camera.get(key), f"intrinsics[{number}].{key}") for key in ("f", "c"))
         if len(f) != 2 or len(c) != 2:
             raise NeecoError(f"{path}: intrinsics[{number}]: f and c take two numbers each; correct them")
-        k = matrix_numbers(path, camera.get("k", []), f"intrinsics[{number}].k")
-        lenses.append(_lens(path, (*f, *c), k, (document.get("width"), document.get("height"))))
-    turn = matrix_numbers(path, extrinsics.get("om"), "extrinsics.om")
-    return (lenses[0], lenses[1], _pose(path, turn, matrix_numbers(path, extrinsics.get("T"), "extrinsics.T")))
+        found[side] = _camera_keys(f, c, camera.get("k", []), (document.get("width"), document.get("height")))
+    return found
 
 
-def _ini(path: Path) -> tuple[Lens, Lens, np.ndarray]:
-    """From [StereoLeft] and [StereoRight] with res_x, fc_x, cc_x, kc_0 ..., R_0 ... R_8 (by rows) and T_0 ... T_2."""
+def _of_ini(path: Path) -> dict[str, Any]:
+    """Return [StereoLeft] and [StereoRight] with res_x, fc_x, cc_x, kc_0 ..., R_0 ... R_8 (by rows) and T_0 ... T_2, in
+    the keys of OpenCV."""
     parser = configparser.ConfigParser(interpolation=None)
     try:
         parser.read_string(read_text(path, EXPECTED))
     except configparser.Error as error:
         reason = " ".join(str(error).replace("<string>", path.name).split())[:160]
         raise NeecoError(f"{path}: not readable as an .ini file ({reason}); save the calibration again") from None
-    cameras: list[dict[str, list[float]]] = []
-    lenses = []
-    for side in ("StereoLeft", "StereoRight"):
-        if not parser.has_section(side):
-            raise NeecoError(f"{path}: [{side}]: missing; expected {EXPECTED}")
-        values = dict(parser[side])
-        found = {
-            stem: [values[key] for key in _indexed(stem, values)] for stem in ("fc_", "cc_", "res_", "kc_", "r_", "t_")
+    found: dict[str, Any] = {}
+    poses = []
+    for section, side in (("StereoLeft", "left"), ("StereoRight", "right")):
+        if not parser.has_section(section):
+            raise NeecoError(f"{path}: [{section}]: missing; expected {EXPECTED}")
+        values = dict(parser[section])
+        numbers = {
+            stem: [_number(path, f"[{section}] {stem}", values[key]) for key in _indexed(stem, values)]
+            for stem in ("fc_", "cc_", "res_", "kc_", "r_", "t_")
         }
-        numbers = {stem: [_number(path, f"[{side}] {stem}", text) for text in texts] for stem, texts in found.items()}
         for stem, count in (("fc_", 2), ("cc_", 2)):
             if len(numbers[stem]) != count:
-                raise NeecoError(f"{path}: [{side}] {stem}x, {stem}y: missing; save the calibration again")
+                raise NeecoError(f"{path}: [{section}] {stem}x, {stem}y: missing; save the calibration again")
         size = numbers["res_"] if len(numbers["res_"]) == 2 else [None, None]
-        cameras.append(numbers)
-        lenses.append(_lens(path, (*numbers["fc_"], *numbers["cc_"]), numbers["kc_"], (size[0], size[1])))
-    left, right = cameras
-    turned = left["r_"] and not np.allclose(left["r_"], np.eye(3).ravel()[: len(left["r_"])], atol=1e-6)
-    if turned or any(left["t_"]):
+        found[side] = _camera_keys(numbers["fc_"], numbers["cc_"], numbers["kc_"], size)
+        poses.append((numbers["r_"], numbers["t_"]))
+    (turn, shift), right = poses
+    if any(shift) or (turn and not np.allclose(turn, np.eye(3).ravel()[: len(turn)], atol=1e-6)):
         raise NeecoError(f"{path}: [StereoLeft] R, T: the left camera must be the origin; give the right one's from it")
-    return lenses[0], lenses[1], _pose(path, right["r_"], right["t_"])
+    return found | {"R": right[0], "T": right[1]}
 
 
 def _indexed(stem: str, values: dict[str, str]) -> list[str]:
-    """The keys `stem` and x, y or 0, 1, 2 ... as far as they go on without a gap."""
+    """Return the keys `stem` and x, y or 0, 1, 2 ... up to the first gap."""
     keys = [key for key in (f"{stem}x", f"{stem}y") if key in values]
     while f"{stem}{len(keys)}" in values:
         keys.append(f"{stem}{len(keys)}")
@@ -178,15 +181,16 @@ def _one_camera(path: Path) -> CameraNumbers:
 def _rectified(
     of_left: tuple[Path, CameraNumbers], of_right: tuple[Path, CameraNumbers]
 ) -> tuple[Lens, Lens, np.ndarray]:
-    """From the rectification and projection of two cameras, each with the file that states it, as ROS's camera_info and
-    ORB-SLAM's settings have them: the right projection's fourth column is -focal length x baseline."""
+    """Return lenses and pose from the rectification and projection of two cameras, each with the file that states it,
+    as ROS's camera_info and ORB-SLAM's settings have them: the right projection's fourth column is -focal length x
+    baseline."""
     left, right = of_left[0], of_right[0]
     lenses, turns, projections = [], [], []
     for path, camera in (of_left, of_right):
         lenses.append(lens_of(path, camera))
         turns.append(_numbers(path, camera.keys, _RECTIFICATION, 9).reshape(3, 3))
         projections.append(_numbers(path, camera.keys, _PROJECTION, 12).reshape(3, 4))
-        if rotation_error(turns[-1]) > NOT_ROTATED:
+        if rotation_error(turns[-1]) > ROTATION_TOLERANCE:
             raise NeecoError(
                 f"{path}: rectification_matrix: is no rotation; calibrate the two cameras as one stereo rig"
             )
@@ -227,19 +231,16 @@ def _numbers(path: Path, document: Mapping[str, Any], names: tuple[str, ...], co
     return np.array(found)
 
 
-def _lens(
-    path: Path, matrix: Sequence[float], distortion: Sequence[float], size: tuple[Any, Any], fisheye: bool = False
-) -> Lens:
-    """A lens as OpenCV means its numbers: the first pixel's centre at 0. size: width and height of its images, as they
-    stand there."""
-    length = next((count for count in COEFFICIENTS if count >= len(distortion)), len(distortion))
-    coefficients = [*distortion, *[0.0] * (length - len(distortion))]
-    values = [matrix[0], matrix[1], matrix[2] + 0.5, matrix[3] + 0.5]
-    return checked_lens(path, values, coefficients, image_size(path, *size), fisheye=fisheye)
+def _lens(path: Path, camera: CameraNumbers) -> Lens:
+    """Return the lens of a camera, its distortion filled up with zeros to as many coefficients as OpenCV has."""
+    length = next((count for count in COEFFICIENTS if count >= len(camera.distortion)), len(camera.distortion))
+    missing = (0.0,) * (length - len(camera.distortion))
+    return lens_of(path, replace(camera, distortion=camera.distortion + missing))
 
 
 def _pose(path: Path, turn: Sequence[float] | np.ndarray, shift: Sequence[float] | np.ndarray) -> np.ndarray:
-    """right_from_left [4, 4] mm of a rotation (9 numbers by rows, or a rotation vector of 3) and a translation."""
+    """Return right_from_left [4, 4] mm of a rotation (9 numbers by rows, or a rotation vector of 3) and a
+    translation."""
     angles, vector = np.asarray(turn, np.float64).ravel(), np.asarray(shift, np.float64).ravel()
     if len(angles) not in (3, 9) or len(vector) != 3:
         raise NeecoError(
@@ -248,14 +249,14 @@ def _pose(path: Path, turn: Sequence[float] | np.ndarray, shift: Sequence[float]
     if not (np.isfinite(angles).all() and np.isfinite(vector).all()):
         raise NeecoError(f"{path}: R, T: are not all numbers; calibrate again")
     matrix = angles.reshape(3, 3) if len(angles) == 9 else Rotation.from_rotvec(angles).as_matrix()
-    if np.abs(matrix).max() > 2 or rotation_error(matrix) > NOT_ROTATED or np.linalg.det(matrix) < 0:
+    if np.abs(matrix).max() > 2 or rotation_error(matrix) > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
         raise NeecoError(f"{path}: R: is no rotation; write it row by row")
     rotation = Rotation.from_matrix(matrix)
-    if rotation.magnitude() > WIDEST_TURN:
+    if rotation.magnitude() > MAX_TURN:
         degrees = math.degrees(rotation.magnitude())
         raise NeecoError(f"{path}: R: turns by {degrees:.0f} degrees; the cameras of a stereo scope look the same way")
     distance = float(np.linalg.norm(vector))
-    scales = [scale for scale, (least, most) in ((1.0, MILLIMETRES), (1000.0, METRES)) if least <= distance <= most]
+    scales = [scale for scale, (least, most) in ((1.0, BASELINE_MM), (1000.0, BASELINE_M)) if least <= distance <= most]
     if len(scales) != 1:
         raise NeecoError(f"{path}: T: {distance:.4g} long, which is no stereo scope's in mm or m; give T in mm")
     if vector[0] > np.abs(vector[1:]).max():

@@ -17,7 +17,7 @@ from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
-from neeco.ingest.calibration.lens import BORDER_SAMPLES, find_border, visible_mask
+from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.cameras.still import Background, find_background, moving_masks
 from neeco.ingest.cameras.tissue_surface import TissueSurface, surface_behind, surface_from_stereo
@@ -66,7 +66,7 @@ def read_right_camera(
     """Write the right camera's images at the `selected` [K] video frames, called as `stems`, undistorted, into
     `folder`. times [V] s: of the left video's frames. The two videos begin together. Raises NeecoError."""
     _, lens, right_from_left = read_stereo(partner.calibration)
-    video = partner.open()
+    video = partner.source.open()
     lens.check_size(video.size, partner.calibration)
     rows = {_nearest(video.times, times, int(frame), len(times)): row for row, frame in enumerate(selected)}
     rows.pop(-1, None)
@@ -78,7 +78,7 @@ def read_right_camera(
     folder.mkdir(exist_ok=True)
     sample = sorted(rows)
     border = find_border(
-        image for _, image in video.read([sample[i] for i in evenly_spaced(len(rows), BORDER_SAMPLES)])
+        image for _, image in video.read([sample[i] for i in evenly_spaced(len(rows), MAX_BORDER_FRAMES)])
     )
     visible = None if border is None else lens.undistort_mask(visible_mask(border, video.size))
     mask = None if visible is None else folder / "visible.png"

@@ -15,7 +15,7 @@ from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Border, Lens
-from neeco.ingest.calibration.lens import BORDER_SAMPLES, find_border, visible_mask
+from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.frames.selection import choose_frames, describe_ranges, frame_features, frozen_frames
 from neeco.ingest.frames.views import StageProgress, Views
 from neeco.ingest.readers import VideoSource
@@ -94,7 +94,7 @@ def choose_images(data: Episodes, folder: Path, progress: StageProgress) -> Chos
     size = data.video.size
     images = ChosenImages(folder=folder, size=size, lens=lens, selected=selected, dropped=dropped, border=None)
     _write(images, data.video, progress)
-    sample = selected[evenly_spaced(len(selected), BORDER_SAMPLES, floor=True)]
+    sample = selected[evenly_spaced(len(selected), MAX_BORDER_FRAMES, floor=True)]
     border = find_border(image for _, image in data.video.read(sample.tolist()))
     if border is not None:
         dark = 1 - visible_mask(border, size).mean()

@@ -1,7 +1,7 @@
-"""What recordings come in: one module of this folder per format of files or folders.
+"""Formats of recordings: one module of this folder per format of files or folders.
 
-A format is a subclass of `RecordingFormat`; `format_of` chooses it by what the file is called and holds, and nothing
-else names it. Whatever holds several streams (a bag, an episode, a sequence of images with transforms) lists them, and
+A format is a subclass of `RecordingFormat`; `format_of` chooses it by the file's name and content, and nothing else
+names it. Whatever holds several streams (a bag, an episode, a sequence of images with transforms) lists them, and
 gives each as what the rest of the program takes: poses and readings as a table, images with their times, a lens. What a
 table's columns mean is the same for all formats (`columns.py`, `logs.py`).
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib.util
 from abc import ABC
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import ClassVar
@@ -28,14 +28,14 @@ MISSING = {"", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"}
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
 HUGE = 1e20
 MAX_LISTED = 3  # lines named in a message
-MAX_UNLIKE = 0.1  # share by which a video may be longer or shorter than the states of its images
+MAX_UNLIKE = 0.1  # share by which a video may differ in length from the states of its images
 DELIMITED = (".csv", ".tsv", ".txt")
 ENTRY_POINTS = "neeco.readers"  # the group in which installed packages name their formats
 
 
 @dataclass(frozen=True)
 class Body:
-    """One of the bodies whose poses stand beside each other in a table. columns: by their index, of which the second
+    """One of several bodies whose poses share the rows of a table. columns: by their index, of which the second
     and later ones of a name end in `#2`, ...; without that, they are named as a table of this body alone would name
     them."""
 
@@ -45,10 +45,10 @@ class Body:
 
 @dataclass(frozen=True)
 class Table:
-    """What a log file, or one stream of it, holds. header: column names, all different; rows: cells, stripped, of which
-    a row may have more or fewer than the header, or numbers [R, C], NaN where missing; lines: int64 [R] the file's line
-    (or record) of each row, from 1; stream: which of the file's; record: what a row is called; stated_in: the
-    file's own name of the frame that poses are stated in, meaning: what that says (None: nothing, taken as a base);
+    """The content of a log file, or of one stream of it. header: column names, all different; rows: cells, stripped, of
+    which a row may have more or fewer than the header, or numbers [R, C], NaN where missing; lines: int64 [R] the
+    file's line (or record) of each row, from 1; stream: which of the file's; record: what a row is called; stated_in:
+    the file's own name of the frame that poses are stated in, meaning: what that says (None: nothing, taken as a base);
     notes: what reading it changed or left out, in words; image_hz: images a second of the video, where every row is the
     state of one of its images; None: rows have times of their own; bodies: where the columns of several stand beside
     each other, behind those that all share."""
@@ -57,6 +57,7 @@ class Table:
     header: tuple[str, ...]
     rows: list[list[str]] | np.ndarray
     lines: np.ndarray
+    _: KW_ONLY
     decimal_comma: bool = False
     stream: str | None = None
     record: str = "line"
@@ -68,17 +69,17 @@ class Table:
 
     @property
     def frame(self) -> str | None:
-        """What poses are stated in, BASE or a camera's frame (`frames.CAMERA_FRAMES`), where the file says it."""
+        """The frame of poses, BASE or a camera's frame (`frame_names.CAMERA_FRAMES`), where the file states it."""
         return None if self.meaning is None else self.meaning.frame
 
     @property
     def where(self) -> str:
-        """Begins a message: the file, and the stream."""
+        """The beginning of a message: the file, and the stream."""
         return str(self.path) if self.stream is None else f"{self.path}: {self.stream}"
 
     @property
     def title(self) -> str:
-        """Begins a note: the same without folders."""
+        """The beginning of a note: the same without folders."""
         return self.path.name if self.stream is None else f"{self.path.name}: {self.stream}"
 
     def list_rows(self, lines: Sequence[int] | np.ndarray) -> str:
@@ -89,7 +90,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Stream:
-    """One of what a file holds. name: as a recording says it (`stream: NAME`); kind: POSES, READINGS, IMAGES or OTHER;
+    """A stream of a file. name: as a recording states it (`stream: NAME`); kind: POSES, READINGS, IMAGES or OTHER;
     type: the format's own word for it; count: of its samples; rate_hz: None where nobody knows.
 
     For a template: offered: is it what is recorded most likely, or only there, too? body: what it is of, where the
@@ -104,6 +105,7 @@ class Stream:
     type: str
     count: int
     rate_hz: float | None = None
+    _: KW_ONLY
     offered: bool = True
     body: str | None = None
     joints: tuple[tuple[str, str], ...] | None = None

@@ -1,4 +1,4 @@
-"""What one pass over a bag finds: all poses and readings, and of images everything but the pixels."""
+"""One pass over a bag: poses, readings, all of the images but their pixels, and transforms chained by frames."""
 
 from __future__ import annotations
 
@@ -10,29 +10,37 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from neeco.ingest.readers import OTHER, Stream
+from neeco.capture.documents import printable
+from neeco.errors import NeecoError
+from neeco.ingest.readers import OTHER, Stream, Table
 from neeco.ingest.readers._bagfile import Bag, open_bag, plain
 from neeco.ingest.readers._rosimages import ImageLog
+from neeco.ingest.readers.columns import BASE, PoseColumns
+from neeco.ingest.readers.frame_names import meaning_of, of_dvrk
+from neeco.ingest.readers.interpolate import poses_at
+from neeco.ingest.readers.logs import NORM_TOLERANCE, read_pose_log
 
+CHAIN_HEADER = ("t_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 POSE = {"geometry_msgs/PoseStamped", "geometry_msgs/TransformStamped"}
 TRANSFORMS = {"tf2_msgs/TFMessage", "tf/tfMessage"}
 JOINTS = "sensor_msgs/JointState"
 IMAGE = {"sensor_msgs/Image", "sensor_msgs/CompressedImage"}
 CAMERA_INFO = "sensor_msgs/CameraInfo"
 READ = {*POSE, *TRANSFORMS, JOINTS, *IMAGE, CAMERA_INFO}
-MOST_JOINTS = 400  # of one topic
-MOST_FRAMES = 2000  # of all transforms
+MAX_JOINTS = 400  # of one topic
+MAX_FRAMES = 2000  # of all transforms
 
 
 @dataclass
 class Samples:
-    """Samples of a stream, by message. stamps, received: ns; stamps are 0 where the header has none."""
+    """Samples of a stream, one per message. stamps, received: ns; a stamp is 0 where the header has none."""
 
     type: str
     stamps: array[int] = field(default_factory=lambda: array("q"))
     received: array[int] = field(default_factory=lambda: array("q"))
-    frames: set[str] = field(default_factory=set)  # that poses are stated in, as ROS 2 writes them: without a slash
+    frames: set[str] = field(default_factory=set)  # of the poses, as ROS 2 writes them: without a slash
     damaged: int = 0
 
     def stamp(self, header: Any, received: int) -> None:
@@ -43,13 +51,21 @@ class Samples:
 
 @dataclass
 class Poses(Samples):
-    """values: x, y, z m and qx, qy, qz, qw of each; static: holds at all times."""
+    """Poses of a body. values: x, y, z m and qx, qy, qz, qw of each; static: valid at all times."""
 
     values: array[float] = field(default_factory=lambda: array("d"))
     static: bool = False
 
-    def add(self, header: Any, received: int, place: Any, turn: Any) -> None:
-        self.stamp(header, received)
+    def add(self, received: int, message: Any) -> None:
+        """Add a PoseStamped or TransformStamped (None: a damaged one)."""
+        if message is None:
+            self.damaged += 1
+            return
+        self.stamp(message.header, received)
+        if hasattr(message, "pose"):
+            place, turn = message.pose.position, message.pose.orientation
+        else:
+            place, turn = message.transform.translation, message.transform.rotation
         self.values.extend((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
 
     def table(self) -> np.ndarray:
@@ -59,21 +75,23 @@ class Poses(Samples):
 
 @dataclass
 class Joints(Samples):
-    """columns: which each joint's are, by name; values: by column, NaN where a message does not have the joint."""
+    """Readings of joints. columns: values by joint, NaN where a message does not have the joint."""
 
     columns: dict[str, array[float]] = field(default_factory=dict)
 
     def add(self, received: int, message: Any) -> None:
-        positions = message.position
-        names = [plain(name) for name in message.name] or [f"joint_{number + 1}" for number in range(len(positions))]
-        if len(names) != len(positions):
+        """Add a JointState (None: a damaged one)."""
+        positions = [] if message is None else message.position.tolist()
+        names = [] if message is None else [plain(name) for name in message.name]
+        names = names or [f"joint_{number + 1}" for number in range(len(positions))]
+        if message is None or len(names) != len(positions):
             self.damaged += 1
             return
         for name in names:
-            if name not in self.columns and len(self.columns) < MOST_JOINTS:
+            if name not in self.columns and len(self.columns) < MAX_JOINTS:
                 self.columns[name] = array("d", [np.nan]) * len(self.stamps)
         self.stamp(message.header, received)
-        for name, value in zip(names, positions.tolist(), strict=True):
+        for name, value in zip(names, positions, strict=True):
             if name in self.columns and len(self.columns[name]) < len(self.stamps):
                 self.columns[name].append(value)
         for values in self.columns.values():
@@ -87,7 +105,7 @@ class Joints(Samples):
 
 @dataclass
 class Survey:
-    """What one pass over a bag found."""
+    """Contents of a bag by stream, without the pixels of images."""
 
     path: Path
     poses: dict[str, Poses] = field(default_factory=dict)  # by stream
@@ -107,39 +125,24 @@ class Survey:
         elif kind in TRANSFORMS:
             for item in [] if message is None else message.transforms:
                 name = f"tf:{plain(item.child_frame_id).lstrip('/')}"
-                if name not in self.poses and len(self.poses) < MOST_FRAMES:
+                if name not in self.poses and len(self.poses) < MAX_FRAMES:
                     self.poses[name] = Poses(kind, static=topic.endswith("tf_static"))
                 if name in self.poses:
-                    self._add_pose(self.poses[name], received, item)
+                    self.poses[name].add(received, item)
         elif kind in POSE:
-            log = self.poses.setdefault(topic, Poses(kind))
-            if message is None:
-                log.damaged += 1
-            else:
-                self._add_pose(log, received, message)
+            self.poses.setdefault(topic, Poses(kind)).add(received, message)
         else:
-            readings = self.joints.setdefault(topic, Joints(kind))
-            if message is None:
-                readings.damaged += 1
-            else:
-                readings.add(received, message)
-
-    def _add_pose(self, log: Poses, received: int, message: Any) -> None:
-        if hasattr(message, "pose"):
-            log.add(message.header, received, message.pose.position, message.pose.orientation)
-        else:
-            log.add(message.header, received, message.transform.translation, message.transform.rotation)
+            self.joints.setdefault(topic, Joints(kind)).add(received, message)
 
     def seconds(self, stamps: Sequence[int], received: Sequence[int]) -> np.ndarray:
-        """[N] s from the origin, of stamps or, where those are 0, of receipt, ns."""
+        """Return times [N] s from the origin: the stamps or, where those are 0, the times of receipt, ns."""
         given, arrived = np.array(stamps, np.int64), np.array(received, np.int64)
         return (np.where(given == 0, arrived, given) - self.origin) * 1e-9
 
 
 @lru_cache(maxsize=4)
 def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
-    """One pass over a bag; `state` of its files tells it from another of its name."""
-
+    """Read a bag once; `state` of its files distinguishes it from another of its name."""
     survey = Survey(path)
     with open_bag(path) as bag:
         _fill(survey, bag)
@@ -147,7 +150,6 @@ def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
 
 
 def _fill(survey: Survey, bag: Bag) -> None:
-
     kinds: dict[str, str] = {}
     for topic in bag.topics.values():
         if topic.type in READ and topic.problem is None:
@@ -167,3 +169,96 @@ def _fill(survey: Survey, bag: Bag) -> None:
 
 def _calibrated(info: Any) -> bool:
     return bool((info.K if hasattr(info, "K") else info.k)[0])
+
+
+def chained(survey: Survey, stream: str, images: set[str]) -> Table:
+    """Return poses of `tf:CHILD in FRAME`, at the times of the child's nearest transform that moves. images: frames of
+    the bag's images."""
+    child, word, frame = stream.removeprefix("tf:").partition(" in ")
+    where = f"{survey.path}: {stream}"
+    known = {name.removeprefix("tf:") for name in survey.poses if name.startswith("tf:")}
+    parents = {parent for name in known for parent in survey.poses[f"tf:{name}"].frames}
+    for name, there in ((child, known | parents if word else known), (frame, known | parents)):
+        if name not in there and (word or name is child):
+            listed = printable(", ".join(sorted(there)), 300).strip("'")
+            remedy = f"name one of {listed}" if there else "the bag has no tf; name a topic"
+            raise NeecoError(f"{where}: there is no transform of {printable(name)}; {remedy}")
+    ups, downs = _path(survey, where, child, frame)
+    moving = [edge for edge in (*ups, *downs) if not survey.poses[f"tf:{edge}"].static]
+    if not moving:
+        raise NeecoError(f"{where}: does not move: all transforms between are static; name another frame")
+    clock = survey.poses[f"tf:{moving[0]}"]
+    seconds = np.unique(survey.seconds(clock.stamps, clock.received))
+    frame_from_child = np.linalg.inv(_composed(survey, downs, seconds))
+    frame_from_child = frame_from_child @ _composed(survey, ups, seconds)
+    known_rows = np.isfinite(frame_from_child).all(axis=(1, 2))
+    quats = np.full((len(seconds), 4), np.nan)
+    quats[known_rows] = Rotation.from_matrix(frame_from_child[known_rows, :3, :3]).as_quat()
+    rows = np.column_stack([seconds, frame_from_child[:, :3, 3], quats])
+    return Table(
+        survey.path, CHAIN_HEADER, rows, np.arange(1, len(rows) + 1), stream=stream, record="message",
+        stated_in=frame, meaning=meaning_of(frame, images, dvrk=of_dvrk(child)),
+    )  # fmt: skip
+
+
+def fixed_transform(survey: Survey, child: str, frame: str) -> np.ndarray | None:
+    """Return frame_from_child [4, 4] mm where static transforms join the two; None elsewhere."""
+    try:
+        ups, downs = _path(survey, str(survey.path), child, frame)
+    except NeecoError:
+        return None
+    if not all(survey.poses[f"tf:{edge}"].static for edge in (*ups, *downs)):
+        return None
+    once = np.zeros(1)
+    return np.asarray((np.linalg.inv(_composed(survey, downs, once)) @ _composed(survey, ups, once))[0])
+
+
+def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str], list[str]]:
+    """Return the transforms from a child and from a frame up to their common ancestor, each by its child. Raises
+    NeecoError."""
+    ups, downs = (_to_root(survey, where, name) for name in (child, frame))
+    while ups and downs and ups[-1] == downs[-1]:
+        ups.pop()
+        downs.pop()
+    ends = [_parent(survey, where, edges[-1]) if edges else name for edges, name in ((ups, child), (downs, frame))]
+    if ends[0] != ends[1]:
+        raise NeecoError(f"{where}: nothing joins {child} to {frame}; they hang from {ends[0]} and {ends[1]}")
+    return ups, downs
+
+
+def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.ndarray:
+    """Return [N, 4, 4] mm, the pose of the first edge's child in the last one's parent; NaN where any is unknown."""
+    total = np.tile(np.eye(4), (len(seconds), 1, 1))
+    for edge in edges:
+        log = survey.poses[f"tf:{edge}"]
+        if log.static:
+            values, pose = log.table()[-1], np.eye(4)
+            if not (np.isfinite(values).all() and abs(np.linalg.norm(values[3:]) - 1) < NORM_TOLERANCE):
+                raise NeecoError(f"{survey.path}: tf:{edge}: is no rotation and translation; record it anew")
+            pose[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
+            pose[:3, 3] = 1000 * values[:3]
+            poses = np.tile(pose, (len(seconds), 1, 1))
+        else:
+            # as it stands, whatever its parent's axes: those of the last frame alone matter
+            log_of_edge = read_pose_log(PoseColumns(survey.path, stream=f"tf:{edge}", frame=BASE))
+            poses, _ = poses_at(log_of_edge, seconds, 0.0)
+        total = poses @ total
+    return total
+
+
+def _parent(survey: Survey, where: str, child: str) -> str:
+    frames = survey.poses[f"tf:{child}"].frames
+    if len(frames) > 1:
+        raise NeecoError(f"{where}: {child} hangs from several frames ({', '.join(sorted(frames)[:4])}); name another")
+    return next(iter(frames))
+
+
+def _to_root(survey: Survey, where: str, name: str) -> list[str]:
+    """Return the transforms from a frame up, each by its child."""
+    edges: list[str] = []
+    while f"tf:{name}" in survey.poses:
+        if name in edges:
+            raise NeecoError(f"{where}: the transforms go round in a circle at {name}; record them anew")
+        edges.append(name)
+        name = _parent(survey, where, name)
+    return edges

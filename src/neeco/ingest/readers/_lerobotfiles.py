@@ -1,10 +1,11 @@
-"""What a LeRobot data set says of itself, versions 2.0, 2.1 and 3.0, and its Parquet files, a few columns at a time."""
+"""The description of a LeRobot data set, versions 2.0, 2.1 and 3.0, and its Parquet files, a few columns at a time."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path, PurePosixPath
@@ -23,21 +24,21 @@ VERSIONS = re.compile(r"v?(2)\.[01]|v?(3)\.0")
 FILM_COLUMNS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")  # of each camera, version 3
 FIXED = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns that every data set has
 
-MOST_INFO = 16 * 2**20  # bytes of meta/info.json
-MOST_EPISODES = 2_000_000
-MOST_TRIED = 1000  # episodes, for one that is there
-MOST_FEATURES = 2000
-MOST_NUMBERS = 4096  # of one feature in a row
-MOST_ROWS = 2_000_000  # of an episode
-MOST_BYTES = 2**30  # that the columns read of a file may unpack to
-BUFFER = 2**20  # bytes of a column that are read at a time
-MOST_LINE = 2**20  # characters of a line of meta/episodes.jsonl
+MAX_INFO_BYTES = 16 * 2**20  # of meta/info.json
+MAX_EPISODES = 2_000_000
+MAX_TRIED = 1000  # episodes, for one that is there
+MAX_FEATURES = 2000
+MAX_NUMBERS = 4096  # of one feature in a row
+MAX_ROWS = 2_000_000  # of an episode
+MAX_BYTES = 2**30  # that the columns read of a file may unpack to
+BUFFER_BYTES = 2**20  # of a column, read at a time
+MAX_LINE = 2**20  # characters of a line of meta/episodes.jsonl
 
 _FIELD = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")
 
 
 class _NotThere(NeecoError):
-    """A file, or what is said of one, is missing, as where somebody downloaded a part of a data set."""
+    """A file or its description is missing, as where a data set was downloaded in part."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Feature:
 
 @dataclass(frozen=True)
 class Film:
-    """Where an episode's images of one camera are: a file, and its part (s, None: all of it)."""
+    """The file of an episode's images of one camera, and its part (s, None: all of it)."""
 
     file: Path
     start: float | None = None
@@ -86,20 +87,20 @@ class DataSet:
 
     @property
     def films(self) -> tuple[str, ...]:
-        """Features that are videos."""
+        """The features that are videos."""
         return tuple(key for key, feature in self.features.items() if feature.dtype == "video")
 
     def episodes(self) -> tuple[int, int, int]:
-        """How many episodes it has, the first number and the last. Raises NeecoError."""
+        """Return the number of episodes, the first one's number and the last one's. Raises NeecoError."""
         numbers = [int(record["episode_index"]) for record in self._records(None)]
         if not numbers:
             raise NeecoError(f"{self.path}: holds no episode; download the data set again")
         return len(numbers), min(numbers), max(numbers)
 
     def first_present(self) -> Episode:
-        """The first episode whose states are there: not everybody downloads all. Raises NeecoError."""
+        """Return the first episode whose states were downloaded. Raises NeecoError."""
         problem = None
-        for record in islice(self._records(None), MOST_TRIED):
+        for record in islice(self._records(None), MAX_TRIED):
             try:
                 return self.episode(record["episode_index"])
             except _NotThere as error:
@@ -107,14 +108,14 @@ class DataSet:
         raise problem or NeecoError(f"{self.path}: holds no episode; download the data set again")
 
     def episode(self, number: int) -> Episode:
-        """One episode. Raises NeecoError when it is not there."""
+        """Return one episode. Raises NeecoError when it is not there."""
         record = next(self._records(number), None)
         if record is None:
             count, first, last = self.episodes()
             listed = f"{first}" if count == 1 else f"{first} to {last}"
             raise NeecoError(f"{self.path}: holds no episode {number}; its episodes are {listed}")
         length = record["length"]
-        if not 0 < length <= MOST_ROWS:
+        if not 0 < length <= MAX_ROWS:
             raise NeecoError(f"{self.path}: episode {number}: length: {length} rows cannot be; correct meta")
         place: dict[str, int | str] = {"episode_chunk": number // self.chunks_size, "episode_index": number}
         if self.version == 3:
@@ -128,7 +129,8 @@ class DataSet:
         return Episode(number, length, self._file("data_path", place), films, absent)
 
     def _film(self, number: int, key: str, record: Mapping[str, Any], place: Mapping[str, int | str]) -> Film:
-        """Where one camera's images of an episode are. Raises _NotThere, and NeecoError for what cannot be."""
+        """Return the place of one camera's images of an episode. Raises _NotThere, and NeecoError for an impossible
+        one."""
         if self.version == 2:
             return Film(self._file("video_path", {**place, "video_key": key}))
         names = {name: f"videos/{key}/{name}" for name in FILM_COLUMNS}
@@ -144,7 +146,7 @@ class DataSet:
         return Film(self._file("video_path", {**own, "video_key": key}), start, end)
 
     def _file(self, field: str, values: Mapping[str, int | str]) -> Path:
-        """The file that a template of info.json names. Raises NeecoError when it leads out of the data set."""
+        """Return the file that a template of info.json names. Raises NeecoError when it leads out of the data set."""
         template = getattr(self, field)
         where = f"{self.path / INFO}: {field}"
         if template is None:
@@ -167,11 +169,11 @@ class DataSet:
         return require_inside(file, _boundary(self.path))
 
     def _records(self, number: int | None) -> Iterator[dict[str, Any]]:
-        """What meta says of the episodes, or of one."""
+        """Yield the records of all episodes, or of one."""
         records = self._lines() if self.version == 2 else self._rows(number)
         for count, record in enumerate(records):
-            if count >= MOST_EPISODES:
-                raise NeecoError(f"{self.path}: holds over {MOST_EPISODES} episodes; give a part of it")
+            if count >= MAX_EPISODES:
+                raise NeecoError(f"{self.path}: holds over {MAX_EPISODES} episodes; give a part of it")
             if number is None or record["episode_index"] == number:
                 yield record
 
@@ -182,7 +184,7 @@ class DataSet:
         require_content(require_inside(file, _boundary(self.path)))
         with file.open("rb") as stream:
             line = 0
-            while text := stream.readline(MOST_LINE):
+            while text := stream.readline(MAX_LINE):
                 line += 1
                 if not text.strip():
                     continue
@@ -216,10 +218,10 @@ class DataSet:
 
 
 def read_data_set(path: Path) -> DataSet:
-    """What meta/info.json says. Raises NeecoError naming field and remedy."""
+    """Read meta/info.json. Raises NeecoError naming field and remedy."""
     file = path / INFO
-    if file.is_file() and file.stat().st_size > MOST_INFO:
-        raise NeecoError(f"{file}: has over {MOST_INFO >> 20} MiB; that is no description of a data set")
+    if file.is_file() and file.stat().st_size > MAX_INFO_BYTES:
+        raise NeecoError(f"{file}: has over {MAX_INFO_BYTES >> 20} MiB; that is no description of a data set")
     require_inside(file, _boundary(path))
     info = read_json(file)
     if not isinstance(info, dict):
@@ -233,7 +235,7 @@ def read_data_set(path: Path) -> DataSet:
         raise NeecoError(f"{file}: fps: {printable(info.get('fps'))} is no frame rate; correct it")
     if type(chunks) is not int or chunks < 1:
         raise NeecoError(f"{file}: chunks_size: {printable(chunks)} is no count of episodes; correct it")
-    if not isinstance(features, dict) or not 0 < len(features) <= MOST_FEATURES:
+    if not isinstance(features, dict) or not 0 < len(features) <= MAX_FEATURES:
         raise NeecoError(f"{file}: features: expected an object that describes each column; correct it")
     data, video = info.get("data_path"), info.get("video_path")
     if not isinstance(data, str) or not isinstance(video, str | None):
@@ -246,88 +248,70 @@ class ParquetFile:
     """A Parquet file: chosen columns of one episode as numpy arrays. Raises NeecoError."""
 
     def __init__(self, path: Path) -> None:
-        import pyarrow.parquet
+        import pyarrow.dataset
+        import pyarrow.fs
 
         require_content(path)
         self.path = path
-        with self._reading():
+        with _damage_named(path):
             # a buffer: else all of a column is taken into memory, and images can stand in it
-            self.file = pyarrow.parquet.ParquetFile(path, buffer_size=BUFFER)
-            self.names: list[str] = self.file.schema_arrow.names
+            options = pyarrow.dataset.ParquetFragmentScanOptions(use_buffered_stream=True, buffer_size=BUFFER_BYTES)
+            kind = pyarrow.dataset.ParquetFileFormat(default_fragment_scan_options=options)
+            self._file = kind.make_fragment(str(path), pyarrow.fs.LocalFileSystem())
+            self.names: list[str] = self._file.physical_schema.names
 
     def read(self, columns: Sequence[str], episode: int | None) -> dict[str, np.ndarray]:
-        """Columns as float or integer arrays [R, ...], only of the rows of an episode where one is given."""
+        """Return columns as float or integer arrays [R, ...], only of the rows of an episode where one is given."""
         wanted = list(dict.fromkeys(["episode_index", *columns]))
-        parts = list(self.batches(wanted, episode, 2**16))
-        parts = [part for part in parts if len(part["episode_index"])] or parts[:1]
-        return {name: np.concatenate([_array(self.path, name, part[name]) for part in parts]) for name in wanted}
+        parts = [part for part in self.batches(wanted, episode, 2**16) if len(part)]
+        parts = parts or [self._file.physical_schema.empty_table()]
+        return {name: np.concatenate([_array(self.path, name, part.column(name)) for part in parts]) for name in wanted}
 
-    def batches(self, columns: Sequence[str], episode: int | None, rows: int) -> Iterator[dict[str, Any]]:
-        """The same as pyarrow arrays of at most so many rows; at least one, which may be empty. `columns` has
-        episode_index."""
-        import pyarrow
-        import pyarrow.compute as compute
+    def batches(self, columns: Sequence[str], episode: int | None, rows: int) -> Iterator[Any]:
+        """Yield the same as pyarrow's record batches of at most so many rows."""
+        import pyarrow.dataset
 
         for name in columns:
             if name not in self.names:
                 listed = ", ".join(self.names[:16]) + (", ..." if len(self.names) > 16 else "")
                 raise NeecoError(f"{self.path}: has no column {printable(name)}; its columns are {listed}")
-        groups = self._groups(columns, episode)
-        with self._reading():
-            if not groups:
-                schema = self.file.schema_arrow
-                yield {name: pyarrow.array([], schema.field(name).type) for name in columns}
-                return
-            for batch in self.file.iter_batches(batch_size=rows, row_groups=groups, columns=list(columns)):
-                if episode is not None:
-                    batch = batch.filter(compute.equal(batch.column("episode_index"), episode))
-                yield {name: batch.column(name) for name in columns}
+        wanted = None if episode is None else pyarrow.dataset.field("episode_index") == episode
+        with _damage_named(self.path):
+            yield from self.groups(columns, wanted).to_batches(
+                columns=list(columns), filter=wanted, batch_size=rows, batch_readahead=0, use_threads=False
+            )
 
-    def _groups(self, columns: Sequence[str], episode: int | None) -> list[int]:
-        """The row groups that may hold rows of the episode."""
-        found, size = [], 0
-        with self._reading():
-            data = self.file.metadata
-            for number in range(data.num_row_groups):
-                group = data.row_group(number)
-                chunks = [group.column(i) for i in range(group.num_columns)]
-                held = next((c.statistics for c in chunks if c.path_in_schema == "episode_index"), None)
-                bounds = (held.min, held.max) if held is not None and held.has_min_max else (0, MOST_EPISODES)
-                if episode is not None and not bounds[0] <= episode <= bounds[1]:
-                    continue
-                found.append(number)
-                read = [c for c in chunks if any(_is_of(c.path_in_schema, name) for name in columns)]
-                size = max(size, sum(c.total_uncompressed_size for c in read))
-        if size > MOST_BYTES:
-            raise NeecoError(f"{self.path}: unpacks to over {MOST_BYTES >> 20} MiB at once; write smaller row groups")
-        return found
-
-    def _reading(self) -> _Reading:
-        return _Reading(self.path)
+    def groups(self, columns: Sequence[str], wanted: Any) -> Any:
+        """Return the part of the file that may hold wanted rows (None: all of it), by the statistics of its row groups.
+        Raises NeecoError where a row group unpacks to more than memory should hold."""
+        part = self._file if wanted is None else self._file.subset(filter=wanted)
+        for group in part.row_groups:
+            data = self._file.metadata.row_group(group.id)
+            chunks = [data.column(index) for index in range(data.num_columns)]
+            read = [chunk for chunk in chunks if any(_is_of(chunk.path_in_schema, name) for name in columns)]
+            if sum(chunk.total_uncompressed_size for chunk in read) > MAX_BYTES:
+                raise NeecoError(
+                    f"{self.path}: unpacks to over {MAX_BYTES >> 20} MiB at once; write smaller row groups"
+                )
+        return part
 
 
-class _Reading:
-    """Turns what pyarrow raises into one line."""
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """Turn what pyarrow raises into one line."""
+    import pyarrow
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, NeecoError) or error is None:
-            return
-        import pyarrow
-
-        known = (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, MemoryError)
-        if isinstance(error, known):
-            reason = " ".join(str(error).split())[:100] or type(error).__name__
-            raise NeecoError(f"{self.path}: cannot be read as Parquet ({reason}); download it again") from None
+    try:
+        yield
+    except NeecoError:
+        raise
+    except (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, MemoryError) as error:
+        reason = " ".join(str(error).split())[:100] or type(error).__name__
+        raise NeecoError(f"{path}: cannot be read as Parquet ({reason}); download it again") from None
 
 
 def _array(file: Path, name: str, column: Any) -> np.ndarray:
-    """Numbers [R, ...] of a column of numbers or of lists of them, all of one length."""
+    """Return the numbers [R, ...] of a column of numbers or of lists of them, all of one length."""
     import pyarrow
     import pyarrow.compute as compute
 
@@ -355,19 +339,19 @@ def _array(file: Path, name: str, column: Any) -> np.ndarray:
 
 
 def _whole(file: Path, name: str, values: np.ndarray) -> np.ndarray:
-    """A column of counts and indices."""
+    """Return a column of counts and indices. Raises NeecoError for other values."""
     if values.ndim != 1 or not np.issubdtype(values.dtype, np.integer) or (values < 0).any():
         raise NeecoError(f"{file}: {name}: holds no whole numbers from 0; download it again")
     return values
 
 
 def _is_of(path: str, column: str) -> bool:
-    """Is a leaf (`observation.state.list.element`) of this column?"""
+    """Return whether a leaf (`observation.state.list.element`) is of this column."""
     return path == column or path.startswith(column + ".")
 
 
 def _boundary(path: Path) -> Path:
-    """The folder that links may not lead out of: the data set, or the hub's cache that holds its files as links."""
+    """Return the folder that links may not lead out of: the data set, or the hub's cache that holds its files."""
     return path.resolve().parents[1] if path.resolve().parent.name == "snapshots" else path
 
 
@@ -380,7 +364,7 @@ def _feature(file: Path, key: str, value: Any) -> Feature:
         raise NeecoError(f"{where}: shape: {printable(shape)} is none; correct it")
     count = int(np.prod(shape, dtype=np.int64))
     numeric = re.fullmatch(r"(float|int|uint)\d+|bool", dtype) is not None
-    if numeric and count > MOST_NUMBERS:
+    if numeric and count > MAX_NUMBERS:
         numeric = False  # an image or a point cloud kept as numbers
     info = value.get("info")
     depth = any(isinstance(held, dict) and held.get(name) for held in (value, info)
@@ -389,7 +373,8 @@ def _feature(file: Path, key: str, value: Any) -> Feature:
 
 
 def _names(key: str, shape: Sequence[int], count: int, given: Any) -> tuple[str, ...]:
-    """Of each number: as the data set names it, flat, nested, or by index, else `KEY[4]` or `KEY[0,3]`."""
+    """Return a name of each number: as the data set names it, flat, nested, or by index, else `KEY[4]` or
+    `KEY[0,3]`."""
     if isinstance(given, dict) and all(type(index) is int for index in given.values()):
         found = sorted(given, key=lambda name: given[name])
     else:
@@ -402,7 +387,7 @@ def _names(key: str, shape: Sequence[int], count: int, given: Any) -> tuple[str,
 
 
 def _flat(value: Any, depth: int = 0) -> Iterator[str]:
-    """The texts in lists and objects of lists, as `[[x, y]]` and `{motors: [x, y]}`."""
+    """Yield the texts in lists and objects of lists, as `[[x, y]]` and `{motors: [x, y]}`."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, list | dict) and depth < 3:

@@ -21,8 +21,8 @@ from neeco.ingest.calibration.lens import opencv_lens
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.readers._bagfile import open_bag, plain
 
-LARGEST_IMAGE = 90_000_000  # px, as for files of images
-READ_PAST = 30  # images that are read past rather than sought over
+MAX_PIXELS = 90_000_000  # of an image, as for files of images
+MAX_SKIPPED = 30  # images that are read and dropped rather than sought over
 MIN_IMAGES = 2
 COMPRESSED = ("JPEG", "PNG")
 # encoding -> bytes a pixel, OpenCV's conversion to RGB (None: it is RGB)
@@ -45,7 +45,7 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 
 class ImageLog:
-    """What a pass over a bag notes of an image topic: all but the pixels."""
+    """The messages of an image topic, all but the pixels."""
 
     def __init__(self) -> None:
         self.received = array("q")  # of every message, ns
@@ -81,7 +81,7 @@ class ImageLog:
         encoding, width, height = message.encoding, message.width, message.height
         if encoding not in ENCODINGS:
             return f"is in encoding {printable(encoding, 24)}, which is not read"
-        if not 0 < width * height <= LARGEST_IMAGE:
+        if not 0 < width * height <= MAX_PIXELS:
             return f"has {width}x{height} pixels"
         if message.step < width * ENCODINGS[encoding][0] or len(message.data) < message.step * height:
             return "has fewer pixels than its size says"
@@ -100,7 +100,7 @@ class ImageLog:
             return f"is no whole JPEG or PNG ({printable(message.format, 24)})"
         if mode[0] in "IF":
             return "has 16 bits a channel, which is not read"
-        if size[0] * size[1] > LARGEST_IMAGE:
+        if size[0] * size[1] > MAX_PIXELS:
             return f"has {size[0]}x{size[1]} pixels"
         if kind == "JPEG" and b"\xff\xd9" not in data[-4096:].tobytes():
             return "is no whole JPEG or PNG (cut short)"
@@ -110,7 +110,7 @@ class ImageLog:
 
 
 def decode(message: Any) -> np.ndarray:
-    """uint8 [H, W, 3] RGB of an Image or a CompressedImage that `ImageLog` found usable."""
+    """Return uint8 [H, W, 3] RGB of an Image or a CompressedImage that `ImageLog` found usable."""
     if not hasattr(message, "encoding"):
         with Image.open(BytesIO(message.data), formats=COMPRESSED) as image:
             return np.array(image.convert("RGB"))
@@ -144,15 +144,10 @@ class BagImages(VideoSource):
                     raise NeecoError(f"{self.path}: {self.topic}: is shorter than before; do not change the bag")
 
     def _stretches(self, wanted: list[int]) -> Iterator[list[int]]:
-        """Frames that lie near each other, in order, in the bag."""
-        stretch: list[int] = []
-        for index in wanted:
-            if stretch and not 0 < self.numbers[index] - self.numbers[stretch[-1]] <= READ_PAST:
-                yield stretch
-                stretch = []
-            stretch.append(index)
-        if stretch:
-            yield stretch
+        """Group frames that lie near each other, in order, in the bag."""
+        steps = np.diff(self.numbers[wanted])
+        cuts = np.flatnonzero((steps <= 0) | (steps > MAX_SKIPPED)) + 1
+        yield from (stretch.tolist() for stretch in np.split(np.array(wanted, np.int64), cuts) if len(stretch))
 
     def _decoded(self, number: int, message: Any) -> np.ndarray:
         try:
@@ -168,7 +163,7 @@ class BagImages(VideoSource):
 
 
 def open_topic(path: Path, topic: str, log: ImageLog, seconds: np.ndarray, notes: Sequence[str]) -> BagImages:
-    """The images of a topic, by time; seconds [M] of those that can be used. Raises NeecoError."""
+    """Return the images of a topic, sorted by time; seconds [M]: of those that can be used. Raises NeecoError."""
     where, notes = f"{path}: {topic}", list(notes)
     usable = len(log.numbers)
     worst = log.bad.most_common(1)[0] if log.bad else None
@@ -195,7 +190,7 @@ def open_topic(path: Path, topic: str, log: ImageLog, seconds: np.ndarray, notes
 
 
 def lens_of(where: str, info: Any, rectified: bool) -> Lens | None:
-    """The lens of a CameraInfo; of a rectified image, the pinhole that is left. None where the camera was not
+    """Return the lens of a CameraInfo; of a rectified image, its pinhole camera. None where the camera was not
     calibrated. Raises NeecoError."""
     # ROS 1 has capitals
     matrix, projection, distortion = (getattr(info, key if hasattr(info, key) else key.lower()) for key in "KPD")

@@ -21,19 +21,19 @@ from neeco.files import require_content
 from neeco.ingest.readers import VideoSource
 
 META, NRRD = (".mha", ".mhd"), (".nrrd", ".nhdr")
-LONGEST_LINE = 1 << 16
-LONGEST_HEADER = 1 << 29  # 100 000 frames of 20 transforms
-MOST_FRAMES = 10_000_000
-LARGEST_SIDE = 8192  # px
-BEST_RATIO = 1032  # of zlib: more comes out of no data
-CHUNK = 1 << 20
+MAX_LINE_BYTES = 1 << 16
+MAX_HEADER_BYTES = 1 << 29  # 100 000 frames of 20 transforms
+MAX_FRAMES = 10_000_000
+MAX_SIDE = 8192  # px
+MAX_RATIO = 1032  # of unpacked to packed bytes by zlib
+CHUNK_BYTES = 1 << 20
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w{1,200})")
 _UCHAR = ("met_uchar", "uchar", "unsigned char", "uint8", "uint8_t")
 
 
 @dataclass(frozen=True)
 class FrameSequence:
-    """What a sequence's header says. size: (width, height) px, (0, 0) without images; count: of its frames; channels: 1
+    """The header of a sequence. size: (width, height) px, (0, 0) without images; count: of its frames; channels: 1
     or 3; fields: by name, each frame's text by its number; data: the file that holds the images, and from which byte;
     window: of zlib, None where the images are not compressed."""
 
@@ -90,8 +90,8 @@ def read_sequence(path: Path) -> FrameSequence:
 
 def _lines(path: Path, stream: BinaryIO) -> Iterator[str]:
     """The lines of a header, of which the last may end with the file."""
-    while line := stream.readline(LONGEST_LINE):
-        if len(line) == LONGEST_LINE or stream.tell() > LONGEST_HEADER:
+    while line := stream.readline(MAX_LINE_BYTES):
+        if len(line) == MAX_LINE_BYTES or stream.tell() > MAX_HEADER_BYTES:
             raise _unended(path)
         yield line.decode("utf-8", "replace").strip()
 
@@ -186,7 +186,7 @@ def _dimensions(header: _Header, name: str, sizes: list[int], kinds: list[str]) 
     if len(sizes) not in (3, 4) or (len(sizes) == 4 and sizes[2] > 1):
         raise NeecoError(f"{header.path}: {name}: {sizes} is no sequence of images; expected width, height, frames")
     width, height, count = sizes[0], sizes[1], sizes[-1]
-    if max(width, height) > LARGEST_SIDE or count > MOST_FRAMES:
+    if max(width, height) > MAX_SIDE or count > MAX_FRAMES:
         raise NeecoError(f"{header.path}: {name}: {sizes} is beyond all measure; export the sequence again")
     return (width, height), count, channels
 
@@ -220,7 +220,7 @@ def _checked(header: _Header, sequence: FrameSequence) -> FrameSequence:
         what = f"holds {held / frame:.4g} images, its header speaks of {sequence.count}"
     elif sequence.window is not None and re.fullmatch(r"\d{1,18}", stored) and held < int(stored):
         what = f"holds {held} bytes of compressed images, its header speaks of {stored}"
-    elif sequence.window is not None and promised > BEST_RATIO * (held + 64):
+    elif sequence.window is not None and promised > MAX_RATIO * (held + 64):
         what = f"holds {held} bytes, of which no {sequence.count} images of {sequence.size} can come"
     else:
         return sequence
@@ -263,67 +263,44 @@ def _pixels(sequence: FrameSequence, numbers: list[int]) -> Iterator[np.ndarray]
 
 
 def _unpacked(sequence: FrameSequence, numbers: list[int]) -> Iterator[bytes]:
-    """The bytes of frames in increasing order. Raises NeecoError where the data ends before them, is damaged, or does
-    not end with the last of the sequence."""
+    """Yield the bytes of frames in increasing order. Raises NeecoError where the data ends before them, is damaged, or
+    does not end with the last of the sequence."""
     file, start = sequence.data
     length = sequence.size[0] * sequence.size[1] * sequence.channels
     assert sequence.window is not None
     try:
         with file.open("rb") as stream:
             stream.seek(start)
-            source = _Unpacker(file, stream, sequence.window)
-            reached = 0
+            parts, held, first = _inflated(stream, sequence.window), bytearray(), 0  # first: the byte where held begins
             for number in numbers:
-                while reached < number * length:
-                    reached += len(source.take(min(number * length - reached, CHUNK)))
-                content = source.take(length)
-                reached += length
-                yield content
-            if reached == sequence.count * length and not source.at_end():
+                while first + len(held) < (number + 1) * length:
+                    if (part := next(parts, None)) is None:
+                        raise NeecoError(f"{file}: its compressed images end early; copy or export the sequence again")
+                    held += part
+                    passed = min(number * length - first, len(held))
+                    first, held = first + passed, held[passed:]
+                yield bytes(held[number * length - first :][:length])
+            if (
+                numbers
+                and numbers[-1] == sequence.count - 1
+                and (first + len(held) > sequence.count * length or next(parts, b""))
+            ):
                 raise NeecoError(f"{file}: holds more images than its header says; export the sequence again")
+    except zlib.error:
+        raise NeecoError(f"{file}: its compressed images are damaged; copy or export the sequence again") from None
     except OSError as error:
         raise NeecoError(f"{file}: cannot read: {error.strerror or error}; correct the path") from None
 
 
-class _Unpacker:
-    """Takes bytes out of zlib's or gzip's streams, one after the other, never more than were asked for."""
-
-    def __init__(self, file: Path, stream: BinaryIO, window: int) -> None:
-        self.file, self.stream, self.window = file, stream, window
-        self.machine = zlib.decompressobj(window)
-        self.packed = b""
-
-    def take(self, length: int) -> bytes:
-        """Raises NeecoError where there are fewer, or they are damaged."""
-        parts: list[bytes] = []
-        missing = length
-        while missing:
-            part = self._more(missing)
-            if not part:
-                raise NeecoError(f"{self.file}: its compressed images end early; copy or export the sequence again")
-            parts.append(part)
-            missing -= len(part)
-        return b"".join(parts)
-
-    def at_end(self) -> bool:
-        return not self._more(1)
-
-    def _more(self, most: int) -> bytes:
-        while True:
-            if self.machine.eof:
-                self.packed = self.machine.unused_data or self.stream.read(CHUNK)
-                if not self.packed or self.window == zlib.MAX_WBITS:
-                    return b""
-                self.machine = zlib.decompressobj(self.window)
-            elif not self.packed:
-                self.packed = self.stream.read(CHUNK)
-            ended = not self.packed
-            try:
-                part = self.machine.decompress(self.packed, most)
-            except zlib.error:
-                raise NeecoError(
-                    f"{self.file}: its compressed images are damaged; copy or export the sequence again"
-                ) from None
-            self.packed = self.machine.unconsumed_tail
-            if part or ended:
-                return part
+def _inflated(stream: BinaryIO, window: int) -> Iterator[bytes]:
+    """Yield what zlib's stream, or gzip's streams one after the other, unpack to, at most CHUNK_BYTES at a time."""
+    machine, packed = zlib.decompressobj(window), b""
+    while packed := packed or stream.read(CHUNK_BYTES):
+        if part := machine.decompress(packed, CHUNK_BYTES):
+            yield part
+        packed = machine.unconsumed_tail
+        if machine.eof:
+            packed = machine.unused_data
+            if window == zlib.MAX_WBITS:
+                return
+            machine = zlib.decompressobj(window)

@@ -1,8 +1,8 @@
-"""What a log of poses may mean where nothing in its file says it: each order of a quaternion, convention of angles and
-frame, with what tells them apart.
+"""The possible meanings of a log of poses whose file leaves them open: orders of a quaternion, conventions of angles
+and frames, with measures that distinguish them.
 
-The turn from one frame to the next is the same for both orders of a quaternion. What differs is where a tool's shaft
-points, which goes through the trocar all the time: the lines along the right axis pass near one point.
+Both orders of a quaternion give the same turn from one frame to the next, but not the same direction of the shaft. It
+passes through the trocar all the time: the lines along the right axis pass near one point.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
 from neeco.geometry.lines import distances_to_lines, nearest_point
+from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import POSES, Stream, format_of, numbers, read_table
 from neeco.ingest.readers.columns import (
     BASE,
@@ -28,7 +30,7 @@ from neeco.ingest.readers.columns import (
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame
 from neeco.ingest.readers.logs import in_opencv, to_quaternions, with_named_frame
 
-UNIT_NORM = 1e-3  # of a quaternion's length, and of R^T R - I: what float32 and rounded text leave
+UNIT_TOLERANCE = 1e-3  # of a quaternion's length, and of R^T R - I: rounding of float32 and text
 CONVENTIONS = ("XYZ", "ZYX", "xyz", "zyx")  # of three angles, as scipy names them
 ANGLES = (("roll", "pitch", "yaw"), ("rx", "ry", "rz"), ("alpha", "beta", "gamma"))
 QUATERNION = "quaternion"  # of either order
@@ -37,8 +39,8 @@ AXES = "xyz"
 
 @dataclass(frozen=True)
 class Shaft:
-    """How near all lines along one axis of a body pass to one point. axis: 0 to 2; point [3] and rms in the log's unit
-    of length."""
+    """The point that all lines along one axis of a body pass nearest to. axis: 0 to 2; point [3] and rms distance in
+    the log's unit of length."""
 
     axis: int
     point: np.ndarray
@@ -55,8 +57,8 @@ class Reading:
 
 @dataclass(frozen=True)
 class OpenPoses:
-    """Poses of which something is not said. times [R] s; positions [R, 3] in the file's unit; frame: what they are
-    taken to be stated in, BASE or a camera's frame, whose axes are turned to OpenCV's."""
+    """Poses whose meaning is left open. times [R] s; positions [R, 3] in the file's unit; frame: assumed, BASE or a
+    camera's frame, whose axes are turned to OpenCV's."""
 
     title: str
     times: np.ndarray
@@ -66,8 +68,8 @@ class OpenPoses:
 
 
 def find_rotations(values: np.ndarray) -> list[tuple[int, str]]:
-    """(first column, QUATERNION or ROTATION_MATRIX) of what is a rotation by its numbers [R, C]: four of unit length,
-    of which more than one changes, or nine that are a rotation matrix in every row."""
+    """Return (first column, QUATERNION or ROTATION_MATRIX) of rotations among numbers [R, C]: four of unit length, of
+    which more than one changes, or nine that are a rotation matrix in every row."""
     values = values.astype(np.float64)
     values = values[np.isfinite(values).all(axis=1)]
     if not len(values):
@@ -79,7 +81,7 @@ def find_rotations(values: np.ndarray) -> list[tuple[int, str]]:
         if nine.shape[1] == 9 and _are_rotations(nine.reshape(-1, 3, 3)):
             found.append((place, ROTATION_MATRIX))
             place += 9
-        elif np.abs(np.linalg.norm(four, axis=1) - 1).max() < UNIT_NORM and (np.ptp(four, axis=0) > 0).sum() > 1:
+        elif np.abs(np.linalg.norm(four, axis=1) - 1).max() < UNIT_TOLERANCE and (np.ptp(four, axis=0) > 0).sum() > 1:
             found.append((place, QUATERNION))
             place += 4
         else:
@@ -88,15 +90,15 @@ def find_rotations(values: np.ndarray) -> list[tuple[int, str]]:
 
 
 def open_poses(source: Path) -> list[OpenPoses]:
-    """The poses of a file of which something is not said, in every frame that may be meant, with every way to read
-    them. Raises NeecoError."""
+    """Return the poses of a file that leaves their meaning open, in every possible frame, with every possible reading.
+    Raises NeecoError."""
     known = format_of(source)
     streams = () if known is None else known.streams(source)
     return [poses for stream in streams if stream.kind == POSES and stream.asks for poses in _open(source, stream)]
 
 
 def shaft_of(positions: np.ndarray, quats: np.ndarray) -> Shaft:
-    """The axis of a body whose lines through positions [R, 3] pass nearest to one point, by least squares."""
+    """Return the axis of a body whose lines through positions [R, 3] pass nearest to one point, by least squares."""
     best = None
     for axis in range(3):
         lines = axis_directions(quats, axis)
@@ -109,20 +111,14 @@ def shaft_of(positions: np.ndarray, quats: np.ndarray) -> Shaft:
 
 
 def axis_directions(quats: np.ndarray, axis: int) -> np.ndarray:
-    """[R, 3] where an axis of bodies with turns quats [R, 4] wxyz points."""
-    w, x, y, z = quats.T
-    columns = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack(columns[axis], 1)
+    """Return the directions [R, 3] of an axis of bodies with rotations quats [R, 4] wxyz."""
+    return np.asarray(Rotation.from_quat(quats, scalar_first=True).as_matrix()[:, :, axis])
 
 
 def largest_step(quats: np.ndarray) -> float:
-    """rad, of the turns from one sample to the next."""
-    cosines = np.abs((quats[1:] * quats[:-1]).sum(1)).clip(0, 1)
-    return float(2 * np.arccos(cosines).max(initial=0.0))
+    """Return the largest turn from one sample to the next, rad."""
+    turns = Rotation.from_quat(quats, scalar_first=True)
+    return float((turns[1:] * turns[:-1].inv()).magnitude().max(initial=0.0)) if len(quats) > 1 else 0.0
 
 
 def _open(source: Path, stream: Stream) -> list[OpenPoses]:
@@ -163,7 +159,7 @@ _Way = tuple[str, tuple[str, ...], str, str | None]  # title, columns, form, con
 
 
 def _ways(values: np.ndarray, columns: Sequence[str], rotation: tuple[str, ...] | None, form: str | None) -> list[_Way]:
-    """Every way to read the rotation that some columns hold."""
+    """Return every possible reading of the rotation that some columns hold."""
     if rotation and form:
         return [(f"{form}, as named", rotation, form, None)]
     for names in ANGLES:
@@ -197,5 +193,4 @@ def _ending(columns: Sequence[str], name: str) -> int:
 
 
 def _are_rotations(matrices: np.ndarray) -> bool:
-    off = np.einsum("nji,njk->nik", matrices, matrices) - np.eye(3)
-    return bool(np.abs(off).max() < UNIT_NORM and (np.linalg.det(matrices) > 0).all())
+    return bool(rotation_error(matrices).max() < UNIT_TOLERANCE and (np.linalg.det(matrices) > 0).all())

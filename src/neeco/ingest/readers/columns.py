@@ -1,13 +1,15 @@
-"""Which columns of a log hold what, in which unit: as a recording says, or as common loggers name them."""
+"""The meaning and unit of a log's columns: as a recording states them, or as common loggers name them."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Annotated
 
+from neeco.capture.documents import Node, printable
 from neeco.errors import NeecoError
 
 TRACKER_CLOCK = "em"  # what a tracker's clock is called unless the recording names it
@@ -39,13 +41,25 @@ _ALIASES = {
 _UNIT_SUFFIX = re.compile(r"^(?P<base>.*?)(?:[\s_\-/]+|[\s_]*[\[(]\s*)(?P<unit>[a-zµ°]+)\s*[\])]?$")
 
 
+def _unit(kind: str) -> Callable[[Node], str]:
+    """Return the parser of a unit."""
+
+    def parse(node: Node) -> str:
+        unit = canonical_unit(str(node.value))
+        if unit not in UNITS[kind]:
+            node.error(f"{printable(node.value)} is no unit of {kind}", f"use {', '.join(UNITS[kind])}")
+        return unit
+
+    return parse
+
+
 @dataclass(frozen=True)
 class Units:
     """Units that a recording states; None: the columns' names state it."""
 
-    time: str | None = None
-    length: str | None = None
-    angle: str | None = None
+    time: Annotated[str, _unit("time")] | None = None
+    length: Annotated[str, _unit("length")] | None = None
+    angle: Annotated[str, _unit("angle")] | None = None
 
 
 @dataclass(frozen=True)
@@ -62,6 +76,7 @@ class PoseColumns:
 
     path: Path
     clock: str = TRACKER_CLOCK
+    _: KW_ONLY
     time: tuple[str, ...] | None = None
     position: tuple[str, ...] | None = None
     rotation: tuple[str, ...] | None = None
@@ -83,6 +98,7 @@ class JointColumns:
 
     path: Path
     clock: str
+    _: KW_ONLY
     time: tuple[str, ...] | None = None
     value: str | None = None
     units: Units = field(default_factory=Units)
@@ -92,9 +108,9 @@ class JointColumns:
     stream: str | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RecognisedColumns:
-    """The columns that a header seems to name. None: not found; unclear: what was found in several ways or in part."""
+    """The columns that a header seems to name. None: not found; unclear: meanings found in several ways or in part."""
 
     time: tuple[str, ...] | None = None
     position: tuple[str, ...] | None = None
@@ -223,8 +239,8 @@ def recognise_pose(header: Sequence[str], given: _Given = _NOTHING) -> Recognise
 
 
 def pose_bodies(header: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """The columns of every body that has a position, by what the body may be called: what tells the columns' prefixes
-    apart, or all that is before `pose` and the like; "" for one body without a prefix."""
+    """Return the columns of every body that has a position, by the body's name: the words that distinguish the columns'
+    prefixes, or all before `pose` and the like; "" for one body without a prefix."""
     plain = _by_plain_name(header, "length")
     for prefixed, names in _POSITIONS:
         if all(name in plain for name in names):
@@ -256,13 +272,13 @@ def recognise_value(header: Sequence[str], given: _Given = _NOTHING) -> tuple[st
 
 
 def _left(header: Sequence[str], given: _Given) -> list[str]:
-    """The columns that mean nothing yet."""
+    """Return the columns without a meaning so far."""
     taken = {name for names in given.values() for name in names}
     return [name for name in header if name not in taken]
 
 
 def quaternion_form(names: Sequence[str]) -> str | None:
-    """Whether four columns are named in the order w x y z or x y z w; None when their names do not say."""
+    """Return the form of four columns by the order of their names, w x y z or x y z w; None when they do not say."""
     last = "".join(_plain(name)[-1:] for name in names)
     if last == "wxyz" or (last[1:] == "xyz" and _plain(names[0]).endswith("q0")):
         return QUATERNION_WXYZ
@@ -270,7 +286,7 @@ def quaternion_form(names: Sequence[str]) -> str | None:
 
 
 def _plain(name: str) -> str:
-    """In small letters, its words joined by _; without what tells columns of one name apart, and `#` for a number."""
+    """Return a name in small letters, its words joined by _, without the number of columns of one name."""
     name = re.sub(r"\s*#\d*$", "", name)
     return re.sub(r"[.\s/:\-]+", "_", name.strip().lower()).strip("%_" if name[:2] != "__" else "")
 

@@ -40,13 +40,14 @@ class DelimitedText(RecordingFormat):
         if not rows:
             raise NeecoError(f"{path}: has a header but no rows; record again or name another file")
         cells = [line.cells for line in rows]
-        return Table(path, unique_names(names), cells, np.array([line.number for line in rows]), lines[0].decimal_comma)
+        numbers, comma = np.array([line.number for line in rows]), lines[0].decimal_comma
+        return Table(path, unique_names(names), cells, numbers, decimal_comma=comma)
 
 
 @dataclass(frozen=True)
 class Line:
     """A line of a table that is not blank. number: in the file, from 1; cells: stripped; is_comment: behind a `#`, `//`
-    or `% `, which is left out; decimal_comma: are commas in its cells those of decimals?"""
+    or `% `, which is left out; decimal_comma: commas in its cells are those of decimals."""
 
     number: int
     cells: list[str]
@@ -54,7 +55,7 @@ class Line:
     decimal_comma: bool
 
     def number_at(self, column: int) -> bool:
-        """Whether a cell holds a number."""
+        """Return whether a cell holds a number."""
         cell = self.cells[column] if column < len(self.cells) else ""
         value = parse_number(cell.replace(",", ".") if self.decimal_comma else cell)
         return value is not None and cell.lower() not in MISSING
@@ -122,7 +123,7 @@ def _header_and_rows(path: Path, lines: Sequence[Line]) -> tuple[list[str], list
 
 
 def _is_row(line: Line, numeric: Sequence[int]) -> bool:
-    """Whether a line holds numbers, or a word for a missing one, wherever most do."""
+    """Return whether a line holds numbers, or a word for a missing one, wherever most do."""
     held = [line.number_at(i) for i in numeric]
     return any(held) and all(
         is_number or (i < len(line.cells) and line.cells[i].lower() in MISSING)
@@ -131,7 +132,7 @@ def _is_row(line: Line, numeric: Sequence[int]) -> bool:
 
 
 def _names_columns(line: Line, numeric: Sequence[int]) -> bool:
-    """Whether a line has no numbers where the rows have them, and names for half of those columns or more."""
+    """Return whether a line has no numbers where the rows have them, and names for at least half of those columns."""
     named = sum(i < len(line.cells) and bool(line.cells[i]) for i in numeric)
     return named >= 0.5 * len(numeric) and not any(line.number_at(i) for i in numeric)
 
@@ -162,7 +163,7 @@ def _grouped(names: list[str], groups: Sequence[str]) -> list[str]:
 
 
 def _delimiter(lines: Sequence[str]) -> str:
-    """What divides the cells of the rows, which are most of the second half of a file."""
+    """Return the sign between the cells of the rows, which are most of the second half of a file."""
     rows = lines[len(lines) // 2 :][:SAMPLE_LINES]
     for delimiter in "\t;":  # before commas, which may be those of decimals then
         count, alike = Counter(row.count(delimiter) for row in rows).most_common(1)[0]

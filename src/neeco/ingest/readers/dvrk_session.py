@@ -7,7 +7,6 @@ A session is a folder with `index.json`, videos, beside each a JSON file with it
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,8 +32,8 @@ from neeco.ingest.readers import (
 )
 from neeco.ingest.readers.delimited import DelimitedText
 from neeco.ingest.readers.frame_names import meaning_of
-from neeco.ingest.readers.rosbag import POSE_HEADER, RosBag
-from neeco.ingest.readers.video import open_video
+from neeco.ingest.readers.rosbag import DVRK_HINT, POSE_HEADER, RosBag, joint_column, wrist_joints
+from neeco.ingest.readers.video import ChosenFrames, ImageFiles, open_video
 
 INDEX, TYPES = "index.json", ("dc_index_v1", "dc::index@", "dvrk_data:index@")
 TOPIC = "# Topic: /"  # begins a CSV file of `extract`
@@ -44,8 +43,6 @@ _STAMPED = re.compile(r"(?P<name>.+)_(?P<time>\d{9,11}\.\d{3,9})\.(?:jpg|jpeg|pn
 _POSE_PARTS = (("pose.position.", "pose.orientation."), ("transform.translation.", "transform.rotation."))
 _POSES = re.compile(r"/(PSM\d)/measured_cp")  # an instrument's; the endoscope's arm reports in another base
 _JOINTS = re.compile(r"/(PSM\d)/(?:jaw/)?measured_js")
-_WRIST = ("wrist_pitch", "wrist_yaw", "jaw")  # of an instrument; the joints before them move all of it
-_SLIDES = re.compile(r"insertion|prismatic", re.IGNORECASE)  # joints in m
 HALVES = {"LR": ("left", "right"), "RL": ("right", "left")}  # what the halves of a video show, from the left on
 
 
@@ -131,44 +128,17 @@ class DvrkSession(RecordingFormat):
         )
         if film.files[0].suffix.lower() != ".mp4":
             files = tuple(file for file, good in zip(film.files, keep, strict=True) if good)
-            return _Files(path, open_image(files[0]).size, tuple(notes), times[keep] - start, files)
+            return ImageFiles(path, open_image(files[0]).size, tuple(notes), times[keep] - start, files)
         video = open_video(film.files[0])
         count = len(video.times)
         notes += compare_counts(film.files[0], count, len(times), "times", UNLIKE)
         usable = np.flatnonzero(keep[:count])
         width, height = video.size
         size = (width if film.half is None else width // 2, height)
-        return _Timed(
+        return ChosenFrames(
             path, size, (*video.notes, *notes), times[usable] - start, video, tuple(usable.tolist()), film.half,
             pixel_aspect=video.pixel_aspect,
         )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Timed(VideoSource):
-    """Frames of a video, or halves of them, at times of their own."""
-
-    video: VideoSource
-    frames: tuple[int, ...]
-    half: int | None
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        wanted = {self.frames[int(index)]: int(index) for index in indices}
-        for frame, pixels in self.video.read(sorted(wanted)):
-            start = (self.half or 0) * self.size[0]
-            yield wanted[frame], np.ascontiguousarray(pixels[:, start : start + self.size[0]])
-
-
-@dataclass(frozen=True)
-class _Files(VideoSource):
-    files: tuple[Path, ...]
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        for index in sorted({int(index) for index in indices}):
-            pixels = np.array(open_image(self.files[index]).convert("RGB"))
-            if pixels.shape[:2] != self.size[::-1]:
-                raise NeecoError(f"{self.files[index]}: is of another size than the first; give images of one size")
-            yield index, pixels
 
 
 def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:
@@ -292,24 +262,16 @@ def _stream(topic: str, kind: str, columns: list[str], table: Table) -> Stream:
     if kind == POSES:
         stated_in = _frames(table)
         meaning = meaning_of(stated_in[0] if len(stated_in) == 1 else "", dvrk=True)
-        hints = ("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit",)
         return Stream(
-            topic, POSES, "poses", len(table.rows), None, match is not None, body, None, (*meaning.hints, *hints),
-            asks=meaning.asks,
+            topic, POSES, "poses", len(table.rows), offered=match is not None, body=body,
+            hints=(*meaning.hints, DVRK_HINT), asks=meaning.asks,
         )  # fmt: skip
-    names = _joint_names(table, columns)
-    wrist = [(known, _joint_column(name)) for known in _WRIST for name in names if name.endswith(known)]
-    if "/jaw/" in topic and len(names) == 1:
-        wrist = [("jaw", _joint_column(names[0]))]
-    return Stream(topic, READINGS, "joints", len(table.rows), None, match is not None, body, tuple(wrist))
-
-
-def _joint_column(name: str) -> str:
-    return f"{name}_{'m' if _SLIDES.search(name) else 'rad'}"
+    joints = wrist_joints(_joint_names(table, columns), "/jaw/" in topic)
+    return Stream(topic, READINGS, "joints", len(table.rows), offered=match is not None, body=body, joints=joints)
 
 
 def _joint_names(table: Table, columns: list[str]) -> list[str]:
-    """Of columns position.0, position.1, ..., by the first row's name.0, name.1, ..."""
+    """Return the joints of columns position.0, position.1, ..., by the first row's name.0, name.1, ..."""
     first = dict(zip(table.header, table.rows[0], strict=False))
     return [first.get(f"name.{number}") or f"joint_{number + 1}" for number in range(len(columns))]
 
@@ -324,7 +286,7 @@ def _converted(path: Path, stream: Stream, table: Table, columns: list[str], sta
     if stream.kind == POSES:
         header: tuple[str, ...] = POSE_HEADER
     else:
-        header = ("t_s", *(_joint_column(name) for name in _joint_names(table, columns)))
+        header = ("t_s", *map(joint_column, _joint_names(table, columns)))
         if len(set(header)) < len(header):
             raise NeecoError(f"{table.path}: names a joint twice; record again")
     values, _, bad = numbers(table, columns)

@@ -1,4 +1,4 @@
-"""What the name of a frame says: a camera's with known axes, a robot's base or a tracker's, or nothing certain.
+"""The meaning of a frame's name: a camera's with known axes, a robot's base or a tracker's, or nothing certain.
 
 A frame's name is not its axes: the dVRK's ECM and the optical frame of ROS have one origin and are half a turn apart. A
 name that fits several conventions is asked for, never guessed.
@@ -34,8 +34,8 @@ _BASE_IN = re.compile(_NAMED_IN.format(r"(?:robot[_.\-/]?)?base"), re.IGNORECASE
 
 @dataclass(frozen=True)
 class NamedFrame:
-    """frame: a key of CAMERA_FRAMES or BASE, None where it must be asked; why: what the name leaves open, or is taken
-    to mean, in words; choices: what may be meant, the likeliest first."""
+    """The meaning of a frame's name. frame: a key of CAMERA_FRAMES or BASE, None where it must be asked; why: the
+    reason, or what the name leaves open; choices: the possible frames, the likeliest first."""
 
     frame: str | None
     why: str = ""
@@ -43,7 +43,7 @@ class NamedFrame:
 
     @property
     def question(self) -> str:
-        """What a refusal asks; "" where nothing is open."""
+        """The question of a refusal; "" where nothing is open."""
         if self.frame is not None:
             return ""
         *others, last = [f"frame: {name} ({_describe(name)})" for name in self.choices]
@@ -51,7 +51,7 @@ class NamedFrame:
 
     @property
     def hints(self) -> tuple[str, ...]:
-        """What is assumed and why, as lines of a template."""
+        """The assumed frame and the reason, as lines of a template."""
         return (f"poses are stated in {self.why}",) if self.frame is not None and self.why else ()
 
     @property
@@ -64,8 +64,8 @@ class NamedFrame:
 
 
 def meaning_of(name: str, images: Collection[str] = (), *, dvrk: bool = False) -> NamedFrame:
-    """What a frame's own name says. images: frames that the images of the same file are stated in; dvrk: are the poses
-    a dVRK's?"""
+    """Return the meaning of a frame's own name. images: the frames of the images of the same file; dvrk: the poses are
+    a dVRK's."""
     plain, own = name.strip("/").lower(), {image.strip("/").lower() for image in images}
     name = printable(name).strip("'")
     last = plain.rpartition("/")[2]
@@ -97,8 +97,8 @@ def meaning_of(name: str, images: Collection[str] = (), *, dvrk: bool = False) -
 
 
 def meaning_in(names: Sequence[str], *, dvrk: bool = False) -> NamedFrame | None:
-    """What all of some names of columns, features or files say of a frame (`pose_in_ecm`, `camera_frame`); None where
-    they name none."""
+    """Return the meaning of the frame that names of columns, features or files hold (`pose_in_ecm`, `camera_frame`);
+    None where they hold none."""
     for pattern in (_CAMERA_IN, _BASE_IN):
         found = [pattern.search(name) for name in names]
         words = {(match[1] or match[2]).lower() for match in found if match}
@@ -132,12 +132,12 @@ def unsaid(*, dvrk: bool = False) -> NamedFrame:
 
 
 def of_dvrk(*names: str) -> bool:
-    """Whether any of some names of topics, columns or files is a dVRK's."""
+    """Return whether any of some names of topics, columns or files is a dVRK's."""
     return any(_DVRK.search(name) for name in names)
 
 
 def _describe(frame: str) -> str:
-    """What a value of `frame` means, in words."""
+    """Return the meaning of a value of `frame`, in words."""
     if frame == BASE:
         return "a robot's base or a tracker"
     convention = CAMERA_FRAMES[frame]

@@ -22,7 +22,7 @@ from neeco.ingest.readers.frame_names import NamedFrame
 ARMS = ("master left", "master right", "slave left", "slave right")  # in the order of their columns
 COLUMNS = 19  # of an arm
 RATE_HZ = 30.0
-MOST_BYTES = 2**28
+MAX_BYTES = 2**28
 GRIPPER = "gripper_angle_rad"
 HEADER = ("t_s", "x_m", "y_m", "z_m", *(f"r{row}{column}" for row in range(3) for column in range(3)), GRIPPER)
 USED = (*range(12), 18)  # of an arm's columns; its velocities follow from them
@@ -65,8 +65,8 @@ class JigsawsKinematics(RecordingFormat):
 
 def _numbers(path: Path) -> np.ndarray:
     """float64 [R, 76]. Raises NeecoError naming the line that has not as many numbers."""
-    if path.is_file() and path.stat().st_size > MOST_BYTES:
-        raise NeecoError(f"{path}: has over {MOST_BYTES >> 20} MiB; cut it into trials")
+    if path.is_file() and path.stat().st_size > MAX_BYTES:
+        raise NeecoError(f"{path}: has over {MAX_BYTES >> 20} MiB; cut it into trials")
     lines = read_bytes(path, "kinematics of 76 columns").splitlines()
     while lines and not lines[-1].strip():
         lines.pop()

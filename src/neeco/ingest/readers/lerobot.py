@@ -44,11 +44,11 @@ if TYPE_CHECKING:
 
 TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names
-LARGEST_IMAGE = 90_000_000  # px, as for files of images
+MAX_PIXELS = 90_000_000  # of an image, as for files of images
 IMAGES_AT_ONCE = 16  # of those that stand in Parquet
 DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
-_OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+_OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns that every data set has
 _JOINT = re.compile(r"(^|[_.\-/])(jaws?|grip(per)?|finger|wrist|joint)([_.\-/0-9]|$)", re.IGNORECASE)
 
 
@@ -68,7 +68,7 @@ class LeRobot(RecordingFormat):
             return False
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        """Those of the first episode that is there; all others have the same."""
+        """Return those of the first episode that was downloaded; all others have the same."""
         data = self._data_set(path)
         count, first, last = data.episodes()
         found = self._episode_streams(data, data.first_present())
@@ -100,7 +100,7 @@ class LeRobot(RecordingFormat):
         times, order, notes = _times(data, episode)
         if data.features[key].dtype == "image":
             return _open_stored(data, episode, key, times, order, notes)
-        from neeco.ingest.readers.video import open_video
+        from neeco.ingest.readers.video import ChosenFrames, open_video
 
         if key in episode.absent:
             raise NeecoError(episode.absent[key])
@@ -115,7 +115,7 @@ class LeRobot(RecordingFormat):
         remedy = "download the data set again, or name another episode"
         notes = (*notes, *compare_counts(film.file, shown, len(times), states, remedy=remedy))
         frames = tuple(np.flatnonzero(usable).tolist())
-        return _Episode(
+        return ChosenFrames(
             video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames,
             pixel_aspect=video.pixel_aspect,
         )  # fmt: skip
@@ -135,7 +135,7 @@ class LeRobot(RecordingFormat):
         return read_data_set(path)
 
     def _chosen(self, data: DataSet, stream: str | None, kinds: Sequence[str]) -> tuple[Episode, str]:
-        """The episode and the feature that a stream names; the only ones there are where none is named."""
+        """Return the episode and the feature that a stream names; the only ones there are where none is named."""
         match = None if stream is None else _NAME.fullmatch(stream)
         if match is None:
             count, first, last = data.episodes()
@@ -186,7 +186,7 @@ class LeRobot(RecordingFormat):
         return tuple(found)
 
     def _table_streams(self, data: DataSet, feature: Feature, name: str, episode: Episode) -> list[Stream]:
-        """A stream for every body that the names of a feature's columns tell apart."""
+        """Return a stream for every body that the names of a feature's columns distinguish."""
         title = f"{feature.dtype} of {len(feature.names)}"
         plain = Stream(name, READINGS, title, episode.length, data.fps, offered=False)
         if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
@@ -222,19 +222,6 @@ class LeRobot(RecordingFormat):
         if values.shape[1] != len(feature.names):
             return np.zeros((len(values), len(columns)))
         return values[:, [feature.names.index(column) for column in columns]]
-
-
-@dataclass(frozen=True)
-class _Episode(VideoSource):
-    """The frames of a video that have states. frames: which, of the video's."""
-
-    video: VideoSource
-    frames: tuple[int, ...]
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        back = {self.frames[int(index)]: int(index) for index in indices}
-        for number, pixels in self.video.read(list(back)):
-            yield back[number], pixels
 
 
 @dataclass(frozen=True)
@@ -275,14 +262,14 @@ def _open_stored(
 
 
 def _cells(file: Path, key: str, episode: int) -> Iterator[tuple[int, Any]]:
-    """(row of the episode, bytes) of a column of images."""
+    """Yield (row of the episode, bytes) of a column of images."""
     import pyarrow
 
     from neeco.ingest.readers._lerobotfiles import ParquetFile
 
     row = 0
     for part in ParquetFile(file).batches(["episode_index", key], episode, IMAGES_AT_ONCE):
-        column = part[key]
+        column = part.column(key)
         if pyarrow.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0:
             column = column.field("bytes")
         if not (pyarrow.types.is_binary(column.type) or pyarrow.types.is_large_binary(column.type)):
@@ -297,7 +284,7 @@ def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np
         raise NeecoError(f"{where}: has no image in it; write the data set with its images")
     try:
         with Image.open(BytesIO(cell), formats=("PNG", "JPEG")) as image:
-            if image.size[0] * image.size[1] > LARGEST_IMAGE:
+            if image.size[0] * image.size[1] > MAX_PIXELS:
                 raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
             pixels = np.array(image.convert("RGB"))
     except NeecoError:
@@ -310,7 +297,7 @@ def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np
 
 
 def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Times [R] s of an episode's rows from the first on, which rows of its file these are, and what is odd of them."""
+    """Return times [R] s of an episode's rows from the first on, the rows of its file in their order, and notes."""
     from neeco.ingest.readers._lerobotfiles import ParquetFile
 
     table = ParquetFile(episode.data).read(["timestamp", "frame_index"], episode.number)
@@ -332,7 +319,7 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, tup
 
 
 def _frame_numbers(video: VideoSource) -> np.ndarray:
-    """Which frame of the episode each of a video's is: those that cannot be decoded are left out of it."""
+    """Return the episode's frame of each of a video's, in which those that cannot be decoded are missing."""
     step = float(np.median(np.diff(video.times)))
     return np.rint(video.times / step).astype(np.int64)
 
@@ -344,13 +331,13 @@ def _kind(feature: Feature) -> str:
 
 
 def _meaning(key: str, columns: Sequence[str]) -> NamedFrame:
-    """What a feature's name, or those of all its columns, says of the frame."""
+    """Return the meaning of the frame in a feature's name, or in those of all its columns."""
     dvrk = of_dvrk(key, *columns)
     return meaning_in([key], dvrk=dvrk) or meaning_in(columns, dvrk=dvrk) or unsaid(dvrk=dvrk)
 
 
 def _rotation_asks(values: np.ndarray, columns: Sequence[str]) -> tuple[str, ...]:
-    """What may be a rotation by its numbers [R, C], as lines to choose from."""
+    """Return the columns that may be a rotation by their numbers [R, C], as lines to choose from."""
     asks = []
     for place, kind in find_rotations(values):
         size, why = 4, "or quaternion_xyzw: their length is 1, nothing says their order"
@@ -368,12 +355,12 @@ def _flow(columns: Sequence[str]) -> str:
 
 
 def _joint_name(column: str, body: str) -> str:
-    """`jaw` of `psm1_jaw`, without the unit."""
+    """Return `jaw` of `psm1_jaw`, without the unit."""
     words = [word for word in re.split(r"[_.\-/]+", split_unit(column, "angle")[0]) if word and word != body]
     return "_".join(words) or column
 
 
 def _camera_order(key: str) -> tuple[bool, bool, bool, str]:
-    """Endoscopes before cameras at the wrist, the left one before any other but the right one."""
+    """Return a sort key: endoscopes before cameras at the wrist, the left one first, the right one last."""
     name = key.lower()
     return "wrist" in name or "psm" in name, "right" in name, "left" not in name, key

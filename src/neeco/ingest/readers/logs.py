@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,17 +25,17 @@ from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_in, meaning_
 from neeco.ingest.readers.ndi import tool_columns
 
 MIN_SAMPLES = 4  # of a usable log
-WRONG_ROWS = 0.05  # share of rows that may be wrong (not missing) before the file is refused
+MAX_WRONG = 0.05  # share of rows that may be wrong (not missing) before the file is refused
 _FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)
 _FRAME_COLUMN = re.compile(r"(?!.*child)(.*[._/])?(reference[._ ]?)?frame([._ ]?id)?")
-LISTED_STATES = 8  # states that drop rows and are named in the notes
+MAX_LISTED_STATES = 8  # of those that drop rows, in the notes
 MAX_SAME_TIME = 0.5  # share of rows at the time of another: more, and times are too coarse
-STUCK_S, STUCK_SAMPLES = 0.5, 10  # that a tracker's noise never leaves a pose unchanged for
+STUCK_S, STUCK_SAMPLES = 0.5, 10  # a tracker's noise leaves no pose unchanged for as long
 GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
-FARTHEST_MM = 20_000.0  # no tracker of instruments sees that far: the unit is wrong
-TWO_TURNS = 4 * np.pi  # rad, more than any joint turns: the unit is wrong
-CLAMPED = 0.05  # of a calibration table's range: readings that far outside it count as its end
-NORM_TOLERANCE = 0.02  # of a quaternion's length: two decimals pass
+MAX_DISTANCE_MM = 20_000.0  # no tracker of instruments reaches farther: the unit is wrong
+MAX_ANGLE = 4 * np.pi  # rad, more than any joint turns: the unit is wrong
+CLAMPED_SHARE = 0.05  # of a calibration table's range: readings that far outside it count as its end
+NORM_TOLERANCE = 0.02  # of a quaternion's length: numbers of two decimals pass
 ROUNDED_TOLERANCE = 0.02  # of R^T R - I: loggers round to two decimals
 
 
@@ -54,6 +54,7 @@ class PoseLog:
     times: np.ndarray
     positions: np.ndarray
     quats: np.ndarray
+    _: KW_ONLY
     gaps: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = ()
     frame: str = named.BASE
@@ -69,13 +70,14 @@ class ReadingLog:
     clock: str
     times: np.ndarray
     values: np.ndarray
+    _: KW_ONLY
     gaps: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = ()
     image_hz: float | None = None
 
 
 class Rows:
-    """Which rows of a table are in use; those left out, by reason, and those repaired, for the notes."""
+    """The rows of a table in use; those left out, by reason, and those repaired, for the notes."""
 
     def __init__(self, table: Table) -> None:
         self.table = table
@@ -93,13 +95,13 @@ class Rows:
     def drop_wrong(self, wrong: np.ndarray, reason: str) -> None:
         """Leave out a few rows that are wrong (bool [R]). Raises NeecoError when they are more than a few."""
         lines, count = self.table.lines[wrong & self.keep], int(self.keep.sum())
-        if len(lines) > max(1, WRONG_ROWS * count):
+        if len(lines) > max(1, MAX_WRONG * count):
             share = f"{self.table.list_rows(lines)} ({len(lines)} of {count_rows(count)})"
             raise NeecoError(f"{self.table.where}: {share}: {reason}")
         self.drop(wrong, reason.split(";")[0])
 
     def notes(self) -> tuple[str, ...]:
-        """What was done to the rows, one sentence each."""
+        """Return the changes to the rows, one sentence each."""
         name = self.table.title
         dropped = (
             f"{name}: {count_rows(len(lines))} dropped: {reason} ({self.table.list_rows(lines)})"
@@ -135,8 +137,10 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
         frame = named.CAMERA
         if source.frame is None and table.meaning is not None:
             notes = (*notes, f"{table.title}: poses are stated in {table.meaning.why}")
-    log = PoseLog(table.path, source.clock, times, positions, quats, gaps, notes, frame, stated_in)
-    return replace(log, image_hz=table.image_hz)
+    return PoseLog(
+        table.path, source.clock, times, positions, quats, gaps=gaps, notes=notes, frame=frame, stated_in=stated_in,
+        image_hz=table.image_hz,
+    )  # fmt: skip
 
 
 def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,7 +154,7 @@ def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.
 
 
 def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
-    """The table with what is said of the frame of its poses: by the names of their columns, else by the file, else by a
+    """Return the table with the meaning of its poses' frame: by the names of their columns, else by the file, else by a
     column of frames' names, else by the file's name. Raises NeecoError where the column names several."""
     dvrk = of_dvrk(table.path.stem, *columns)
     meaning = meaning_in(columns, dvrk=dvrk)
@@ -177,8 +181,8 @@ def _frame_names(table: Table) -> list[str]:
 
 
 def _frame_of(table: Table, source: PoseColumns) -> str:
-    """What poses are stated in: as the recording says, else as the file does. Raises NeecoError where neither does, or
-    the two contradict each other."""
+    """Return the frame of poses that the recording states, else the file. Raises NeecoError where neither does, or they
+    contradict each other."""
     if source.frame is None:
         if table.meaning is not None and table.frame is None:
             raise NeecoError(f"{table.where}: frame: {table.meaning.question}")
@@ -211,13 +215,13 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     else:
         hint = " Counts need a calibration table, `calibration`."
         values = values * named.scale_of(table.where, (value,), "angle", source.units.angle, None, hint)
-        impossible = np.abs(np.where(rows.keep, values, 0)) > TWO_TURNS
+        impossible = np.abs(np.where(rows.keep, values, 0)) > MAX_ANGLE
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
         rows.drop_wrong(impossible, reason)
     times, order = _in_order(rows, times)
     gaps, gap_notes = _gaps(table, times)
     notes = (*rows.notes(), *clamped, *gap_notes)
-    return ReadingLog(table.path, source.clock, times, values[order], gaps, notes, table.image_hz)
+    return ReadingLog(table.path, source.clock, times, values[order], gaps=gaps, notes=notes, image_hz=table.image_hz)
 
 
 def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:
@@ -260,7 +264,7 @@ def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[n
     what = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
     rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {what}; name the right columns")
     distance = np.median(np.linalg.norm(positions[rows.keep], axis=1)) if rows.keep.any() else 0.0
-    if distance > FARTHEST_MM:
+    if distance > MAX_DISTANCE_MM:
         raise NeecoError(
             f"{table.where}: {', '.join(position)}: half the samples are over {distance / 1000:.3g} m from the tracker"
             "; correct the unit in the header or in units.length"
@@ -321,7 +325,7 @@ def _keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
         if state.lower() not in good:
             by_state.setdefault(state[:20], []).append(row)
     for number, (state, members) in enumerate(by_state.items()):
-        if number < LISTED_STATES:
+        if number < MAX_LISTED_STATES:
             rows.drop(members, f"{name} is {state or 'empty'!r}")
         rows.keep[members] = False
     if not rows.keep.any():
@@ -470,7 +474,7 @@ def _in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:
-    """Where samples are missing (steps longer than 4 usual ones and 0.15 s), and a note of it."""
+    """Return the gaps in time (steps longer than 4 usual ones and 0.15 s), and a note of them."""
     steps = np.diff(times)
     longest = max(GAP_STEPS * float(np.median(steps)), GAP_SECONDS)
     gaps = tuple((float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest))
@@ -520,7 +524,7 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
             f"{path}: lines {first} and {second}: the angle does not go on rising (or falling) with the counts, so a "
             "count has no one angle; measure these points again"
         )
-    if np.abs(angles).max() > TWO_TURNS:
+    if np.abs(angles).max() > MAX_ANGLE:
         raise NeecoError(f"{path}: {angle_name}: goes beyond two turns; correct the column's unit")
     return counts, angles
 
@@ -535,7 +539,7 @@ def _calibrated(
     low, high = counts[0], counts[-1]
     readings = np.where(rows.keep, readings, low)
     excess = np.maximum(low - readings, readings - high)
-    outside = excess > CLAMPED * (high - low)
+    outside = excess > CLAMPED_SHARE * (high - low)
     values = PchipInterpolator(counts, angles)(np.clip(readings, low, high))
     clamped = (excess > 0) & ~outside
     note = ""

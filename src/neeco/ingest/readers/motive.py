@@ -53,7 +53,7 @@ class MotiveExport(RecordingFormat):
             raise NeecoError(f"{path}: has a header but no rows; export the take again")
         axes = lines[start].cells
         cells, places = [line.cells for line in rows], np.array([line.number for line in rows])
-        raw = Table(path, tuple(map(str, range(len(axes)))), cells, places, lines[0].decimal_comma)
+        raw = Table(path, tuple(map(str, range(len(axes)))), cells, places, decimal_comma=lines[0].decimal_comma)
         kinds, names, parts = ([*lines[n].cells, *[""] * len(axes)] for n in (types, types + 1, start - 1))
         unit = canonical_unit(preamble.get("Length Units", ""))
         suffix = f"_{unit}" if unit in UNITS["length"] else ""

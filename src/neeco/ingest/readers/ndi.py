@@ -1,5 +1,5 @@
-"""Exports of trackers that hold the columns of several bodies beside each other: NDI's tools, each followed by its
-markers, and the rigid bodies that a format tells of."""
+"""Exports of trackers with the columns of several bodies in a row: NDI's tools, each followed by its markers, and the
+rigid bodies of `Table.bodies`."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
 
 
 def tool_names(table: Table) -> tuple[str, ...]:
-    """What a recording may call each tool of an export of several, by name or serial number, else by port; () for other
+    """Return a name for each tool of an export of several: its name or serial number, else its port; () for other
     tables, and for one tool without a name."""
     tools = _tools(table)
     if len(tools) < 2 and not table.bodies:
@@ -109,7 +109,7 @@ def _tools(table: Table) -> list[_Tool]:
 
 
 def _refuse_mixed(table: Table, source: PoseColumns, tools: list[_Tool]) -> None:
-    """Columns that the recording names must all be one tool's own."""
+    """Raise NeecoError where the columns that the recording names are not all one tool's own."""
     named = [*(source.position or ()), *(source.rotation or ()), *([source.state] if source.state else [])]
     places = {name: table.header.index(name) for name in named if name in table.header}
     owners = [next((tool.title for tool in tools if place in tool.columns), None) for place in places.values()]

@@ -146,14 +146,14 @@ def _transforms(sequence: FrameSequence) -> list[str]:
 
 
 def _ends(name: str) -> tuple[str, str]:
-    """What a transform maps from and to: Stylus and Tracker of StylusToTracker."""
+    """Return the ends of a transform: Stylus and Tracker of StylusToTracker."""
     match = _ENDS.fullmatch(name)
     assert match is not None
     return match[1], match[2]
 
 
 def _meaning(name: str) -> NamedFrame:
-    """What the frame is that a transform maps to."""
+    """Return the meaning of the frame that a transform maps to."""
     body, frame = _ends(name)
     return meaning_of(frame, dvrk=of_dvrk(body))
 
@@ -191,7 +191,7 @@ def _image_frames(sequence: FrameSequence) -> tuple[list[int], list[str]]:
 
 
 def _too_few(sequence: FrameSequence, frames: Sequence[int], notes: Sequence[str]) -> str:
-    """Why the images cannot be used, of which only these frames are good."""
+    """Return why the images cannot be used, of which only these frames are good."""
     why = f" ({notes[0].partition(': ')[2]})" if notes else ""
     return f"{len(frames)} of {sequence.count} images can be used{why}; record again"
 

@@ -37,14 +37,15 @@ if TYPE_CHECKING:
 DVRK_CAMERA = "ECM"  # the arm that holds the endoscope, and the frame of its tip
 POSE_HEADER = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 MM_PER_M = 1000.0
-LATE = 1.0  # s between stamps and receipt that tell of another clock
+OTHER_CLOCK_S = 1.0  # between stamps and receipt: they are of different clocks
 _DVRK = re.compile(r"(?:^|/)(PSM\d|ECM|MTM[LR]|SUJ)(?:/|$)", re.IGNORECASE)
 _DVRK_POSE = re.compile(r"(^|/)(PSM\d|ECM)/(measured_cp|position_cartesian_current)$", re.IGNORECASE)
 _DVRK_JOINTS = re.compile(r"(^|/)PSM\d/((jaw/)?measured_js|state_joint_current|state_jaw_current)$", re.IGNORECASE)
 DVRK_JOINTS = ("outer_yaw", "outer_pitch", "outer_insertion", "outer_roll", "outer_wrist_pitch", "outer_wrist_yaw")
-_WRIST = ("wrist_pitch", "wrist_yaw", "jaw")  # of an instrument; the joints before them move all of it
-_WANTED = re.compile(r"setpoint|goal|desired|command|target|servo|move_", re.IGNORECASE)  # not what was measured
-_SLIDES = re.compile(r"insertion|prismatic", re.IGNORECASE)  # joints in m
+DVRK_WRIST = ("wrist_pitch", "wrist_yaw", "jaw")  # of an instrument; the joints before them move all of it
+DVRK_HINT = "kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit"
+_COMMANDS = re.compile(r"setpoint|goal|desired|command|target|servo|move_", re.IGNORECASE)  # nothing measured
+_PRISMATIC = re.compile(r"insertion|prismatic", re.IGNORECASE)  # joints in m
 
 
 class RosBag(RecordingFormat):
@@ -75,13 +76,13 @@ class RosBag(RecordingFormat):
     def read(self, path: Path, stream: str | None = None) -> Table:
         survey = self._survey(path)
         if stream is not None and stream.startswith("tf:") and stream not in survey.poses:
-            from neeco.ingest.readers._transforms import chained
+            from neeco.ingest.readers._bagsurvey import chained
 
             return chained(survey, stream, _image_frames(survey))
         chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS)).name
         if chosen in survey.joints:
             readings = survey.joints[chosen]
-            header = ("t_s", *map(_joint_column, _joint_names(chosen, readings)))
+            header = ("t_s", *map(joint_column, _joint_names(chosen, readings)))
             return _table(survey, chosen, readings, header, readings.table())
         poses = survey.poses[chosen]
         names = poses.frames
@@ -124,7 +125,7 @@ class RosBag(RecordingFormat):
         return lens_of(f"{path}: {topic}", survey.lenses[topic], rectified)
 
     def origin_s(self, path: Path) -> float:
-        """The moment that the times of its streams count from, s of the recorder's clock."""
+        """Return the time from which all streams' times count, s of the recorder's clock."""
         return self._survey(path).origin * 1e-9
 
     def _survey(self, path: Path) -> Survey:
@@ -155,7 +156,7 @@ class RosBag(RecordingFormat):
         elif name.startswith("tf:"):
             offered = not log.static and all(topic.startswith("tf:") for topic in survey.poses)
         else:
-            offered = not _WANTED.search(name)
+            offered = not _COMMANDS.search(name)
         frame = ", ".join(sorted(frames)) or "no named frame"
         title = f"{log.type} in {frame}{', static' if log.static else ''}"
         hints = list(meaning.hints or (f"poses are stated in {frame}",))
@@ -165,36 +166,24 @@ class RosBag(RecordingFormat):
             if of_arms - frames:  # these would not register them
                 offered, title = False, f"{title}, the arms' in {', '.join(sorted(of_arms))}"
         elif name in dvrk:
-            hints.append("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit")
+            hints.append(DVRK_HINT)
         rate = _rate(survey.seconds(log.stamps, log.received))
-        kind = OTHER if log.static else POSES
-        damaged = _all_damaged(log)
         return Stream(
-            name,
-            kind,
-            title,
-            len(log.stamps),
-            rate,
-            offered,
-            _body(name),
-            None,
-            tuple(hints),
-            asks=meaning.asks,
-            problem=damaged,
-        )
+            name, OTHER if log.static else POSES, title, len(log.stamps), rate, offered=offered, body=_body(name),
+            hints=tuple(hints), asks=meaning.asks, problem=_all_damaged(log),
+        )  # fmt: skip
 
     def _joint_stream(self, survey: Survey, name: str) -> Stream:
-        log, offered, wrist = survey.joints[name], not _WANTED.search(name), None
+        log, offered, wrist = survey.joints[name], not _COMMANDS.search(name), None
         if _DVRK.search(name):
             offered = bool(_DVRK_JOINTS.search(name))
             names = _joint_names(name, log)
-            found = [(known, joint) for known in _WRIST for joint in names if joint.endswith(known)]
-            if "jaw" in name and len(names) == 1:
-                found = [("jaw", names[0])]
-            wrist = tuple((known, _joint_column(joint)) for known, joint in found)
+            wrist = wrist_joints(names, "jaw" in name)
         rate = _rate(survey.seconds(log.stamps, log.received))
-        problem = _all_damaged(log)
-        return Stream(name, READINGS, log.type, len(log.stamps), rate, offered, _body(name), wrist, problem=problem)
+        return Stream(
+            name, READINGS, log.type, len(log.stamps), rate, offered=offered, body=_body(name), joints=wrist,
+            problem=_all_damaged(log),
+        )  # fmt: skip
 
 
 def _table(survey: Survey, name: str, log: Samples, header: tuple[str, ...], values: np.ndarray) -> Table:
@@ -212,7 +201,7 @@ def _all_damaged(log: Samples) -> str | None:
 
 
 def _time_notes(title: str, stamps: Sequence[int], received: np.ndarray) -> list[str]:
-    """What is odd about the stamps of a stream."""
+    """Return notes on missing stamps and on stamps of another clock."""
     given = np.array(stamps, np.int64)
     none = given == 0
     notes = []
@@ -221,7 +210,7 @@ def _time_notes(title: str, stamps: Sequence[int], received: np.ndarray) -> list
         notes.append(f"{title}: {what}; those of receipt are taken")
     if not none.all() and len(given):
         late = float(np.median(received[~none] - given[~none])) * 1e-9
-        if abs(late) > LATE:
+        if abs(late) > OTHER_CLOCK_S:
             notes.append(
                 f"{title}: its headers' times are {late:.2f} s before those of receipt, on another clock; where "
                 "the streams do not share one, name its `clock` and give `sync`"
@@ -235,13 +224,13 @@ def _rate(seconds: np.ndarray) -> float | None:
 
 
 def _image_frames(survey: Survey) -> set[str]:
-    """Frames of the first camera's images: another's, as a stereo scope's right one, has its own place."""
+    """Return the frames of the first camera's images; another camera, as a stereo scope's right one, has its own."""
     first = min(survey.images, key=_camera_order, default=None)
     return set() if first is None else survey.images[first].frames - {""}
 
 
 def _meaning(survey: Survey, name: str) -> NamedFrame:
-    """What the frame of a stream's poses is; of several, which are refused when read, nothing."""
+    """Return the meaning of the frame of a stream's poses; BASE for several frames, which are refused when read."""
     frames, images = survey.poses[name].frames, _image_frames(survey)
     if len(frames) != 1:
         return NamedFrame(BASE)
@@ -254,9 +243,9 @@ def _meaning(survey: Survey, name: str) -> NamedFrame:
 
 
 def _camera_from_stated(survey: Survey, name: str) -> np.ndarray | None:
-    """[4, 4] mm from the frame of a stream's poses to the images' own, where the first's axes are not certain by its
-    name but static transforms tell them; else None."""
-    from neeco.ingest.readers._transforms import fixed_transform
+    """Return [4, 4] mm from the frame of a stream's poses to the images', where the name leaves the axes open
+    but static transforms state them; else None."""
+    from neeco.ingest.readers._bagsurvey import fixed_transform
 
     frame, images = next(iter(survey.poses[name].frames), ""), _image_frames(survey)
     if len(survey.poses[name].frames) != 1 or len(images) != 1 or frame in images:
@@ -267,13 +256,13 @@ def _camera_from_stated(survey: Survey, name: str) -> np.ndarray | None:
 
 
 def _camera_order(topic: str) -> tuple[bool, bool, bool, str]:
-    """The left camera first, then any that is not the right one; images as they are before packed ones."""
+    """Return a sort key: the left camera first, the right one last; raw images before compressed ones."""
     name = topic.lower()
     return "right" in name, "left" not in name, name.endswith("/compressed"), topic
 
 
 def _body(topic: str) -> str | None:
-    """The arm of the dVRK, else the topic's namespace."""
+    """Return the arm of the dVRK, else the topic's namespace."""
     if topic.startswith("tf:"):
         return topic.removeprefix("tf:")
     arm = _DVRK.search(topic)
@@ -283,11 +272,19 @@ def _body(topic: str) -> str | None:
 
 
 def _joint_names(topic: str, log: Joints) -> list[str]:
-    """As the messages have them; where a dVRK's have none, as it calls its joints."""
+    """Return the joints' names; where a dVRK's messages have none, its own."""
     names, usual = list(log.columns), {6: DVRK_JOINTS, 1: ("jaw",)}
     unnamed = names == [f"joint_{number + 1}" for number in range(len(names))]
     return list(usual.get(len(names), names)) if unnamed and _DVRK_JOINTS.search(topic) else names
 
 
-def _joint_column(name: str) -> str:
-    return f"{name}_{'m' if _SLIDES.search(name) else 'rad'}"
+def joint_column(name: str) -> str:
+    """Return the column of a joint, with the unit in its name."""
+    return f"{name}_{'m' if _PRISMATIC.search(name) else 'rad'}"
+
+
+def wrist_joints(names: Sequence[str], is_jaw: bool) -> tuple[tuple[str, str], ...]:
+    """Return (joint as tool files call it, column) of the wrist and jaw among a dVRK topic's joints."""
+    if is_jaw and len(names) == 1:
+        return (("jaw", joint_column(names[0])),)
+    return tuple((known, joint_column(name)) for known in DVRK_WRIST for name in names if name.endswith(known))

@@ -32,12 +32,13 @@ from neeco.ingest.readers import (
     choose_stream,
     compare_lengths,
 )
-from neeco.ingest.readers.logs import WRONG_ROWS
+from neeco.ingest.readers.logs import MAX_WRONG
+from neeco.ingest.readers.rosbag import DVRK_HINT
 from neeco.ingest.readers.video import open_images, open_video
 
 POSE_FILE, JOINT_FILE = "api_cp_data.yaml", "api_jp_data.yaml"
 FRAMES_PER_SECOND = 30.0
-LARGEST_FILE = 1 << 26  # bytes; 1000 frames of two arms are 1 MB
+MAX_FILE_BYTES = 1 << 26  # 1000 frames of two arms are 1 MB
 JOINTS_BEHIND = "_joints"  # the stream's name, after the arm's
 JOINT_NAMES = ("yaw_rad", "pitch_rad", "insertion_m", "roll_rad", "wrist_pitch_rad", "wrist_yaw_rad", "jaw_rad")
 WRIST = (("wrist_pitch", "wrist_pitch_rad"), ("wrist_yaw", "wrist_yaw_rad"), ("jaw", "jaw_rad"))
@@ -72,8 +73,7 @@ class SurgPose(RecordingFormat):
             for number, name in enumerate(videos)
         ]
         for name, (frames, _) in sorted(arms.poses.items()):
-            hints = ("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit",)
-            found.append(Stream(name, POSES, "poses", len(frames), FRAMES_PER_SECOND, body=name, hints=hints))
+            found.append(Stream(name, POSES, "poses", len(frames), FRAMES_PER_SECOND, body=name, hints=(DVRK_HINT,)))
         for name, (frames, values) in sorted(arms.joints.items()):
             wrist = tuple(joint for joint in WRIST if joint[1] in JOINT_NAMES[: values.shape[1]])
             title = f"{name}{JOINTS_BEHIND}"
@@ -132,7 +132,7 @@ def _read(path: Path) -> _Arms:
             state = file.stat()
         except OSError as error:
             raise NeecoError(f"{file}: cannot read: {error.strerror or error}; put the trajectory's there") from None
-        if state.st_size > LARGEST_FILE:
+        if state.st_size > MAX_FILE_BYTES:
             raise NeecoError(f"{file}: is {state.st_size >> 20} MB large, beyond all measure; give one trajectory")
         states += [state.st_size, state.st_mtime_ns]
     return _cached(path, tuple(states))
@@ -163,7 +163,7 @@ def _by_arm(file: Path, parse: Any, expected: str) -> dict[str, tuple[np.ndarray
     for arm, rows in found.items():
         rows.sort(key=lambda row: row[0])
         bad = [frame for frame, row in rows if row is None]
-        if len(bad) > WRONG_ROWS * len(rows):
+        if len(bad) > MAX_WRONG * len(rows):
             raise NeecoError(f"{file}: frame {bad[0]}: {printable(arm)}: expected {expected}; copy it again")
         lengths = {len(row) for _, row in rows if row is not None}
         if len(lengths) > 1:

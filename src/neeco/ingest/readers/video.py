@@ -1,4 +1,4 @@
-"""Where the frames come from: a video file in any format ffmpeg reads, or a folder of images."""
+"""Frames of a video file in any format that ffmpeg reads, or of a folder of images."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     bad = [file for file, found in zip(files, sizes, strict=True) if found is None]
     notes += _left_out(folder, "cannot be read", bad) + _left_out(folder, "are of another size", other)
     usable = [index for index, found in enumerate(sizes) if found == size]
-    return _Images(folder, size, tuple(notes), stamps[usable], tuple(files[i] for i in usable))
+    return ImageFiles(folder, size, tuple(notes), stamps[usable], tuple(files[i] for i in usable))
 
 
 def _are_few(count: int, total: int) -> bool:
@@ -96,8 +96,8 @@ def _left_out(folder: Path, why: str, files: Sequence[Path]) -> list[str]:
 
 
 def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarray:
-    """Which place in time each image has, [N] from 0: by the last number in its name, where nearly all names are alike
-    but for it and count on evenly, else by its place in the folder."""
+    """Return each image's place in time, [N] from 0: by the last number in its name, where the names differ in it alone
+    and count on evenly, else by its place in the folder."""
     places = np.arange(len(files))
     parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", file.stem) for file in files]
     if any(part is None for part in parts) or len({(part[1], part[3]) for part in parts if part}) != 1:
@@ -118,7 +118,9 @@ def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarr
 
 
 @dataclass(frozen=True)
-class _Images(VideoSource):
+class ImageFiles(VideoSource):
+    """Images in files of their own."""
+
     files: tuple[Path, ...]
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
@@ -127,7 +129,25 @@ class _Images(VideoSource):
                 pixels = np.array(open_image(self.files[index]).convert("RGB"))
             except NeecoError as error:
                 raise NeecoError(f"{self.files[index]}: cannot be read any more; do not change the images") from error
+            if pixels.shape[1::-1] != self.size:
+                raise NeecoError(f"{self.files[index]}: is of another size than the first; give images of one size")
             yield index, pixels
+
+
+@dataclass(frozen=True)
+class ChosenFrames(VideoSource):
+    """Some frames of a video, at times of their own. frames: their numbers in it; half: of the pixels, of a video that
+    shows two cameras side by side (0: the left one, 1: the right one, None: it does not)."""
+
+    video: VideoSource
+    frames: tuple[int, ...]
+    half: int | None = None
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        places = {self.frames[int(index)]: int(index) for index in indices}
+        start = (self.half or 0) * self.size[0]
+        for frame, pixels in self.video.read(sorted(places)):
+            yield places[frame], np.ascontiguousarray(pixels[:, start : start + self.size[0]])
 
 
 @dataclass(frozen=True)

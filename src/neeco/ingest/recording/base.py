@@ -1,12 +1,12 @@
-"""What a recording says of where an instrument's base stands: to a still camera, or to the scope's tracker
-(`camera_from_base`, `world_from_base`)."""
+"""A robot base's pose as a recording states it: to a still camera, or to the scope's tracker (`camera_from_base`,
+`world_from_base`)."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
@@ -16,18 +16,20 @@ from neeco.files import read_text
 from neeco.geometry.conventions import DVRK_ECM
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_of
+from neeco.ingest.recording.sections import Fault, existing_file, join_places, read_section, word
 
+BASE_KEY, WORLD_KEY = "camera_from_base", "world_from_base"  # to a still camera; to the laparoscope's tracker
 UNKNOWN = "unknown"
-DVRK_SD_MM, DVRK_SD_DEG = 8.0, 5.0  # what the dVRK's registration by a marker reaches, by its own README: 5 to 10 mm
+DVRK_SD_MM, DVRK_SD_DEG = 8.0, 5.0  # accuracy of the dVRK's registration by a marker, by its own README: 5 to 10 mm
 MM = 1000.0  # per m
 WHAT = "a camera registration of the dVRK: JSON"
+_AXES = word((*CAMERA_FRAMES,), "is no convention", f"write one of {', '.join(CAMERA_FRAMES)}")
 
 
 @dataclass(frozen=True, eq=False)
 class StatedBase:
-    """Where a base stands: camera_from_base [4, 4] mm, OpenCV axes, or, where it is `to_world`, the same to the frame
-    of the laparoscope's poses (None: unknown); and its standard deviations: mm at the instrument and degrees (None:
-    exact)."""
+    """The pose of a base: camera_from_base [4, 4] mm, OpenCV axes, or, where `to_world`, the same to the frame of the
+    laparoscope's poses (None: unknown); and its standard deviations: mm at the instrument and degrees (None: exact)."""
 
     matrix: np.ndarray | None = None
     sd_mm: float | None = None
@@ -39,23 +41,43 @@ class StatedBase:
         return self.matrix is not None and self.sd_mm is None
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BaseSection:
+    """{transform, axes, sd_mm, sd_deg}; axes: those of the camera that the transform leads to."""
+
+    transform: Annotated[np.ndarray | None, Node.rigid] = None
+    axes: Annotated[str, _AXES] = CAMERA
+    sd_mm: float | None = None
+    sd_deg: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.transform is None:
+            raise Fault("transform", "is missing; give 4 rows of 4 numbers, mm")
+        if (self.sd_mm is None) != (self.sd_deg is None):
+            missing = "sd_mm" if self.sd_mm is None else "sd_deg"
+            raise Fault(missing, "is missing; give both, or none where the transform is exact")
+
+
 def same_base(one: StatedBase | None, other: StatedBase | None) -> bool:
-    """Whether two recordings say the same of a base."""
+    """Return whether two recordings state the same of a base."""
     if one is None or other is None:
         return one is other
     mine, theirs = one.matrix, other.matrix
-    alike = mine is theirs if mine is None or theirs is None else np.array_equal(mine, theirs)
-    return alike and (one.sd_mm, one.sd_deg, one.to_world) == (other.sd_mm, other.sd_deg, other.to_world)
+    same = mine is theirs if mine is None or theirs is None else np.array_equal(mine, theirs)
+    return same and (one.sd_mm, one.sd_deg, one.to_world) == (other.sd_mm, other.sd_deg, other.to_world)
 
 
 def read_dvrk_registration(path: Path) -> StatedBase:
-    """The file that `camera_registration.py` of jhu-dvrk/dvrk_camera_registration writes for a camera that stands
-    still: `…-registration-open-cv.json`, or, in the dVRK's axes, `…-registration-dVRK.json`, which is no JSON by
-    itself but a piece of a system.json. Metres. Raises NeecoError for another file."""
-    text = read_text(path, WHAT).strip()
-    whole = text.startswith("{")
+    """Read the file that `camera_registration.py` of jhu-dvrk/dvrk_camera_registration writes for a still camera, in
+    metres. Raises NeecoError for another file.
+
+    It is `…-registration-open-cv.json` or, in the dVRK's axes, `…-registration-dVRK.json`: a piece of a system.json
+    and no JSON by itself.
+    """
+    content = read_text(path, WHAT).strip()
+    whole = content.startswith("{")
     try:
-        document = json.loads(text if whole else "{" + text.rstrip(",") + "}")
+        document = json.loads(content if whole else "{" + content.rstrip(",") + "}")
     except (ValueError, RecursionError) as error:
         raise NeecoError(f"{path}: is not {WHAT}; give the file …-registration-open-cv.json") from error
     node = Node(document, str(path), "", RaisingReport())
@@ -81,32 +103,21 @@ def read_dvrk_registration(path: Path) -> StatedBase:
     return StatedBase(DVRK_ECM.poses_to_opencv(matrix) if turned else matrix, DVRK_SD_MM, DVRK_SD_DEG)
 
 
-def parse_base(node: Node, folder: Path) -> StatedBase:
-    """`unknown`, a registration of the dVRK (a file's name, relative to `folder`), or {transform, axes, sd_mm, sd_deg},
-    axes: those of the camera that the transform leads to."""
-    value: Any = node.value
-    if value == UNKNOWN:
+def parse_base(node: Node) -> StatedBase:
+    """Return the base of `camera_from_base`: `unknown`, a file of the dVRK's registration, or a BaseSection."""
+    if node.value == UNKNOWN:
         return StatedBase()
-    if isinstance(value, str):
-        path = folder / value
-        if not path.is_file():
-            node.error(f"no such file: {printable(value)}", "write `unknown`, a registration file or {transform: …}")
-        return read_dvrk_registration(path)
-    if not isinstance(value, dict):
-        node.error(f"expected `unknown`, a file or {{transform: …}}, found {printable(value)}")
-    for key in value:
-        if key not in ("transform", "axes", "sd_mm", "sd_deg"):
-            node.child(str(key)).error("unknown key", "the keys here are transform, axes, sd_mm and sd_deg")
-    if not node.has("transform"):
-        node.child("transform").error("is missing", "give 4 rows of 4 numbers, mm")
-    matrix = node.child("transform").rigid()
-    axes = value.get("axes", CAMERA)
-    if not isinstance(axes, str) or axes not in CAMERA_FRAMES:
-        node.child("axes").error(f"{printable(axes)} is no convention", f"write one of {', '.join(CAMERA_FRAMES)}")
-    assert matrix is not None
-    matrix = CAMERA_FRAMES[axes].poses_to_opencv(matrix)
-    sd_mm, sd_deg = (node.child(key).number(above=0.0) if node.has(key) else None for key in ("sd_mm", "sd_deg"))
-    if (sd_mm is None) != (sd_deg is None):
-        missing = "sd_mm" if sd_mm is None else "sd_deg"
-        node.child(missing).error("is missing", "give both, or none where the transform is exact")
-    return StatedBase(matrix, sd_mm, sd_deg)
+    if isinstance(node.value, str):
+        return read_dvrk_registration(existing_file(node))
+    if not isinstance(node.value, dict):
+        raise Fault(node.field, f"expected `unknown`, a file or {{transform: …}}, found {printable(node.value)}")
+    stated = read_section(BaseSection, node)
+    assert stated.transform is not None
+    return StatedBase(CAMERA_FRAMES[stated.axes].poses_to_opencv(stated.transform), stated.sd_mm, stated.sd_deg)
+
+
+def parse_world_base(node: Node) -> StatedBase:
+    """Return the base of `world_from_base`, which has no axes of a camera."""
+    if node.has("axes"):
+        raise Fault(join_places(node.field, "axes"), "a tracker's frame has none of a camera's; leave it out")
+    return replace(parse_base(node), to_world=True)

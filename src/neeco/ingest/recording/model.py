@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
+from typing import Annotated, ClassVar
 
+from neeco.capture.documents import Node
 from neeco.capture.kinematics import KinematicTree
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
@@ -15,29 +17,75 @@ from neeco.ingest.readers import VideoSource, format_of
 from neeco.ingest.readers.columns import JointColumns, PoseColumns
 from neeco.ingest.readers.video import open_images, open_video
 from neeco.ingest.recording.base import StatedBase
+from neeco.ingest.recording.sections import Fault, columns, integer, number, ranges
 
 STILL, MOVING = "still", "moving"  # what `camera` may say of a scope
 EACH = "each"  # what `tissue` says where every recording has a world of its own
-MIN_FRAMES = 10  # that cameras can be found from
+MIN_FRAMES = 10  # from which cameras can be found
+MAX_SHAFT_MM = 40.0  # diameter
+MAX_EPISODES = 500  # of one capture
+
+
+@dataclass(frozen=True)
+class VideoFile:
+    """A video, or a file that holds one as a stream. fps: overrides the video's own times; stream: which of several."""
+
+    shorthand: ClassVar[str] = "file"
+    file: Path
+    fps: float | None = None
+    stream: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.fps is not None and format_of(self.file) is not None:
+            raise Fault("fps", "the file has times of its own; leave it out")
+        if self.stream is not None and format_of(self.file) is None:
+            raise Fault("stream", "a video has one; leave it out")
+
+    def open(self) -> VideoSource:
+        """Return the frames. Raises NeecoError."""
+        known = format_of(self.file)
+        if known is None:
+            return open_video(self.file, self.fps)
+        known.require_package(self.file)
+        return known.open_images(self.file, self.stream)
+
+
+@dataclass(frozen=True)
+class ImageFolder:
+    """A folder of images, with their rate or a table of their times."""
+
+    shorthand: ClassVar[str] = "folder"
+    folder: Path
+    fps: float | None = None
+    times: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.fps is None and self.times is None:
+            raise Fault("fps", "when were the images taken? Give fps or times (a CSV file)")
+
+    def open(self) -> VideoSource:
+        """Return the frames. Raises NeecoError."""
+        return open_images(self.folder, self.fps, self.times)
 
 
 @dataclass(frozen=True)
 class ShaftInVideo:
-    """What is known of an instrument whose poses are to be found in the video: its shaft's diameter, the length from
-    the shaft's end to the tip (None: measured), and whether it passes a fixed trocar (None: it is found out)."""
+    """An instrument whose poses are to be found in the video: its shaft's diameter, the length from the shaft's end to
+    the tip (None: measured), and whether it passes a fixed trocar (None: found out)."""
 
-    shaft_diameter_mm: float
+    shaft_diameter_mm: Annotated[float, number(above=0.0, below=MAX_SHAFT_MM)]
     working_length_mm: float | None = None
     fixed_trocar: bool | None = None
 
 
 @dataclass(frozen=True)
 class InstrumentLogs:
-    """One instrument: where its poses are (None: it was not tracked), its joints' readings, by joint, its links, and
-    what is said of the base that its poses are in; or what tells its poses from the video alone, and its roll where
+    """One instrument: its poses (None: it was not tracked), its joints' readings, by joint, its links, and the stated
+    pose of the base that its poses are in; or its shaft, where the poses are found in the video, and its roll where
     that was logged."""
 
     name: str
+    _: KW_ONLY
     poses: PoseColumns | None = None
     joints: Mapping[str, JointColumns] = field(default_factory=dict)
     kinematics: KinematicTree | None = None
@@ -47,26 +95,33 @@ class InstrumentLogs:
 
     @property
     def placed(self) -> bool:
-        """Whether its poses become known."""
+        """Whether its poses are logged or found in the video."""
         return self.poses is not None or self.from_video is not None
+
+
+def _episode_names(node: Node) -> tuple[str, ...]:
+    """Return the names of episodes; those of a data set may be given by their numbers alone."""
+    names = columns(*range(1, MAX_EPISODES + 1))(node)
+    return tuple(f"episode_{name}" if name.isdecimal() else name for name in names)
 
 
 @dataclass(frozen=True)
 class Splits:
-    """How frames are split. test_every: every n-th (0: none; None: every eighth, of several episodes the last
-    ones); unseen_fraction: of the frames (0: none), the extreme of `unseen_by` (a joint; None: of the whole state); or
-    given: ranges (first, last) of video frames, or names of whole episodes."""
+    """The split of frames. test_every: every n-th (0: none; None: every eighth, of several episodes the last ones);
+    unseen_fraction: of the frames (0: none), the extreme of `unseen_by` (a joint; None: of the whole state); or given:
+    ranges (first, last) of video frames, or names of whole episodes."""
 
-    test_every: int | None = None
-    unseen_fraction: float = 0.15
+    test_every: Annotated[int, integer(0)] | None = None
+    unseen_fraction: Annotated[float, number(least=0.0, below=0.9)] = 0.15
     unseen_by: str | None = None
-    test: tuple[tuple[int, int], ...] = ()
-    unseen: tuple[tuple[int, int], ...] = ()
-    test_episodes: tuple[str, ...] = ()
-    unseen_episodes: tuple[str, ...] = ()
+    test: Annotated[tuple[tuple[int, int], ...], ranges] = ()
+    unseen: Annotated[tuple[tuple[int, int], ...], ranges] = ()
+    _: KW_ONLY
+    test_episodes: Annotated[tuple[str, ...], _episode_names] = ()
+    unseen_episodes: Annotated[tuple[str, ...], _episode_names] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class IngestSettings:
     """Numbers that decide what comes of a recording (`settings` in recording.yaml). All are above 0."""
 
@@ -86,34 +141,23 @@ class IngestSettings:
 
 @dataclass(frozen=True)
 class StereoPartner:
-    """The right camera of a stereo scope: its video or images, and the file that says how it stands beside the left."""
+    """The right camera of a stereo scope: the file that states its pose to the left one, and its frames."""
 
     calibration: Path
-    video: Path | None = None
-    images: Path | None = None
-    fps: float | None = None
-    times: Path | None = None
-    stream: str | None = None
-
-    def open(self) -> VideoSource:
-        """The frames. Raises NeecoError."""
-        return _open(self)
+    source: VideoFile | ImageFolder
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What was recorded. path: the file that said so (for messages). One of video and images is given; stream: which,
-    where `video` holds several; fps: overrides a video's own times; times: a CSV of the images' times; intrinsics: a
-    calibration file, (fl_x, fl_y, cx, cy) px or None (the file's own, else estimated); sync: t_log = t_video + offset s
-    of each clock that is known; frames: how many to keep; camera: STILL, MOVING or None (to be noticed); episodes: by
-    number, those of its data set that are meant instead of the one that its streams name; episode: what this one of
-    several is called, where the file says it; tissue: over which of several it was taken, EACH: one of its own."""
+    """What was recorded. path: the file that states it (for messages); source: the frames; intrinsics: a calibration
+    file, (fl_x, fl_y, cx, cy) px or None (the file's own, else estimated); sync: t_log = t_video + offset s of each
+    clock that is known; frames: how many to keep; camera: STILL, MOVING or None (to be detected); episodes: by number,
+    those of its data set that are meant instead of the one that its streams name; episode: what this one of several is
+    called, where the file names it; tissue: of several, the one it was taken over, EACH: one of its own."""
 
     path: Path
-    video: Path | None = None
-    images: Path | None = None
-    fps: float | None = None
-    times: Path | None = None
+    source: VideoFile | ImageFolder
+    _: KW_ONLY
     intrinsics: Path | tuple[float, ...] | None = None
     instruments: tuple[InstrumentLogs, ...] = ()
     laparoscope: PoseColumns | None = None
@@ -122,7 +166,6 @@ class Recording:
     splits: Splits | None = None
     notes: tuple[str, ...] = ()
     settings: IngestSettings = field(default_factory=IngestSettings)
-    stream: str | None = None
     camera: str | None = None
     stereo: StereoPartner | None = None
     episodes: tuple[int, ...] = ()
@@ -130,17 +173,28 @@ class Recording:
     tissue: str | None = None
 
     @property
+    def video(self) -> Path | None:
+        """The video's file; None where the frames are a folder of images."""
+        return self.source.file if isinstance(self.source, VideoFile) else None
+
+    @property
+    def stream(self) -> str | None:
+        """The stream of the video's file that holds the frames, where it holds several."""
+        return self.source.stream if isinstance(self.source, VideoFile) else None
+
+    @property
+    def logs(self) -> tuple[PoseColumns | JointColumns, ...]:
+        """All logs of poses and readings."""
+        return logs_of(self.instruments, self.laparoscope)
+
+    @property
     def clocks(self) -> tuple[str, ...]:
         """Names of the clocks of all logs, each once."""
-        return clocks_of(self.instruments, self.laparoscope)
-
-    def open(self) -> VideoSource:
-        """The frames. Raises NeecoError."""
-        return _open(self)
+        return tuple(dict.fromkeys(log.clock for log in self.logs))
 
     def read_lens(self) -> tuple[Lens | None, str]:
-        """The lens given, else that which the images' file states (None: to be estimated), and what says so. Raises
-        NeecoError."""
+        """Return the lens given, else that which the images' file states (None: to be estimated), and its source.
+        Raises NeecoError."""
         if self.intrinsics is None and self.stereo is not None:
             return read_stereo(self.stereo.calibration)[0], str(self.stereo.calibration)
         if self.intrinsics is None and self.video is not None and (known := format_of(self.video)) is not None:
@@ -155,21 +209,11 @@ class Recording:
             raise NeecoError(f"{where}: {str(error).removeprefix('intrinsics: ')}") from error
 
 
-def _open(source: Recording | StereoPartner) -> VideoSource:
-    """The frames of a recording or of its stereo partner. Raises NeecoError."""
-    if source.video is not None:
-        known = format_of(source.video)
-        if known is not None:
-            known.require_package(source.video)
-            return known.open_images(source.video, source.stream)
-        return open_video(source.video, source.fps)
-    assert source.images is not None
-    return open_images(source.images, source.fps, source.times)
-
-
-def clocks_of(instruments: Sequence[InstrumentLogs], laparoscope: PoseColumns | None) -> tuple[str, ...]:
-    """Names of the clocks of all these logs, each once."""
+def logs_of(
+    instruments: Sequence[InstrumentLogs], laparoscope: PoseColumns | None
+) -> tuple[PoseColumns | JointColumns, ...]:
+    """Return all logs of a recording."""
     logs: list[PoseColumns | JointColumns | None] = [laparoscope]
     for instrument in instruments:
         logs += [instrument.poses, instrument.roll, *instrument.joints.values()]
-    return tuple(dict.fromkeys(log.clock for log in logs if log))
+    return tuple(log for log in logs if log is not None)

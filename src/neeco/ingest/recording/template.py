@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +44,12 @@ _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)"
 @dataclass(frozen=True)
 class _Log:
     """A log: its file, relative to the folder, and which stream of it; body: what it is of, hints: lines on it, asks:
-    keys that nothing answers, clock: of its times, where the format says so; is_whole: are all columns the body's?
+    keys that nothing answers, clock: of its times, where the format says so; is_whole: all columns are the body's;
     tool: which of several in an NDI export."""
 
     file: str
     stream: str | None = None
+    _: KW_ONLY
     body: str | None = None
     hints: tuple[str, ...] = ()
     asks: tuple[str, ...] = ()
@@ -58,7 +59,7 @@ class _Log:
 
     @property
     def stem(self) -> str:
-        """What it may be called."""
+        """A name for the log's body."""
         return without_frame(self._name)
 
     @property
@@ -77,7 +78,7 @@ class _Log:
 
 @dataclass
 class _FolderFiles:
-    """What the files of a folder seem to be, as paths relative to it. others: what there is, too, in words."""
+    """The files of a folder by their likely kind, as paths relative to it. others: those not used, in words."""
 
     videos: list[_Log] = field(default_factory=list)
     images: list[str] = field(default_factory=list)
@@ -102,8 +103,8 @@ class _FolderFiles:
 
 def write_template(source: Path, report: Callable[[str], None] = lambda problem: None) -> str:
     """The text of a recording.yaml for the files in a folder and its subfolders, or for one file or folder that holds
-    several streams, to stand beside it; `read_recording` accepts it. report: is told of what cannot be read, which is
-    left out.
+    several streams, to stand beside it; `read_recording` accepts it. report: called with each
+    file that cannot be read, which is left out.
 
     Raises NeecoError when there are no images.
     """
@@ -154,7 +155,7 @@ def write_template(source: Path, report: Callable[[str], None] = lambda problem:
 
 
 def holds_streams(source: Path) -> bool:
-    """Is the path a recording in itself (a bag, a data set's folder), rather than a folder of a recording's files?"""
+    """Return whether the path is a recording in itself (a bag, a data set's folder), not a folder of its files."""
     return source.is_file() or format_of(source) is not None
 
 
@@ -202,7 +203,10 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         found.leave_out(name, _without_place(str(error), path, name), images=True)
         return path.is_dir()
     for stream in streams:
-        log = _Log(name, stream.name, stream.body, stream.hints, stream.asks, stream.clock, stream.columns is None)
+        log = _Log(
+            name, stream.name, body=stream.body, hints=stream.hints, asks=stream.asks, clock=stream.clock,
+            is_whole=stream.columns is None,
+        )  # fmt: skip
         used = stream.offered and stream.count > 0 and stream.problem is None
         if used and stream.kind == IMAGE_STREAMS:
             found.videos.append(log)

@@ -1,12 +1,11 @@
-"""Base to camera from images: where a robot's base stands, found from what moves and how the instrument was posed.
+"""Base registration from images: where a robot's base stands, from foreground masks and the poses that its arm logs.
 
-The instrument's shape in its own frame is unknown but rigid, up to what its readings move: with the right base one
-shape explains what moves in all images. A rough place comes from lines and tips of shafts (`base_search`), the exact
-one from least squares on the outlines (`base_fit`), which also say how sure it is. An offset or a turn of the
-instrument's own frame does not matter: the shape makes up for it. What moves the instrument alike in every frame,
-such as a shift of the base when the instrument never turns, is therefore left open, and so is, for one still camera
-and an instrument that moves about a trocar, much of the size of everything: only how far the tip moves in and out
-tells it.
+The instrument's shape in its own frame is unknown but rigid, up to what its readings move: at the right base one shape
+explains the masks of all images. Lines and tips of shafts give a rough base (`silhouette_search`), least squares on the
+silhouettes the exact one (`silhouette_fit`) and its uncertainty. The shape absorbs a constant offset or turn of the
+instrument's own frame. Motion that is the same in every frame stays undetermined, such as a shift of the base when the
+instrument never turns. So does, for one still camera and an instrument that moves about a trocar, most of the scale:
+only the tip's motion in and out shows it.
 """
 
 from __future__ import annotations
@@ -22,58 +21,59 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
-from neeco.ingest.registration.base_fit import (
-    CLOCK_SD,
-    FRONT,
+from neeco.ingest.registration.axial_texture import with_marks
+from neeco.ingest.registration.layers import LayerFit, ShaftLine
+from neeco.ingest.registration.silhouette_fit import (
+    CLOCK_SD_S,
+    FRONT_SHARE,
     WIDTHS_PX,
-    Prior,
-    Sureness,
-    fit_outlines,
+    BasePrior,
+    FitInformation,
+    fit_information,
+    fit_silhouettes,
     refine,
-    sureness,
 )
-from neeco.ingest.registration.base_layers import LayerFit, ShaftLine
-from neeco.ingest.registration.base_marks import with_marks
-from neeco.ingest.registration.base_search import Candidates, Seen, rotations_about, search, uniform_rotations
-from neeco.ingest.registration.base_shape import (
-    MOTION,
-    SHIFTS,
-    Fit,
-    Problem,
+from neeco.ingest.registration.silhouette_model import (
+    CLOCK_SHIFTS_S,
+    SilhouetteFit,
+    SilhouetteProblem,
     instrument_in_base,
-    outlines,
     pivot_of,
     resized,
+    sides,
 )
+from neeco.ingest.registration.silhouette_search import ShaftViews, rotations_about, search, uniform_rotations
 
-FEWEST = 12  # frames that show a shaft, to find a base from
-QUICK = 40  # frames that starts are compared on
-MOST = 140  # frames that the result is fitted to
-BLOCKS = 10  # stretches of a recording whose errors are taken to be independent
-ROTATIONS, EVERYWHERE = 500, 4000  # tried about a rough base, and without one
-SIZES = 1.25, 1.1  # factors by which everything is made larger or smaller, one after the other
-FARTHEST = 8  # times each
-SPAN, SAMPLES = 0.15, 9  # of the logarithm of the size, over which the loss is sampled at last
-AS_MUCH = 0.95  # of the overlap before must stay: less of an instrument fits more easily
-LEAST_OVERLAP = 0.25  # of the instrument's outline with what moves, to believe a base
-# by which the size is off however many frames there are: jaws blur where the tip is; and with marks on the shaft
-SIZE_BIAS, MARKED_BIAS = 0.03, 0.007
-USUAL_RADII = (1.5, 5.5)  # mm: a shaft outside is first taken to be of the usual size
-USUAL_RADIUS = 3.5  # mm of a shaft, to guess how far away one is
-LEVER = 40.0  # mm from the instrument's middle at which a turn counts as a shift
-OPEN_MM = 3.0  # standard deviation at that lever from which a direction counts as open
-OPEN_SHARE = 0.7  # of the prior's: the images have hardly added to it
-STILL_AS_GOOD = 1.5  # times the loss with the right poses: under exchanged poses masks must fit worse than that
-UNEXPLAINED = 1.5  # px of masks 160 wide: outlines farther off on average explain nothing
+MIN_FRAMES = 12  # that show a shaft
+SEARCH_FRAMES, FIT_FRAMES = 40, 140  # on which starts are compared, and that the result is fitted to
+N_BLOCKS = 10  # stretches of a recording whose errors are taken to be independent
+N_ROTATIONS, N_UNIFORM = 500, 4000  # tried about a rough base, and without one
+MAX_START_COST = 2.0  # of robust losses below 1 each, and the prior's
+SIZE_FACTORS, MAX_SIZE_STEPS = (1.25, 1.1), 8  # by which the scale is varied, and how often at most
+LOG_SIZE_RANGE, SIZE_SAMPLES = 0.15, 9  # of the loss about its minimum
+MIN_OVERLAP_RATIO = 0.95  # to the overlap before: less of an instrument fits more easily
+MIN_OVERLAP = 0.25  # of the instrument's silhouette with the masks
+# standard deviations of the log size that more frames do not lower: jaws blur the tip; and with texture on the shaft
+SIZE_SD, MARKED_SIZE_SD = 0.03, 0.007
+RADIUS_RANGE_MM, TYPICAL_RADIUS_MM = (1.5, 5.5), 3.5  # of shafts; one outside is first taken to be typical
+LEVER_MM = 40.0  # from the instrument's middle, at which a turn counts as a shift
+OPEN_SD_MM = 3.0  # at that lever, from which a direction counts as undetermined
+OPEN_SHARE = 0.7  # of the prior's standard deviation: the images have hardly reduced it
+EXCHANGED_SHARES = (0.37, 0.61)  # of the recording, by which poses are shifted for comparison
+MIN_EXCHANGED_COST = 1.5  # times the cost with the right poses
+MAX_RESIDUAL_PX = 1.5  # median, of masks 160 wide
+BY_SIZE = "a shift towards where the instrument comes in, together with its size"
+
+Prior = tuple[np.ndarray, float, float]  # world_from_base [4, 4], standard deviations mm at the instrument, and degrees
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class BaseRegistration:
-    """Where a base stands, and how sure that is.
+    """A base and its uncertainty.
 
-    Standard deviations are along
-    the first camera's right, down and forward, at the instrument: mm for shifts and degrees for turns; NaN where a
-    direction is open and nothing was given beforehand. `open_directions`: what the motion does not determine, in words.
+    Standard deviations are along the first camera's right, down and forward, at the instrument: mm for shifts and
+    degrees for turns; NaN where a direction is undetermined and has no prior. `open_directions`: what the motion leaves
+    undetermined, in words.
     """
 
     world_from_base: np.ndarray  # [4, 4]
@@ -82,35 +82,25 @@ class BaseRegistration:
     sd_mm: np.ndarray  # [3]
     sd_deg: np.ndarray  # [3]
     open_directions: tuple[str, ...]
-    moved_mm: float  # from what was given; NaN where nothing was
-    turned_deg: float
-    overlap: float  # of the instrument's fitted shape with what moves, intersection over union; NaN without masks
-    overlap_before: float  # of the same shape under what was given; NaN where nothing was
-    residual_px: float  # median, of the outlines, in the masks' pixels
+    moved_mm: float = np.nan  # from what was given; NaN where nothing was
+    turned_deg: float = np.nan
+    overlap: float = np.nan  # of the instrument's fitted silhouette with the masks (IoU); NaN without masks
+    overlap_before: float = np.nan  # of the same shape at the base that was given; NaN where none was
+    residual_px: float = np.nan  # median, of the silhouettes, in the masks' pixels
     frames: int  # that it was found from
-    fit: Fit | None = None  # None: found without masks, from what stands still behind it
-    problem: Problem | None = None
-    explained: float = np.nan  # then: the share of the change in the images that the shaft explains
+    from_masks: bool
+    explained: float = np.nan  # without masks: the share of the change in the images that the shaft explains
 
     def as_json(self) -> dict[str, Any]:
-        """Numbers for scripts: mm, degrees, s; None where a direction is open and nothing was given."""
+        """Numbers for scripts: mm, degrees, s; None where a direction is undetermined and has no prior."""
 
-        def known(values: np.ndarray) -> list[float | None]:
-            return [float(value) if np.isfinite(value) else None for value in values]
+        def known(values: np.ndarray | float) -> Any:
+            listed = [float(value) if np.isfinite(value) else None for value in np.atleast_1d(values)]
+            return listed if np.ndim(values) else listed[0]
 
-        return {
-            "world_from_base": self.world_from_base.tolist(),
-            "sd_mm": known(self.sd_mm),
-            "sd_deg": known(self.sd_deg),
-            "clock_s": self.clock_s,
-            "clock_sd_s": self.clock_sd_s,
-            "moved_mm": known(np.array([self.moved_mm]))[0],
-            "turned_deg": known(np.array([self.turned_deg]))[0],
-            "overlap": known(np.array([self.overlap]))[0],
-            "explained": known(np.array([self.explained]))[0],
-            "overlap_before": known(np.array([self.overlap_before]))[0],
-            "open": list(self.open_directions),
-        }
+        numbers = ("sd_mm", "sd_deg", "clock_s", "clock_sd_s", "moved_mm", "turned_deg", "overlap", "explained")
+        found = {name: known(getattr(self, name)) for name in (*numbers, "overlap_before")}
+        return {"world_from_base": self.world_from_base.tolist(), **found, "open": list(self.open_directions)}
 
 
 def find_base(
@@ -120,7 +110,7 @@ def find_base(
     camera_from_world: np.ndarray,
     poses_at: Callable[[float], np.ndarray],
     times: np.ndarray,
-    prior: tuple[np.ndarray, float, float] | None = None,
+    prior: Prior | None = None,
     *,
     readings: np.ndarray | None = None,
     hidden: np.ndarray | None = None,
@@ -130,197 +120,176 @@ def find_base(
 ) -> BaseRegistration:
     """Find the base of instrument `name`.
 
-    masks: bool [F, h, w], what moves, seen through a pinhole of `intrinsics` (fx, fy, cx, cy px of the masks);
+    masks: foreground bool [F, h, w], through a pinhole of `intrinsics` (fx, fy, cx, cy px of the masks);
     camera_from_world [F, 4, 4]; poses_at(s): base_from_instrument [F, 4, 4] mm of the frames as the log has them s
-    seconds later, NaN where it has none; times [F] s; prior: (world_from_base, sd mm at the instrument, sd degrees);
-    readings [F, J] of its joints; hidden: bool [h, w], beyond a round border; images: uint8 [F, h, w, 3], from which
-    colours along the instrument tell how far in it is. Raises NeecoError, naming the instrument, where what moves is
-    not it.
+    seconds later, NaN where it has none; times [F] s; readings [F, J] of its joints; hidden: bool [h, w], beyond a
+    round border; images: uint8 [F, h, w, 3], whose texture along the instrument shows how far in it is. Raises
+    NeecoError, naming the instrument, where the foreground is not the instrument.
     """
     generator = np.random.default_rng(seed)
-    problem = _problem(masks, intrinsics, hidden, camera_from_world, poses_at, times, readings, images)
-    lines = shaft_lines(problem.seen.masks, hidden)
-    shows = np.isfinite(lines.points[:, 0])
-    if shows.sum() < FEWEST:
+    problem = _problem(masks, intrinsics, camera_from_world, poses_at, readings=readings, hidden=hidden, images=images)
+    visible = np.isfinite(shaft_lines(problem.silhouettes.masks, hidden).points[:, 0])
+    if visible.sum() < MIN_FRAMES:
         raise NeecoError(
-            f"instrument {name!r}: camera_from_base: what moves looks like a shaft in {int(shows.sum())} of "
-            f"{len(shows)} frames, at least {FEWEST} are needed; give the transform, exactly or, before a "
+            f"instrument {name!r}: camera_from_base: what moves looks like a shaft in {int(visible.sum())} of "
+            f"{len(visible)} frames, at least {MIN_FRAMES} are needed; give the transform, exactly or, before a "
             "still scope, of an arm with a trocar, roughly (sd_mm, sd_deg), or a recording that shows more of it"
         )
-    problem = problem.take(np.flatnonzero(shows))
-    quick = problem.take(np.array(evenly_spaced(len(problem.blocks), QUICK)))
-    distance = _distance(problem, prior)
-    known = _prior(prior, clock_known)
-    starts = _starts(quick, prior, distance, known, generator)
+    problem = problem.take(np.flatnonzero(visible))
+    few = problem.take(np.array(evenly_spaced(len(problem.blocks), SEARCH_FRAMES)))
+    clock_sd = 0.0 if clock_known else CLOCK_SD_S
+    known = BasePrior(np.eye(4), None, None, clock_sd)
+    if prior is not None:
+        known = BasePrior(prior[0], np.radians(prior[2]), prior[1], clock_sd)
+    starts = _starts(few, known, _distance(problem, prior), generator)
     if not starts:
         raise NeecoError(_unmoved(name))
-    fits = [fit_outlines(quick, known, start) for start in starts]
-    best = max(fits, key=lambda fit: overlap(quick, fit))
+    best = max((fit_silhouettes(few, known, start) for start in starts), key=lambda fit: overlap(few, fit))
     radius = float(np.median(best.shape[len(best.shape) // 2 :, 0, 0]))
-    if not USUAL_RADII[0] < radius < USUAL_RADII[1]:
-        best = refine(quick, known, resized(quick, best, USUAL_RADIUS / radius))
-    best = _best_size(quick, known, best, SIZES)
-    fit = fit_outlines(problem, known, best, widths=WIDTHS_PX[-2:])
+    if not RADIUS_RANGE_MM[0] < radius < RADIUS_RANGE_MM[1]:
+        best = refine(few, known, resized(few, best, TYPICAL_RADIUS_MM / radius))
+    best = _best_size(few, known, best)
+    fit = fit_silhouettes(problem, known, best, WIDTHS_PX[-2:])
     problem, fit = with_marks(problem, fit)
     fit, curvature = _settle_size(problem, known, refine(problem, known, fit))
     problem, fit = with_marks(problem, fit)
     fit = refine(problem, known, fit)
     _require_moved(name, problem, known, fit)
-    sure = sureness(problem, known, fit)
-    return _result(problem, known, prior, fit, sure, _size_sd(problem, fit, sure, curvature))
+    information = fit_information(problem, known, fit)
+    return _result(problem, known, fit, information, _size_sd(problem, fit, information, curvature))
 
 
 def _problem(
     masks: np.ndarray,
     intrinsics: tuple[float, float, float, float],
-    hidden: np.ndarray | None,
     camera_from_world: np.ndarray,
     poses_at: Callable[[float], np.ndarray],
-    times: np.ndarray,
+    *,
     readings: np.ndarray | None,
+    hidden: np.ndarray | None,
     images: np.ndarray | None,
-) -> Problem:
-    """The frames whose poses are known at all clocks tried, at most MOST."""
-    poses = np.stack([poses_at(float(shift)) for shift in SHIFTS])
+) -> SilhouetteProblem:
+    """The frames whose poses are known at all clocks tried, at most FIT_FRAMES."""
+    poses = np.stack([poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
     rows = np.flatnonzero(np.isfinite(poses).all((0, 2, 3)) & masks.any((1, 2)))
-    rows = rows[evenly_spaced(len(rows), MOST)] if len(rows) else rows
-    values = np.zeros((len(masks), 0)) if readings is None else np.asarray(readings, np.float64)
-    values = values[rows]
+    rows = rows[evenly_spaced(len(rows), FIT_FRAMES)] if len(rows) else rows
+    values = np.zeros((len(rows), 0)) if readings is None else np.asarray(readings, np.float64)[rows]
     if len(rows):
         moving = values.std(0) > 1e-3
         values = (values[:, moving] - values[:, moving].mean(0)) / values[:, moving].std(0)
-    blocks = np.minimum(np.arange(len(rows)) * BLOCKS // max(len(rows), 1), BLOCKS - 1)
-    return Problem(
-        silhouettes_of(masks[rows], intrinsics, hidden), camera_from_world[rows], poses[:, rows], values, blocks,
-        None if images is None else images[rows],
-    )  # fmt: skip
+    return SilhouetteProblem(
+        silhouettes=silhouettes_of(masks[rows], intrinsics, hidden),
+        camera_from_world=camera_from_world[rows],
+        poses=poses[:, rows],
+        readings=values,
+        blocks=np.minimum(np.arange(len(rows)) * N_BLOCKS // max(len(rows), 1), N_BLOCKS - 1),
+        images=None if images is None else images[rows],
+    )
 
 
-def _distance(problem: Problem, prior: tuple[np.ndarray, float, float] | None) -> float:
-    """mm from the cameras to the instrument, about: where the prior puts it, else as if its shaft were of usual
-    size."""
-    half = float(np.median([mask.max() for mask in problem.seen.distances]))
-    guess = USUAL_RADIUS * problem.seen.intrinsics[0] / max(half, 0.5)
+def _distance(problem: SilhouetteProblem, prior: Prior | None) -> float:
+    """Approximate mm from the cameras to the instrument: by the prior, else by a shaft of typical size."""
+    half = float(np.median([mask.max() for mask in problem.silhouettes.distances]))
+    guess = TYPICAL_RADIUS_MM * problem.silhouettes.intrinsics[0] / max(half, 0.5)
     if prior is None:
         return guess
     place = prior[0][:3, :3] @ problem.middle + prior[0][:3, 3]
-    depths = problem.camera_from_world[:, 2, :3] @ place + problem.camera_from_world[:, 2, 3]
-    depth = float(np.median(depths))
+    depth = float(np.median(problem.camera_from_world[:, 2, :3] @ place + problem.camera_from_world[:, 2, 3]))
     return depth if depth > 0.2 * guess else guess
 
 
-def _prior(prior: tuple[np.ndarray, float, float] | None, clock_known: bool) -> Prior:
-    clock = 0.0 if clock_known else CLOCK_SD
-    return Prior(np.eye(4), None, None, clock) if prior is None else Prior(
-        prior[0], np.radians(prior[2]), prior[1], clock
-    )  # fmt: skip
-
-
 def _starts(
-    problem: Problem,
-    prior: tuple[np.ndarray, float, float] | None,
-    distance: float,
-    known: Prior,
-    generator: np.random.Generator,
-) -> list[Fit]:
+    problem: SilhouetteProblem, known: BasePrior, distance: float, generator: np.random.Generator
+) -> list[SilhouetteFit]:
     """First fits, from lines and tips of the masks."""
-    lines = shaft_lines(problem.seen.masks)
-    seen = Seen(lines, problem.seen.intrinsics, problem.camera_from_world, problem.poses[len(SHIFTS) // 2])
-    if prior is None:
-        rotations = uniform_rotations(EVERYWHERE, generator)
-        center, sd_mm, step = _middle_of_view(problem, distance), distance, 0.2
+    if known.sd_rad is None or known.sd_mm is None:
+        rotations = uniform_rotations(N_UNIFORM, generator)
+        cameras = np.linalg.inv(problem.camera_from_world)  # the instrument is where most of them look
+        center, sd_mm, step = (cameras[:, :3, 3] + distance * cameras[:, :3, 2]).mean(0), distance, 0.2
     else:
-        assert known.sd_rad is not None
-        rotations = rotations_about(prior[0][:3, :3], known.sd_rad, ROTATIONS, generator)
-        center, sd_mm, step = prior[0][:3, :3] @ problem.middle + prior[0][:3, 3], prior[1], 0.5 * known.sd_rad
-    found: Candidates = search(seen, rotations, center, sd_mm, distance, generator, step)
+        given = known.world_from_base
+        rotations = rotations_about(given[:3, :3], known.sd_rad, N_ROTATIONS, generator)
+        center, sd_mm, step = given[:3, :3] @ problem.middle + given[:3, 3], known.sd_mm, 0.5 * known.sd_rad
+    views = ShaftViews(
+        lines=shaft_lines(problem.silhouettes.masks),
+        intrinsics=problem.silhouettes.intrinsics,
+        camera_from_world=problem.camera_from_world,
+        base_from_instrument=problem.poses[len(CLOCK_SHIFTS_S) // 2],
+        center=center,
+        sd_mm=sd_mm,
+        distance=distance,
+    )
+    found = search(views, rotations, generator, step)
     return [
-        Fit(base, 0.0, tip, axis, np.zeros(1), np.zeros((1, 1 + problem.readings.shape[1], 5)), np.zeros(0))
+        SilhouetteFit.of_line(base, 0.0, tip, axis, problem.readings.shape[1])
         for cost, base, tip, axis in zip(found.costs, found.world_from_base, found.tips, found.axes, strict=True)
-        if cost < 2  # of robust losses below 1 each, and the prior's
+        if cost < MAX_START_COST
     ]
 
 
-def _middle_of_view(problem: Problem, distance: float) -> np.ndarray:
-    """[3] the place in the world that most cameras look at, so far away."""
-    cameras = np.linalg.inv(problem.camera_from_world)
-    return np.asarray((cameras[:, :3, 3] + distance * cameras[:, :3, 2]).mean(0))
-
-
-def _best_size(problem: Problem, known: Prior, fit: Fit, steps: tuple[float, ...]) -> Fit:
+def _best_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> SilhouetteFit:
     """The best of fits to instruments of other sizes at other distances, in ever smaller steps: for one still camera
     that is a valley along which least squares creep."""
-    for step in steps:
+    for step in SIZE_FACTORS:
         for factor in (step, 1 / step):
-            for _ in range(FARTHEST):
-                other = refine(problem, known, resized(problem, fit, factor), steps=8)
-                if not (other.loss < fit.loss and overlap(problem, other) > AS_MUCH * overlap(problem, fit)):
+            for _ in range(MAX_SIZE_STEPS):
+                other = refine(problem, known, resized(problem, fit, factor), 8)
+                if not (other.loss < fit.loss and overlap(problem, other) > MIN_OVERLAP_RATIO * overlap(problem, fit)):
                     break
                 fit = other
     return fit
 
 
-def _settle_size(problem: Problem, known: Prior, fit: Fit) -> tuple[Fit, float]:
-    """The fit at the size where the loss is least, by a parabola through those of sizes around, and the curvature of
-    the loss there by the logarithm of the size."""
-    logs = np.linspace(-SPAN, SPAN, SAMPLES)
-    fits = [refine(problem, known, resized(problem, fit, float(np.exp(log))), steps=8) for log in logs]
+def _settle_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> tuple[SilhouetteFit, float]:
+    """The fit at the size of least loss, by a parabola through those of sizes around, and the curvature of the loss
+    there by the logarithm of the size."""
+    logs = np.linspace(-LOG_SIZE_RANGE, LOG_SIZE_RANGE, SIZE_SAMPLES)
+    fits = [refine(problem, known, resized(problem, fit, float(np.exp(log))), 8) for log in logs]
     losses = np.array([other.loss for other in fits])
     near = losses < losses.min() + 0.5 * (np.median(losses) - losses.min()) + 1e-9
-    near |= np.abs(np.arange(SAMPLES) - int(np.argmin(losses))) <= 2
+    near |= np.abs(np.arange(SIZE_SAMPLES) - int(np.argmin(losses))) <= 2
     curve = np.polyfit(logs[near], losses[near], 2)
-    least = (
-        float(np.clip(-curve[1] / (2 * curve[0]), *logs[near][[0, -1]])) if curve[0] > 0 else logs[np.argmin(losses)]
-    )
-    nearest = fits[int(np.argmin(np.abs(logs - least)))]
-    factor = float(np.exp(least - logs[int(np.argmin(np.abs(logs - least)))]))
-    settled = refine(problem, known, resized(problem, nearest, factor), steps=8)
+    least = logs[np.argmin(losses)]
+    if curve[0] > 0:
+        least = float(np.clip(-curve[1] / (2 * curve[0]), *logs[near][[0, -1]]))
+    nearest = int(np.argmin(np.abs(logs - least)))
+    settled = refine(problem, known, resized(problem, fits[nearest], float(np.exp(least - logs[nearest]))), 8)
     return settled, max(float(curve[0]), 0.0)
 
 
-def _size_sd(problem: Problem, fit: Fit, sure: Sureness, curvature: float) -> float:
+def _size_sd(problem: SilhouetteProblem, fit: SilhouetteFit, found: FitInformation, curvature: float) -> float:
     """Standard deviation of the logarithm of the size, from the curvature of the mean loss."""
-    width = problem.seen.distances.shape[2] / 160  # of the narrowest loss, px
-    count = problem.seen.distances.shape[0] * 2 * len(fit.stations) * (1 - FRONT)
-    variance = (fit.residual_px / 0.67 / width) ** 2 * _alike(sure)
-    bias = SIZE_BIAS if problem.marks is None else MARKED_BIAS
+    count = len(problem.blocks) * 2 * len(fit.stations) * (1 - FRONT_SHARE)
+    used = np.flatnonzero(np.diag(found.information) > 0)
+    expected = np.maximum(found.noise * np.diag(found.information)[used], 1e-12)
+    inflation = max(float(np.median(np.diag(found.scatter)[used] / expected)), 1.0)  # of variances, by correlation
+    variance = (fit.residual_px / 0.67 / problem.px_scale) ** 2 * inflation
     still = len(np.unique(problem.camera_from_world.round(3), axis=0)) == 1
-    return float(np.hypot(np.sqrt(variance / max(curvature * count, 1e-9)), bias if still else 0.0))
+    least = SIZE_SD if problem.marks is None else MARKED_SIZE_SD
+    return float(np.hypot(np.sqrt(variance / max(curvature * count, 1e-9)), least if still else 0.0))
 
 
-def _alike(sure: Sureness) -> float:
-    """By how much errors that are alike within a block make a variance larger than independent ones would."""
-    used = np.flatnonzero(np.diag(sure.information) > 0)
-    ratio = np.diag(sure.scatter)[used] / np.maximum(sure.noise * np.diag(sure.information)[used], 1e-12)
-    return max(float(np.median(ratio)), 1.0)
-
-
-def overlap(problem: Problem, fit: Fit) -> float:
-    """Intersection over union of the fit's outline, filled, with the masks, over all frames."""
-    x, y, _ = outlines(problem, fit)
-    stations = len(fit.stations)
+def overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
+    """Intersection over union of the fit's filled silhouette with the masks, over all frames."""
     both, either = 0, 0
-    for row, mask in enumerate(problem.seen.masks):
-        left = np.stack([x[row, :stations], y[row, :stations]], -1)
-        right = np.stack([x[row, stations:], y[row, stations:]], -1)
+    left, right = np.split(sides(problem, fit).pixels, 2, axis=1)
+    corners = np.rint(np.clip(np.concatenate([left, right[:, ::-1]], 1), -1e4, 1e4) - 0.5).astype(np.int32)
+    for corner, mask in zip(corners, problem.silhouettes.masks, strict=True):
         filled = np.zeros(mask.shape, np.uint8)
-        corners = np.clip(np.concatenate([left, right[::-1]]), -1e4, 1e4)
-        cv2.fillPoly(filled, [np.rint(corners - 0.5).astype(np.int32)], 1)
+        cv2.fillPoly(filled, [corner], 1)
         both += int((filled.astype(bool) & mask).sum())
         either += int((filled.astype(bool) | mask).sum())
     return both / max(either, 1)
 
 
-def _require_moved(name: str, problem: Problem, known: Prior, fit: Fit) -> None:
-    """Raise NeecoError where the masks are explained as well by poses of other moments, or by none."""
-    size = problem.seen.distances.shape[2] / 160
-    if not (fit.residual_px < UNEXPLAINED * size and overlap(problem, fit) > LEAST_OVERLAP):
+def _require_moved(name: str, problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> None:
+    """Raise NeecoError where poses of other moments, or none, explain the masks as well."""
+    if not (fit.residual_px < MAX_RESIDUAL_PX * problem.px_scale and overlap(problem, fit) > MIN_OVERLAP):
         raise NeecoError(_unmoved(name))
-    count = len(problem.blocks)
-    for share in (0.37, 0.61):
-        exchanged = replace(problem, poses=np.roll(problem.poses, round(share * count), axis=1))
-        other = refine(exchanged, replace(known, sd_clock=0.0), fit, steps=12)
-        if other.cost < STILL_AS_GOOD * fit.cost:
+    for share in EXCHANGED_SHARES:
+        exchanged = replace(problem, poses=np.roll(problem.poses, round(share * len(problem.blocks)), axis=1))
+        other = refine(exchanged, replace(known, sd_clock=0.0), fit, 12)
+        if other.cost < MIN_EXCHANGED_COST * fit.cost:
             raise NeecoError(_unmoved(name))
 
 
@@ -331,70 +300,74 @@ def _unmoved(name: str) -> str:
     )
 
 
+def _moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, float]:
+    """How far a base is from a given one, at the instrument's mean position [3] mm in its frame."""
+    shift = (base[:3, :3] - given[:3, :3]) @ middle + base[:3, 3] - given[:3, 3]
+    turn = Rotation.from_matrix(base[:3, :3] @ given[:3, :3].T).magnitude()
+    return {"moved_mm": float(np.linalg.norm(shift)), "turned_deg": float(np.degrees(turn))}
+
+
 def _result(
-    problem: Problem,
-    known: Prior,
-    prior: tuple[np.ndarray, float, float] | None,
-    fit: Fit,
-    sure: Sureness,
-    size_sd: float,
+    problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit, information: FitInformation, size_sd: float
 ) -> BaseRegistration:
-    covariance, open_directions, clock_sd = _sureness_in_words(problem, known, fit, sure, size_sd)
+    covariance, open_directions, clock_sd = _covariance(problem, known, fit, information, size_sd)
     view = problem.camera_from_world[0, :3, :3]
     turns, shifts = (view @ covariance[part, part] @ view.T for part in (slice(0, 3), slice(3, 6)))
-    moved, turned, before = np.nan, np.nan, np.nan
-    if prior is not None:
-        given = prior[0]
-        moved = float(np.linalg.norm(
-            (fit.world_from_base[:3, :3] - given[:3, :3]) @ problem.middle + fit.world_from_base[:3, 3] - given[:3, 3]
-        ))  # fmt: skip
-        turned = float(np.degrees(Rotation.from_matrix(fit.world_from_base[:3, :3] @ given[:3, :3].T).magnitude()))
-        before = overlap(problem, replace(fit, world_from_base=given))
+    moved: dict[str, float] = {}
+    if known.sd_mm is not None:
+        moved = _moved_from(known.world_from_base, fit.world_from_base, problem.middle)
+        moved["overlap_before"] = overlap(problem, replace(fit, world_from_base=known.world_from_base))
     with np.errstate(invalid="ignore"):
         sd_mm, sd_deg = np.sqrt(np.diag(shifts)), np.degrees(np.sqrt(np.diag(turns)))
     return BaseRegistration(
-        fit.world_from_base, fit.clock, clock_sd, sd_mm, sd_deg, open_directions, moved, turned,
-        overlap(problem, fit), before, fit.residual_px, len(problem.blocks), fit, problem,
-    )  # fmt: skip
+        world_from_base=fit.world_from_base,
+        clock_s=fit.clock,
+        clock_sd_s=clock_sd,
+        sd_mm=sd_mm,
+        sd_deg=sd_deg,
+        open_directions=open_directions,
+        overlap=overlap(problem, fit),
+        residual_px=fit.residual_px,
+        frames=len(problem.blocks),
+        from_masks=True,
+        **moved,
+    )
 
 
-def _sureness_in_words(
-    problem: Problem, known: Prior, fit: Fit, sure: Sureness, size_sd: float
+def _covariance(
+    problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit, found: FitInformation, size_sd: float
 ) -> tuple[np.ndarray, tuple[str, ...], float]:
-    """Covariance [6, 6] of the base (rad, mm, in the world's directions at the instrument), what is open, and the
-    standard deviation of the clock s."""
+    """Covariance [6, 6] of the base (rad, mm, in the world's directions at the instrument), what is undetermined, in
+    words, and the standard deviation of the clock s."""
     away = pivot_of(problem, fit) - np.linalg.inv(problem.camera_from_world)[:, :3, 3].mean(0)  # moves by it
-    units = np.array([1 / LEVER] * 3 + [1.0] * 3 + [0.05])  # about as much of an outline's motion each
+    depth = float(np.linalg.norm(away))
     used = np.array([True] * 6 + [known.sd_clock > 0])
-    units = units[used]
-    information = sure.information[np.ix_(used, used)] * np.outer(units, units)
-    scatter = sure.scatter[np.ix_(used, used)] * np.outer(units, units)
-    before = np.zeros(MOTION)
+    units = np.array([1 / LEVER_MM] * 3 + [1.0] * 3 + [0.05])[used]  # about as much motion of a silhouette each
+    information = found.information[np.ix_(used, used)] * np.outer(units, units)
+    scatter = found.scatter[np.ix_(used, used)] * np.outer(units, units)
+    before = np.zeros(7)
     if known.sd_rad is not None and known.sd_mm is not None:
         before[:6] = [known.sd_rad**-2.0] * 3 + [known.sd_mm**-2.0] * 3
     before[6] = known.sd_clock**-2.0 if known.sd_clock > 0 else 0.0
     prior = np.diag(before[used] * units**2)
     values, vectors = np.linalg.eigh(information)
     values = np.maximum(values, 1e-12)
-    variances = np.einsum("ip,ij,jp->p", vectors, scatter, vectors) / values**2 + sure.noise / values
+    variances = np.einsum("ip,ij,jp->p", vectors, scatter, vectors) / values**2 + found.noise / values
     posterior = np.linalg.inv(vectors @ np.diag(1 / variances) @ vectors.T + prior + 1e-12 * np.eye(len(prior)))
     covariance = posterior * np.outer(units, units)
     shaft = (fit.world_from_base[:3, :3] @ instrument_in_base(problem, fit)[:, :3, :3] @ fit.axis).mean(0)
     shaft /= np.linalg.norm(shaft)
     words = []
-    far = float(np.linalg.norm(away)) * size_sd
-    if far > OPEN_MM or (known.sd_mm is not None and far > OPEN_SHARE * known.sd_mm):
-        words.append(_BY_SIZE)
+    if depth * size_sd > OPEN_SD_MM or (known.sd_mm is not None and depth * size_sd > OPEN_SHARE * known.sd_mm):
+        words.append(BY_SIZE)
     if known.sd_mm is not None:
-        size_sd = (size_sd**-2 + (known.sd_mm / float(np.linalg.norm(away))) ** -2) ** -0.5
+        size_sd = (size_sd**-2 + (known.sd_mm / depth) ** -2) ** -0.5
     covariance[3:6, 3:6] += size_sd**2 * np.outer(away, away)
     for index in np.argsort(values):
-        vector = vectors[:, index]
-        alone = float(variances[index]) ** 0.5
+        vector, sd = vectors[:, index], float(variances[index]) ** 0.5
         given = float(vector @ prior @ vector)
-        if np.square(vector[:6]).sum() < 0.5:
-            continue
-        if alone > OPEN_MM or (given > 0 and alone > OPEN_SHARE * given**-0.5):
+        undetermined = sd > OPEN_SD_MM or (given > 0 and sd > OPEN_SHARE * given**-0.5)
+        if np.square(vector[:6]).sum() >= 0.5 and undetermined:
             words.append(_direction(problem.camera_from_world[0, :3, :3], shaft, vector[:6]))
     if known.sd_mm is None and words:
         covariance[:6, :6] = np.where(np.abs(covariance[:6, :6]) > 1e6, np.nan, covariance[:6, :6])
@@ -402,42 +375,32 @@ def _sureness_in_words(
     return covariance[:6, :6], tuple(dict.fromkeys(words)), clock_sd
 
 
-_BY_SIZE = "a shift towards where the instrument comes in, together with its size"
-
-
 def _direction(view: np.ndarray, shaft: np.ndarray, vector: np.ndarray) -> str:
-    """A direction in which the base may move, at LEVER: turns and shifts [6], world, as words. view: camera_from_world
-    [3, 3]; shaft [3]: its direction, world."""
+    """Describe a direction in which the base may move: turns and shifts [6], world, at LEVER_MM. view:
+    camera_from_world [3, 3]; shaft [3]: its direction, world."""
     turns = np.square(vector[:3]).sum() > 0.5 * np.square(vector).sum()
     way = vector[:3] if turns else vector[3:]
     way = way / np.linalg.norm(way)
     what, at = ("a turn", "about") if turns else ("a shift", "along")
     if abs(way @ shaft) > 0.94:
         return f"{what} {at} the shaft"
-    seen = view @ way
+    local = view @ way
     names = ("the image's width", "the image's height", "the view (depth)")
-    largest = int(np.argmax(np.abs(seen)))
-    if seen[largest] ** 2 > 0.75:
+    largest = int(np.argmax(np.abs(local)))
+    if local[largest] ** 2 > 0.75:
         return f"{what} {at} {names[largest]}"
-    parts = ", ".join(f"{value:+.1f}" for value in seen)
+    parts = ", ".join(f"{value:+.1f}" for value in local)
     return f"{what} {at} ({parts}) (right, down, forward)"
 
 
 def base_from_layers(
-    prior: tuple[np.ndarray, float, float],
-    found: LayerFit,
-    world_from_camera: np.ndarray,
-    poses: np.ndarray,
-    line: ShaftLine,
+    prior: Prior, found: LayerFit, world_from_camera: np.ndarray, poses: np.ndarray, line: ShaftLine
 ) -> BaseRegistration:
-    """What two layers show of a base before a still camera, given a prior as `find_base` takes it. poses [F, 4, 4]:
+    """Return the base that two layers of a still camera's images show, given its prior. poses [F, 4, 4]:
     base_from_instrument."""
-    base, given = world_from_camera @ found.camera_from_base, prior[0]
-    middle = poses[:, :3, 3].mean(0)
-    moved = (base[:3, :3] - given[:3, :3]) @ middle + base[:3, 3] - given[:3, 3]
-    turned = Rotation.from_matrix(base[:3, :3] @ given[:3, :3].T).magnitude()
+    base = world_from_camera @ found.camera_from_base
     shaft = (found.camera_from_base[:3, :3] @ poses[:, :3, :3] @ line.axis).mean(0)
-    units = np.array([1 / LEVER] * 3 + [1.0] * 3)
+    units = np.array([1 / LEVER_MM] * 3 + [1.0] * 3)
     after, before = found.covariance[:6, :6] / np.outer(units, units), np.square(found.given[:6] / units)
     values, vectors = np.linalg.eigh(after)
     words = [
@@ -445,8 +408,16 @@ def base_from_layers(
         for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
         if value > OPEN_SHARE**2 / (np.square(vector) @ (1 / before))
     ]
+    sds = np.sqrt(np.diag(found.covariance))
     return BaseRegistration(
-        base, found.clock, float(np.sqrt(found.covariance[6, 6])), np.sqrt(np.diag(found.covariance)[3:6]),
-        np.degrees(np.sqrt(np.diag(found.covariance)[:3])), tuple(dict.fromkeys(words)), float(np.linalg.norm(moved)),
-        float(np.degrees(turned)), np.nan, np.nan, np.nan, found.frames, explained=found.explained,
-    )  # fmt: skip
+        world_from_base=base,
+        clock_s=found.clock,
+        clock_sd_s=float(sds[6]),
+        sd_mm=sds[3:6],
+        sd_deg=np.degrees(sds[:3]),
+        open_directions=tuple(dict.fromkeys(words)),
+        frames=found.frames,
+        from_masks=False,
+        explained=found.explained,
+        **_moved_from(prior[0], base, poses[:, :3, 3].mean(0)),
+    )

@@ -16,10 +16,10 @@ from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import ReadingLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
-from neeco.ingest.registration.base import FEWEST, BaseRegistration, base_from_layers, find_base
-from neeco.ingest.registration.base_fit import CLOCK_SD
-from neeco.ingest.registration.base_layers import covered_by, evenly_lit, fit_layers, line_through_trocar
-from neeco.ingest.registration.base_shape import SHIFTS
+from neeco.ingest.registration.base import MIN_FRAMES, BaseRegistration, base_from_layers, find_base
+from neeco.ingest.registration.layers import ArmImages, covered_by, evenly_lit, fit_layers, line_through_trocar
+from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, ClockOffset
 from neeco.ingest.timing.episodes import Episode, Episodes
 
@@ -251,27 +251,32 @@ def _without_masks(arm: _Arm, observed: _Observed, usable: np.ndarray) -> tuple[
     cameras = observed.cameras
     if arm.prior is None or float(np.ptp(cameras, axis=0).max()) >= 1e-6:
         return None
-    poses = np.stack([arm.poses_at(float(shift)) for shift in SHIFTS])
+    poses = np.stack([arm.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
     known = np.flatnonzero(np.isfinite(poses).all((0, 2, 3)))
     if arm.clock.source in KNOWN:  # no other clock is tried
-        poses = np.tile(arm.poses_at(0.0), (len(SHIFTS), 1, 1, 1))
+        poses = np.tile(arm.poses_at(0.0), (len(CLOCK_SHIFTS_S), 1, 1, 1))
         known = np.flatnonzero(np.isfinite(poses[0]).all((1, 2)))
-    line = line_through_trocar(poses[len(SHIFTS) // 2, known]) if len(known) >= FEWEST else None
+    line = line_through_trocar(poses[len(CLOCK_SHIFTS_S) // 2, known]) if len(known) >= MIN_FRAMES else None
     if line is None:
         return None
     wrists = None if arm.wrists is None else arm.wrists[known]
     given, sd_mm, sd_deg = arm.prior
-    found = fit_layers(
-        observed.lit[known], observed.intrinsics, poses[:, known], line,
-        prior=(np.linalg.inv(cameras[0]) @ given, sd_mm, sd_deg),
-        sd_clock=0.0 if arm.clock.source in KNOWN else CLOCK_SD,
-        usable=usable[known], generator=np.random.default_rng(0), wrists=wrists,
-    )  # fmt: skip
+    images = ArmImages(
+        images=observed.lit[known],
+        intrinsics=observed.intrinsics,
+        poses=poses[:, known],
+        line=line,
+        usable=usable[known],
+        wrists=wrists,
+    )
+    prior = np.linalg.inv(cameras[0]) @ given, sd_mm, sd_deg
+    sd_clock = 0.0 if arm.clock.source in KNOWN else CLOCK_SD_S
+    found = fit_layers(images, prior, sd_clock, np.random.default_rng(0))
     if not found.found:
         return None
     covered = np.zeros_like(usable)
-    covered[known] = covered_by(found, usable.shape[1:], observed.intrinsics, poses[:, known], line, wrists)
-    return base_from_layers(arm.prior, found, cameras[0], poses[len(SHIFTS) // 2, known], line), covered
+    covered[known] = covered_by(found, images)
+    return base_from_layers(arm.prior, found, cameras[0], images.poses[len(CLOCK_SHIFTS_S) // 2], line), covered
 
 
 def _in_world(stated: StatedBase, cameras: np.ndarray) -> np.ndarray:
@@ -293,7 +298,7 @@ def describe(name: str, found: BaseRegistration) -> str:
         f"; standard deviations {listed(found.sd_mm)} mm and {listed(found.sd_deg)} deg (right, down, forward of the "
         "camera); "
     )
-    if found.fit is None:
+    if not found.from_masks:
         words += f"without outlines: its shaft explains {found.explained:.0%} of what changes in the images"
     else:
         words += f"its outline and what moves overlap by {found.overlap:.2f}"

@@ -10,7 +10,7 @@ from pathlib import Path
 from neeco.errors import NeecoError
 from neeco.ingest.readers import format_of
 from neeco.ingest.recording.base import same_base
-from neeco.ingest.recording.model import IngestSettings, InstrumentLogs, Recording
+from neeco.ingest.recording.model import ImageFolder, IngestSettings, InstrumentLogs, Recording, VideoFile
 
 
 def separate(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
@@ -35,6 +35,11 @@ def _of_episode(recording: Recording, episode: int) -> Recording:
         moved += 1
         return known.of_episode(stream, episode)
 
+    def source_of(source: VideoFile | ImageFolder, key: str) -> VideoFile | ImageFolder:
+        if isinstance(source, ImageFolder):
+            return source
+        return replace(source, stream=stream_of(source.file, source.stream, key))
+
     instruments = []
     for item in recording.instruments:
         poses = item.poses and replace(item.poses, stream=stream_of(item.poses.path, item.poses.stream, "poses"))
@@ -45,11 +50,10 @@ def _of_episode(recording: Recording, episode: int) -> Recording:
         roll = item.roll and replace(item.roll, stream=stream_of(item.roll.path, item.roll.stream, "roll"))
         instruments.append(replace(item, poses=poses, joints=joints, roll=roll))
     scope, partner = recording.laparoscope, recording.stereo
-    stream = stream_of(recording.video, recording.stream, "video")
     changed = replace(
-        recording, stream=stream, instruments=tuple(instruments),
+        recording, source=source_of(recording.source, "video"), instruments=tuple(instruments),
         laparoscope=scope and replace(scope, stream=stream_of(scope.path, scope.stream, "laparoscope")),
-        stereo=partner and replace(partner, stream=stream_of(partner.video, partner.stream, "stereo")),
+        stereo=partner and replace(partner, source=source_of(partner.source, "stereo")),
         episode=f"episode_{episode}",
     )  # fmt: skip
     if not moved:

@@ -21,7 +21,7 @@ from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording.model import InstrumentLogs, Recording
-from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, LONGEST, ClockOffset
+from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, MAX_LENGTH_S, ClockOffset
 from neeco.ingest.timing.compatibility import check_recordings, episode_names, file_name, refusal
 from neeco.ingest.timing.notes import Notes
 
@@ -361,7 +361,7 @@ def _read(recording: Recording, notes: Notes, episode: int) -> Episode:
     rolls = {item.name: read_reading_log(item.roll) for item in items if item.roll is not None}
     scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
     _check_bases(recording, scope, poses)
-    video = recording.open()
+    video = recording.source.open()
     logs: list[PoseLog | ReadingLog] = [*poses.values(), *([scope] if scope else [])]
     logs += [log for held in joints.values() for log in held.values()] + [*rolls.values()]
     for note in (*recording.notes, *(note for log in logs for note in log.notes), *video.notes):
@@ -452,9 +452,9 @@ def _check_bases(recording: Recording, scope: PoseLog | None, poses: Mapping[str
 def _check_video(recording: Recording, video: VideoSource) -> None:
     """Raise NeecoError for times that no recording has, and for frames too small."""
     rate, length = 1 / float(np.median(np.diff(video.times))), video.times[-1] - video.times[0]
-    if not (MIN_FPS < rate < MAX_FPS and length < LONGEST):
+    if not (MIN_FPS < rate < MAX_FPS and length < MAX_LENGTH_S):
         raise NeecoError(
-            f"{recording.times or video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
+            f"{video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
             "cannot be; correct fps or the times' unit"
         )
     if min(video.size) < MIN_SIDE_PX:

@@ -1,0 +1,302 @@
+"""Base registration to silhouettes: least squares over the base, the clock of its log, and the instrument's shape.
+
+Silhouettes that fit the motion have one shape (`silhouette_model`). The base is as uncertain as that shape can make up
+for another one (compare silhouette coherence: Hernandez, Schmitt, Cipolla, PAMI 2007).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
+from neeco.ingest.registration.silhouette_model import (
+    BASE,
+    LINE,
+    ORDERS,
+    SilhouetteFit,
+    SilhouetteProblem,
+    first_shape,
+    fourier_terms,
+    marks_off,
+    moved,
+    reach,
+    sides,
+)
+
+SHAPE_SD_MM = (10.0, 1.0, 0.7)  # of orders 0 (about the first guess), 1 and 2 at each station
+JOINT_SD_MM = 2.0  # of what a standard deviation of a reading adds to any order
+LEVEL_SD_MM = 1.0  # of the difference of neighbouring radii: shafts are tubes
+LINE_SD_MM, LINE_SD_RAD = 30.0, 0.5  # of the line about its first guess
+END_SD_MM = 4.0  # of what a standard deviation of a reading, or its square, moves the tip
+MARK_SD_MM = 1e4  # of the marks' place along the line
+CLOCK_SD_S = 0.1  # of a clock that nothing gives
+FRONT_SHARE = 0.4  # of the line, from the tip, whose sides do not count: jaws and wrist move there
+MIN_MEDIANS = 3.0  # width of a station's loss, in medians of its residuals
+WIDTHS_PX = (12.0, 6.0, 3.0, 1.5, 1.0)  # of the robust loss, one after the other; px of masks 160 wide
+MARK_SHARE = 0.125  # of that width for marks, which are exact; outlines have correlated errors in a frame
+MAX_STEPS, TOLERANCE = 12, 1e-5  # of Levenberg-Marquardt, at each width; share of the loss
+DAMPING, SMOOTH_DAMPING = 1e-2, 1e-4  # at first
+MAX_TURN_RAD, MAX_SHIFT_MM = 0.15, 15.0  # of the base in one step
+STEPS = np.array([0.012] * 3 + [0.8] * 3 + [0.02] + [0.012] * 2 + [0.8] * 2)  # of differences, by parameter
+
+
+@dataclass(frozen=True, eq=False)
+class BasePrior:
+    """Prior on world_from_base [4, 4]: standard deviations rad about it, mm at the instrument (None: nothing is known),
+    and of the clock s (0: it is known)."""
+
+    world_from_base: np.ndarray
+    sd_rad: float | None
+    sd_mm: float | None
+    sd_clock: float = CLOCK_SD_S
+
+
+@dataclass(frozen=True, eq=False)
+class _Residuals:
+    """Residuals of a fit: those of the 2 K sides, of the tip's reach, and of the marks."""
+
+    px: np.ndarray  # [F, 2K + 2]
+    valid: np.ndarray  # [F, 2K + 2] bool
+    by_mm: np.ndarray  # [F, 2K] derivatives of the sides by mm outwards
+    outwards: np.ndarray  # [F, 2K, 2] px/mm by which the sides move
+    angles: np.ndarray  # [F, 2K] rad about the line
+
+
+class _System:
+    """Residuals, derivatives and priors about a first fit. The first parameters are those of base, clock and line, then
+    follow shape, ends and mark."""
+
+    def __init__(self, problem: SilhouetteProblem, prior: BasePrior, first: SilhouetteFit) -> None:
+        self.problem, self.prior, self.first = problem, prior, first
+        counted = first.stations > FRONT_SHARE * first.stations[-1]
+        self.on_shaft = np.flatnonzero(counted[1:] & counted[:-1])[1:] + 1  # stations with a neighbour before
+        self.front = np.tile(~counted, 2)
+        self.free = np.ones(BASE + LINE + first.shape[1:].size + len(first.ends) + 1, dtype=bool)
+        self.free[BASE + LINE :][: first.shape[1:].size] = np.repeat(counted[1:], first.shape[0].size)
+        self.free[6] = prior.sd_clock > 0
+        self.free[-1] = problem.marks is not None
+
+    def pivot(self, world_from_base: np.ndarray) -> np.ndarray:
+        """Mean position [3] of the instrument in the world."""
+        return np.asarray(world_from_base[:3, :3] @ self.problem.middle + world_from_base[:3, 3])
+
+    def moved(self, fit: SilhouetteFit, step: np.ndarray) -> SilhouetteFit:
+        """The fit after a step in its parameters."""
+        return moved(fit, step, self.pivot(fit.world_from_base))
+
+    def residuals(self, fit: SilhouetteFit) -> _Residuals:
+        """Distances px of the sides from the masks' outlines, and along the line of the tip from the masks' ends and of
+        the marks from where images show them."""
+        found = sides(self.problem, fit)
+        distances, gradient = self.problem.silhouettes.look_up(found.pixels)
+        valid = self.problem.silhouettes.inside(found.pixels, margin=1.0) & (found.px_per_mm[..., 0] != 0)
+        valid &= ~self.front
+        lengths = self._lengths(fit)[0]
+        return _Residuals(
+            np.concatenate([distances, np.nan_to_num(lengths)], 1),
+            np.concatenate([valid, np.isfinite(lengths)], 1),
+            (gradient * found.px_per_mm).sum(-1),
+            found.px_per_mm,
+            found.angles,
+        )
+
+    def _lengths(self, fit: SilhouetteFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals [F, 2] px along the line of tip and marks, NaN where images show neither; derivatives of the
+        first by `ends` [F, E], of the second by `mark` [F]."""
+        ahead, along, by_ends = reach(self.problem, fit)
+        off, by_mark = marks_off(self.problem, fit, along)
+        return np.stack([ahead - self.problem.silhouettes.extent(along), off], 1), by_ends, by_mark
+
+    def jacobian(self, fit: SilhouetteFit, at: _Residuals, smooth: bool) -> np.ndarray:
+        """Derivatives [F, 2K + 2, P] of the residuals `at` a fit.
+
+        smooth: as if masks had the model's outlines and no pixels, whose steps would seem to fix the place along a
+        shaft.
+        """
+        columns = np.zeros((*at.px.shape, len(self.free)))
+        size = np.linalg.norm(at.outwards, axis=-1)
+        normals = at.outwards / np.maximum(size, 1e-9)[..., None]
+
+        def measured(step: np.ndarray) -> np.ndarray:
+            other = self.moved(fit, step)
+            if not smooth:
+                return self.residuals(other).px
+            off = -(sides(self.problem, other).pixels * normals).sum(-1)
+            return np.concatenate([off, np.nan_to_num(self._lengths(other)[0])], 1)
+
+        for index in np.flatnonzero(self.free[: len(STEPS)]):
+            step = np.eye(len(STEPS))[index] * STEPS[index]
+            columns[..., index] = (measured(step) - measured(-step)) / (2 * STEPS[index])
+        by_shape = (-size if smooth else at.by_mm)[..., None] * fourier_terms(at.angles)  # [F, 2K, N_TERMS]
+        factors = np.concatenate([np.ones((len(columns), 1)), self.problem.readings], 1)  # [F, 1 + J]
+        terms = (factors[:, None, :, None] * by_shape[:, :, None]).reshape(*by_shape.shape[:2], -1)
+        for side in range(terms.shape[1]):
+            if station := side % len(fit.stations):  # the tip has no radius
+                start = BASE + LINE + (station - 1) * terms.shape[-1]
+                columns[:, side, start : start + terms.shape[-1]] = terms[:, side]
+        _, columns[:, -2, -len(fit.ends) - 1 : -1], columns[:, -1, -1] = self._lengths(fit)
+        return columns
+
+    def prior_residuals(self, fit: SilhouetteFit) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals [Q] of all priors, in standard deviations, and their derivatives [Q, P]."""
+        count, start = len(self.free), BASE + LINE
+        indices, offsets, sds = [], [], []
+
+        def add(index: np.ndarray, off: np.ndarray, sd: np.ndarray | float) -> None:
+            indices.append(index)
+            offsets.append(off.ravel())
+            sds.append(np.broadcast_to(sd, off.shape).ravel())
+
+        add(np.arange(BASE, start), np.zeros(LINE), np.array([LINE_SD_RAD] * 2 + [LINE_SD_MM] * 2))  # of a step
+        prior, given = self.prior, self.prior.world_from_base
+        if prior.sd_rad is not None and prior.sd_mm is not None:
+            add(np.arange(3), _turn_between(fit.world_from_base, given), prior.sd_rad)
+            add(np.arange(3, 6), self.pivot(fit.world_from_base) - self.pivot(given), prior.sd_mm)
+        if prior.sd_clock > 0:
+            add(np.array([6]), np.array([fit.clock]), prior.sd_clock)
+        off = fit.shape.copy()
+        off[:, 0, 0] -= self.first.shape[:, 0, 0]
+        shape_sd = np.full(off.shape[1:], JOINT_SD_MM)
+        shape_sd[0] = [SHAPE_SD_MM[0]] + [SHAPE_SD_MM[order] for order in range(1, ORDERS + 1) for _ in range(2)]
+        add(start + np.arange(off[1:].size), off[1:], shape_sd)
+        end_sd = np.where(np.arange(len(fit.ends)), END_SD_MM, LINE_SD_MM)
+        add(np.arange(count - 1 - len(fit.ends), count - 1), fit.ends, end_sd)
+        add(np.array([count - 1]), np.zeros(1), MARK_SD_MM)
+        index, values, sd = (np.concatenate(part) for part in (indices, offsets, sds))
+        rows = np.zeros((len(index) + len(self.on_shaft), count))
+        rows[np.arange(len(index)), index] = 1 / sd
+        radii = start + fit.shape[0].size * (self.on_shaft - 1)  # parameters
+        rows[np.arange(len(index), len(rows)), radii] = 1 / LEVEL_SD_MM
+        rows[np.arange(len(index), len(rows)), radii - fit.shape[0].size] = -1 / LEVEL_SD_MM
+        steps = fit.shape[self.on_shaft, 0, 0] - fit.shape[self.on_shaft - 1, 0, 0]
+        return np.concatenate([values / sd, steps / LEVEL_SD_MM]), rows
+
+    def prior_loss(self, fit: SilhouetteFit) -> float:
+        """Sum of squares of the priors' residuals."""
+        return float(np.square(self.prior_residuals(fit)[0]).sum())
+
+
+def _turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Rotation vector [3] rad by which a transform [4, 4] is turned against another."""
+    return np.asarray(Rotation.from_matrix(first[:3, :3] @ second[:3, :3].T).as_rotvec())
+
+
+def fit_silhouettes(
+    problem: SilhouetteProblem, prior: BasePrior, start: SilhouetteFit, widths: tuple[float, ...] = WIDTHS_PX
+) -> SilhouetteFit:
+    """The nearest fit to the silhouettes, from a first one, under a Cauchy loss that narrows."""
+    fit = start
+    for width in widths:
+        fit = first_shape(problem, fit)  # more or less of it is in view than before
+        fit = _minimise(_System(problem, prior, fit), fit, width * problem.px_scale)
+    return fit
+
+
+def refine(problem: SilhouetteProblem, prior: BasePrior, fit: SilhouetteFit, max_steps: int = 40) -> SilhouetteFit:
+    """The fit with the narrowest loss."""
+    # with marks, the place along the line is known: the solver has to follow what outlines leave open
+    smooth = problem.marks is not None
+    return _minimise(_System(problem, prior, fit), fit, WIDTHS_PX[-1] * problem.px_scale, max_steps, smooth)
+
+
+def _widths(at: _Residuals, width: float) -> np.ndarray:
+    """Widths [2K + 2] px of the loss, larger at stations where silhouettes fit badly in most frames (jaws)."""
+    stations = at.px.shape[1] // 2 - 1
+    both, valid = (np.concatenate([part[:, :stations], part[:, stations:-2]]) for part in (np.abs(at.px), at.valid))
+    typical = [np.median(column[use]) if use.any() else 0.0 for column, use in zip(both.T, valid.T, strict=True)]
+    widths = [*np.tile(np.maximum(width, MIN_MEDIANS * np.array(typical)), 2)]
+    for column, narrow in ((-2, width), (-1, MARK_SHARE * width)):
+        last = at.px[at.valid[:, column], column]
+        spread = float(np.median(np.abs(last - np.median(last)))) if len(last) else 0.0
+        widths.append(max(narrow, MIN_MEDIANS * spread))
+    return np.array(widths)
+
+
+def _robust_weights(at: _Residuals, widths: np.ndarray) -> np.ndarray:
+    """Weights [F, 2K + 2] of the Cauchy loss, 1/px^2."""
+    return np.where(at.valid, 1 / (1 + (at.px / widths) ** 2), 0.0) / widths**2
+
+
+def _loss(px: np.ndarray, valid: np.ndarray, widths: np.ndarray) -> float:
+    """Sum of the Cauchy loss over valid residuals, in units of squared widths."""
+    return float(np.where(valid, np.log1p((px / widths) ** 2), 0.0).sum())
+
+
+def _minimise(
+    system: _System, fit: SilhouetteFit, width: float, max_steps: int = MAX_STEPS, smooth: bool = False
+) -> SilhouetteFit:
+    free = system.free
+
+    def linearise(fit: SilhouetteFit) -> Linearisation[SilhouetteFit]:
+        at = system.residuals(fit)
+        columns = system.jacobian(fit, at, smooth)[..., free]
+        widths = _widths(at, width)
+        weights = _robust_weights(at, widths)
+        off, rows = system.prior_residuals(fit)
+        rows = rows[:, free]
+
+        def cost(other: SilhouetteFit, px: np.ndarray | None = None) -> float:
+            px = system.residuals(other).px if px is None else px
+            return _loss(px, at.valid, widths) + system.prior_loss(other)
+
+        gradient = rows.T @ off + np.einsum("fkp,fk,fk->p", columns, weights, at.px)
+        return Linearisation(rows.T @ rows + _information(columns, weights), gradient, cost(fit, at.px), cost)
+
+    def move(fit: SilhouetteFit, free_step: np.ndarray) -> SilhouetteFit:
+        step = np.zeros(len(free))
+        step[free] = free_step
+        step[:3] = np.clip(step[:3], -MAX_TURN_RAD, MAX_TURN_RAD)
+        step[3:6] = np.clip(step[3:6], -MAX_SHIFT_MM, MAX_SHIFT_MM)
+        return system.moved(fit, step)
+
+    damping = SMOOTH_DAMPING if smooth else DAMPING
+    fit = levenberg_marquardt(fit, linearise, move, max_steps=max_steps, damping=damping, tolerance=TOLERANCE)
+    at = system.residuals(fit)
+    median = float(np.median(np.abs(at.px[at.valid]))) if at.valid.any() else np.inf
+    count = max(int(at.valid.sum()), 1)
+    cost = _loss(at.px, at.valid, width * np.append(np.ones(at.px.shape[1] - 1), MARK_SHARE)) / count
+    # where residuals fit they are far smaller than the loss's width, so priors count by the square of that ratio
+    noise = median / 0.67 / width if at.valid.any() else 1.0
+    return replace(fit, cost=cost, loss=cost + noise**2 * system.prior_loss(fit) / count, residual_px=median)
+
+
+@dataclass(frozen=True, eq=False)
+class FitInformation:
+    """Information [BASE, BASE] of silhouettes on base and clock with line and shape marginalised, scatter of its
+    gradient over the recording's blocks [BASE, BASE], and the variance of one residual in widths of the loss. rad and
+    mm about the instrument, s."""
+
+    information: np.ndarray
+    scatter: np.ndarray
+    noise: float
+
+
+def fit_information(problem: SilhouetteProblem, prior: BasePrior, fit: SilhouetteFit) -> FitInformation:
+    """Information at a fit: errors are correlated within a block of the recording, and independent between blocks."""
+    system = _System(problem, prior, fit)
+    at = system.residuals(fit)
+    columns = system.jacobian(fit, at, smooth=True)
+    weights = _robust_weights(at, _widths(at, WIDTHS_PX[-1] * problem.px_scale))
+    scores = np.einsum("fkp,fk,fk->fp", columns, weights, at.px)
+    rows = system.prior_residuals(fit)[1]
+    on_base = rows[:, :BASE].any(1)
+    total = _information(columns, weights) + rows[~on_base].T @ rows[~on_base]
+    base, free = np.flatnonzero(system.free[:BASE]), np.flatnonzero(system.free)
+    rest = free[free >= BASE]
+    taken = np.linalg.solve(total[np.ix_(rest, rest)], total[np.ix_(rest, base)])  # by line and shape
+    information, left = np.zeros((BASE, BASE)), np.zeros((len(scores), BASE))
+    information[np.ix_(base, base)] = total[np.ix_(base, base)] - total[np.ix_(base, rest)] @ taken
+    left[:, base] = scores[:, base] - scores[:, rest] @ taken
+    blocks = np.stack([left[problem.blocks == block].sum(0) for block in np.unique(problem.blocks)])
+    blocks = blocks - blocks.mean(0)
+    noise = float((weights * at.px**2).sum() / max(int(at.valid.sum()), 1))
+    return FitInformation(information, blocks.T @ blocks * len(blocks) / max(len(blocks) - 1, 1), noise)
+
+
+def _information(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """[P, P] from derivatives [F, N, P] and weights [F, N]."""
+    flat = (columns * np.sqrt(weights)[..., None]).reshape(-1, columns.shape[-1])
+    return np.asarray(flat.T @ flat)

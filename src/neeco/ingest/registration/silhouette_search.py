@@ -1,0 +1,168 @@
+"""Rough base registration: of many rotations, those under which one line that ends in one tip, fixed to the instrument,
+projects onto the shafts in the masks.
+
+Given the rotation of world_from_base, the rest follows in closed form. The shaft's direction in the instrument's frame
+lies in every plane through a camera and its image's line (the smallest eigenvector). The base's position and the tip
+are linear in the places of lines and tips.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neeco.geometry.lines import unit
+from neeco.ingest.foreground.silhouettes import ShaftLines
+
+LINE_SD_RAD = 0.03  # of a shaft's direction in a mask: jaws open, masks fray
+TIP_SD_PX, LINE_SD_PX = 5.0, 2.0  # of masks: the tip's place moves with the jaws
+TIP_SD_MM = 60.0  # prior distance of the tip from the tracked frame's origin
+SIDEWAYS_WEIGHT = 5e-4  # of a line's weight: where motion leaves it open, shafts are viewed from the side
+N_ROUNDS = 3  # of robust reweighting
+CHUNK = 500  # rotations tried at once
+MIN_STEP_RAD = 0.004  # to which rotations are narrowed down
+N_FIRST, N_NEXT, N_AROUND, N_BEST = 40, 20, 12, 6  # candidates kept at first and then, rotations about each, results
+DISTINCT_RAD = 0.05  # between results
+PRIOR_WEIGHT = 0.02  # of the mean residual: cost of a base one standard deviation off
+FAR_COST = 1e9  # of a base behind the cameras
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShaftViews:
+    """Shafts [F] in masks, the poses they are of, and where the base may be: `center` [3] mm is the prior mean of the
+    instrument's mean position in the world, sd_mm its standard deviation; distance mm: approximate depth of the
+    instrument."""
+
+    lines: ShaftLines
+    intrinsics: tuple[float, float, float, float]
+    camera_from_world: np.ndarray  # [F, 4, 4]
+    base_from_instrument: np.ndarray  # [F, 4, 4]
+    center: np.ndarray
+    sd_mm: float
+    distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Solutions [B], best first."""
+
+    costs: np.ndarray  # [B] mean robust residual in [0, 1]
+    world_from_base: np.ndarray  # [B, 4, 4]
+    tips: np.ndarray  # [B, 3] mm, instrument frame
+    axes: np.ndarray  # [B, 3] unit, instrument frame, towards the tip
+
+    def distinct(self, count: int, apart_rad: float) -> Candidates:
+        """The first `count` of which none is turned less than apart_rad from a better one."""
+        rows: list[int] = []
+        flat = self.world_from_base[:, :3, :3].reshape(len(self.costs), 9)
+        limit = 2 * np.sqrt(2) * np.sin(apart_rad / 2)  # the distance of rotation matrices so far apart
+        for row in range(len(flat)):
+            if all(np.linalg.norm(flat[row] - flat[other]) >= limit for other in rows):
+                rows.append(row)
+                if len(rows) == count:
+                    break
+        return Candidates(*(values[rows] for values in vars(self).values()))
+
+
+def uniform_rotations(count: int, generator: np.random.Generator) -> np.ndarray:
+    """Rotations [count, 3, 3], uniform over SO(3)."""
+    return Rotation.random(count, random_state=generator).as_matrix()
+
+
+def rotations_about(center: np.ndarray, sd_rad: float, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Rotations [count, 3, 3] turned from `center` [3, 3] by normal rotation vectors; the first is itself."""
+    vectors = generator.normal(0, sd_rad, (count, 3))
+    vectors[0] = 0
+    return Rotation.from_rotvec(vectors).as_matrix() @ center
+
+
+def search(views: ShaftViews, rotations: np.ndarray, generator: np.random.Generator, first_step: float) -> Candidates:
+    """The best bases, different from each other, after narrowing down around the best rotations [B, 3, 3]; first_step
+    rad: between these."""
+    best = _solve_all(views, rotations).distinct(N_FIRST, first_step)
+    step = first_step
+    while step > MIN_STEP_RAD:
+        around = [rotations_about(base[:3, :3], step, N_AROUND, generator) for base in best.world_from_base]
+        step /= 2
+        best = _solve_all(views, np.concatenate(around)).distinct(N_NEXT, step)
+    return best.distinct(N_BEST, DISTINCT_RAD)
+
+
+def _solve_all(views: ShaftViews, rotations: np.ndarray) -> Candidates:
+    """The best base and instrument for each rotation, the cheapest first."""
+    parts = [_solve(views, rotations[first : first + CHUNK]) for first in range(0, len(rotations), CHUNK)]
+    found = [np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)]
+    order = np.argsort(found[0], kind="stable")
+    return Candidates(*(values[order] for values in found))
+
+
+def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
+    fx, fy, cx, cy = views.intrinsics
+    lines, distance, cameras = views.lines, views.distance, np.linalg.inv(views.camera_from_world)
+    places = cameras[:, :3, 3]
+    turned = np.einsum("bij,fjk->bfik", rotations, views.base_from_instrument[:, :3, :3])  # world_from_instrument
+    middle = views.base_from_instrument[:, :3, 3].mean(0)
+    moved = np.einsum("bij,fj->bfi", rotations, views.base_from_instrument[:, :3, 3] - middle)
+
+    def rays(pixels: np.ndarray) -> np.ndarray:
+        slopes = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], -1)
+        return np.einsum("fij,fj->fi", cameras[:, :3, :3], slopes)
+
+    has_line, has_tip = np.isfinite(lines.points[:, 0]), np.isfinite(lines.tips[:, 0])
+    on_line = np.where(has_line[:, None], lines.points, (cx, cy))
+    ahead = np.where(has_line[:, None], lines.directions, (1.0, 0.0))
+    normals = unit(np.cross(rays(on_line), rays(on_line + 10 * ahead)))  # [F, 3] of planes through line and camera
+    tip_rays = rays(np.where(has_tip[:, None], lines.tips, (cx, cy)))
+    across = unit(np.cross(tip_rays, cameras[:, :3, 0]))
+    # equations [F, 3, 3] that are 0 where the tip projects onto its place, and onto its line
+    rows = np.stack([across, unit(np.cross(tip_rays, across)), normals], 1)
+    scale = (fx + fy) / 2 / distance / np.array([TIP_SD_PX, TIP_SD_PX, LINE_SD_PX])
+    given = np.stack([has_tip, has_tip, has_line], -1)
+
+    count = len(rotations)
+    along = np.einsum("fi,bfij->bfj", normals, turned)  # [B, F, 3]
+    towards = np.einsum("fi,bfij->bfj", unit(rays(on_line)), turned)
+    sideways = SIDEWAYS_WEIGHT * np.einsum("bfi,bfj->bij", towards, towards)
+    weight = np.broadcast_to(has_line, (count, len(has_line))).astype(float)
+    weights = np.broadcast_to(given, (count, *given.shape)).astype(float)
+    on_tip = np.einsum("fri,bfij->bfrj", rows, turned)
+    # [B, F, 3, 6]: derivatives by the shift of the middle, and the tip
+    linear = np.concatenate([np.broadcast_to(rows, on_tip.shape), on_tip], -1) * scale[:, None]
+    wanted = np.einsum("fri,bfi->bfr", rows, places - moved) * scale
+    prior = np.diag([views.sd_mm**-2.0] * 3 + [TIP_SD_MM**-2.0] * 3)
+    target = np.append(prior[:3, :3] @ views.center, np.zeros(3))
+    for _ in range(N_ROUNDS):
+        moments = np.einsum("bf,bfi,bfj->bij", weight, along, along) + sideways
+        axes = np.linalg.eigh(moments)[1][:, :, 0]
+        line_off = np.einsum("bfj,bj->bf", along, axes) / LINE_SD_RAD
+        weight = has_line / (1 + line_off**2)
+        matrix = np.einsum("bfr,bfri,bfrj->bij", weights, linear, linear) + prior
+        right = np.einsum("bfr,bfri,bfr->bi", weights, linear, wanted) + target
+        solution = np.linalg.solve(matrix, right[..., None])[..., 0]
+        off = np.einsum("bfri,bi->bfr", linear, solution) - wanted
+        shift, tip = solution[:, :3], solution[:, 3:]
+        at = np.einsum("bfij,bj->bfi", turned, tip) + moved + shift[:, None]  # the tip in the world
+        depth = np.einsum("bfi,fi->bf", at - places, cameras[:, :3, 2])
+        off = off * (distance / np.maximum(depth, 0.1 * distance))[..., None]  # as pixels
+        weights = given / (1 + off**2)
+    costs = _mean(line_off**2 / (1 + line_off**2), has_line) + _mean(off**2 / (1 + off**2), given)
+    costs = costs + PRIOR_WEIGHT * np.square((shift - views.center) / views.sd_mm).sum(-1)
+    costs = np.where((depth > 0).mean(1) > 0.9, costs, FAR_COST)
+    # of the axis' two directions, the one that leads to the tip in most images
+    behind = at - 0.1 * distance * np.einsum("bfij,bj->bfi", turned, axes)
+    ends = [np.einsum("fij,bfj->bfi", cameras[:, :3, :3].transpose(0, 2, 1), end - places) for end in (at, behind)]
+    pixels = [end[..., :2] / np.maximum(end[..., 2:], 1e-3) for end in ends]
+    agreement = np.sign(np.einsum("bfi,fi->bf", pixels[0] - pixels[1], ahead) * has_line).sum(1)
+    axes = axes * np.where(agreement >= 0, 1.0, -1.0)[:, None]
+    bases = np.tile(np.eye(4), (count, 1, 1))
+    bases[:, :3, :3] = rotations
+    bases[:, :3, 3] = shift - rotations @ middle
+    return Candidates(costs, bases, tip, axes)
+
+
+def _mean(values: np.ndarray, given: np.ndarray) -> np.ndarray:
+    """Means [B] over all that is given."""
+    values = (values * given).reshape(len(values), -1)
+    return np.asarray(values.sum(1) / max(int(given.sum()), 1))
