@@ -111,7 +111,7 @@ def test_a_scope_that_does_not_turn_cannot_be_calibrated() -> None:
 def test_a_log_of_another_recording_is_refused() -> None:
     times, log = recorded(offset=0.0)
     other = replace(log, quats=np.roll(log.quats[::-1], 101, axis=0))
-    with pytest.raises(NeecoError, match="its clock cannot be told"):
+    with pytest.raises(NeecoError, match="its clock cannot be determined"):
         register_with_laparoscope(in_sfm(scope_path(times)), times, other, None)
 
 
@@ -173,5 +173,5 @@ def test_rates_are_found_in_long_recordings_too() -> None:
 def test_motion_of_something_else_tells_no_clock() -> None:
     times = np.arange(0, 11, 0.04)
     other = np.random.default_rng(5).gamma(2.0, 1.0, len(times) - 1)
-    with pytest.raises(NeecoError, match=r"tool\.csv: its clock cannot be told"):
+    with pytest.raises(NeecoError, match=r"tool\.csv: its clock cannot be determined"):
         clock_from_instrument(other, times, instrument_log(0.0))
