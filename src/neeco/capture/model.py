@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,14 +23,14 @@ from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
-from neeco.geometry.rotations import as_pose, rigid_fault
+from neeco.geometry.rotations import as_pose, number_text, position_text, rigid_fault
 from neeco.plausible import Fault, joint_fault
 
 SCHEMA = "neeco-capture/1"  # of the folder that holds a capture
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
 UNKNOWN_DEG = 180.0  # the standard deviation of an angle of which nothing is known
 REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
-STILL = 1e-9  # a coordinate that varies less than this in the recording tells nothing apart
+MIN_DEVIATION = 1e-9  # coordinates that vary less in the recording do not count as changing
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,10 @@ class InstrumentState:
             if not isinstance(value, Tensor) and not _is_finite(value):
                 raise NeecoError(f"InstrumentState.joints: {joint!r} is {value!r}, not a finite number; correct it")
 
+    def __repr__(self) -> str:
+        joints = "".join(f", {name}={number_text(value)}" for name, value in self.joints.items())
+        return f"InstrumentState(at {position_text(self.pose)}{joints})"
+
 
 @dataclass(frozen=True)
 class State:
@@ -93,6 +97,11 @@ class State:
         object.__setattr__(self, "instruments", given)
         if not isinstance(self.time, Tensor) and not _is_finite(self.time):
             raise NeecoError(f"State.time: is {self.time!r}, not a finite number of seconds; correct it")
+
+    def __repr__(self) -> str:
+        instruments = "".join(f"{name}: {state!r}, " for name, state in self.instruments.items())
+        tissue = "" if self.tissue is None else f", tissue={self.tissue!r}"
+        return f"State({instruments}time={number_text(self.time)} s{tissue})"
 
     def check(self, instruments: Sequence[Instrument], *, fitted: bool = False) -> None:
         """Raise NeecoError for what none of a scene's instruments can be: poses that are not rigid, instruments and
@@ -151,6 +160,9 @@ class Instrument:
     from_video: FromVideo | None = None
     left_out: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"Instrument({self.name!r}, joints: {', '.join(self.joints) or 'none'})"
+
     def joint_fault(self, joint: str, value: float, slack: float = 0.0) -> Fault | None:
         """What is wrong with a value, rad or mm, of a joint, and what to do; None: it may be right. slack: see
         `neeco.plausible.joint_fault`."""
@@ -186,6 +198,9 @@ class Frame:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image_path", Path(self.image_path))
+
+    def __repr__(self) -> str:
+        return f"Frame({self.name!r}, split={self.split!r}, {self.camera.width}x{self.camera.height} px)"
 
     @property
     def name(self) -> str:
@@ -223,6 +238,7 @@ class Capture:
     frames: tuple[Frame, ...]
     instruments: tuple[Instrument, ...] = ()
     points: PointCloud = field(default_factory=lambda: PointCloud(measured=False))
+    _: KW_ONLY
     registered: bool = True  # instrument poses are in the cameras' world frame
     timed: bool = True  # the recording says when each frame was taken; else `State.time` counts the frames
     lens: Lens | None = None  # through which it was recorded; its distortion is gone from the images
@@ -232,6 +248,11 @@ class Capture:
     def __post_init__(self) -> None:
         for name, kind in {"root": Path, "frames": tuple, "instruments": tuple, "tissues": tuple}.items():
             object.__setattr__(self, name, kind(getattr(self, name)))
+
+    def __repr__(self) -> str:
+        splits = ", ".join(f"{len(self.split(name))} {name}" for name in self.splits)
+        names = ", ".join(item.name for item in self.instruments) or "no instruments"
+        return f"Capture({str(self.root)!r}, {len(self.frames)} frames ({splits}), {names})"
 
     def split(self, name: str) -> tuple[Frame, ...]:
         """The frames of one split, in recorded order."""
@@ -287,7 +308,7 @@ class RecordedStates:
         self.instruments, self.joints = tuple(instruments), joints
         points = np.array([self._coordinates(state) for state in states], np.float64)
         deviation = points.std(0) if len(points) else np.zeros(0)
-        self._moving = deviation > STILL
+        self._moving = deviation > MIN_DEVIATION
         self._deviation = deviation[self._moving]
         self._points = points[:, self._moving] / self._deviation if len(points) else points
 

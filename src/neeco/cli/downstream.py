@@ -14,7 +14,7 @@ from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
     from neeco.studies.downstream.job import DownstreamSettings
-    from neeco.studies.downstream.samples import DataSet
+    from neeco.studies.downstream.samples import ImageSet
 
 
 @dataclass(frozen=True)
@@ -105,15 +105,15 @@ def _settings(args: Downstream) -> DownstreamSettings:
     return DownstreamSettings(**given)
 
 
-def _data_set(word: str) -> DataSet:
+def _data_set(word: str) -> ImageSet:
     """`NAME=DATASET` or `NAME=DATASET:COUNT`; a folder whose name ends so is the folder."""
     from neeco.errors import NeecoError
-    from neeco.studies.downstream.samples import DataSet
+    from neeco.studies.downstream.samples import ImageSet
 
     name, place = name_and_value("--sets", word, "kinematic=dataset")
     folder, colon, count = place.rpartition(":")
     if not colon or not count.isdecimal() or Path(place).exists():
-        return DataSet(name, Path(place))
+        return ImageSet(name, Path(place))
     if int(count) < 1:
         raise NeecoError(f"--sets {word}: {count} images is nothing to learn from; give at least 1")
-    return DataSet(name, Path(folder), int(count))
+    return ImageSet(name, Path(folder), int(count))

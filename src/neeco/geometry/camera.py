@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from neeco.errors import NeecoError
-from neeco.geometry.rotations import as_pose
+from neeco.geometry.rotations import as_pose, number_text, position_text
 from neeco.plausible import camera_fault
 
 COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # how many distortion coefficients OpenCV's models have
@@ -66,7 +66,7 @@ class Camera:
         pose = as_pose(self.world_from_camera, "Camera.world_from_camera", torch.float32)
         object.__setattr__(self, "world_from_camera", pose)
         try:
-            fault = camera_fault(self.fx, self.fy, self.cx, self.cy, self.width, self.height, self.near)
+            fault = camera_fault(self.fx, self.fy, self.cx, self.cy, self.width, self.height, near=self.near)
             shown = all(math.isfinite(number) for number in (*self.distortion, *(self.border or ())))
         except (TypeError, ValueError, OverflowError):
             raise NeecoError("Camera: expected numbers of px; correct them") from None
@@ -78,6 +78,11 @@ class Camera:
             )
         if not shown or (self.border is not None and self.border[2] <= 0):
             raise NeecoError("Camera: distortion, border: must be finite, the radius positive; correct them")
+
+    def __repr__(self) -> str:
+        lens = ", distorted" if self.distortion else ""
+        size = f"{self.width}x{self.height} px, fx={number_text(self.fx)}, fy={number_text(self.fy)}"
+        return f"Camera({size}, at {position_text(self.world_from_camera)}{lens})"
         object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))
 

@@ -172,3 +172,13 @@ def as_pose(value: Any, field: str, dtype: torch.dtype) -> Tensor:
     if (fault := rigid_fault(matrix)) is not None:
         raise NeecoError(f"{field}: {fault[0]}; {fault[1]}")
     return torch.from_numpy(matrix).to(dtype)
+
+
+def position_text(pose: Tensor) -> str:
+    """The position of a pose [4, 4] in mm, for a one-line description."""
+    return f"({', '.join(number_text(value) for value in pose[:3, 3])}) mm"
+
+
+def number_text(value: float | Tensor) -> str:
+    """A number to four digits; "?" for a tensor without values."""
+    return "?" if isinstance(value, Tensor) and value.is_meta else f"{float(value):.4g}"

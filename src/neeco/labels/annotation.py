@@ -275,6 +275,9 @@ class RGBDImage:
     image: Tensor  # float32 [H, W, 3] in [0, 1], sRGB
     depth: Tensor  # float32 [H, W] mm along the optical axis, 0 = nothing opaque
 
+    def __repr__(self) -> str:
+        return f"RGBDImage({self.image.shape[1]}x{self.image.shape[0]} px)"
+
 
 @dataclass(frozen=True)
 class LabelledImage(RGBDImage):
@@ -292,6 +295,10 @@ class LabelledImage(RGBDImage):
     poses: Tensor  # float32 [I, 4, 4] camera_from_instrument, mm, OpenCV axes (x right, y down, z forward)
     part_names: tuple[tuple[str, str], ...]  # (instrument, part) of part id 1, 2, ...
     keypoint_names: tuple[str, ...]  # of the K keypoints
+
+    def __repr__(self) -> str:
+        names = ", ".join(self.instruments) or "no instruments"
+        return f"LabelledImage({self.image.shape[1]}x{self.image.shape[0]} px, {names})"
 
     @classmethod
     def of(

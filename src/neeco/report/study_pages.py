@@ -41,7 +41,7 @@ from neeco.studies.comparison import (
     tables_of,
 )
 from neeco.studies.machine import hardware_words, machine_words
-from neeco.studies.tables import UNKNOWN, Table, csv_text
+from neeco.studies.tables import UNKNOWN, ResultTable, csv_text
 from neeco.training.run import open_run
 
 BINS = 6  # groups of held-out frames by distance
@@ -84,7 +84,7 @@ class Section:
     level: int = 2  # of the heading
     anchor: str = ""
     text: str = ""
-    results: Table | None = None
+    results: ResultTable | None = None
     head: Sequence[str] = ()
     rows: Sequence[Sequence[Any]] = ()
     images: Sequence[Images] = ()

@@ -40,8 +40,8 @@ from neeco.studies.tables import (
     UNKNOWN,
     Cell,
     Column,
+    ResultTable,
     Row,
-    Table,
     csv_text,
     latex_table,
     markdown_table,
@@ -445,7 +445,7 @@ def formatted(measure: str, value: float | None, *, signed: bool = False) -> str
     return f"{value:{'+' if signed else ''}.{digits}f}"
 
 
-def grid(table: AblationTable) -> Table:
+def grid(table: AblationTable) -> ResultTable:
     """A table for reading: per judged measure the paper's number, ours and whether they agree; the rest as ours alone.
 
     What is compared has a column of its own where it is not the same in all rows.
@@ -460,7 +460,7 @@ def grid(table: AblationTable) -> Table:
         cells = [text for measure in table.measures for text in _cells(row, measure, measure in table.judged)]
         keys = (row.comparison, row.label) if several else (row.label,)
         rows.append(Row(keys, tuple(map(Cell, cells)), reference=row.reference))
-    return Table(table.title, ("", "setting") if several else ("setting",), tuple(columns), tuple(rows))
+    return ResultTable(table.title, ("", "setting") if several else ("setting",), tuple(columns), tuple(rows))
 
 
 def _cells(row: AblationRow, measure: str, judged: bool) -> list[str]:

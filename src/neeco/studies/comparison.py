@@ -25,8 +25,8 @@ from neeco.studies.masks import check_masks, score_folder, score_runs, splits_wi
 from neeco.studies.study import JobEvent, Result, check_output, check_workers, run_and_record, spread
 from neeco.studies.tables import (
     Column,
+    ResultTable,
     SummaryRow,
-    Table,
     csv_text,
     latex_document,
     markdown_document,
@@ -381,7 +381,7 @@ def summarise(
     return rows
 
 
-def tables_of(comparison: ComparisonResult) -> list[Table]:
+def tables_of(comparison: ComparisonResult) -> list[ResultTable]:
     """One table per split, then the methods' own. Columns that nobody has a number for are left out."""
     finished = {job["name"] for job in comparison.jobs if "error" not in job}
     reasons: dict[str, str] = {}  # of methods of which no seed finished
@@ -389,7 +389,7 @@ def tables_of(comparison: ComparisonResult) -> list[Table]:
         if "error" in job and job["name"] not in finished:
             reasons.setdefault(job["name"], job["error"])
 
-    def table(title: str, columns: Sequence[Column], rows: Sequence[Mapping[str, Any]]) -> Table:
+    def table(title: str, columns: Sequence[Column], rows: Sequence[Mapping[str, Any]]) -> ResultTable:
         entries = [SummaryRow((row["name"],), row, reasons.get(row["name"])) for row in rows]
         return summary_table(title, ("method",), columns, entries)
 

@@ -57,7 +57,6 @@ if TYPE_CHECKING:
     from neeco.training.run import GaussianRun
 
 SCHEMA = "neeco-dataset/1"
-SAME_IMAGES = ("0.1.0",)  # versions that draw the same images and labels as this one, so that their sets are continued
 INFO = "dataset.json"
 SCENE_FILE = "scene.safetensors"
 
@@ -78,6 +77,7 @@ class Synthesized:
     made_now: int
     refused: dict[str, int]  # reason -> states refused
     skipped: list[int]  # indices whose prescribed state was refused every time
+    still: bool  # the scene was recorded from one place
 
 
 def synthesize(
@@ -150,7 +150,14 @@ def synthesize(
         if not images:
             remedies = "; ".join(REMEDIES[reason] for reason in refused if reason in REMEDIES)
             raise NeecoError(f"{settings.states}: every state was refused ({format_counts(refused)}); {remedies}")
-    return Synthesized(output, len(images), made, refused, skipped(records.values()))
+    return Synthesized(
+        output=output,
+        images=len(images),
+        made_now=made,
+        refused=refused,
+        skipped=skipped(records.values()),
+        still=scene.recorded.still,
+    )
 
 
 def _draw_all(
@@ -195,8 +202,6 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
     if not isinstance(begun.get("settings"), dict):
         raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
     settings = begun["settings"]
-    if begun.get("version") in SAME_IMAGES:
-        begun["version"] = description["version"]
     compared = [(key, begun.get(key), description[key]) for key in ("schema", "version", "scene_sha256")]
     # a version that wrote neither of these folders named neither: all its images are drawn anew
     compared += [(key, begun[key], description[key]) for key in ("soft", "ignore") if begun.get(key) is not None]

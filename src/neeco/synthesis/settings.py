@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import entry_points
 from typing import Any, Literal, get_args
 
 from neeco.errors import NeecoError
+from neeco.settings import structure
 
 LabelWay = Literal["composited", "threshold"]
 Views = Literal["recorded", "perturbed", "orbit"]
@@ -151,6 +153,15 @@ class Settings(ImageSettings):
     """YAML file of blur, noise, smoke and the like, and the ranges they are drawn from (docs/synthesis.md)."""
     max_attempts: int = 50
     """How often to draw a state anew when it is refused."""
+
+    @classmethod
+    def from_values(cls, owner: str, **values: Any) -> Settings:
+        """The settings with `values`, by the fields' names; `owner` has them, in messages. Raises NeecoError naming the
+        one that is unknown or does not fit."""
+        given = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in values.items()}
+        settings = structure(cls, given, owner=owner)
+        settings.check()
+        return settings
 
     def check(self) -> None:
         """Raises NeecoError naming the option that makes no sense."""

@@ -29,11 +29,12 @@ Teach a segmenter on images that are drawn while it learns, nothing written:
 from __future__ import annotations
 
 import itertools
+import os
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -43,16 +44,16 @@ from neeco.capture.documents import Node, RaisingReport
 from neeco.capture.images import open_image, read_image, read_labels
 from neeco.capture.model import InstrumentState, State
 from neeco.capture.readers.cameras import parse_lens
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, naming_arguments
 from neeco.files import read_json, require_inside, require_like
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.labels.annotation import LabelledImage, keypoint_names
 from neeco.labels.labellers import instruments_of
 from neeco.raster.native import torch_threads
+from neeco.scene.drawable import DrawableScene
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import load_gaussians, save_scene
-from neeco.settings import with_fields
 from neeco.synthesis.dataset import INFO, SCENE_FILE
 from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, StatesRefused, limit_threads
 from neeco.synthesis.parallel import PackedSpec
@@ -63,7 +64,25 @@ from neeco.training.run import TrainedRun, load_run
 
 Sample = dict[str, Any]
 Transform = Callable[[Sample], Sample]
-SceneLike = TrainedRun | GaussianScene | Path | str
+
+
+class HasLearned(Protocol):
+    """What `neeco.Scene` is here."""
+
+    @property
+    def learned(self) -> DrawableScene:
+        """The scene as training made it."""
+
+
+class HasTrained(Protocol):
+    """What `neeco.Run` is here."""
+
+    @property
+    def trained(self) -> TrainedRun:
+        """The run as training made it."""
+
+
+SceneLike = HasTrained | HasLearned | TrainedRun | GaussianScene | str | os.PathLike[str]
 STACKED = ("image", "parts", "depth", "ignore")  # of one shape in a batch; the rest are lists
 RANDOM = ("interpolate", "extrapolate")  # samplers that draw anew what is refused
 MAX_REFUSED = 1000  # given states refused in a row, before a stream ends with an error
@@ -87,12 +106,13 @@ def collate(samples: Sequence[Sample]) -> dict[str, Any]:
     }
 
 
+@naming_arguments()
 def sample_states(
     scene: SceneLike,
     count: int,
     *,
     seed: int = 0,
-    states: str = Settings.states,
+    states: str | os.PathLike[str] = Settings.states,
     views: Views = Settings.views,
     margin: float = Settings.margin,
 ) -> list[tuple[State, Camera]]:
@@ -105,8 +125,7 @@ def sample_states(
         for state, camera in neeco.sample_states("runs/sample", 3, states="extrapolate"):
             print(state.instruments["maryland"].joints, camera.width, camera.height)
     """
-    settings = Settings(count=count, seed=seed, states=states, margin=margin, views=views)
-    settings.check()
+    settings = Settings.from_values("sample_states", count=count, seed=seed, states=states, margin=margin, views=views)
     sampler = make_sampler(_opened(scene)[0], settings.states, margin, views, count)
     return [sampler(index, np.random.default_rng(np.random.SeedSequence([seed, index]))) for index in range(count)]
 
@@ -120,7 +139,6 @@ class _Generated:
     def __init__(
         self, scene: SceneLike, instruments: Sequence[SceneLike], settings: Settings, transform: Transform | None
     ) -> None:
-        settings.check()
         self.transform = transform
         opened = [_opened(given) for given in (scene, *instruments)]
         first, *others = (found for found, _ in opened)
@@ -176,23 +194,28 @@ class LabelledImages(_Generated, Dataset[Sample]):
         sample["image"].shape, [images.classes[k - 1] for k in sample["labels"]]
     """
 
+    @naming_arguments()
     def __init__(
         self,
         scene: SceneLike,
         count: int,
         *,
         seed: int = 0,
-        states: str = Settings.states,
+        states: str | os.PathLike[str] = Settings.states,
         views: Views = Settings.views,
         labels: LabelWay = Settings.labels,
-        camera_effects: str | Path | None = None,
+        camera_effects: str | os.PathLike[str] | None = None,
         instruments: Sequence[SceneLike] = (),
         transform: Transform | None = None,
         **settings: Any,
     ) -> None:
-        chosen = _settings(count, seed, camera_effects, states=states, views=views, labels=labels, **settings)
+        given = settings | {"states": states, "views": views, "labels": labels, "camera_effects": camera_effects}
+        chosen = Settings.from_values(ASKED_BY, count=count, seed=seed, **given)
         super().__init__(scene, instruments, chosen, transform)
         self.count = count
+
+    def __repr__(self) -> str:
+        return f"LabelledImages({self.count} images, states={self._settings.states!r}, {', '.join(self.classes)})"
 
     def __len__(self) -> int:
         return self.count
@@ -217,6 +240,7 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
             break
     """
 
+    @naming_arguments()
     def __init__(
         self,
         scene: SceneLike,
@@ -224,23 +248,27 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
         start: int = 0,
         shard: tuple[int, int] = (0, 1),
         seed: int = 0,
-        states: str = Settings.states,
+        states: str | os.PathLike[str] = Settings.states,
         views: Views = Settings.views,
         labels: LabelWay = Settings.labels,
-        camera_effects: str | Path | None = None,
+        camera_effects: str | os.PathLike[str] | None = None,
         instruments: Sequence[SceneLike] = (),
         transform: Transform | None = None,
         **settings: Any,
     ) -> None:
-        if states.startswith(PATH_PREFIX):
+        if str(states).startswith(PATH_PREFIX):
             raise NeecoError(f"states: {states}: a path has an end; use LabelledImages, which has a count")
         if start < 0 or not 0 <= shard[0] < shard[1]:
             raise NeecoError(
                 f"start, shard: {start}, {shard}: give start >= 0 and shard (rank, size), 0 <= rank < size"
             )
-        chosen = _settings(1, seed, camera_effects, states=states, views=views, labels=labels, **settings)
+        given = settings | {"states": states, "views": views, "labels": labels, "camera_effects": camera_effects}
+        chosen = Settings.from_values("LabelledStream", count=1, seed=seed, **given)
         super().__init__(scene, instruments, chosen, transform)
         self.start, self.shard = start, shard
+
+    def __repr__(self) -> str:
+        return f"LabelledStream(start={self.start}, states={self._settings.states!r}, {', '.join(self.classes)})"
 
     def __iter__(self) -> Iterator[Sample]:
         worker = get_worker_info()
@@ -287,6 +315,9 @@ class StoredImages(Dataset[Sample]):
             found = ", ".join(f"{name!r} ({count})" for name, count in Counter(r["split"] for r in records).items())
             raise NeecoError(f"{self.folder}: split {split!r} has no images; it has {found or 'none'}")
 
+    def __repr__(self) -> str:
+        return f"StoredImages({str(self.folder)!r}, {len(self._records)} images, {', '.join(self.classes)})"
+
     def __len__(self) -> int:
         return len(self._records)
 
@@ -323,21 +354,17 @@ class StoredImages(Dataset[Sample]):
 
 def _opened(given: SceneLike) -> tuple[GaussianScene, Path | None]:
     """The scene, and the file that holds it where there is one. Raises NeecoError."""
-    if isinstance(given, str | Path):
+    run: Any = given
+    if isinstance(given, str | os.PathLike):
         path = Path(given)
         if not path.is_dir():
             return load_gaussians(path, ASKED_BY), path
-        given = load_run(path)
-    folder = getattr(given, "path", None)  # a run has one
-    drawable: Any = getattr(given, "scene", given)
-    scene = require_gaussians(getattr(drawable, "learned", drawable), ASKED_BY)  # neeco.Scene holds what was learned
-    return scene, None if folder is None else Path(folder) / SCENE_FILE
-
-
-def _settings(count: int, seed: int, camera_effects: str | Path | None, **given: Any) -> Settings:
-    """The settings of a data set, `given` by the names of their fields."""
-    effects = None if camera_effects is None else str(camera_effects)
-    return with_fields(Settings(count=count, seed=seed), {"camera_effects": effects} | given)
+        run = load_run(path)
+    run = getattr(run, "trained", run)
+    scene = getattr(run, "scene", run)
+    folder = getattr(run, "path", None)  # a run has one
+    found = require_gaussians(getattr(scene, "learned", scene), ASKED_BY)
+    return found, None if folder is None else Path(folder) / SCENE_FILE
 
 
 def _spec(opened: Sequence[tuple[GaussianScene, Path | None]], settings: Settings) -> GeneratorSpec | PackedSpec:

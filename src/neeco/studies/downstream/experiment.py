@@ -28,7 +28,7 @@ from neeco.studies.downstream.job import (
 from neeco.studies.downstream.model import model_class
 from neeco.studies.downstream.results import comparisons, failed_jobs, findings, summarise_folds
 from neeco.studies.downstream.samples import (
-    DataSet,
+    ImageSet,
     class_names,
     frame_size,
     has_labels,
@@ -279,7 +279,7 @@ def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict
     return made | {"answers": findings(made)}
 
 
-def _made_by(data: DataSet) -> dict[str, Any] | None:
+def _made_by(data: ImageSet) -> dict[str, Any] | None:
     """What dataset.json says of how a set was synthesized; None where there is none."""
     info, keys = data.info(), ("settings", "scene", "scene_sha256", "version", "complete")
     return None if info is None else {key: info.get(key) for key in keys}

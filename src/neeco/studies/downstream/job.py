@@ -23,8 +23,8 @@ from neeco.studies.downstream.model import Model, TrainedModel, TrainingTask, in
 from neeco.studies.downstream.samples import (
     BatchSampler,
     ClassNames,
-    DataSet,
     Edges,
+    ImageSet,
     Sample,
     augment,
     class_names,
@@ -120,7 +120,7 @@ class DownstreamSettings:
 
     capture: Path
     output: Path
-    sets: tuple[DataSet, ...] = ()
+    sets: tuple[ImageSet, ...] = ()
     models: tuple[str, ...] = ("unet",)
     num_real: tuple[str, ...] = ("0", "20", "all")  # labelled recorded frames: numbers or all; 0 for sets alone
     folds: int = 5
@@ -216,7 +216,7 @@ class DownstreamJob:
         return f"{self.model}, {self.condition.name}{labelled}, fold {self.fold}"
 
     @property
-    def sets(self) -> list[DataSet]:
+    def sets(self) -> list[ImageSet]:
         """The data sets it learns from."""
         return [data for data in self.settings.sets if data.name in self.condition.sets]
 

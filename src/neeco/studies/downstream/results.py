@@ -22,9 +22,9 @@ from neeco.studies.tables import (
     UNKNOWN,
     Cell,
     Column,
+    ResultTable,
     Row,
     SummaryRow,
-    Table,
     csv_text,
     latex_document,
     markdown_document,
@@ -293,14 +293,14 @@ def equivalent(curve: Sequence[tuple[int, float]], value: float) -> str:
     return f"as good as about {as_many:.0f}"
 
 
-def tables_of(experiment: Document) -> list[Table]:
+def tables_of(experiment: Document) -> list[ResultTable]:
     """For every model and split the scores of each condition, then the differences of its main score."""
     pairs = models_and_splits(experiment)
     tables = [table(experiment, model, split) for model, split in pairs for table in (scores_table, differences_table)]
     return [table for table in tables if table.rows]
 
 
-def scores_table(experiment: Document, model: Document, split: str) -> Table:
+def scores_table(experiment: Document, model: Document, split: str) -> ResultTable:
     """The scores of each condition, mean and standard deviation over folds."""
     name, jobs = model["name"], [job for job in experiment["jobs"] if job["model"] == model["name"]]
     order = list(dict.fromkeys(job["condition"] for job in experiment["jobs"]))
@@ -315,7 +315,7 @@ def scores_table(experiment: Document, model: Document, split: str) -> Table:
     return summary_table(f"{name}, split {split}", KEYS, columns, entries)
 
 
-def differences_table(experiment: Document, model: Document, split: str) -> Table:
+def differences_table(experiment: Document, model: Document, split: str) -> ResultTable:
     """The paired differences of the main score, with their intervals."""
     columns = (Column("difference", "difference"), Column("low", "95 % from"), Column("high", "to"))
     rows = []
@@ -324,7 +324,7 @@ def differences_table(experiment: Document, model: Document, split: str) -> Tabl
         against = title_of(row["against"], row["against_real"])
         rows.append(Row((*_keys(row), against), tuple(map(Cell, [*texts, str(row["folds"])]))))
     title = f"{model['name']}, split {split}: differences of {TITLES[MAIN[model['answers']]]}"
-    return Table(title, (*KEYS, "against"), (*columns, Column("folds", "folds")), tuple(rows))
+    return ResultTable(title, (*KEYS, "against"), (*columns, Column("folds", "folds")), tuple(rows))
 
 
 def _keys(row: Document) -> tuple[str, str]:

@@ -150,7 +150,7 @@ Sample = RecordedSample | SyntheticSample
 
 
 @dataclass(frozen=True)
-class DataSet:
+class ImageSet:
     """A folder of synthetic images to train on. `count`: use so many of them, None for all."""
 
     name: str
@@ -229,7 +229,7 @@ def frame_size(samples: Sequence[RecordedSample]) -> tuple[int, int]:
 
 
 def synthetic_samples(
-    data: DataSet, classes: Sequence[str], edges: Edges, size: tuple[int, int]
+    data: ImageSet, classes: Sequence[str], edges: Edges, size: tuple[int, int]
 ) -> tuple[SyntheticSample, ...]:
     """The images of a data set in their order, each with its labels; the first `count` of them.
 
@@ -267,7 +267,7 @@ def synthetic_samples(
     return tuple(samples)
 
 
-def _training_images(data: DataSet, images: list[Path]) -> list[Path]:
+def _training_images(data: ImageSet, images: list[Path]) -> list[Path]:
     """The images that are synthetic, or recorded frames of split train."""
     info, states = data.info(), data.file(STATES_FILE)
     settings = info.get("settings") if isinstance(info, dict) else None
@@ -285,7 +285,7 @@ def _training_images(data: DataSet, images: list[Path]) -> list[Path]:
     return chosen
 
 
-def _labels_of(data: DataSet, classes: Sequence[str]) -> tuple[str, LabelMap]:
+def _labels_of(data: ImageSet, classes: Sequence[str]) -> tuple[str, LabelMap]:
     """The folder of a data set that holds its labels, and what they mean."""
     file, info = data.file(DATASET_FILE), data.info()
     if info is None:
