@@ -108,7 +108,7 @@ def test_a_label_too_small_misses_what_looks_like_no_tissue(scene: GaussianScene
     half = torch.nonzero(label.sum(0))[:, 0].float().mean().round().long()
     label[:, half:] = 0
     cut = replace(drawing, parts=label, image=torch.where((label > 0)[..., None], drawing.image, drawing.tissue_image))
-    judged = estimate_trust(cut, drawing.image, None, USUAL, beside=0.2)  # a very small image
+    judged = estimate_trust(cut, drawing.image, None, USUAL, neighbourhood=0.2)  # a very small image
     assert judged.missed > 0.2
     assert judged.value < 0.9
 
