@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -108,6 +108,7 @@ class Survey:
     """Contents of a bag by stream, without the pixels of images."""
 
     path: Path
+    _: KW_ONLY
     poses: dict[str, Poses] = field(default_factory=dict)  # by stream
     joints: dict[str, Joints] = field(default_factory=dict)
     images: dict[str, ImageLog] = field(default_factory=dict)

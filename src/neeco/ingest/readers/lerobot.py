@@ -116,7 +116,7 @@ class LeRobot(RecordingFormat):
         notes = (*notes, *compare_counts(film.file, shown, len(times), states, remedy=remedy))
         frames = tuple(np.flatnonzero(usable).tolist())
         return ChosenFrames(
-            video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames,
+            video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video=video, frames=frames,
             pixel_aspect=video.pixel_aspect,
         )  # fmt: skip
 
@@ -224,7 +224,7 @@ class LeRobot(RecordingFormat):
         return values[:, [feature.names.index(column) for column in columns]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Stored(VideoSource):
     """Images that stand in the Parquet file, as PNG or JPEG. rows: of the episode, in its file, of each image."""
 
@@ -258,7 +258,8 @@ def _open_stored(
         raise NeecoError(f"{where}: holds no images of episode {episode.number}; download it again")
     pixels = _decoded(f"{where}: frame 0", first[1], None)
     size = (pixels.shape[1], pixels.shape[0])
-    return _Stored(episode.data, size, notes, times, key, episode.number, tuple(order.tolist()))
+    rows = tuple(order.tolist())
+    return _Stored(episode.data, size, notes, times, key=key, episode=episode.number, rows=rows)
 
 
 def _cells(file: Path, key: str, episode: int) -> Iterator[tuple[int, Any]]:

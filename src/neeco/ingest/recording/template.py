@@ -76,7 +76,7 @@ class _Log:
         return [f"{key}: {_scalar(value)}" for key, value in given if value is not None]
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _FolderFiles:
     """The files of a folder by their likely kind, as paths relative to it. others: those not used, in words."""
 
