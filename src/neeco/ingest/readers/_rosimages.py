@@ -199,7 +199,7 @@ def lens_of(where: str, info: Any, rectified: bool) -> Lens | None:
     region = info.roi
     cut = region.height not in (0, info.height) or region.width not in (0, info.width)
     if max(info.binning_x, info.binning_y) > 1 or cut:
-        raise NeecoError(f"{where}: speaks of binning or of a part of the image; give the images' own `intrinsics`")
+        raise NeecoError(f"{where}: states binning or a part of the image; give the images' own `intrinsics`")
     camera = [*projection[0:3], *projection[4:7], *projection[8:11]] if rectified else [*matrix]
     if not camera[0]:
         return None

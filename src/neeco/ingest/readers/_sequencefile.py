@@ -187,7 +187,7 @@ def _dimensions(header: _Header, name: str, sizes: list[int], kinds: list[str]) 
         raise NeecoError(f"{header.path}: {name}: {sizes} is no sequence of images; expected width, height, frames")
     width, height, count = sizes[0], sizes[1], sizes[-1]
     if max(width, height) > MAX_SIDE or count > MAX_FRAMES:
-        raise NeecoError(f"{header.path}: {name}: {sizes} is beyond all measure; export the sequence again")
+        raise NeecoError(f"{header.path}: {name}: {sizes} is too large; export the sequence again")
     return (width, height), count, channels
 
 
@@ -219,9 +219,9 @@ def _checked(header: _Header, **values: Any) -> FrameSequence:
     promised = frame * sequence.count
     stored = header.plain.get("compresseddatasize", "")
     if sequence.window is None and held != promised:
-        what = f"holds {held / frame:.4g} images, its header speaks of {sequence.count}"
+        what = f"holds {held / frame:.4g} images, its header states {sequence.count}"
     elif sequence.window is not None and re.fullmatch(r"\d{1,18}", stored) and held < int(stored):
-        what = f"holds {held} bytes of compressed images, its header speaks of {stored}"
+        what = f"holds {held} bytes of compressed images, its header states {stored}"
     elif sequence.window is not None and promised > MAX_RATIO * (held + 64):
         what = f"holds {held} bytes, of which no {sequence.count} images of {sequence.size} can come"
     else:

@@ -282,7 +282,7 @@ class _Scan:
                 own = _another_rate(1 / float(np.median(np.diff(times))), fps)
                 times = np.arange(len(order)) / fps
             if own is not None:
-                notes.append(f"{self.path.name}: says itself {own:.4g} frames a second, the recording {fps:g}")
+                notes.append(f"{self.path.name}: states {own:.4g} frames a second itself, the recording {fps:g}")
             if len(order) < len(stamps):
                 notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
         else:
@@ -315,7 +315,7 @@ class _Scan:
         if self.interlaced:
             notes.append(f"{self.path.name}: is interlaced; deinterlace it (ffmpeg -vf yadif) for sharper frames")
         if self.turned:
-            notes.append(f"{self.path.name}: says to be turned by {self.turned} degrees; its frames are used as stored")
+            notes.append(f"{self.path.name}: states a rotation by {self.turned} degrees; its frames are used as stored")
         return notes
 
 
