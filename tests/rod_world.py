@@ -111,6 +111,9 @@ class FakeRun:
     path: Path
     scene: GaussianScene
 
+    def gaussians(self, asked_by: str) -> FakeRun:
+        return self
+
 
 @pytest.fixture(scope="session")
 def scene() -> GaussianScene:

@@ -34,11 +34,6 @@ INGEST = (
     *("posing", "registration", "shaft", "cameras", "foreground"),
     *("frames", "timing", "recording", "readers", "calibration"),
 )
-# a package that loads the modules of a folder of its own when they are asked for, and they use what it declares
-LAZY = {
-    "neeco.studies.downstream <-> neeco.studies.downstream.models",
-    "neeco.synthesis <-> neeco.synthesis.writers",
-}
 OUTSIDE = ("__init__", "__main__", "_native")  # the package's version, its start (the command line's), the C++ kernels
 Graph = dict[str, set[str]]  # module -> modules it imports anywhere: at its top, in functions, for types alone
 
@@ -151,7 +146,7 @@ def test_no_circle_between_modules() -> None:
 def test_no_circle_between_folders() -> None:
     imports = folders(graph())
     root = "neeco"  # holds what all use (errors, files) and what uses all (api)
-    assert set(circles({folder: others - {root} for folder, others in imports.items()})) <= LAZY
+    assert circles({folder: others - {root} for folder, others in imports.items()}) == []
 
 
 def test_a_folder_of_ingest_imports_only_from_folders_below() -> None:

@@ -6,10 +6,12 @@ The names below are imported when they are first used, so that `import neeco` ta
 from __future__ import annotations
 
 import importlib
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neeco.api import Scene, check, load, train
+    from neeco.api import Run, Scene, check, ingest, load, synthesize, track, train
     from neeco.capture import Camera, State, read_capture
     from neeco.errors import NeecoError
     from neeco.synthesis.torch_datasets import LabelledImages, LabelledStream, StoredImages, sample_states
@@ -20,18 +22,22 @@ __all__ = [
     "LabelledImages",
     "LabelledStream",
     "NeecoError",
+    "Run",
     "Scene",
     "State",
     "StoredImages",
     "check",
+    "ingest",
     "load",
     "read_capture",
     "sample_states",
+    "synthesize",
+    "track",
     "train",
 ]
 
 _MODULES = {
-    "neeco.api": ("Scene", "check", "load", "train"),
+    "neeco.api": ("Run", "Scene", "check", "ingest", "load", "synthesize", "track", "train"),
     "neeco.capture": ("Camera", "State", "read_capture"),
     "neeco.errors": ("NeecoError",),
     "neeco.synthesis.torch_datasets": ("LabelledImages", "LabelledStream", "StoredImages", "sample_states"),
@@ -49,3 +55,13 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+class _Package(ModuleType):
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute, but leave `neeco.ingest` the function when the folder of that name is imported."""
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -1,21 +1,20 @@
-"""What a program calls: `train`, `load`, `check`, and the `Scene` that draws. `import neeco` gives these names.
+"""The functions of `import neeco`, one for each verb that a program uses, and the `Scene` and `Run` that they return.
 
-The command line's verbs call the functions that these call, so that a notebook and a shell do the same.
+The command line calls the same functions, or those that these call, so that a notebook and a shell do the same.
 """
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 from neeco.capture import Camera, Capture, Problem, State, check_capture
 from neeco.capture.model import Instrument
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, naming_arguments
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.evaluation.image_metrics import find_lpips
 from neeco.geometry.rotations import rigid_fault
@@ -24,12 +23,20 @@ from neeco.plausible import Fault, focal_fault
 from neeco.raster.devices import device_of
 from neeco.scene.drawable import DrawableScene
 from neeco.scene.io import load_scene
+from neeco.synthesis.dataset import Synthesized
+from neeco.synthesis.dataset import synthesize as synthesize_run
+from neeco.synthesis.settings import DEFAULT_FORMATS, Settings
 from neeco.training import run as runs
 from neeco.training.config import training_config
 from neeco.training.train import ProgressRow
 from neeco.training.train import train as train_run
 
+if TYPE_CHECKING:
+    from neeco.report.ingested import Ingested
+    from neeco.tracking.track import Tracked
+
 PathLike = str | os.PathLike[str]
+Progress = Callable[[str, int, int], None]  # is given what is being done, how much of it is done, and of how much
 
 
 class Scene:
@@ -45,6 +52,7 @@ class Scene:
 
     learned: DrawableScene  # the scene as training makes it: a torch module
 
+    @naming_arguments()
     def __init__(self, file: PathLike, device: str = "auto") -> None:
         self.learned = load_scene(Path(file)).to(device_of(device))
 
@@ -129,19 +137,24 @@ class Run:
     def capture(self) -> Capture:
         """The capture that the run was trained on; joints that nobody recorded are as training found them. Raises
         NeecoError when it has moved."""
-        return self._run.capture()
+        return self.trained.capture()
 
     @property
-    def _run(self) -> runs.TrainedRun:
+    def trained(self) -> runs.TrainedRun:
+        """The run as the rest of the program sees it."""
         return runs.TrainedRun(self.path, self.scene.learned, dict(self.config))
 
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r}, {self.scene!r})"
+
+    @naming_arguments()
     def evaluate(
         self,
         splits: Sequence[str] | None = None,
         *,
         align: bool = False,
         lpips_weights: PathLike | None = None,
-        progress: Callable[[str, int, int], None] | None = None,
+        progress: Progress | None = None,
     ) -> dict[str, Any]:
         """Score the run on recorded frames, as `neeco evaluate` does; writes evaluation.json into the run's folder.
 
@@ -153,9 +166,9 @@ class Run:
             neeco.load("runs/sample").evaluate(["test"])["given"]["test"]["psnr"]
         """
         networks = find_lpips(None if lpips_weights is None else Path(lpips_weights))
-        tell = progress or (lambda what, done, total: None)
+        report = progress or _silent
         with self.scene.learned.torch_threads():
-            return evaluate_run(self._run, self.capture, splits, align=align, networks=networks, progress=tell)
+            return evaluate_run(self.trained, self.capture, splits, align=align, networks=networks, progress=report)
 
 
 def _view_fault(camera: Camera) -> Fault | None:
@@ -167,6 +180,7 @@ def _view_fault(camera: Camera) -> Fault | None:
     return focal_fault(camera.fx, camera.fy, camera.width, camera.height)
 
 
+@naming_arguments()
 def load(path: PathLike, device: str = "auto") -> Run:
     """Open the run folder `path` that `train` or `neeco train` wrote; its scene goes to `device` (see `Scene`).
 
@@ -179,6 +193,7 @@ def load(path: PathLike, device: str = "auto") -> Run:
     return Run(opened.path, Scene.of(opened.scene), opened.config)
 
 
+@naming_arguments()
 def train(
     capture: PathLike,
     output: PathLike,
@@ -197,10 +212,9 @@ def train(
     method: kinematic (None), neeco (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta. iterations: frames
     that are learned from; minutes: stop in time with a finished run. The same seed (None: 0) gives the same scene on
     the same machine, unless `minutes` is given. resume: continue an interrupted run in `output`, under its own
-    settings, which what is given here must not contradict. progress: is
-    called with every row of metrics (iteration, loss, psnr, num_gaussians, progress in [0, 1], note). settings: any
-    field of the training config, with two underscores for a dot (`deformation__shadow=False`); `neeco train --help`
-    lists them.
+    settings, which what is given here must not contradict. progress: is called with every row of metrics (iteration,
+    loss, psnr, num_gaussians, progress in [0, 1], note). settings: any field of the training config, with two
+    underscores for a dot (`deformation__shadow=False`); `neeco train --help` lists them.
 
     Raises NeecoError for a capture that `check` finds errors in, for settings that do not fit, and for an `output` that
     is not empty.
@@ -208,13 +222,13 @@ def train(
         run = neeco.train("samples/liver-mini", "runs/sample", minutes=2)
     """
     given = {"iterations": iterations, "minutes": minutes, "seed": seed}
-    texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in settings.items()}
-    assignments = [f"{name.replace('__', '.')}={text}" for name, text in texts.items()]
-    config = training_config(method, given, assignments, runs.begun_config(Path(output)) if resume else None)
+    others = {name.replace("__", "."): value for name, value in settings.items()}
+    config = training_config(method, given, others, runs.begun_config(Path(output)) if resume else None)
     path = train_run(Path(capture), Path(output), config, device=device_of(device), resume=resume, progress=progress)
     return load(path, device)
 
 
+@naming_arguments()
 def check(capture: PathLike, transforms: str = "transforms.json") -> list[Problem]:
     """Everything that is wrong with the capture in folder `capture`, at once; an empty list when nothing is.
 
@@ -225,3 +239,171 @@ def check(capture: PathLike, transforms: str = "transforms.json") -> list[Proble
             print(problem.severity, problem)
     """
     return check_capture(Path(capture), transforms)
+
+
+@naming_arguments()
+def synthesize(
+    run: Run | PathLike,
+    output: PathLike,
+    count: int,
+    *,
+    instruments: Sequence[Run | PathLike] = (),
+    formats: Sequence[str] = DEFAULT_FORMATS,
+    resume: bool = False,
+    workers: int = 1,
+    device: str = "auto",
+    progress: Progress | None = None,
+    **settings: Any,
+) -> Synthesized:
+    """Write a labelled data set of `count` images of states that nobody recorded into the folder `output`.
+
+    run: a run or its folder, opened on `device`. instruments: runs whose instruments are rendered over the run's
+    tissue, instead of its own. formats: index files to write besides plain images, masks, parts and depth. resume:
+    continue a data set begun with the same settings, or enlarge it. workers: processes that share the work; more than
+    one need `if __name__ == "__main__"` around the program's start. settings: any option of `neeco synthesize`, such as
+    states="extrapolate", views="orbit", seed=1, size="640x512" or camera_effects="effects.yaml". The result has
+    `output` (the folder), `images` (how many), `refused` (states refused, by reason) and `skipped`.
+
+    Raises NeecoError for settings that do not fit, an `output` that is not empty or was begun otherwise, and where
+    every state is refused.
+
+        made = neeco.synthesize("runs/sample", "dataset-4", 4, states="extrapolate")
+        images = neeco.StoredImages(made.output)
+    """
+    chosen = Settings.from_values("synthesize", count=count, **settings)
+    report = progress or _silent
+    first, *others = (_opened(one, device).gaussians("synthesize") for one in (run, *instruments))
+    with first.scene.torch_threads():
+        return synthesize_run(
+            first,
+            Path(output),
+            chosen,
+            formats,
+            resume,
+            on_progress=lambda done: report("synthesize", done, count),
+            workers=workers,
+            instrument_runs=others,
+        )
+
+
+@naming_arguments()
+def track(
+    run: Run | PathLike,
+    footage: PathLike,
+    output: PathLike,
+    *,
+    start: Literal["first", "none"] = "none",
+    tissue: Literal["run", "footage"] | None = None,
+    min_trust: float = 0.5,
+    resume: bool = False,
+    device: str = "auto",
+    progress: Progress | None = None,
+) -> Tracked:
+    """Find the states of the run's instruments in `footage`, from its images alone; writes the frames that can be
+    trusted as a capture into the folder `output`, and track.html, the page about all of them.
+
+    run: a run of method kinematic, or its folder, opened on `device`. footage: a capture with cameras, whose states are
+    not read, or a video file, whose cameras are found first. start: "first" where the first frame's state is roughly
+    known. tissue: "run" where the footage shows the run's tissue with cameras in its world, "footage" for any other
+    (None: as a capture or a video mostly is). min_trust: the least confidence in [0, 1] of a frame that is written.
+    The result has `output`, `records` (one for each frame), `written` (how many are in the capture) and `verdict`.
+
+    Raises NeecoError for a run or footage that cannot be used, an `output` that is not empty (without `resume`), and
+    where no frame reaches `min_trust`.
+
+        tracked = neeco.track("runs/sample", "footage", "tracked", start="first")
+        print(tracked.verdict, tracked.written, len(neeco.read_capture(tracked.output).frames))
+    """
+    from neeco.ingest.footage_video import read_footage
+    from neeco.report.track_page import write_track_page
+    from neeco.tracking.track import track_footage
+
+    output, report = Path(output), progress or _silent
+    is_video = Path(footage).is_file()
+    if is_video and tissue == "run":
+        raise NeecoError(f"--tissue: run: {footage} is a video, whose cameras are in no run's world; leave it out")
+    opened = _opened(run, device).gaussians("track")
+    with opened.scene.torch_threads():
+        tracked = track_footage(
+            opened,
+            read_footage(Path(footage), output, opened.scene, resume, report),
+            output,
+            start=start,
+            tissue=tissue or ("footage" if is_video else "run"),
+            min_trust=min_trust,
+            resume=resume,
+            on_progress=lambda done, total: report("track", done, total),
+            on_stage=report,
+        )
+        write_track_page(tracked)
+    tracked.require_trusted()
+    return tracked
+
+
+@naming_arguments()
+def ingest(
+    *recordings: PathLike,
+    output: PathLike,
+    video: PathLike | None = None,
+    instrument: PathLike | None = None,
+    laparoscope: PathLike | None = None,
+    joints: Mapping[str, tuple[PathLike, PathLike | None]] | None = None,
+    shaft_diameter: float | None = None,
+    intrinsics: tuple[float, float, float, float] | None = None,
+    calibration: PathLike | None = None,
+    sync: PathLike | None = None,
+    frames: int | None = None,
+    fps: float | None = None,
+    progress: Progress | None = None,
+) -> Ingested:
+    """Make the capture folder `output` from a recording, as `neeco ingest` does.
+
+    recordings: recording.yaml, or several of one instrument; or one folder in another format (nerfstudio, Blender,
+    COLMAP, EndoNeRF), which is converted. Without any: `video` (a file, or a folder of images) with the CSV logs of the
+    trackers of `instrument` and `laparoscope`, or with `shaft_diameter` in mm of an instrument that nothing tracked;
+    `joints`: name -> (log, calibration or None); `intrinsics` (fx, fy, cx, cy in px) or a file `calibration`; `sync`: a
+    JSON file of clock offsets; `frames`: how many to keep; `fps`, where the video does not state it.
+
+    Raises NeecoError for unusable input: file, row or key, and what to do.
+
+        made = neeco.ingest("recording.yaml", output="captures/liver")
+        print(made.output, made.verdict, len(made.capture.frames))
+    """
+    from neeco.ingest.convert import convert_folder
+    from neeco.ingest.recording.file import recording_from_flags
+    from neeco.ingest.sources import folder_to_convert, read_recordings
+    from neeco.report.ingested import Ingested, ingest_and_report
+
+    sources, output, report = [Path(path) for path in recordings], Path(output), progress or _silent
+    if (folder := folder_to_convert(sources)) is not None:
+        return Ingested(output, notes=convert_folder(folder, output))
+    if sources:
+        return ingest_and_report(read_recordings(sources, frames), output, report)
+    if video is None:
+        raise NeecoError("--video: give the video (or a folder of images), or a recording.yaml")
+    if intrinsics is not None and calibration is not None:
+        raise NeecoError("--calibration: given with --intrinsics; give one of them")
+    recording = recording_from_flags(
+        Path(video),
+        instrument=_path(instrument),
+        laparoscope=_path(laparoscope),
+        joints=[(name, Path(log), _path(table)) for name, (log, table) in (joints or {}).items()],
+        intrinsics=intrinsics or _path(calibration),
+        sync=_path(sync),
+        frames=frames,
+        fps=fps,
+        shaft_diameter=shaft_diameter,
+    )
+    return ingest_and_report([recording], output, report)
+
+
+def _opened(run: Run | PathLike, device: str) -> runs.TrainedRun:
+    return run.trained if isinstance(run, Run) else runs.load_run(Path(run), device_of(device))
+
+
+def _path(path: PathLike | None) -> Path | None:
+    return None if path is None else Path(path)
+
+
+def _silent(what: str, done: int, total: int) -> None:
+    """Report no progress."""

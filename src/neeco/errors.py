@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 # what libraries without a MemoryError of their own say: PyTorch, safetensors, OpenCV, the dynamic linker, threads
 MEMORY_MESSAGES = re.compile(
@@ -12,18 +14,42 @@ MEMORY_MESSAGES = re.compile(
     "failed to map segment|can't start new thread",
     re.IGNORECASE,
 )
+OPTION = re.compile(r"(?<![\w/-])--(?:set:? ([A-Za-z_][\w.]*)|(no-)?([a-z][a-z-]*[a-z]|[a-z]))(?![\w/-])")
 TOO_LITTLE = "memory: too little"  # begins every line of `memory_failure`
 
 
 class NeecoError(Exception):
-    """Bad input. The message is one line naming the file, the field and what to do; the command line prints it and
-    exits 1. In Python an option named there is the argument of that name: `--max-attempts` is `max_attempts`.
+    """Bad input. The message is one line naming the file or argument, the field and what to do; the command line prints
+    it, with options in place of arguments (`command_line`), and exits 1.
 
         try:
             neeco.load("runs/nothing")
         except neeco.NeecoError as error:
             print(error)
     """
+
+    command_line: str | None = None  # the message as the command line words it, where that differs
+
+
+@contextmanager
+def naming_arguments() -> Iterator[None]:
+    """Name arguments of Python in the messages of errors raised in the block, or in the function so decorated:
+    `max_attempts` for `--max-attempts`, `density__min_opacity` for `--set density.min_opacity`. Commands quoted in
+    backticks stay."""
+    try:
+        yield
+    except NeecoError as error:
+        words = str(error).split("`")
+        words[::2] = [OPTION.sub(_argument, text) for text in words[::2]]
+        error.command_line = error.command_line or str(error)
+        error.args = ("`".join(words),)
+        raise
+
+
+def _argument(option: re.Match[str]) -> str:
+    setting, off, name = option.groups()
+    argument = setting.replace(".", "__") if setting else name.replace("-", "_")
+    return f"{argument}=False" if off else argument
 
 
 def memory_failure(error: BaseException) -> str | None:

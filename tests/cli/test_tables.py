@@ -8,14 +8,14 @@ import pytest
 from rich.console import Console
 
 from neeco.cli._output import fitted
-from neeco.studies.tables import Cell, Column, Row, Table
+from neeco.studies.tables import Cell, Column, ResultTable, Row
 
 
 @pytest.mark.parametrize("width", [22, 60])
 def test_a_failed_row_is_whole_in_every_piece_however_narrow_its_columns(width: int) -> None:
     numbers = tuple(map(Cell, ("12.00", "3", "4")))
     rows = Row(("a",), numbers), Row(("lost",), (Cell("-"),) * 3, failed="its loss became nan")
-    table = Table("t", ("method",), tuple(Column(title, title) for title in ("PSNR", "n", "m")), rows)
+    table = ResultTable("t", ("method",), tuple(Column(title, title) for title in ("PSNR", "n", "m")), rows)
     console = Console(width=width, record=True, file=io.StringIO())
     pieces = fitted(table, width)
     for piece in pieces:

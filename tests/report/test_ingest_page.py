@@ -23,7 +23,7 @@ from neeco.capture.model import Frame, State
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.ingest.assessment import MAX_SHOWN, assess_ingest
-from neeco.ingest.foreground.motion import RoughShape
+from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.result import IngestResult
@@ -51,16 +51,10 @@ def made(folder: Path, **changes) -> IngestResult:
     times = np.array([frame.state.time for frame in capture.frames])
     clock = ClockOffset(0.0388, 0.0012, "scope motion")
     registration = Registration(
-        4.4,
-        np.eye(3),
-        np.zeros(3),
-        np.eye(4),
-        clock,
-        0.004,
-        np.full(count, 0.5),
-        np.full(count, 0.003),
-        np.arange(count),
-    )
+        scale=4.4, rotation=np.eye(3), translation=np.zeros(3), camera_from_sensor=np.eye(4), clock=clock,
+        scale_sd=0.004, position_residual=np.full(count, 0.5), rotation_residual=np.full(count, 0.003),
+        used=np.arange(count),
+    )  # fmt: skip
     dropped = tuple((frame, f"blurred: {frame % 50}% of its neighbours' sharpness") for frame in (96, 97, 98, 105))
     result = IngestResult(
         capture=folder, recording="rec <1>.yaml", video_frames=106, video_fps=25.0, size=(240, 192),
@@ -76,7 +70,10 @@ def made(folder: Path, **changes) -> IngestResult:
 
 def based(overlap: float) -> BaseRegistration:
     """A base found from outlines that overlap with what moves by so much."""
-    return BaseRegistration(np.eye(4), 0.0, 0.0, np.ones(3), np.ones(3), (), 0.0, 0.0, overlap, 0.5, 1.0, 100)
+    return BaseRegistration(
+        world_from_base=np.eye(4), clock_s=0.0, clock_sd_s=0.0, sd_mm=np.ones(3), sd_deg=np.ones(3), open_directions=(),
+        moved_mm=0.0, turned_deg=0.0, overlap=overlap, overlap_before=0.5, residual_px=1.0, frames=100, from_masks=True,
+    )  # fmt: skip
 
 
 def write_ingest_page(result: IngestResult, path: Path) -> None:

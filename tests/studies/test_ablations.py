@@ -158,7 +158,7 @@ def _neeco(job) -> bool:
         ({"iterations": 0}, "--iterations: 0 is no training"),
         ({"kinematic_iterations": -1}, "--kinematic-iterations: -1 is no training"),
         ({"settings": ("minutes=3",)}, "--set minutes: use the budget"),
-        ({"settings": ("sed=3",)}, "--set: unknown field 'sed'"),
+        ({"settings": ("sed=3",)}, "--set sed: unknown field"),
         ({"settings": ("deformation.wide=3",)}, "--set deformation.wide: no such field in the methods"),
     ],
 )

@@ -22,7 +22,7 @@ from neeco.synthesis.rendered_views import View, render
 from neeco.synthesis.settings import ImageSettings, Settings, SizeSettings
 
 SETTINGS = Settings(count=2, seed=3, tissue_tolerance_mm=2.0)
-LENS = Lens(52.0, 52.0, 32.5, 23.5, (-0.3, 0.1, 0.001, -0.002), (64, 48), (32.0, 24.0, 30.0))
+LENS = Lens(52.0, 52.0, 32.5, 23.5, (-0.3, 0.1, 0.001, -0.002), (64, 48), border=(32.0, 24.0, 30.0))
 FORMATS = ("coco", "yolo", "webdataset", "imagefolder")
 
 
@@ -105,7 +105,7 @@ def test_everything_in_a_data_set_agrees_with_its_size_and_format(run, tmp_path)
 def test_what_is_drawn_through_the_lens_is_the_undistorted_drawing_once_it_is_undistorted(lens_scene, state):
     """At four times the size, so that edges are no more than a few pixels of many."""
     pinhole = lens_scene.recorded.cameras[0].resized(256, 192)
-    bent = LENS.before(lens_scene.recorded.cameras[0]).resized(256, 192)
+    bent = LENS.distorted_camera(lens_scene.recorded.cameras[0]).resized(256, 192)
     lens = Lens.of(bent)
     labeller = CompositedLabels(lens_scene)
     straight, drawn = (draw_layers(lens_scene, labeller, state(y=8.0), camera, 0.01) for camera in (pinhole, bent))

@@ -190,7 +190,11 @@ def test_indices_and_settings_out_of_range_are_refused(run, rod_images):
     assert_same(rod_images[-1], rod_images[COUNT - 1])
     with pytest.raises(IndexError):
         rod_images[COUNT]
-    for wrong, message in (({"seed": -1}, "--seed"), ({"states": "nowhere.jsonl"}, "nowhere.jsonl: no such file")):
+    for wrong, message in (
+        ({"seed": -1}, "^seed: -1 is negative"),
+        ({"sed": 1}, "^sed: LabelledImages has no such field"),
+        ({"states": "nowhere.jsonl"}, "nowhere.jsonl: no such file"),
+    ):
         with pytest.raises(NeecoError, match=message):
             LabelledImages(run, 1, **wrong)
     with pytest.raises(NeecoError, match="a path has an end"):

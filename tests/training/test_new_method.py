@@ -129,7 +129,7 @@ def test_a_new_method_that_needs_instruments_says_so(tmp_path: Path) -> None:
 
 
 def test_a_field_that_the_method_does_not_have_is_refused_by_name() -> None:
-    with pytest.raises(NeecoError, match=r"--set: deformation.raech: method drift has no such field; it has reach"):
+    with pytest.raises(NeecoError, match=r"--set deformation.raech: method drift has no such field; it has reach"):
         training_config("drift", {"iterations": 12}, ["deformation.raech=3"])
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,28 +23,28 @@ from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
-from neeco.geometry.rotations import as_pose, rigid_fault
+from neeco.geometry.rotations import as_pose, number_text, position_text, rigid_fault
 from neeco.plausible import Fault, joint_fault
 
 SCHEMA = "neeco-capture/1"  # of the folder that holds a capture
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
 UNKNOWN_DEG = 180.0  # the standard deviation of an angle of which nothing is known
 REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
-STILL = 1e-9  # a coordinate that varies less than this in the recording tells nothing apart
+MIN_DEVIATION = 1e-9  # coordinates that vary less in the recording do not count as changing
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How far an instrument's state may be off: standard deviations."""
+    """Standard deviations of an instrument's state."""
 
     translation_mm: tuple[float, float, float]  # of the origin, in the camera's axes: across, across, depth
-    rotation_deg: tuple[float, float, float]  # about the instrument's x, y, z: tilt, tilt, roll; 180: nobody knows it
+    rotation_deg: tuple[float, float, float]  # about the instrument's x, y, z: tilt, tilt, roll; 180: unknown
     joints_deg: Mapping[str, float] = field(default_factory=dict)  # name -> degrees (mm for sliding joints)
 
 
 @dataclass(frozen=True)
 class InstrumentState:
-    """Where one instrument is and how its joints stand.
+    """Pose and joint values of one instrument.
 
     The pose may be given as a tensor, an array or nested lists; what is no tensor becomes float64. Raises NeecoError
     when it is not 4x4, or given so and no rotation and translation, and for joints that are not finite numbers.
@@ -52,8 +52,8 @@ class InstrumentState:
 
     pose: Tensor  # [4, 4] float64, world_from_instrument, mm
     joints: Mapping[str, float] = field(default_factory=dict)  # name -> rad (mm for sliding joints, named *_mm)
-    trust: float | None = None  # in [0, 1], how far `track` trusts it; None: it was recorded
-    uncertainty: Uncertainty | None = None  # None: nobody said
+    trust: float | None = None  # in [0, 1], confidence of `track`; None: it was recorded
+    uncertainty: Uncertainty | None = None  # None: not stated
 
     if TYPE_CHECKING:  # what may be given
 
@@ -70,6 +70,10 @@ class InstrumentState:
         for joint, value in self.joints.items():
             if not isinstance(value, Tensor) and not _is_finite(value):
                 raise NeecoError(f"InstrumentState.joints: {joint!r} is {value!r}, not a finite number; correct it")
+
+    def __repr__(self) -> str:
+        joints = "".join(f", {name}={number_text(value)}" for name, value in self.joints.items())
+        return f"InstrumentState(at {position_text(self.pose)}{joints})"
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,11 @@ class State:
         object.__setattr__(self, "instruments", given)
         if not isinstance(self.time, Tensor) and not _is_finite(self.time):
             raise NeecoError(f"State.time: is {self.time!r}, not a finite number of seconds; correct it")
+
+    def __repr__(self) -> str:
+        instruments = "".join(f"{name}: {state!r}, " for name, state in self.instruments.items())
+        tissue = "" if self.tissue is None else f", tissue={self.tissue!r}"
+        return f"State({instruments}time={number_text(self.time)} s{tissue})"
 
     def check(self, instruments: Sequence[Instrument], *, fitted: bool = False) -> None:
         """Raise NeecoError for what none of a scene's instruments can be: poses that are not rigid, instruments and
@@ -127,7 +136,7 @@ class State:
 
 @dataclass(frozen=True)
 class FromVideo:
-    """What is known of a rigid instrument whose poses were found in the images, from its shaft.
+    """Dimensions of a rigid instrument whose poses were estimated from its shaft in the images.
 
     Its frame then has +z along the shaft, from the handle towards the tip, and its origin on the shaft's axis,
     `working_length_mm` behind the tip as the silhouette shows it."""
@@ -151,8 +160,11 @@ class Instrument:
     from_video: FromVideo | None = None
     left_out: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"Instrument({self.name!r}, joints: {', '.join(self.joints) or 'none'})"
+
     def joint_fault(self, joint: str, value: float, slack: float = 0.0) -> Fault | None:
-        """What is wrong with a value, rad or mm, of a joint, and what to do; None: it may be right. slack: see
+        """Return what is wrong with a value, rad or mm, of a joint, and what to do; None: it may be right. slack: see
         `neeco.plausible.joint_fault`."""
         if joint in self.joints:
             return joint_fault(value, self.joints[joint], self.slides(joint), slack)
@@ -166,7 +178,7 @@ class Instrument:
         return 0.0 if limits is None else (limits[0] + limits[1]) / 2
 
     def slides(self, joint: str) -> bool:
-        """Is a joint's reading a length in mm? As its kinematics state, else by its name."""
+        """Return True if a joint's reading is a length in mm, by its kinematics, else by its name."""
         tree = self.kinematics
         if tree is None or joint not in tree.readings:
             return joint.endswith("_mm")
@@ -182,14 +194,17 @@ class Frame:
     state: State
     split: str  # train, test, unseen, or any other name
     mask_path: Path | None = None  # black pixels are ignored by the loss
-    background: float = 1.0  # what shows through transparent pixels: 0 black, 1 white
+    background: float = 1.0  # colour behind transparent pixels: 0 black, 1 white
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image_path", Path(self.image_path))
 
+    def __repr__(self) -> str:
+        return f"Frame({self.name!r}, split={self.split!r}, {self.camera.width}x{self.camera.height} px)"
+
     @property
     def name(self) -> str:
-        """The image file's stem; it names everything drawn for this frame."""
+        """The image file's stem; it names everything rendered for this frame."""
         return self.image_path.stem
 
     def load_image(self) -> Tensor:
@@ -223,6 +238,7 @@ class Capture:
     frames: tuple[Frame, ...]
     instruments: tuple[Instrument, ...] = ()
     points: PointCloud = field(default_factory=lambda: PointCloud(measured=False))
+    _: KW_ONLY
     registered: bool = True  # instrument poses are in the cameras' world frame
     timed: bool = True  # the recording says when each frame was taken; else `State.time` counts the frames
     lens: Lens | None = None  # through which it was recorded; its distortion is gone from the images
@@ -233,12 +249,17 @@ class Capture:
         for name, kind in {"root": Path, "frames": tuple, "instruments": tuple, "tissues": tuple}.items():
             object.__setattr__(self, name, kind(getattr(self, name)))
 
+    def __repr__(self) -> str:
+        splits = ", ".join(f"{len(self.split(name))} {name}" for name in self.splits)
+        names = ", ".join(item.name for item in self.instruments) or "no instruments"
+        return f"Capture({str(self.root)!r}, {len(self.frames)} frames ({splits}), {names})"
+
     def split(self, name: str) -> tuple[Frame, ...]:
         """The frames of one split, in recorded order."""
         return tuple(frame for frame in self.frames if frame.split == name)
 
     def over(self, tissue: str) -> Capture:
-        """What was recorded over one of several tissues, as a capture of one."""
+        """The capture of one of several tissues."""
         frames = tuple(frame for frame in self.frames if frame.state.tissue == tissue)
         points = next(item.points for item in self.tissues if item.name == tissue)
         return replace(self, frames=frames, points=points, tissues=())
@@ -257,21 +278,21 @@ def _is_finite(value: object) -> bool:
 
 
 def _is_readable(value: object, only_cheaply: bool) -> bool:
-    """Whether a number or tensor may be read; `only_cheaply`: without waiting for a GPU, and none with gradients."""
+    """Return True if a number or tensor may be read; `only_cheaply`: without waiting for a GPU, nor gradients."""
     if not isinstance(value, Tensor):
         return True
     return not value.is_meta and not (only_cheaply and (value.requires_grad or value.device.type != "cpu"))
 
 
 def share_lamps(cameras: Sequence[Camera], states: Sequence[State]) -> tuple[Camera, ...]:
-    """The cameras of a still scope, of which the first (over each tissue, as `states` say) has the lamps beside it: a
-    second one, of a stereo scope, has none of its own."""
+    """Give the cameras of a still scope the lamps of the first one over each tissue: the second camera of a stereo
+    scope has none of its own."""
     shared = []
     firsts: dict[str | None, Tensor] = {}
     for camera, state in zip(cameras, states, strict=True):
         first = firsts.setdefault(state.tissue, camera.world_from_camera)
-        beside = torch.equal(camera.world_from_camera, first)
-        shared.append(camera if beside else replace(camera, world_from_lamps=first))
+        has_lamps = torch.equal(camera.world_from_camera, first)
+        shared.append(camera if has_lamps else replace(camera, world_from_lamps=first))
     return tuple(shared)
 
 
@@ -287,13 +308,13 @@ class RecordedStates:
         self.instruments, self.joints = tuple(instruments), joints
         points = np.array([self._coordinates(state) for state in states], np.float64)
         deviation = points.std(0) if len(points) else np.zeros(0)
-        self._moving = deviation > STILL
+        self._moving = deviation > MIN_DEVIATION
         self._deviation = deviation[self._moving]
         self._points = points[:, self._moving] / self._deviation if len(points) else points
 
     @property
     def still(self) -> bool:
-        """Whether nothing moved, so that no state is nearer than another."""
+        """True if nothing moved, so that no state is nearer than another."""
         return not self._moving.any()
 
     def distances(self, state: State) -> np.ndarray:

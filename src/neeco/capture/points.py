@@ -42,6 +42,9 @@ class PointCloud:
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "colors", colors)
 
+    def __repr__(self) -> str:
+        return f"PointCloud({len(self.positions)} points, measured={self.measured})"
+
 
 def read_ply(path: Path) -> PointCloud:
     """Read a PLY file's vertices: x y z and, where present, red green blue (grey otherwise). Other data is ignored.

@@ -97,7 +97,7 @@ def _status(words: list[str]) -> int:
         if failure := memory_failure(error):
             _print_error(failure)
         elif isinstance(error, NeecoError):
-            _print_error(str(error))
+            _print_error(error.command_line or str(error))
         elif isinstance(error, OSError):
             where = error.filename or ("output" if error.errno == errno.ENOSPC else "system")
             _print_error(f"{where}: {error.strerror or error}; check that path and the disk")

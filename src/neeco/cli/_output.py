@@ -15,7 +15,7 @@ from neeco.errors import NeecoError
 from neeco.files import new_folder
 
 if TYPE_CHECKING:
-    from neeco.studies.tables import Table as ResultTable
+    from neeco.studies.tables import ResultTable
 
 BORDER = 3  # what a column takes beside its text
 

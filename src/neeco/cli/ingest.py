@@ -97,7 +97,7 @@ def run(args: Ingest) -> int:
         except KeyboardInterrupt:
             raise KeyboardInterrupt("nothing was written") from None
     print(json.dumps(done.as_json(), indent=2, allow_nan=False) if args.json else "\n".join(done.lines()))
-    return 1 if args.strict and done.doubtful else 0
+    return 1 if args.strict and done.verdict == "doubtful" else 0
 
 
 def _refuse_others(args: Ingest, what: str, keep: tuple[str, ...]) -> None:

@@ -12,7 +12,7 @@ from neeco.errors import NeecoError
 from neeco.settings import Device
 from neeco.synthesis.settings import DEFAULT_FORMATS, Settings, formats_help
 
-# what is drawn of a scene that was seen from one place
+# by `views`, for a scene that was recorded from one place
 VIEWS_OF_STILL = {
     "recorded": "the recorded ones",
     "perturbed": "within about a degree and a millimetre of the recorded ones",
@@ -43,43 +43,35 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Make the data set and say where it lies."""
-    from neeco.cli._progress import counting, resumable
-    from neeco.raster.devices import device_of
-    from neeco.synthesis.dataset import synthesize
-    from neeco.training.run import load_run, open_gaussian_run
+    from neeco.api import synthesize
+    from neeco.cli._progress import Bars, resumable
 
     settings = arguments.settings
-    settings.check()
-    run_path, instrument_runs = _runs(arguments)
-    device = device_of(arguments.device)
-    with (
-        open_gaussian_run(run_path, "synthesize", device) as trained,
-        counting("synthesize", settings.count) as advance,
-    ):
-        if trained.scene.recorded.still and settings.views in VIEWS_OF_STILL:
-            print(f"the scope stood still: views are {VIEWS_OF_STILL[settings.views]}")
-        others = [load_run(path, device).gaussians("synthesize") for path in instrument_runs]
-        with resumable("what was drawn is kept; run the same command again with --resume"):
-            summary = synthesize(
-                trained,
-                arguments.output,
-                settings,
-                arguments.formats,
-                arguments.resume,
-                on_progress=advance,
-                workers=arguments.workers,
-                instrument_runs=others,
-            )
-    print(f"{summary.images} images in {summary.output} ({summary.made_now} drawn now); look at preview.png")
-    for reason, times in summary.refused.items():
+    tissue, instruments = _runs(arguments)
+    with Bars() as bars, resumable("what was rendered is kept; run the same command again with --resume"):
+        made = synthesize(
+            tissue,
+            arguments.output,
+            instruments=instruments,
+            formats=arguments.formats,
+            resume=arguments.resume,
+            workers=arguments.workers,
+            device=arguments.device,
+            progress=bars.stage,
+            **vars(settings),
+        )
+    if made.still and settings.views in VIEWS_OF_STILL:
+        print(f"the scope stood still: views are {VIEWS_OF_STILL[settings.views]}")
+    print(f"{made.images} images in {made.output} ({made.made_now} rendered now); look at preview.png")
+    for reason, times in made.refused.items():
         print(f"refused {times} states: instrument {reason}")
-    if summary.skipped:
-        print(f"skipped given states {summary.skipped}: refused from every view tried")
+    if made.skipped:
+        print(f"skipped given states {made.skipped}: refused from every view tried")
     return 0
 
 
 def _runs(arguments: Arguments) -> tuple[Path, tuple[Path, ...]]:
-    """The run that is drawn, and those whose instruments are drawn over its tissue."""
+    """The run to render, and those whose instruments are rendered over its tissue."""
     if (arguments.run is None) == (arguments.tissue is None):
         raise NeecoError("synthesize: give a RUN, or --tissue RUN with --instruments RUN ...; one of the two")
     if (arguments.tissue is None) != (not arguments.instruments):

@@ -37,39 +37,12 @@ class Arguments:
 
 
 def run(arguments: Arguments) -> int:
-    """Track, write the page, and say where both lie."""
+    """Track, and say where the capture and the page lie."""
+    from neeco.api import track
     from neeco.cli._progress import Bars, resumable
-    from neeco.errors import NeecoError
-    from neeco.ingest.footage_video import read_footage
-    from neeco.raster.devices import device_of
-    from neeco.report.track_page import write_track_page
-    from neeco.tracking.track import track_footage
-    from neeco.training.run import open_gaussian_run
 
-    is_video = arguments.footage.is_file()
-    if is_video and arguments.tissue == "run":
-        raise NeecoError(
-            f"--tissue: run: {arguments.footage} is a video, whose cameras are in no run's world; leave it out"
-        )
-    with open_gaussian_run(arguments.run, "track", device_of(arguments.device)) as trained:
-        with (
-            Bars() as bars,
-            resumable("what was done is kept; run the same command again with --resume"),
-        ):
-            footage = read_footage(arguments.footage, arguments.output, trained.scene, arguments.resume, bars.stage)
-            tracked = track_footage(
-                trained,
-                footage,
-                arguments.output,
-                start=arguments.start,
-                tissue=arguments.tissue or ("footage" if is_video else "run"),
-                min_trust=arguments.min_trust,
-                resume=arguments.resume,
-                on_progress=lambda done, total: bars.stage("track", done, total),
-                on_stage=bars.stage,
-            )
-        page = write_track_page(tracked)
-    tracked.require_trusted()
-    print(f"{tracked.written} of {len(tracked.records)} frames in {tracked.output}; what was found in all: {page}")
-    print(f"how good it is: {tracked.verdict}")
+    with Bars() as bars, resumable("what was done is kept; run the same command again with --resume"):
+        tracked = track(**vars(arguments), progress=bars.stage)
+    print(f"{tracked.written} of {len(tracked.records)} frames in {tracked.output}; all of them: {tracked.page}")
+    print(f"verdict: {tracked.verdict}")
     return 0

@@ -10,13 +10,16 @@ import numpy as np
 
 from neeco.capture.model import PointCloud, evenly_spaced
 from neeco.errors import NeecoError
-from neeco.ingest.cameras.still import LOOKED_AT, find_background, moving_masks, same_place, stands_still
+from neeco.ingest.cameras.still import N_FRAMES, same_place, stands_still
 from neeco.ingest.cameras.still_scene import RightCamera, look_behind, read_right_camera, still_cameras
+from neeco.ingest.foreground.background import find_background
+from neeco.ingest.foreground.masks import moving_masks
 from neeco.ingest.frames.images import ChosenImages
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.recording.model import STILL
-from neeco.ingest.registration.find_bases import check_frames
+from neeco.ingest.registration.clocks import find_instrument_clocks
+from neeco.ingest.registration.find_bases import check_frames, find_bases
 from neeco.ingest.shaft.video_instruments import find_in_video
 from neeco.ingest.timing.episodes import Episodes
 from neeco.ingest.world import (
@@ -25,8 +28,6 @@ from neeco.ingest.world import (
     check_motion,
     longest_lag,
     residual_flow,
-    with_bases,
-    with_instrument_clocks,
 )
 
 SAME_PLACE = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
@@ -70,10 +71,10 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     def moving(rows: np.ndarray) -> np.ndarray:
         return moving_masks(views.load, count, rows, views.visible)
 
-    data = with_instrument_clocks(data, residual_flow(cameras, views), views, progress)
+    data = find_instrument_clocks(data, residual_flow(cameras, views), views, progress)
     in_camera = [name for name, log in data.parts[0].poses.items() if log.frame == CAMERA]
     data = replace(data, world_from_base={name: np.eye(4) for name in in_camera})
-    data, bases = with_bases(data, views, moving, progress)
+    data, bases = find_bases(data, views, moving, progress)
     if unplaced := [name for name in data.parts[0].poses if name not in data.world_from_base]:
         data.notes.add(
             f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}, "
@@ -115,8 +116,8 @@ def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgre
     progress("comparing what the recordings show", 0, 0)
     backgrounds = {}
     for episode, rows in _rows_by_episode(data, images).items():
-        load = images.loader(rows[evenly_spaced(len(rows), LOOKED_AT)])
-        found = find_background(load, min(len(rows), LOOKED_AT))
+        load = images.loader(rows[evenly_spaced(len(rows), N_FRAMES)])
+        found = find_background(load, min(len(rows), N_FRAMES))
         backgrounds[episode] = np.clip(found.colors, 0, 255).astype(np.uint8)
     first, *others = backgrounds
     for episode in others:

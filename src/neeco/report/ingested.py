@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from neeco.capture import read_capture
+from neeco.capture import Capture, read_capture
 from neeco.capture.checks import inspect_capture
 from neeco.capture.documents import Problem, errors_only
 from neeco.errors import NeecoError
 from neeco.files import finite
-from neeco.ingest.assessment import Assessment, assess_ingest
+from neeco.ingest.assessment import VERDICTS, Assessment, assess_ingest
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.model import Recording
@@ -27,17 +28,31 @@ PAGE = "ingest.html"
 
 @dataclass(frozen=True)
 class Ingested:
-    """The report and the verdict on every tissue, by name ("" where recordings name none); `check`'s problems."""
+    """What `ingest` made: the capture in folder `output`, and how far it can be trusted.
+
+    The report and the verdict on every tissue are by its name, "" where recordings name none; a folder converted from
+    another format has none, but `notes` on what it lacks."""
 
     output: Path
-    results: dict[str, IngestResult]
-    verdicts: dict[str, Assessment]
-    problems: list[Problem]
-    rrd: Path | None
+    results: dict[str, IngestResult] = field(default_factory=dict)
+    verdicts: dict[str, Assessment] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)  # found by `check`
+    rrd: Path | None = None
+    notes: tuple[str, ...] = ()
 
     @property
-    def doubtful(self) -> bool:
-        return any(verdict.level == "bad" for verdict in self.verdicts.values())
+    def verdict(self) -> str | None:
+        """ "good", "usable" or "doubtful", the worst of the tissues' verdicts; None for a converted folder."""
+        found = {VERDICTS[verdict.level] for verdict in self.verdicts.values()}
+        return next((verdict for verdict in reversed(VERDICTS.values()) if verdict in found), None)
+
+    @cached_property
+    def capture(self) -> Capture:
+        """The capture, read from its folder."""
+        return read_capture(self.output)
+
+    def __repr__(self) -> str:
+        return f"Ingested({str(self.output)!r}, verdict={self.verdict!r})"
 
     def as_json(self) -> dict[str, Any]:
         """Return numbers and verdicts for scripts."""

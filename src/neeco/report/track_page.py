@@ -19,7 +19,6 @@ from neeco.report.charts import SMALL, Level, Series, line_chart
 from neeco.report.page import jpeg, write_page
 from neeco.tracking.track import Tracked, state_of
 
-PAGE = "track.html"
 STRIP, DOUBTED = 24, 12  # frames shown: spread over the footage, and the least trusted
 BAND = 2.0  # standard deviations
 HOWS = {
@@ -40,7 +39,7 @@ def write_track_page(tracked: Tracked) -> Path:
     least = sorted(range(len(records)), key=lambda k: values[k])[:DOUBTED]
     missing = sum(record["how"] == "lost" for record in records)
     return write_page(
-        tracked.output / PAGE,
+        tracked.page,
         "track.html",
         title=f"{tracked.footage.root.name}: tracked",
         name=tracked.footage.root.name,

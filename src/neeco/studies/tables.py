@@ -1,7 +1,8 @@
 """Result tables of every study: CSV by pandas, and one kind of table for the terminal, pages, Markdown and LaTeX.
 
-`csv_text` writes rows of numbers in full. `summary_table` makes a `Table` of means and standard deviations, rounded,
-the best of each column marked; `markdown_document` and `latex_document` write several, `write_files` all of a study.
+`csv_text` writes rows of numbers in full. `summary_table` makes a `ResultTable` of means and standard deviations,
+rounded, the best of each column marked; `markdown_document` and `latex_document` write several, and `write_files` all
+tables of a study.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Table:
+class ResultTable:
     """A titled table: `keys` heads the columns that say what a row is, the numbers' columns follow."""
 
     title: str
@@ -91,7 +92,9 @@ class SummaryRow:
     failed: str | None = None
 
 
-def summary_table(title: str, keys: tuple[str, ...], columns: Sequence[Column], rows: Sequence[SummaryRow]) -> Table:
+def summary_table(
+    title: str, keys: tuple[str, ...], columns: Sequence[Column], rows: Sequence[SummaryRow]
+) -> ResultTable:
     """Mean ± standard deviation by row and column. Columns that no row has a number for are left out.
 
     The best mean of a column is judged as it is written, so that equal entries are all best; of one entry there is no
@@ -115,7 +118,7 @@ def summary_table(title: str, keys: tuple[str, ...], columns: Sequence[Column], 
         )
 
     made = (Row(row.keys, tuple(cell(row, column) for column in shown), row.failed) for row in rows)
-    return Table(title, keys, shown, tuple(made))
+    return ResultTable(title, keys, shown, tuple(made))
 
 
 def _has(row: SummaryRow, column: Column) -> bool:
@@ -141,7 +144,7 @@ def summary_csv(keys: Sequence[str], metrics: Sequence[str], rows: Iterable[Mapp
     return csv_text([*keys, *(f"{metric}_{part}" for metric in metrics for part in parts)], flat)
 
 
-def markdown_table(table: Table) -> list[str]:
+def markdown_table(table: ResultTable) -> list[str]:
     """The table's lines in Markdown under its title; the best of a column is bold."""
     headings, rows = _texts(table, markdown_escape, "**{}**", "failed: {}")
     rule = "|" + "---|" * len(table.keys) + "---:|" * (len(headings) - len(table.keys))
@@ -150,7 +153,7 @@ def markdown_table(table: Table) -> list[str]:
 
 
 def markdown_document(
-    title: str, lead: str, tables: Sequence[Table], over: str, notes: Sequence[str], findings: Sequence[str] = ()
+    title: str, lead: str, tables: Sequence[ResultTable], over: str, notes: Sequence[str], findings: Sequence[str] = ()
 ) -> str:
     """Markdown: a heading, a sentence, findings, the tables and notes. over: what their means are taken over."""
     parts = [f"# {markdown_escape(title)}", "", markdown_escape(lead), ""]
@@ -169,7 +172,7 @@ def markdown_escape(text: str) -> str:
     return text
 
 
-def latex_table(table: Table, caption: str) -> str:
+def latex_table(table: ResultTable, caption: str) -> str:
     """The table in LaTeX for the package booktabs; the best of a column is bold."""
     import pandas
 
@@ -180,7 +183,7 @@ def latex_table(table: Table, caption: str) -> str:
     return str(style.to_latex(hrules=True, position_float="centering", caption=caption, column_format=columns))
 
 
-def latex_document(caption: str, tables: Sequence[Table], lead: Sequence[str], notes: Sequence[str]) -> str:
+def latex_document(caption: str, tables: Sequence[ResultTable], lead: Sequence[str], notes: Sequence[str]) -> str:
     """LaTeX tables for the package booktabs. caption: with {} for a table's title; lead, notes: comments."""
     comments = [["% " + " ".join(text.split()) for text in texts] for texts in (lead, notes)]
     parts = ["% \\usepackage{booktabs}", *comments[0], ""]
@@ -193,7 +196,9 @@ def latex_escape(text: str) -> str:
     return "".join(LATEX_SPECIAL.get(character, character) for character in text)
 
 
-def _texts(table: Table, escape: Callable[[str], str], bold: str, failed: str) -> tuple[list[str], list[list[str]]]:
+def _texts(
+    table: ResultTable, escape: Callable[[str], str], bold: str, failed: str
+) -> tuple[list[str], list[list[str]]]:
     """Headings and rows as texts; bold, failed: the markup of a best entry and of a row without numbers, with {}."""
     rows = []
     for row in table.rows:

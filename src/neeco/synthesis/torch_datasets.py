@@ -1,4 +1,4 @@
-"""Labelled images as torch data sets: drawn on the fly, or read from a folder that `neeco synthesize` wrote.
+"""Labelled images as torch data sets: rendered on the fly, or read from a folder that `neeco synthesize` wrote.
 
 A sample is a dict; H x W is the image's size, I the number of instruments that it shows, K that of keypoint names:
 
@@ -15,7 +15,7 @@ A sample is a dict; H x W is the image's size, I the number of instruments that 
     camera     Camera: intrinsics (px) and world_from_camera (mm, OpenCV axes)
     index      int
 
-Teach a segmenter on images that are drawn while it learns, nothing written:
+Train a segmenter on images that are rendered on the fly, nothing written:
 
     import neeco
     from torch.utils.data import DataLoader
@@ -29,11 +29,12 @@ Teach a segmenter on images that are drawn while it learns, nothing written:
 from __future__ import annotations
 
 import itertools
+import os
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -43,16 +44,16 @@ from neeco.capture.documents import Node, RaisingReport
 from neeco.capture.images import open_image, read_image, read_labels
 from neeco.capture.model import InstrumentState, State
 from neeco.capture.readers.cameras import parse_lens
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, naming_arguments
 from neeco.files import read_json, require_inside, require_like
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.labels.annotation import LabelledImage, keypoint_names
 from neeco.labels.labellers import instruments_of
 from neeco.raster.native import torch_threads
+from neeco.scene.drawable import DrawableScene
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import load_gaussians, save_scene
-from neeco.settings import with_fields
 from neeco.synthesis.dataset import INFO, SCENE_FILE
 from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, StatesRefused, limit_threads
 from neeco.synthesis.parallel import PackedSpec
@@ -63,12 +64,30 @@ from neeco.training.run import TrainedRun, load_run
 
 Sample = dict[str, Any]
 Transform = Callable[[Sample], Sample]
-SceneLike = TrainedRun | GaussianScene | Path | str
+
+
+class HasLearned(Protocol):
+    """What `neeco.Scene` is here."""
+
+    @property
+    def learned(self) -> DrawableScene:
+        """The scene as training made it."""
+
+
+class HasTrained(Protocol):
+    """What `neeco.Run` is here."""
+
+    @property
+    def trained(self) -> TrainedRun:
+        """The run as training made it."""
+
+
+SceneLike = HasTrained | HasLearned | TrainedRun | GaussianScene | str | os.PathLike[str]
 STACKED = ("image", "parts", "depth", "ignore")  # of one shape in a batch; the rest are lists
 RANDOM = ("interpolate", "extrapolate")  # samplers that draw anew what is refused
 MAX_REFUSED = 1000  # given states refused in a row, before a stream ends with an error
 ASKED_BY = "LabelledImages"  # in error messages
-READ = ("parts", "ignore", "depth")  # folders of the files that a sample is made of beside its image
+READ = ("parts", "ignore", "depth")  # folders of the files of a sample, in addition to its image
 REMEDY = "give a folder that `neeco synthesize` wrote"
 INFO_LIKE = {
     "ids": [{"id": int, "part": str}],
@@ -87,40 +106,39 @@ def collate(samples: Sequence[Sample]) -> dict[str, Any]:
     }
 
 
+@naming_arguments()
 def sample_states(
     scene: SceneLike,
     count: int,
     *,
     seed: int = 0,
-    states: str = Settings.states,
+    states: str | os.PathLike[str] = Settings.states,
     views: Views = Settings.views,
     margin: float = Settings.margin,
 ) -> list[tuple[State, Camera]]:
     """`count` instrument states, each with a camera to see it from, as `neeco synthesize` draws them at first.
 
     scene: a run, its folder, a scene, or its file. states: interpolate, extrapolate, grid, path:FILE.jsonl or
-    FILE.jsonl; views: recorded, perturbed or orbit (see `Settings`). Nothing is drawn, so none is refused for what the
-    image shows. The same seed gives the same states. Raises NeecoError for settings or a scene that do not fit.
+    FILE.jsonl; views: recorded, perturbed or orbit (see `Settings`). Nothing is rendered, so none is refused for what
+    the image shows. The same seed gives the same states. Raises NeecoError for settings or a scene that do not fit.
 
         for state, camera in neeco.sample_states("runs/sample", 3, states="extrapolate"):
             print(state.instruments["maryland"].joints, camera.width, camera.height)
     """
-    settings = Settings(count=count, seed=seed, states=states, margin=margin, views=views)
-    settings.check()
+    settings = Settings.from_values("sample_states", count=count, seed=seed, states=states, margin=margin, views=views)
     sampler = make_sampler(_opened(scene)[0], settings.states, margin, views, count)
     return [sampler(index, np.random.default_rng(np.random.SeedSequence([seed, index]))) for index in range(count)]
 
 
 class _Generated:
-    """What draws the samples of a data set. To another process it goes as the scene's file where there is one, else as
-    the file's bytes, and is opened there when the first sample is drawn."""
+    """The generator of a data set's samples. Other processes get the scene's file where there is one, else the file's
+    bytes, and open it for the first sample."""
 
     collate = staticmethod(collate)
 
     def __init__(
         self, scene: SceneLike, instruments: Sequence[SceneLike], settings: Settings, transform: Transform | None
     ) -> None:
-        settings.check()
         self.transform = transform
         opened = [_opened(given) for given in (scene, *instruments)]
         first, *others = (found for found, _ in opened)
@@ -155,10 +173,10 @@ class _Generated:
 
 
 class LabelledImages(_Generated, Dataset[Sample]):
-    """A map-style data set of `count` labelled images, drawn when they are asked for: nothing is written.
+    """A map-style data set of `count` labelled images, rendered on access: nothing is written.
 
     scene: a run (`neeco.load`), its folder, a scene, or its file. instruments: runs or scenes whose instruments are
-    drawn over the scene's tissue, instead of its own. states: interpolate, extrapolate, grid, path:FILE.jsonl or
+    rendered over the scene's tissue, instead of its own. states: interpolate, extrapolate, grid, path:FILE.jsonl or
     FILE.jsonl; views: recorded, perturbed or orbit; labels: composited or threshold; camera_effects: a YAML file;
     `settings`: any other field of `neeco.synthesis.settings.Settings`, such as size="1280x1024", scale=2.0 or
     lens=True. transform: sample -> sample, such as an augmentation. Samples are described in this module's docstring.
@@ -168,31 +186,36 @@ class LabelledImages(_Generated, Dataset[Sample]):
     worker uses one thread; it opens the scene's file when it draws its first sample (a scene without a file is sent to
     it). Drawing on a GPU needs spawned workers, or none.
 
-    Raises NeecoError for a scene or settings that do not fit, and, when a sample is drawn, StatesRefused (a NeecoError)
-    where no state is acceptable.
+    Raises NeecoError for a scene or settings that do not fit, and, when a sample is rendered, StatesRefused (a
+    NeecoError) where no state is acceptable.
 
         images = neeco.LabelledImages("runs/sample", 100, seed=1)
         sample = images[0]
         sample["image"].shape, [images.classes[k - 1] for k in sample["labels"]]
     """
 
+    @naming_arguments()
     def __init__(
         self,
         scene: SceneLike,
         count: int,
         *,
         seed: int = 0,
-        states: str = Settings.states,
+        states: str | os.PathLike[str] = Settings.states,
         views: Views = Settings.views,
         labels: LabelWay = Settings.labels,
-        camera_effects: str | Path | None = None,
+        camera_effects: str | os.PathLike[str] | None = None,
         instruments: Sequence[SceneLike] = (),
         transform: Transform | None = None,
         **settings: Any,
     ) -> None:
-        chosen = _settings(count, seed, camera_effects, states=states, views=views, labels=labels, **settings)
+        given = settings | {"states": states, "views": views, "labels": labels, "camera_effects": camera_effects}
+        chosen = Settings.from_values(ASKED_BY, count=count, seed=seed, **given)
         super().__init__(scene, instruments, chosen, transform)
         self.count = count
+
+    def __repr__(self) -> str:
+        return f"LabelledImages({self.count} images, states={self._settings.states!r}, {', '.join(self.classes)})"
 
     def __len__(self) -> int:
         return self.count
@@ -207,8 +230,8 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
     """An endless stream of the samples `start`, `start` + 1, ... of `LabelledImages`, which see for the arguments.
 
     The workers of a DataLoader share the indices: of W workers the k-th draws start + k, start + k + W, ...; `shard` =
-    (rank, world size) shares them among processes in the same way first. So no sample is drawn twice, and each is the
-    same whoever draws it. Prescribed states that are refused are left out; path:FILE.jsonl, which has an end, is not
+    (rank, world size) shares them among processes in the same way first. So no sample is rendered twice, and each is
+    the same in any worker. Prescribed states that are refused are left out; path:FILE.jsonl, which has an end, is not
     for a stream.
 
         stream = neeco.LabelledStream("runs/sample", seed=1)
@@ -217,6 +240,7 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
             break
     """
 
+    @naming_arguments()
     def __init__(
         self,
         scene: SceneLike,
@@ -224,23 +248,27 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
         start: int = 0,
         shard: tuple[int, int] = (0, 1),
         seed: int = 0,
-        states: str = Settings.states,
+        states: str | os.PathLike[str] = Settings.states,
         views: Views = Settings.views,
         labels: LabelWay = Settings.labels,
-        camera_effects: str | Path | None = None,
+        camera_effects: str | os.PathLike[str] | None = None,
         instruments: Sequence[SceneLike] = (),
         transform: Transform | None = None,
         **settings: Any,
     ) -> None:
-        if states.startswith(PATH_PREFIX):
+        if str(states).startswith(PATH_PREFIX):
             raise NeecoError(f"states: {states}: a path has an end; use LabelledImages, which has a count")
         if start < 0 or not 0 <= shard[0] < shard[1]:
             raise NeecoError(
                 f"start, shard: {start}, {shard}: give start >= 0 and shard (rank, size), 0 <= rank < size"
             )
-        chosen = _settings(1, seed, camera_effects, states=states, views=views, labels=labels, **settings)
+        given = settings | {"states": states, "views": views, "labels": labels, "camera_effects": camera_effects}
+        chosen = Settings.from_values("LabelledStream", count=1, seed=seed, **given)
         super().__init__(scene, instruments, chosen, transform)
         self.start, self.shard = start, shard
+
+    def __repr__(self) -> str:
+        return f"LabelledStream(start={self.start}, states={self._settings.states!r}, {', '.join(self.classes)})"
 
     def __iter__(self) -> Iterator[Sample]:
         worker = get_worker_info()
@@ -287,6 +315,9 @@ class StoredImages(Dataset[Sample]):
             found = ", ".join(f"{name!r} ({count})" for name, count in Counter(r["split"] for r in records).items())
             raise NeecoError(f"{self.folder}: split {split!r} has no images; it has {found or 'none'}")
 
+    def __repr__(self) -> str:
+        return f"StoredImages({str(self.folder)!r}, {len(self._records)} images, {', '.join(self.classes)})"
+
     def __len__(self) -> int:
         return len(self._records)
 
@@ -297,8 +328,8 @@ class StoredImages(Dataset[Sample]):
         image = require_inside(self.folder / record["image"], self.folder)
         depth = np.asarray(open_image(files["depth"], size), np.float32) * np.float32(self._mm_per_count)
         labelled = LabelledImage.of(
-            read_image(image, size),
-            torch.from_numpy(depth),
+            image=read_image(image, size),
+            depth=torch.from_numpy(depth),
             parts=read_labels(files["parts"], size),
             ignore=read_labels(files["ignore"], size) == self._ignored,
             labels=record["labels"],
@@ -316,28 +347,24 @@ class StoredImages(Dataset[Sample]):
         )
         lens = parse_lens(place)
         assert lens is not None
-        camera = lens.before(Camera(world_from_camera, *lens.intrinsics, *size))
+        camera = lens.distorted_camera(Camera(world_from_camera, *lens.intrinsics, *size))
         found = labelled.targets() | {"state": state, "camera": camera, "index": record["index"]}
         return found if self.transform is None else self.transform(found)
 
 
 def _opened(given: SceneLike) -> tuple[GaussianScene, Path | None]:
     """The scene, and the file that holds it where there is one. Raises NeecoError."""
-    if isinstance(given, str | Path):
+    run: Any = given
+    if isinstance(given, str | os.PathLike):
         path = Path(given)
         if not path.is_dir():
             return load_gaussians(path, ASKED_BY), path
-        given = load_run(path)
-    folder = getattr(given, "path", None)  # a run has one
-    drawable: Any = getattr(given, "scene", given)
-    scene = require_gaussians(getattr(drawable, "learned", drawable), ASKED_BY)  # neeco.Scene holds what was learned
-    return scene, None if folder is None else Path(folder) / SCENE_FILE
-
-
-def _settings(count: int, seed: int, camera_effects: str | Path | None, **given: Any) -> Settings:
-    """The settings of a data set, `given` by the names of their fields."""
-    effects = None if camera_effects is None else str(camera_effects)
-    return with_fields(Settings(count=count, seed=seed), {"camera_effects": effects} | given)
+        run = load_run(path)
+    run = getattr(run, "trained", run)
+    scene = getattr(run, "scene", run)
+    folder = getattr(run, "path", None)  # a run has one
+    found = require_gaussians(getattr(scene, "learned", scene), ASKED_BY)
+    return found, None if folder is None else Path(folder) / SCENE_FILE
 
 
 def _spec(opened: Sequence[tuple[GaussianScene, Path | None]], settings: Settings) -> GeneratorSpec | PackedSpec:

@@ -45,6 +45,7 @@ INFO = "track.json"
 STEPS = "steps"  # the folder of finished steps, removed at the end
 SECOND = "second"  # in it: steps with tissue and light that were learned again
 FOOTAGE = "footage"  # the folder of the output in which `neeco track` keeps a video as a capture
+PAGE = "track.html"
 RUN = "run"  # the folder of the run with which footage over another tissue was tracked
 OTHER_TISSUE_MISFIT = 3.0  # of instruments over tissue learned from footage, times that over their own
 MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
@@ -67,6 +68,14 @@ class Tracked:
     written: int
     min_trust: float
     scene: GaussianScene
+
+    @property
+    def page(self) -> Path:
+        """The page about all frames, once `write_track_page` has written it."""
+        return self.output / PAGE
+
+    def __repr__(self) -> str:
+        return f"Tracked({str(self.output)!r}, {self.written} of {len(self.records)} frames)"
 
     @property
     def verdict(self) -> str:

@@ -165,26 +165,33 @@ def schedule_parts() -> tuple[str, ...]:
 
 
 def training_config(
-    name: str | None, values: Mapping[str, Any], assignments: Sequence[str] = (), begun: TrainConfig | None = None
+    name: str | None,
+    values: Mapping[str, Any],
+    assignments: Sequence[str] | Mapping[str, Any] = (),
+    begun: TrainConfig | None = None,
 ) -> TrainConfig:
     """Return the settings of a run.
 
     name: METHOD or METHOD+dta, whose defaults are changed; None: the default method. values: those that are not None
-    replace defaults. assignments: NAME=VALUE, applied last (dots reach nested fields); a preset that they name comes
-    before all. begun: settings of a run to be resumed, in place of the defaults. Raises NeecoError naming the option
-    for an unknown name, a value that does not fit, and an unknown method or variant.
+    replace defaults. assignments: NAME=VALUE, or values by name, applied last (dots reach nested fields); a preset
+    that they name comes before all. begun: settings of a run to be resumed, in place of the defaults. Raises NeecoError
+    naming the option for an unknown name, a value that does not fit, and an unknown method or variant.
     """
-    given = {field: value for field, value in values.items() if value is not None}
     base = _variant_defaults(name or DEFAULT) if begun is None else _resumed(begun, name)
-    config: TrainConfig = with_fields(_with_preset(base, assignments), given)
-    _check_length(config)
-    changed = config_to_dict(config)
-    for assignment in assignments:
-        _assign(changed, config, assignment)
+    if isinstance(assignments, Mapping):
+        named: list[tuple[str, Any]] = list(assignments.items())
+    else:
+        named = [name_and_value("--set", assignment, "ssim_weight=0.2") for assignment in assignments]
+    changed = config_to_dict(_with_preset(base, named))
+    changed |= {option: value for option, value in values.items() if value is not None}
+    for option, value in named:
+        _assign(changed, option, value, parse=not isinstance(assignments, Mapping))
     try:
         config = config_from_dict(changed)
     except NeecoError as error:
-        raise NeecoError(f"--set: {error}") from None
+        option, colon, problem = str(error).partition(":")
+        option = f"--{option.replace('_', '-')}" if option in values else f"--set {option}"
+        raise NeecoError(f"{option}{colon}{problem}") from None
     check_ranges(config)
     return config
 
@@ -228,10 +235,9 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _with_preset(config: TrainConfig, assignments: Sequence[str]) -> TrainConfig:
+def _with_preset(config: TrainConfig, assignments: Sequence[tuple[str, Any]]) -> TrainConfig:
     """Return `config` with the fields of the preset that `assignments` name; an unknown one is refused later."""
-    named = (assignment.partition("=") for assignment in assignments)
-    chosen = [value for name, _, value in named if name == "deformation.preset"]
+    chosen = [value for name, value in assignments if name == "deformation.preset"]
     presets = method_class(config.method).presets
     preset: TrainConfig = with_fields(config, presets.get(chosen[-1], {}) if chosen else {})
     return preset
@@ -239,7 +245,10 @@ def _with_preset(config: TrainConfig, assignments: Sequence[str]) -> TrainConfig
 
 def check_ranges(config: TrainConfig) -> None:
     """Raise NeecoError naming the option of a number that is out of range."""
-    _check_length(config)
+    if config.iterations < 1:
+        raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
+    if config.minutes is not None and not config.minutes > 0:
+        raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
     schedule, density, resolution = config.schedule, config.density, config.resolution
     if (steps := schedule.published_steps) is not None and steps < 1:
         raise NeecoError(f"--set schedule.published_steps: {steps!r} is not a positive whole number; give e.g. 20000")
@@ -279,33 +288,24 @@ def check_ranges(config: TrainConfig) -> None:
             raise NeecoError(f"--set density.{name}: {getattr(density, name)} is not between 0 and {limit}")
 
 
-def _check_length(config: TrainConfig) -> None:
-    if config.iterations < 1:
-        raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
-    if config.minutes is not None and not config.minutes > 0:
-        raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
-
-
-def _assign(values: dict[str, Any], config: TrainConfig, assignment: str) -> None:
-    """Set NAME=VALUE in `values`, the plain dicts of `config`; the value's type is checked later."""
-    name, text = name_and_value("--set", assignment, "ssim_weight=0.2")
+def _assign(values: dict[str, Any], name: str, value: Any, *, parse: bool) -> None:
+    """Set the field `name` in `values`, the plain dicts of a config; the value's type is checked later. With `parse`
+    the value is text, read as YAML unless the field is text."""
     *path, last = name.split(".")
     target: Any = values
     for part in path:
         target = target.get(part) if isinstance(target, dict) else None
     open_ended = path == ["deformation"]
     if not isinstance(target, dict) or (last not in target and not open_ended):
-        raise NeecoError(f"--set: unknown field {name!r}; see config.yaml of any run for the names")
+        raise NeecoError(f"--set {name}: unknown field; see config.yaml of any run for the names")
     if path == [] and last == "method":
         raise NeecoError("--set method: would keep the other method's settings; use --method")
     old = target.get(last)
-    if isinstance(old, str):  # taken literally: YAML reads on and off as truth values
-        target[last] = text
-        return
-    try:
-        value = yaml.load(text, YamlLoader)
-    except yaml.YAMLError:
-        raise NeecoError(f"--set {name}: {text!r} is not a value; quote it as in YAML") from None
+    if parse and not isinstance(old, str):  # a word is taken literally: YAML reads on and off as truth values
+        try:
+            value = yaml.load(value, YamlLoader)
+        except yaml.YAMLError:
+            raise NeecoError(f"--set {name}: {value!r} is not a value; quote it as in YAML") from None
     if isinstance(old, dict) and not isinstance(value, dict):
         raise NeecoError(f"--set {name}: is a group of fields; give one of {', '.join(old) or 'them'}, as {name}.FIELD")
     target[last] = value

@@ -20,7 +20,7 @@ from neeco.studies.downstream.job import (
     labelled_frames,
     parse_condition,
 )
-from neeco.studies.downstream.samples import DataSet
+from neeco.studies.downstream.samples import ImageSet
 
 SETS = ("kin", "other")
 SETTINGS = DownstreamSettings(capture=Path("capture"), output=Path("out"))
@@ -127,7 +127,7 @@ def test_the_command_makes_the_same_study() -> None:
     assert SETTINGS.command() == f"neeco downstream {Path('capture').absolute()} --output DIR"
     changed = replace(
         SETTINGS,
-        sets=(DataSet("kin", Path("/sets/a b"), 5), DataSet("other", Path("/sets/c"))),
+        sets=(ImageSet("kin", Path("/sets/a b"), 5), ImageSet("other", Path("/sets/c"))),
         num_real=("5", "all"),
         frame_selection="first",
         weights={"unet": Path("/w.safetensors")},

@@ -24,7 +24,7 @@ from neeco.studies.downstream import model as models_module
 from neeco.studies.downstream.experiment import plan_downstream, run_downstream
 from neeco.studies.downstream.job import DownstreamSettings, job_folder
 from neeco.studies.downstream.results import failed_jobs, tables_of, write_tables
-from neeco.studies.downstream.samples import DataSet
+from neeco.studies.downstream.samples import ImageSet
 from neeco.studies.downstream.scores import Detections
 
 TIMES = ("seconds", "processor_seconds", "machine")
@@ -53,7 +53,7 @@ def spec(recorded: Path, drawn: Path, tmp_path: Path) -> DownstreamSettings:
     return DownstreamSettings(
         capture=recorded,
         output=tmp_path / "out",
-        sets=(DataSet("kin", drawn),),
+        sets=(ImageSet("kin", drawn),),
         models=("pixels",),
         num_real=("0", "6", "all"),
         folds=2,
@@ -192,7 +192,7 @@ def test_more_folds_sets_conditions_models_and_frames_are_added(spec: Downstream
     trained(small)
     before = job_files(spec.output)
     assert len(before) == 2
-    sets = (*spec.sets, DataSet("other", write_set(tmp_path / "other"), 3))
+    sets = (*spec.sets, ImageSet("other", write_set(tmp_path / "other"), 3))
     conditions = ("real", "kin", "other", "kin+real")
     more = replace(small, models=("pixels", "corners"), conditions=conditions, num_real=("0", "6", "7"), folds=2)
     wide = replace(more, sets=sets)
@@ -307,7 +307,7 @@ def test_a_folder_of_other_jobs_is_refused_before_the_work(spec, change, told: s
 def test_another_set_under_the_same_name_is_refused(spec: DownstreamSettings, tmp_path: Path) -> None:
     small = replace(spec, conditions=("kin",), folds=1)
     trained(small)
-    for data in (DataSet("kin", write_set(tmp_path / "else")), replace(spec.sets[0], count=3)):
+    for data in (ImageSet("kin", write_set(tmp_path / "else")), replace(spec.sets[0], count=3)):
         with refused("job.json: sets: is", "give another --output"):
             plan_downstream(replace(small, sets=(data,)))
 
@@ -557,7 +557,7 @@ def test_jobs_are_handed_the_capture(spec: DownstreamSettings, monkeypatch: pyte
 
 def test_a_set_of_others_is_no_less_a_set(spec: DownstreamSettings, tmp_path: Path) -> None:
     root = write_set(tmp_path / "others", info=False)
-    result = trained(replace(replace(spec, conditions=("kin",), folds=1), sets=(DataSet("kin", root),)))
+    result = trained(replace(replace(spec, conditions=("kin",), folds=1), sets=(ImageSet("kin", root),)))
     assert result["sets"][0]["made_by"] is None
     assert "error" not in result["jobs"][0]
 

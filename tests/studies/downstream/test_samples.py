@@ -15,8 +15,8 @@ from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.studies.downstream.samples import (
     WHOLE,
-    DataSet,
     Example,
+    ImageSet,
     class_names,
     frame_size,
     has_labels,
@@ -31,7 +31,7 @@ PARTS = ("shaft", "wrist", "jaws")
 
 
 def loaded(root: Path, classes=WHOLE, edges="hard", count=None) -> list[Example]:
-    return [sample.load() for sample in synthetic_samples(DataSet("set", root, count), classes, edges, SIZE)]
+    return [sample.load() for sample in synthetic_samples(ImageSet("set", root, count), classes, edges, SIZE)]
 
 
 def refused(*words: str):
@@ -116,9 +116,9 @@ def test_edges_are_read_where_they_are_asked_for(drawn: Path) -> None:
 
 
 def test_a_count_takes_the_first_images(drawn: Path) -> None:
-    samples = synthetic_samples(DataSet("set", drawn, 4), WHOLE, "hard", SIZE)
+    samples = synthetic_samples(ImageSet("set", drawn, 4), WHOLE, "hard", SIZE)
     assert [sample.name for sample in samples] == ["000000", "000001", "000002", "000003"]
-    assert len(synthetic_samples(DataSet("set", drawn), WHOLE, "hard", SIZE)) == 6
+    assert len(synthetic_samples(ImageSet("set", drawn), WHOLE, "hard", SIZE)) == 6
 
 
 def annotated(drawn: Path, splits: list[str]) -> Path:
@@ -132,7 +132,7 @@ def annotated(drawn: Path, splits: list[str]) -> Path:
 
 def test_of_annotated_frames_only_those_trained_on_are_learned_from(drawn: Path) -> None:
     splits = ["test", "train", "train", "unseen", "train", "test"]
-    samples = synthetic_samples(DataSet("set", annotated(drawn, splits)), WHOLE, "hard", SIZE)
+    samples = synthetic_samples(ImageSet("set", annotated(drawn, splits)), WHOLE, "hard", SIZE)
     assert [sample.name for sample in samples] == ["000001", "000002", "000004"]
 
 
@@ -173,7 +173,7 @@ def test_sets_that_cannot_be_read_are_refused(drawn: Path, tmp_path: Path) -> No
     with refused("--sets set", "has 6 images, not 7; synthesize more"):
         loaded(drawn, count=7)
     with refused("--sets set", "is 48x40, the capture's frames are 60x50"):
-        synthetic_samples(DataSet("set", drawn), WHOLE, "hard", (60, 50))
+        synthetic_samples(ImageSet("set", drawn), WHOLE, "hard", (60, 50))
     (drawn / "parts" / "000005.png").unlink()
     assert len(loaded(drawn, count=5)) == 5
     with refused("--sets set", "000005.png", "every image needs its labels"):
@@ -211,7 +211,7 @@ def test_ids_that_mean_nothing_are_refused(drawn: Path) -> None:
     parts[0, 0] = 9
     save_grey(drawn / "parts" / "000000.png", parts)
     with refused("000000.png: id 9 has no class", "dataset.json"):
-        synthetic_samples(DataSet("set", drawn), WHOLE, "hard", SIZE)  # known before the work
+        synthetic_samples(ImageSet("set", drawn), WHOLE, "hard", SIZE)  # known before the work
 
 
 def test_a_description_with_numbers_that_are_none_is_refused(drawn: Path) -> None:

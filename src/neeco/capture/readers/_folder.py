@@ -41,7 +41,7 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
 
 
 def capture_of(parsed: Parsed) -> Capture:
-    """What was read without an error, as a capture, the poses of articulated instruments as those of their roots.
+    """Build the capture from what was read without errors. Poses of articulated instruments become their roots'.
     Raises NeecoError for an image whose name is not in UTF-8."""
     frames, instruments = tuple(parsed.frames), parsed.instruments
     for frame in frames:
@@ -63,7 +63,15 @@ def capture_of(parsed: Parsed) -> Capture:
             for item in instruments
         )
     return Capture(
-        parsed.root, frames, instruments, points, parsed.registered, parsed.timed, parsed.lens, parsed.still, tissues
+        parsed.root,
+        frames,
+        instruments,
+        points,
+        registered=parsed.registered,
+        timed=parsed.timed,
+        lens=parsed.lens,
+        still=parsed.still,
+        tissues=tissues,
     )
 
 

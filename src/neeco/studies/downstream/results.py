@@ -1,4 +1,4 @@
-"""From jobs to what they say: means over folds, paired differences with intervals, findings in words, tables.
+"""Results of jobs: means over folds, paired differences with intervals, findings in words, tables.
 
 A study's results are one document, that of downstream.json, of plain values: "jobs" as they wrote them, "summary",
 "paired" and "answers" from here. An arm is what is averaged over folds: a model, a condition and a number of labelled
@@ -22,9 +22,9 @@ from neeco.studies.tables import (
     UNKNOWN,
     Cell,
     Column,
+    ResultTable,
     Row,
     SummaryRow,
-    Table,
     csv_text,
     latex_document,
     markdown_document,
@@ -131,7 +131,7 @@ def scores_by_fold(jobs: Sequence[Document], model: str, split: str, metric: str
 
 
 def paired(jobs: Sequence[Document], first: Arm, second: Arm, split: str, metric: str) -> dict[str, Any] | None:
-    """How much better `first` does than `second` (of one model) on the folds that both finished: the mean difference,
+    """Compare `first` with `second` (of one model) on the folds that both finished: the mean difference of scores,
     and the interval that holds the mean with 95 % confidence (Student's t; None for a single fold)."""
     scores = scores_by_fold(jobs, first.model, split, metric)
     ours, theirs = (scores.get(arm[1:], {}) for arm in (first, second))
@@ -153,7 +153,7 @@ def comparisons(
     """The differences that the study is about, over the jobs that finished.
 
     With synthetic images against without, at every number of labelled frames; synthetic images alone against the most
-    labelled frames; the first set against each other set, alone and beside labelled frames; every condition that does
+    labelled frames; the first set against each other set, alone and with labelled frames; every condition that does
     something to a set (`set+soft`) against the set as it is.
     """
     done = [job for job in jobs if "error" not in job]
@@ -205,7 +205,7 @@ def main_differences(experiment: Document, model: Document, split: str) -> list[
 
 
 def findings(experiment: Document) -> list[str]:
-    """What the numbers say: a sentence for every model, split and condition with synthetic images."""
+    """Return the findings: a sentence for every model, split and condition with synthetic images."""
     return [
         f"{model['name']}, {split}: {sentence}"
         for model, split in models_and_splits(experiment)
@@ -221,7 +221,7 @@ def findings_of(experiment: Document, model: Document, split: str) -> list[str]:
 
 
 def _finding(key: tuple[str, int], scores: Scores, experiment: Document, model: Document, split: str) -> str | None:
-    """One condition beside labelled frames alone; None where there is nothing to compare."""
+    """Compare one condition with labelled frames alone; None where there is nothing to compare."""
     (condition, real), metric = key, TITLES[MAIN[model["answers"]]]
     words = condition.split("+")
     sets = [entry for entry in experiment["sets"] if entry["name"] in words]
@@ -267,7 +267,7 @@ def real_curve(scores: Scores, key: tuple[str, int]) -> list[tuple[int, float]]:
 
 
 def verdict(row: Document) -> str:
-    """What a paired difference shows: one of VERDICTS; "" where there is no interval."""
+    """Return the verdict of a paired difference, one of VERDICTS; "" where there is no interval."""
     if row["low"] is None:
         return ""
     return HELPS if row["low"] > 0 else HURTS if row["high"] < 0 else NONE_SHOWN
@@ -293,14 +293,14 @@ def equivalent(curve: Sequence[tuple[int, float]], value: float) -> str:
     return f"as good as about {as_many:.0f}"
 
 
-def tables_of(experiment: Document) -> list[Table]:
+def tables_of(experiment: Document) -> list[ResultTable]:
     """For every model and split the scores of each condition, then the differences of its main score."""
     pairs = models_and_splits(experiment)
     tables = [table(experiment, model, split) for model, split in pairs for table in (scores_table, differences_table)]
     return [table for table in tables if table.rows]
 
 
-def scores_table(experiment: Document, model: Document, split: str) -> Table:
+def scores_table(experiment: Document, model: Document, split: str) -> ResultTable:
     """The scores of each condition, mean and standard deviation over folds."""
     name, jobs = model["name"], [job for job in experiment["jobs"] if job["model"] == model["name"]]
     order = list(dict.fromkeys(job["condition"] for job in experiment["jobs"]))
@@ -315,7 +315,7 @@ def scores_table(experiment: Document, model: Document, split: str) -> Table:
     return summary_table(f"{name}, split {split}", KEYS, columns, entries)
 
 
-def differences_table(experiment: Document, model: Document, split: str) -> Table:
+def differences_table(experiment: Document, model: Document, split: str) -> ResultTable:
     """The paired differences of the main score, with their intervals."""
     columns = (Column("difference", "difference"), Column("low", "95 % from"), Column("high", "to"))
     rows = []
@@ -324,7 +324,7 @@ def differences_table(experiment: Document, model: Document, split: str) -> Tabl
         against = title_of(row["against"], row["against_real"])
         rows.append(Row((*_keys(row), against), tuple(map(Cell, [*texts, str(row["folds"])]))))
     title = f"{model['name']}, split {split}: differences of {TITLES[MAIN[model['answers']]]}"
-    return Table(title, (*KEYS, "against"), (*columns, Column("folds", "folds")), tuple(rows))
+    return ResultTable(title, (*KEYS, "against"), (*columns, Column("folds", "folds")), tuple(rows))
 
 
 def _keys(row: Document) -> tuple[str, str]:
@@ -340,7 +340,7 @@ def _metric_title(metric: str) -> str:
 
 
 def budget_text(experiment: Document) -> str:
-    """What every training was given, and how often."""
+    """Return the budget of every training and the number of folds, in words."""
     models = [
         f"{model['name']}: {model['steps']} steps of {model['batch']} images of {model['input'][0]}x{model['input'][1]}"
         for model in experiment["models"]
