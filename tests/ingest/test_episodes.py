@@ -20,7 +20,8 @@ from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.splits import assign_splits
 from neeco.ingest.timing.compatibility import episode_names, separate
-from neeco.ingest.timing.episodes import PAUSE_S, read_episodes
+from neeco.ingest.timing.episodes import PAUSE_S
+from neeco.ingest.timing.reading import read_episodes
 
 BEGINS = (0.0, 2.0, 4.5)  # s of the bar's motion
 
