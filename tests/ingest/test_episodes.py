@@ -114,7 +114,7 @@ def test_another_tissue_is_refused_by_name(tmp_path: Path) -> None:
                            "joints": {"jaw": {"file": "bar.csv", "columns": {"value": "qx"},
                                               "units": {"angle": "rad"}}}}]}, "bar: joints (jaw)"),
         ({"camera": "moving"}, "camera: is not as"),
-        ({"splits": {"test_every": 3}}, "splits: says another than"),
+        ({"splits": {"test_every": 3}}, "splits: differs from that"),
     ],
 )  # fmt: skip
 def test_what_one_capture_cannot_hold_is_refused_in_one_line(

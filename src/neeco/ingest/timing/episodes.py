@@ -48,7 +48,7 @@ class Episode:
 
     @property
     def times(self) -> np.ndarray:
-        """[V] s of every frame."""
+        """Times [V] s of every frame."""
         return self.video.times
 
     def logged_poses(self, log: PoseLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -90,7 +90,7 @@ class Episodes:
 
     @property
     def times(self) -> np.ndarray:
-        """[V] s of every frame."""
+        """Times [V] s of every frame."""
         return self.video.times
 
     def episode_of(self, frames: np.ndarray) -> np.ndarray:

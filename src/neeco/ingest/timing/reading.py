@@ -80,7 +80,7 @@ def _read(recording: Recording, notes: Notes, episode: int) -> Episode:
     clocks = {name: ClockOffset(float(seconds), 0.0, GIVEN) for name, seconds in recording.sync.items()}
     if VIDEO_CLOCK in recording.clocks:
         clocks[VIDEO_CLOCK] = ClockOffset(0.0, 0.0, "the images' own")
-    # joints' clocks that nothing gives are the video's: images tell them to some 20 ms at best. Trackers' clocks, and
+    # joints' clocks that nothing gives are the video's: images determine them to some 20 ms at best. Trackers' clocks, and
     # those of joints on one of them, are found later, from motion
     found_later = {log.clock for log in (*poses.values(), *([scope] if scope else []))}
     for joint, log in ((joint, log) for name in placed for joint, log in joints[name].items()):
@@ -105,7 +105,7 @@ def _check_bases(recording: Recording, scope: PoseLog | None, poses: Mapping[str
         if stated is not None and name not in placed and log.stated_in not in (None, stated) and log.frame == BASE:
             raise NeecoError(
                 f"{recording.path}: laparoscope: its poses are stated in {stated}, those of {name} in "
-                f"{log.stated_in}; where these are one frame say `frame: base` for both, else say how they stand "
+                f"{log.stated_in}; where these are one frame write `frame: base` for both, else state how they stand "
                 "(world_from_base)"
             )
 
