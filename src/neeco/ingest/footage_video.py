@@ -16,14 +16,14 @@ from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.file import recording_from_flags
 from neeco.ingest.result import IngestResult
 from neeco.scene import GaussianScene
-from neeco.tracking.footage_tissue import Report
+from neeco.tracking.footage_tissue import Progress
 from neeco.tracking.track import FOOTAGE
 
 SOURCE = "source.json"  # in it: which video that is
 FARTHEST = 0.5  # quantile of the tissue's distances that is what ingest takes for the whole
 
 
-def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, report: Report) -> Capture:
+def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, report: Progress) -> Capture:
     """The footage at `path`: a capture, or a video file, which becomes the capture `FOOTAGE` in the folder `output`.
 
     No video tells lengths: those of a moving scope are such that the tissue lies as far from it as from the cameras

@@ -30,7 +30,7 @@ from neeco.scene.gaussian_scene import one_tissue
 from neeco.scene.io import load_gaussians, save_scene
 from neeco.tracking.follow import SEARCH_ROLLS_EVERY, Follower, Step
 from neeco.tracking.footage_scene import adapted, over_tissue
-from neeco.tracking.footage_tissue import Report, learn_again, learn_tissue
+from neeco.tracking.footage_tissue import Progress, learn_again, learn_tissue
 from neeco.tracking.parameters import TrackedParameters, fitter_of
 from neeco.tracking.trust import Reference
 from neeco.training.run import SCENE_FILE, stored_config, write_config
@@ -106,7 +106,7 @@ def track_footage(
     min_trust: float = MIN_TRUST,
     resume: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-    on_stage: Report = lambda what, done, total: None,
+    on_stage: Progress = lambda what, done, total: None,
 ) -> Tracked:
     """Find the states of the run's instruments in every frame of `footage`, and write those that are trusted as a
     capture.
@@ -175,7 +175,7 @@ def track_footage(
 
 
 def _learned_again(
-    scene: GaussianScene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Report
+    scene: GaussianScene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Progress
 ) -> GaussianScene:
     """Return the scene with tissue and light learned again from the tracked frames; kept in `folder`."""
     file = folder / "scene-2.safetensors"
@@ -185,7 +185,7 @@ def _learned_again(
 
 
 def _over_footage(
-    instruments: GaussianScene, footage: Capture, folder: Path, report: Report
+    instruments: GaussianScene, footage: Capture, folder: Path, report: Progress
 ) -> tuple[GaussianScene, dict[str, Any]]:
     """Return the instruments over the footage's tissue in its light, and that light; kept in `folder`."""
     file, light = folder / SCENE_FILE, folder / "light.json"
