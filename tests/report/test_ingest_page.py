@@ -23,7 +23,7 @@ from neeco.capture.model import Frame, State
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.ingest.assessment import MAX_SHOWN, assess_ingest
-from neeco.ingest.foreground.motion import RoughShape
+from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.result import IngestResult
