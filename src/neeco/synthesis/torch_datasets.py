@@ -347,7 +347,7 @@ class StoredImages(Dataset[Sample]):
         )
         lens = parse_lens(place)
         assert lens is not None
-        camera = lens.before(Camera(world_from_camera, *lens.intrinsics, *size))
+        camera = lens.distorted_camera(Camera(world_from_camera, *lens.intrinsics, *size))
         found = labelled.targets() | {"state": state, "camera": camera, "index": record["index"]}
         return found if self.transform is None else self.transform(found)
 

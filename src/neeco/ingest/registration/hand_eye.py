@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.model import IngestSettings
@@ -150,8 +151,7 @@ def register_with_laparoscope(
     scale, rotation, origin, hand, lever, _, _ = unpack(solution)
     position, turn, keep = errors(solution)
     used = np.flatnonzero(keep)
-    camera_from_sensor = np.eye(4)
-    camera_from_sensor[:3, :3], camera_from_sensor[:3, 3] = hand.as_matrix(), lever
+    camera_from_sensor = rigid(hand.as_matrix(), lever)
     return Registration(
         scale,
         rotation.as_matrix(),
