@@ -23,10 +23,10 @@ from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_text
 from neeco.geometry.camera import Camera
+from neeco.geometry.rotations import rigid
 from neeco.labels.annotation import place_in_image, working_ends
 from neeco.labels.drawing import LayeredDrawing, to_numpy
 from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
-from neeco.synthesis.states import rigid
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene, Recorded

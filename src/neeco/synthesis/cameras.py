@@ -37,7 +37,7 @@ class DrawnCameras:
 
     def __call__(self, camera: Camera) -> Camera:
         """The camera in the place of `camera`, a pinhole."""
-        seen = camera if self.lens is None else self.lens.before(camera)
+        seen = camera if self.lens is None else self.lens.distorted_camera(camera)
         size = self.size.of(seen.width, seen.height)
         return seen if size == (seen.width, seen.height) else seen.resized(*size)
 

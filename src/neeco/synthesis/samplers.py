@@ -22,6 +22,7 @@ from neeco.errors import NeecoError
 from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import rays_of_pixels
+from neeco.geometry.rotations import rigid
 from neeco.labels.annotation import any_in_image, working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
@@ -33,7 +34,6 @@ from neeco.synthesis.states import (
     ListedStates,
     PathStates,
     StateSampler,
-    rigid,
     turn_about,
 )
 

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
 
 ZERO_SHARE = 0.05  # of a joint's range: what lies past 0 by less is noise of its sensor
@@ -49,13 +50,6 @@ class JointRange:
             lower = min(self.lower, max(lower, limits[0]))
             upper = max(self.upper, min(upper, limits[1]))
         return JointRange(lower, upper)
-
-
-def rigid(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """The pose [4, 4] of a rotation [3, 3] and a position [3] mm."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, position
-    return pose
 
 
 def turn_about(point: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
