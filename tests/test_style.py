@@ -20,22 +20,20 @@ TRITON = "neeco.raster.triton"  # kernels, whose arguments are addresses and str
 # Offenders left in each room: a number may fall, never rise. Lower it with every change that removes some.
 LONG_CALLS = {
     "cli": 2,
-    "ingest": 24,
+    "ingest": 12,
     "labels": 1,
     "methods": 7,
     "raster": 2,
-    "report": 1,
     "scene": 3,
     "viewer": 2,
 }
 LONG_DATACLASSES = {
     "cli": 9,
     "geometry": 1,
-    "ingest": 20,
+    "ingest": 8,
     "labels": 2,
     "methods": 7,
     "raster": 4,
-    "report": 1,
     "scene": 3,
     "viewer": 3,
 }

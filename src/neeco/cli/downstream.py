@@ -1,4 +1,4 @@
-"""`neeco downstream`: does a model trained on drawn images do better on recorded frames?"""
+"""`neeco downstream`: does a model trained on synthetic images do better on recorded frames?"""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Downstream:
-    """Train detectors and segmenters on recorded and on drawn images, and test them on recorded frames.
+    """Train detectors and segmenters on recorded and on synthetic images, and test them on recorded frames.
 
     Each model is trained from scratch in every condition, with as many steps, on the same labelled frames of a fold;
     tests are frames of the other splits. Conditions are sums of words: `real`, names of sets, `augment`, and for the
-    edges of drawn labels `hard`, `soft` or `ignore`. Interrupted, the same command goes on where it stopped; with more
-    models, sets, conditions or folds it adds them. Needs neeco[downstream].
+    edges of synthetic labels `hard`, `soft` or `ignore`. Interrupted, the same command goes on where it stopped; with
+    more models, sets, conditions or folds it adds them. Needs neeco[downstream].
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
@@ -36,11 +36,11 @@ class Downstream:
     models: tuple[str, ...] = ("unet",)
     """unet (MONAI's U-Net, masks), dfine (a small D-FINE, boxes), yolo (your own ultralytics program, boxes)."""
     num_real: tuple[str, ...] = ("0", "20", "all")
-    """How many recorded training frames are labelled: numbers or all; 0 teaches with sets alone."""
+    """How many recorded training frames are labelled: numbers or all; 0 trains on sets alone."""
     folds: int = 5
     """Each takes other labelled frames and another seed; intervals are over folds."""
     conditions: tuple[str, ...] = ()
-    """What to teach with, such as real, real+augment, SET, SET+real, SET+soft; default: these but the last."""
+    """Training data, such as real, real+augment, SET, SET+real, SET+soft; default: these but the last."""
     labels: Path | None = None
     """Folder of masks named as the frames, for the recorded training frames; default: the capture's truth."""
     classes: Literal["instrument", "parts"] = "instrument"
@@ -52,7 +52,7 @@ class Downstream:
     steps: int | None = None
     """Optimisation steps of every training; default: the model's own."""
     size: int | None = None
-    """Longer side in pixels of images as a model sees them; default: the model's own. Scores are at full size."""
+    """Longer side in pixels of a model's input images; default: the model's own. Scores are at full size."""
     batch: int | None = None
     """Images in a step; default: the model's own."""
     weights: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
