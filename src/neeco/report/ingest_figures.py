@@ -198,7 +198,7 @@ def _project(points: np.ndarray, pose: Tensor, camera: Camera) -> tuple[np.ndarr
     return project_world(world, camera, nearest=NEAR)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Tracks:
     """Everything in one frame: x right, y down, z forward as the cameras look on average; mm."""
 
@@ -227,13 +227,13 @@ def read_tracks(capture: Capture) -> Tracks:
                 track[index] = frame.state.instruments[instrument.name].pose.numpy()[:3, 3]
         instruments[instrument.name] = (track - middle) @ axes
     return Tracks(
-        (capture.points.positions.astype(np.float64) - middle) @ axes,
-        np.asarray(capture.points.colors, dtype=np.float64),
-        (poses[:, :3, 3] - middle) @ axes,
-        poses[:, :3, 2] @ axes,
-        steps > GAP * max(float(np.median(steps)), 1e-9) if len(steps) else np.zeros(0, dtype=bool),
-        instruments,
-        capture.points.measured,
+        points=(capture.points.positions.astype(np.float64) - middle) @ axes,
+        colors=np.asarray(capture.points.colors, dtype=np.float64),
+        camera=(poses[:, :3, 3] - middle) @ axes,
+        looking=poses[:, :3, 2] @ axes,
+        breaks=steps > GAP * max(float(np.median(steps)), 1e-9) if len(steps) else np.zeros(0, dtype=bool),
+        instruments=instruments,
+        measured=capture.points.measured,
     )
 
 

@@ -38,14 +38,14 @@ DIMMED = 0.35  # of its light is left of what cannot be compared
 
 @dataclass(frozen=True)
 class Picture:
-    """What is shown, and how far away it is."""
+    """Shown pixels and their depth."""
 
     pixels: Pixels  # uint8 [H, W, 3]
     depth: np.ndarray  # [H, W] mm, 0 = nothing there
     note: str = ""  # what the colours mean, where that differs from picture to picture
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunPicture:
     """A run's part of the window, and what the status says of it."""
 
@@ -60,7 +60,7 @@ class RunPicture:
 
 
 def views_of(scene: DrawableScene, has_images: bool) -> tuple[str, ...]:
-    """Which of VIEWS there are of a scene; has_images: the capture is at hand."""
+    """The VIEWS that a scene has; has_images: the capture is at hand."""
     absent = set()
     if not scene.label_names:
         absent |= set(LABELLED)
@@ -94,8 +94,8 @@ def picture(scene: DrawableScene, state: State, camera: Camera, view: str, label
 
 @torch.no_grad()
 def difference(scene: DrawableScene, state: State, recorded_by: Camera, image: np.ndarray, window: Camera) -> Picture:
-    """How far what the camera that recorded `image` [H, W, 3] in [0, 1] would see is from it, as `window` shows it: a
-    camera at the same place with the same vertical field of view. What it shows beside the image is black."""
+    """Difference between `image` [H, W, 3] in [0, 1] and a rendering by the camera that recorded it, as `window` shows
+    it: a camera at the same place with the same vertical field of view. Outside the image it is black."""
     rendering = scene.render(state, recorded_by)
     compared = difference_map(rendering.color.clamp(0, 1).cpu().numpy(), image, legend=False)
     # the recorded pixel [H, W] that looks where each of the window's pixels does
@@ -110,12 +110,12 @@ def difference(scene: DrawableScene, state: State, recorded_by: Camera, image: n
 
 
 def dimmed(shown: Picture) -> Picture:
-    """The same picture, darker: it is not what was asked for."""
+    """Darken a picture that is not the requested one."""
     return replace(shown, pixels=_uint8(shown.pixels * DIMMED))
 
 
-def beside(pictures: list[Picture]) -> Picture:
-    """Pictures of one height side by side, a white line between them."""
+def side_by_side(pictures: list[Picture]) -> Picture:
+    """Join pictures of one height, with white lines between them."""
     if len(pictures) == 1:
         return pictures[0]
     pixels = np.concatenate([shown.pixels for shown in pictures], 1)
@@ -157,7 +157,15 @@ def render_run(
             shown = dimmed(picture(scene, state, camera, IMAGE))
             note = ONLY_RECORDED if view == DIFFERENCE else f"{view}: a scene of method {scene.method} has none"
     trouble = runs.watched[number].trouble or loaded.trouble
-    return RunPicture(loaded, shown, controls.frame, frame is not None, as_recorded, note or shown.note, trouble)
+    return RunPicture(
+        loaded=loaded,
+        picture=shown,
+        frame=controls.frame,
+        exact=frame is not None,
+        seen_as_recorded=as_recorded,
+        note=note or shown.note,
+        trouble=trouble,
+    )
 
 
 def _in_world_of(
@@ -178,7 +186,7 @@ def _in_world_of(
 
 
 def scored(shown: RunPicture) -> RunPicture:
-    """The same with its score, where the frame is seen as recorded and its capture at hand. Raises NeecoError."""
+    """Add the score where the frame is rendered as recorded and its capture is at hand. Raises NeecoError."""
     if not shown.seen_as_recorded or not shown.loaded.frames:
         return shown
     with shown.loaded.scene.torch_threads():
