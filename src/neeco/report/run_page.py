@@ -16,7 +16,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from neeco.capture.model import Capture, Frame, State
-from neeco.evaluation.image_metrics import FULL_SCALE, PART_COLORS, overlay_outline, overlay_parts
+from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, overlay_parts, part_color
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import pairs_of
 from neeco.geometry.camera import Camera
@@ -225,12 +225,8 @@ def _parts(evaluation: dict[str, Any]) -> dict[str, Any]:
 def _tints(scene: DrawableScene) -> list[tuple[str, str]]:
     """Colour and name of every part."""
     several = len({instrument for instrument, _ in scene.label_names}) > 1
-    tints = []
-    for index, (instrument, part) in enumerate(scene.label_names):
-        name = f"{instrument} {part}" if several else part
-        red, green, blue = (int(value) for value in PART_COLORS[index % len(PART_COLORS)])
-        tints.append((f"rgb({red}, {green}, {blue})", name.replace("_", " ")))
-    return tints
+    names = [f"{instrument} {part}" if several else part for instrument, part in scene.label_names]
+    return [(part_color(part), name.replace("_", " ")) for part, name in enumerate(names, 1)]
 
 
 def _diagnostics(diagnostics: Mapping[str, Any]) -> dict[str, Any]:

@@ -50,7 +50,7 @@ class LoadedRun:
     """
 
     name: str
-    world: str  # the capture's folder: runs of one capture share their world frame
+    world: str  # the capture's folder, whose world frame the scene has
     scene: DrawableScene
     recorded: Recorded
     frames: tuple[Frame, ...]  # those of `recorded`, with their images; empty: the capture is not at hand
@@ -278,8 +278,13 @@ class ViewedRuns:
     """The runs that all browsers of a server share, and what is known of their frames. Any thread may use it."""
 
     def __init__(self, paths: Sequence[Path], device: torch.device | None = None, tissue: str | None = None) -> None:
-        """Raises NeecoError where a run folder holds nothing to look at."""
+        """Raises NeecoError for a run folder without a scene, and for runs of different captures."""
         self.watched = [WatchedRun(path, device, tissue) for path in paths]
+        worlds = [loaded.world for loaded in self.loaded]
+        if len(set(worlds)) > 1:
+            raise NeecoError(
+                f"view: {paths[1]}: was trained on {worlds[1]}, {paths[0]} on {worlds[0]}; compare runs of one capture"
+            )
         self.distance = self.loaded[0].distance  # mm
         self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
         self.timelines = [Timeline(loaded) for loaded in self.loaded]

@@ -225,7 +225,7 @@ class ClientSession:
         camera = browser_camera(window, self._runs.unit, height, share)
         view = self._panel.view.value
         try:
-            parts = [render_run(self._runs, k, controls, camera, self._camera_frame, view) for k in range(len(current))]
+            parts = [render_run(self._runs, k, controls, camera, view) for k in range(len(current))]
         except NeecoError as error:
             self._panel.status.content = message_html(str(error))
             return

@@ -20,7 +20,7 @@ from neeco.raster.types import Rendering
 from neeco.scene.gaussian_scene import is_gaussian
 from neeco.viewer.controls import Controls, controlled_state, corresponding_frame
 from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRuns, score_frame
-from neeco.viewer.viser_scene import carried_over, stands_at
+from neeco.viewer.viser_scene import stands_at
 
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene
@@ -133,16 +133,12 @@ def split(left: Picture, right: Picture, share: float) -> Picture:
     return Picture(pixels, depth, _joined_notes([left, right]))
 
 
-def render_run(
-    runs: ViewedRuns, number: int, controls: Controls, camera: Camera, camera_frame: int, view: str
-) -> RunPicture:
-    """Render run `number` as the controls, made for the first run, say and `camera` sees it. Raises NeecoError.
-
-    A run of another capture has a world of its own: there the camera has gone, from the frame that belongs to
-    `camera_frame`, the way that `camera` went from that frame.
-    """
-    loaded = runs.loaded[number]
-    controls, camera = _in_world_of(loaded, runs.loaded[0], controls, camera, camera_frame)
+def render_run(runs: ViewedRuns, number: int, controls: Controls, camera: Camera, view: str) -> RunPicture:
+    """Render run `number` as seen by `camera`, at the controls, which were made for the first run. Raises
+    NeecoError."""
+    first, loaded = runs.loaded[0], runs.loaded[number]
+    frames = len(first.recorded.states), len(loaded.recorded.states)
+    controls = replace(controls, frame=corresponding_frame(controls.frame, *frames))
     scene, state = loaded.scene, controlled_state(loaded.recorded.states, loaded.shafts, controls)
     frame = controls.recorded_frame
     as_recorded = frame is not None and stands_at(camera, loaded.recorded.cameras[frame], loaded.distance)
@@ -165,23 +161,6 @@ def render_run(
         seen_as_recorded=as_recorded,
         note=note or shown.note,
         trouble=trouble,
-    )
-
-
-def _in_world_of(
-    loaded: LoadedRun, first: LoadedRun, controls: Controls, camera: Camera, camera_frame: int
-) -> tuple[Controls, Camera]:
-    """Controls and camera, made for the first run, for another."""
-    frames = len(first.recorded.states), len(loaded.recorded.states)
-    controls = replace(controls, frame=corresponding_frame(controls.frame, *frames))
-    if loaded.world == first.world:
-        return controls, camera
-    # a place in the first run's world means nothing in this one
-    unplaced = {name: replace(item, pose=None) for name, item in controls.instruments.items()}
-    start = loaded.recorded.cameras[int(corresponding_frame(camera_frame, *frames))]
-    scale = loaded.distance / first.distance
-    return replace(controls, instruments=unplaced), carried_over(
-        camera, first.recorded.cameras[camera_frame], start, scale
     )
 
 

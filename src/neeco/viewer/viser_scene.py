@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.model import evenly_spaced
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import to_numpy
-from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.states import rigid
 from neeco.viewer.runs import DISTANCE_UNITS, LoadedRun
 
@@ -75,14 +74,6 @@ def stands_at(window: Camera, recorded: Camera, distance: float) -> bool:
     apart = float(np.linalg.norm(one[:3, 3] - two[:3, 3]))
     turned = Rotation.from_matrix(one[:3, :3].T @ two[:3, :3]).magnitude()
     return apart <= SAME_PLACE * distance and turned <= SAME_TURN
-
-
-def carried_over(camera: Camera, here: Camera, there: Camera, scale: float) -> Camera:
-    """Camera that relates to `there` as `camera` relates to `here`, in a world that is `scale` times as large."""
-    pose, start, end = (to_numpy(item.world_from_camera) for item in (camera, here, there))
-    moved = np.linalg.inv(start) @ pose
-    moved[:3, 3] *= scale
-    return moved_camera(camera, end @ moved)
 
 
 def fitting_view(camera: Camera, aspect: float) -> float:
