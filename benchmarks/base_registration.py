@@ -39,7 +39,7 @@ from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.files import write_json
 from neeco.geometry.conventions import swap_camera_axes
-from neeco.ingest.cameras.still import moving_masks
+from neeco.ingest.foreground.masks import moving_masks
 from neeco.ingest.registration.base import find_base
 
 CLOCK_S = 0.04  # by which the log is ahead

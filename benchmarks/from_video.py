@@ -34,9 +34,8 @@ from neeco.files import write_json
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project_world
-from neeco.ingest.cameras.still import moving_masks
-from neeco.ingest.foreground.motion import ResidualFlow
-from neeco.ingest.foreground.passing import passing_masks
+from neeco.ingest.foreground.masks import moving_masks, passing_masks
+from neeco.ingest.foreground.residual_flow import ResidualFlow
 from neeco.ingest.frames.views import SfmResult, reduced
 from neeco.ingest.recording.model import IngestSettings
 from neeco.ingest.shaft.axis import ShaftVideo

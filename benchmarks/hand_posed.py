@@ -32,7 +32,7 @@ from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
 from neeco.ingest.frames.views import reduced
 from neeco.ingest.posing.hand_posed import HandPose, write_answers
-from neeco.ingest.posing.posed_capture import PosedCapture, Posing, prepare
+from neeco.ingest.posing.posed_capture import PosedCapture, SolvedPosing, prepare
 from neeco.ingest.shaft.axis import ShaftVideo
 from neeco.ingest.shaft.from_video import find_shaft
 
@@ -141,7 +141,7 @@ def capture_of(true: Capture, shaft: Shaft, output: Path) -> Capture:
     return read_capture(output)
 
 
-def scores(posing: Posing, truth: Truth, free: bool) -> tuple[np.ndarray, np.ndarray]:
+def scores(posing: SolvedPosing, truth: Truth, free: bool) -> tuple[np.ndarray, np.ndarray]:
     """Errors [F] of roll and joint, degrees; free: of roll as far as one turn for all frames can explain it."""
     true_roll = posing.shafts.rolls(truth.camera_from_instrument[:, :3, 0])
     roll = np.exp(1j * (posing.rolls.values - true_roll))
@@ -151,7 +151,7 @@ def scores(posing: Posing, truth: Truth, free: bool) -> tuple[np.ndarray, np.nda
     return np.degrees(np.angle(roll)), np.degrees(solved.values - truth.joint)
 
 
-def row(label: str, posing: Posing, truth: Truth, free: bool = False) -> str:
+def row(label: str, posing: SolvedPosing, truth: Truth, free: bool = False) -> str:
     found = []
     doubts = [posing.rolls.deviations, next(iter(posing.joints.values())).deviations]
     for errors, doubt in zip(scores(posing, truth, free), doubts, strict=True):

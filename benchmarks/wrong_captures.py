@@ -27,8 +27,8 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.checks import inspect_capture
 from neeco.capture.checks.colors import _Colors, check_images
-from neeco.capture.checks.motion import _by_chance, _of_root, check_motion
-from neeco.capture.checks.motion_evidence import Rays
+from neeco.capture.checks.motion import check_motion, evidence_by_chance, root_poses
+from neeco.capture.checks.motion_evidence import MotionEvidence
 from neeco.capture.documents import ProblemReport
 from neeco.capture.readers import parse_capture
 from neeco.capture.readers.parsed import Parsed
@@ -211,12 +211,13 @@ def margins(name: str, parsed: Parsed) -> None:
         chosen = replace(parsed, frames=parsed.frames[rows], places=parsed.places[rows])
         report = parsed.places[0].report
         report.problems.clear()
-        rays, evidence = Rays.of(chosen), []
-        for instrument in chosen.instruments if rays is not None else ():
-            assert rays is not None
+        motion, evidence = MotionEvidence.of(chosen), []
+        for instrument in chosen.instruments if motion is not None else ():
+            assert motion is not None
             states = [frame.state.instruments[instrument.name] for frame in chosen.frames]
-            given = _of_root(instrument, np.stack([state.pose.numpy() for state in states]), states)[rays.views.rows]
-            evidence.append(f"{rays.mean(given):.2f} ({_by_chance(rays, given):.2f})")
+            recorded = np.stack([state.pose.numpy() for state in states])
+            given = root_poses(instrument, recorded, states)[motion.views.rows]
+            evidence.append(f"{motion.mean(given):.2f} ({evidence_by_chance(motion, given):.2f})")
         colors = "-"
         if chosen.points is not None and chosen.points.measured:
             agree = _Colors(chosen)

@@ -32,7 +32,7 @@ def wrist(tool: str = REVOLUTE) -> KinematicTree:
             Link("wrist", "shaft", REVOLUTE, shifted(0, 0, 2), Y, {"pitch": 1.0}),
             Link("cap", "wrist", origin=shifted(0, 0, 1)),
             *(
-                Link(name, "wrist", tool, shifted(0, 0, 9), X, {"yaw": 1.0, "jaw": gain}, 0.1)
+                Link(name, "wrist", tool, shifted(0, 0, 9), X, {"yaw": 1.0, "jaw": gain}, offset=0.1)
                 for name, gain in jaw.items()
             ),
             Link("tip", "jaw_left", origin=shifted(0, 0, 12), body=False),

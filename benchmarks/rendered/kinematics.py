@@ -33,13 +33,13 @@ def true_kinematics(spec: SceneSpec) -> KinematicTree:
     start = 0.0 if slides else design.pitch_at
     kind, axis = (PRISMATIC, rotation[:, 2]) if slides else (REVOLUTE, rotation[:, 1])
     origin = _shift(rotation @ np.array([0.0, 0.0, start]) + shift)
-    links = [Link("shaft"), Link("wrist", "shaft", kind, origin, axis, {first: 1.0}, -encoders.offsets[0])]
+    links = [Link("shaft"), Link("wrist", "shaft", kind, origin, axis, {first: 1.0}, offset=-encoders.offsets[0])]
     hinge = _shift(rotation @ np.array([0.0, 0.0, design.hinge - start]))
     for part, sense, share in zip(truth_ids(spec), (-1, 1), design.shares, strict=True):
         gain = sense * share * spec.joint.sign  # per reading of the jaw
         offset = -gain * spec.joint.zero - sum(encoders.offsets[1:])
         value = dict.fromkeys(others, 1.0) | {"jaw_angle": gain}
-        links.append(Link(JAW_NAMES[part], "wrist", REVOLUTE, hinge, rotation[:, 0], value, offset))
+        links.append(Link(JAW_NAMES[part], "wrist", REVOLUTE, hinge, rotation[:, 0], value, offset=offset))
     return KinematicTree(tuple(links))
 
 

@@ -65,7 +65,7 @@ def time_fault(time: float) -> Fault | None:
     return f"is {time:g} s", "give seconds (not milli- or nanoseconds)"
 
 
-def passes_limits(value: float, limits: tuple[float, float] | None) -> bool:
+def exceeds_limits(value: float, limits: tuple[float, float] | None) -> bool:
     """Whether a joint's value exceeds its limits by more than rounding explains."""
     return limits is not None and not limits[0] - LIMIT_TOLERANCE <= value <= limits[1] + LIMIT_TOLERANCE
 
@@ -80,7 +80,7 @@ def joint_fault(value: float, limits: tuple[float, float] | None, slides: bool, 
         limits = limits[0] - room, limits[1] + room
         message = f"is {value:g} {unit}, outside its limits {limits[0]:g} .. {limits[1]:g}"
         remedy = "repair the reading or the limits" if slides else "repair the reading (radians?) or the limits"
-        return (message, remedy) if passes_limits(value, limits) else None
+        return (message, remedy) if exceeds_limits(value, limits) else None
     if abs(value) > (LONGEST_SLIDE if slides else FULL_TURN) * (1 + slack):
         if slides:
             return f"is {value:g} mm, farther than any instrument slides", "give mm, or state the joint's limits"

@@ -158,7 +158,7 @@ MISTAKES = [
     ("cameras", lambda pose: pose * [1, -1, -1, 1], "camera axes are OpenCV's"),
     ("cameras", np.linalg.inv, "world-to-camera"),
     ("cameras", lambda pose: np.linalg.inv(pose * [1, -1, -1, 1]), "world-to-camera with OpenCV axes"),
-    ("cameras", lambda pose: _scale(pose, 1e-3), "camera positions are in metres"),
+    ("cameras", lambda pose: _scale(pose, 1e-3), "positions of the cameras are in metres"),
 ]
 
 

@@ -57,7 +57,7 @@ def capture(tmp_path_factory) -> Parsed:
     rows, columns = ((points[:, [1, 0]] + 75) * 2).astype(int).T
     place = Node(None, "transforms.json", "frames[0]", ProblemReport())
     cloud = PointCloud(points, picture[rows, columns] / 255)
-    return Parsed(folder, frames, [place] * FRAMES, points=cloud, points_place=place)
+    return Parsed(folder, frames=frames, places=[place] * FRAMES, points=cloud, points_place=place)
 
 
 def found(capture: Parsed) -> list[str]:

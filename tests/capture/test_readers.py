@@ -70,7 +70,7 @@ def test_a_written_capture_reads_back_exactly(folder, tmp_path):
         write_capture(capture, tmp_path / "copy")
 
 
-LENS = Lens(30.0, 31.0, 16.5, 12.0, (-0.2, 0.05, 0.0, 0.001), (32, 24), (16.0, 12.0, 14.0))
+LENS = Lens(30.0, 31.0, 16.5, 12.0, (-0.2, 0.05, 0.0, 0.001), (32, 24), border=(16.0, 12.0, 14.0))
 
 
 @pytest.mark.parametrize("lens", [LENS, Lens(30.0, 30.0, 16.0, 12.0, (), (32, 24))])

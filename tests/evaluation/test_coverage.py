@@ -22,9 +22,9 @@ def test_tissue_behind_the_instrument_is_unseen_until_a_view_from_elsewhere(worl
     scene = world.TinyScene()
     frames = world.make_capture(tmp_path, scene, ("train", "train")).frames
     behind = torch.tensor([[-5.0 / 60 * 100, -3.0 / 60 * 100, 100.0]])  # the bar of frame 0 hides it from frame 0
-    assert not observed_depths(scene, frames[:1]).seen(behind).item()
+    assert not observed_depths(scene, frames[:1]).observed(behind).item()
     moved_away = [frames[0], world.moved(frames[0], world.translation(0, 20.0), world.translation())]
-    assert observed_depths(scene, moved_away).seen(behind).item()
+    assert observed_depths(scene, moved_away).observed(behind).item()
 
 
 def test_without_training_views_nothing_was_seen(world, tmp_path):

@@ -188,4 +188,4 @@ def test_the_device_is_waited_for_before_a_clock_is_read(world, tmp_path, monkey
     waited = []
     monkeypatch.setattr(evaluate, "synchronise", waited.append)
     evaluated(make_run(world, tmp_path), ["test"])
-    assert waited == [torch.device("cpu")] * (evaluate.TIMED_DRAWS + 2)
+    assert waited == [torch.device("cpu")] * (evaluate.N_TIMED + 2)

@@ -117,7 +117,7 @@ def test_a_few_hand_posed_frames_tell_all(world: PosingWorld) -> None:
     assert rms_deg(solved.joints[JOINT].values - world.jaws) < 6
     before = posed.solve(given[:1])[NAME]
     assert rms_deg(before.joints[JOINT].values - world.jaws) > rms_deg(solved.joints[JOINT].values - world.jaws)
-    assert solved.sureness()["roll"] < before.sureness()["roll"]
+    assert solved.deviations()["roll"] < before.deviations()["roll"]
 
 
 def test_no_frame_is_asked_twice_and_every_answer_changes_what_is_asked(world: PosingWorld) -> None:
@@ -131,11 +131,11 @@ def test_no_frame_is_asked_twice_and_every_answer_changes_what_is_asked(world: P
 def test_an_answer_that_its_neighbours_contradict_is_doubted(world: PosingWorld) -> None:
     posed = PosedCapture(world.root)
     good = answers(world, [0, 8, 16, 24, 32, 39])
-    assert posed.solve(good)[NAME].doubts() == []
+    assert posed.solve(good)[NAME].outliers() == []
     turned = [*good[:3], replace(good[3], roll_deg=good[3].roll_deg + 180), *good[4:]]
-    assert {doubt.frame for doubt in posed.solve(turned)[NAME].doubts() if abs(doubt.degrees) > 120} == {24}
+    assert {doubt.frame for doubt in posed.solve(turned)[NAME].outliers() if abs(doubt.degrees) > 120} == {24}
     twice = [*good, replace(good[2], joints_deg={JOINT: good[2].joints_deg[JOINT] + 20})]
-    said = [str(doubt) for doubt in posed.solve(twice)[NAME].doubts()]
+    said = [str(doubt) for doubt in posed.solve(twice)[NAME].outliers()]
     assert f"{JOINT} differs by 20° from an earlier answer" in said
 
 

@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from neeco.ingest.cameras.still import exposure, find_background, moving_masks, stands_still
+from neeco.ingest.cameras.still import stands_still
+from neeco.ingest.foreground.background import exposure, find_background
+from neeco.ingest.foreground.masks import moving_masks
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 40
 

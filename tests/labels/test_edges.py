@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from neeco.labels.drawing import REACH, uncertain_edge, without_components
+from neeco.labels.drawing import EDGE_WIDTH, uncertain_edge, without_components
 from neeco.labels.labellers import CLEAR_SHARES, LABEL_THRESHOLD
 
 HEIGHT, WIDTH = 120, 160
-REACH_PX = REACH * np.hypot(HEIGHT, WIDTH)  # 1.6
+REACH_PX = EDGE_WIDTH * np.hypot(HEIGHT, WIDTH)  # 1.6
 
 
 def disc(radius: float, x: float = 60.0, y: float = 50.0) -> np.ndarray:

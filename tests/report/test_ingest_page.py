@@ -23,7 +23,7 @@ from neeco.capture.model import Frame, State
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.ingest.assessment import MAX_SHOWN, assess_ingest
-from neeco.ingest.foreground.motion import RoughShape
+from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.result import IngestResult
@@ -76,7 +76,10 @@ def made(folder: Path, **changes) -> IngestResult:
 
 def based(overlap: float) -> BaseRegistration:
     """A base found from outlines that overlap with what moves by so much."""
-    return BaseRegistration(np.eye(4), 0.0, 0.0, np.ones(3), np.ones(3), (), 0.0, 0.0, overlap, 0.5, 1.0, 100)
+    return BaseRegistration(
+        world_from_base=np.eye(4), clock_s=0.0, clock_sd_s=0.0, sd_mm=np.ones(3), sd_deg=np.ones(3), open_directions=(),
+        moved_mm=0.0, turned_deg=0.0, overlap=overlap, overlap_before=0.5, residual_px=1.0, frames=100, from_masks=True,
+    )  # fmt: skip
 
 
 def write_ingest_page(result: IngestResult, path: Path) -> None:

@@ -46,7 +46,7 @@ def test_a_scene_comes_back_exactly(any_scene: GaussianScene, tmp_path: Path) ->
 
 
 def test_a_scene_knows_the_lens_of_its_recording(kinematic: GaussianScene, tmp_path: Path) -> None:
-    lens = Lens(60.0, 61.0, 32.0, 24.0, (-0.3, 0.1, 0.0, 0.0, 0.01), (64, 48), (31.0, 25.0, 28.0))
+    lens = Lens(60.0, 61.0, 32.0, 24.0, (-0.3, 0.1, 0.0, 0.0, 0.01), (64, 48), border=(31.0, 25.0, 28.0))
     assert load_scene(_saved(kinematic, tmp_path)).recorded.lens is None
     kinematic.recorded = dataclasses.replace(kinematic.recorded, lens=lens)
     path = _saved(kinematic, tmp_path)

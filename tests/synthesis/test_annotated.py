@@ -108,7 +108,7 @@ def test_a_label_too_small_misses_what_looks_like_no_tissue(scene: GaussianScene
     half = torch.nonzero(label.sum(0))[:, 0].float().mean().round().long()
     label[:, half:] = 0
     cut = replace(drawing, parts=label, image=torch.where((label > 0)[..., None], drawing.image, drawing.tissue_image))
-    judged = estimate_trust(cut, drawing.image, None, USUAL, beside=0.2)  # a very small image
+    judged = estimate_trust(cut, drawing.image, None, USUAL, neighbourhood=0.2)  # a very small image
     assert judged.missed > 0.2
     assert judged.value < 0.9
 
@@ -223,7 +223,7 @@ def test_recorded_images_and_labels_are_written_as_large_as_asked_and_through_th
     recorded: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = replace(recorded, recording=replace(recorded.recording, frames=recorded.recording.frames[2:4]))
-    lens = Lens(50.0, 50.0, 32.0, 24.0, (-0.3, 0.1, 0.0, 0.0), (64, 48), (32.0, 24.0, 31.0))
+    lens = Lens(50.0, 50.0, 32.0, 24.0, (-0.3, 0.1, 0.0, 0.0), (64, 48), border=(32.0, 24.0, 31.0))
     monkeypatch.setattr(few.scene, "recorded", replace(few.scene.recorded, lens=lens))
     annotate_capture(few, tmp_path / "large", images=ImageSettings(scale=2.0, image_format="jpg"), formats=())
     annotate_capture(few, tmp_path / "bent", images=ImageSettings(lens=True), formats=())

@@ -22,7 +22,7 @@ from neeco.synthesis.rendered_views import View, render
 from neeco.synthesis.settings import ImageSettings, Settings, SizeSettings
 
 SETTINGS = Settings(count=2, seed=3, tissue_tolerance_mm=2.0)
-LENS = Lens(52.0, 52.0, 32.5, 23.5, (-0.3, 0.1, 0.001, -0.002), (64, 48), (32.0, 24.0, 30.0))
+LENS = Lens(52.0, 52.0, 32.5, 23.5, (-0.3, 0.1, 0.001, -0.002), (64, 48), border=(32.0, 24.0, 30.0))
 FORMATS = ("coco", "yolo", "webdataset", "imagefolder")
 
 

@@ -124,7 +124,9 @@ def area_averaged(image: Tensor, width: int, height: int) -> Tensor:
 
 
 def is_repeated(before: np.ndarray, picture: np.ndarray) -> bool:
-    """Whether a grey picture, uint8 [h, w], is the one before, coded again."""
+    """Return True if a grey image, uint8 [h, w], is the one before, coded again."""
+    if before.shape != picture.shape:
+        return False
     change = cv2.absdiff(before, picture)
     return bool(change.mean() < REPEATED_MEAN and change.max() < REPEATED_MAX)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -36,6 +36,7 @@ class Link:
     origin: Array = field(default_factory=lambda: np.eye(4))
     axis: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     value: Mapping[str, float] = field(default_factory=dict)  # gain of every reading that drives the joint
+    _: KW_ONLY
     offset: float = 0.0  # rad or mm
     limits: tuple[float, float] | None = None  # of the value
     body: bool = True

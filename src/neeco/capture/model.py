@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,7 @@ SCHEMA = "neeco-capture/1"  # of the folder that holds a capture
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
 UNKNOWN_DEG = 180.0  # the standard deviation of an angle of which nothing is known
 REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
-STILL = 1e-9  # a coordinate that varies less than this in the recording tells nothing apart
+MIN_DEVIATION = 1e-9  # coordinates that vary less in the recording do not count as changing
 
 
 @dataclass(frozen=True)
@@ -238,6 +238,7 @@ class Capture:
     frames: tuple[Frame, ...]
     instruments: tuple[Instrument, ...] = ()
     points: PointCloud = field(default_factory=lambda: PointCloud(measured=False))
+    _: KW_ONLY
     registered: bool = True  # instrument poses are in the cameras' world frame
     timed: bool = True  # the recording says when each frame was taken; else `State.time` counts the frames
     lens: Lens | None = None  # through which it was recorded; its distortion is gone from the images
@@ -307,7 +308,7 @@ class RecordedStates:
         self.instruments, self.joints = tuple(instruments), joints
         points = np.array([self._coordinates(state) for state in states], np.float64)
         deviation = points.std(0) if len(points) else np.zeros(0)
-        self._moving = deviation > STILL
+        self._moving = deviation > MIN_DEVIATION
         self._deviation = deviation[self._moving]
         self._points = points[:, self._moving] / self._deviation if len(points) else points
 

@@ -1,4 +1,4 @@
-"""Which tissue a test frame shows that no training frame saw: nothing can draw it right, so it is scored apart."""
+"""Tissue in test frames that no training frame observed: no model can render it right, so it is scored apart."""
 
 from __future__ import annotations
 
@@ -20,41 +20,40 @@ from neeco.raster.types import Rendering
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene
 
-MAX_VIEWS = 96  # training views compared with, evenly spaced over the recording: neighbours see the same tissue
-FACTOR = 0.25  # of the image's resolution
-MIN_SIDE = 48  # px; small images are shrunk no further
-TOLERANCE = 0.02  # of the depth
-TOLERANCE_MM = 1.0
-NEAREST_MM = 1e-3  # what lies behind a camera is not seen, wherever it falls
-CHUNK = 16  # views tested at once; most points are found seen in the first chunk
+MAX_VIEWS = 96  # training views compared with, evenly spaced over the recording: neighbours show the same tissue
+SCALE = 0.25  # of the image's resolution
+MIN_SIDE_PX = 48  # below which images are not reduced
+TOLERANCE, TOLERANCE_MM = 0.02, 1.0  # of the depth
+NEAREST_MM = 1e-3  # points behind a camera are not observed
+CHUNK_VIEWS = 16  # tested at once; most points are observed in the first chunk
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Depth maps of the training views, rendered once and compared with every test frame."""
+    """Depth maps of the training views, rendered once for all test frames."""
 
     camera_from_world: Tensor  # [V, 4, 4]
     intrinsics: Tensor  # [V, 4] fx, fy, cx, cy in px of the depth maps
     depths: Tensor  # [V, h, w] mm
     sizes: Tensor  # [V, 2] width, height of each view's map (maps are padded to a common size)
 
-    def seen(self, points: Tensor) -> Tensor:
-        """bool [M]: which world points [M, 3] (mm) at least one training view saw unoccluded.
+    def observed(self, points: Tensor) -> Tensor:
+        """Return bool [M]: which world points [M, 3] (mm) at least one training view observed unoccluded.
 
-        A view saw a point that projects into it no deeper than the surface drawn there, within 2% + 1 mm.
+        A view observed a point that projects into it no deeper than the surface rendered there, within 2% + 1 mm.
         """
-        seen = torch.zeros(len(points), dtype=torch.bool)
-        for start in range(0, len(self.depths), CHUNK):
-            open_points = torch.nonzero(~seen)[:, 0]
-            if len(open_points) == 0:
+        observed = torch.zeros(len(points), dtype=torch.bool)
+        for start in range(0, len(self.depths), CHUNK_VIEWS):
+            left = torch.nonzero(~observed)[:, 0]
+            if len(left) == 0:
                 break
             # views far apart in time first: each chunk takes every stride-th view
-            views = torch.arange(len(self.depths))[start // CHUNK :: -(-len(self.depths) // CHUNK)]
-            seen[open_points] = self._seen_by(points[open_points], views).any(dim=0)
-        return seen
+            views = torch.arange(len(self.depths))[start // CHUNK_VIEWS :: -(-len(self.depths) // CHUNK_VIEWS)]
+            observed[left] = self._observed_by(points[left], views).any(dim=0)
+        return observed
 
-    def _seen_by(self, points: Tensor, views: Tensor) -> Tensor:
-        """bool [V', M] for the views with the given indices."""
+    def _observed_by(self, points: Tensor, views: Tensor) -> Tensor:
+        """Return bool [V', M] for the views with the given indices."""
         pose = self.camera_from_world[views]
         local = torch.einsum("vij,mj->vmi", pose[:, :3, :3], points) + pose[:, None, :3, 3]  # [V', M, 3]
         depth = local[..., 2]
@@ -70,7 +69,7 @@ class Coverage:
 
 @torch.no_grad()
 def observed_depths(scene: DrawableScene, frames: Sequence[Frame]) -> Coverage:
-    """Render the depth maps of (at most MAX_VIEWS of) the training `frames`, small, instrument included."""
+    """Render small depth maps of at most MAX_VIEWS training `frames`, instruments included."""
     chosen = [frames[index] for index in evenly_spaced(len(frames), MAX_VIEWS)]
     cameras = [_small(frame.camera) for frame in chosen]
     maps = [_filled(scene.render(frame.state, camera)) for frame, camera in zip(chosen, cameras, strict=True)]
@@ -89,10 +88,10 @@ def observed_depths(scene: DrawableScene, frames: Sequence[Frame]) -> Coverage:
 
 @torch.no_grad()
 def unobserved_tissue(coverage: Coverage, scene: DrawableScene, frame: Frame) -> tuple[Tensor, Tensor]:
-    """Tissue in `frame` that no training view saw, and all its tissue: two bool masks [H, W].
+    """Return tissue in `frame` that no training view observed, and all its tissue: two bool masks [H, W].
 
-    The surface is the scene's own expected depth at the frame's state and camera; where nothing is drawn, that of the
-    nearest drawn pixel. Instrument pixels (by the composited label) move with the state and are in neither mask.
+    The surface is the scene's own expected depth at the frame's state and camera, where nothing is rendered that of the
+    nearest pixel. Instrument pixels (by the composited label) move with the state and are in neither mask.
     """
     camera = _small(frame.camera)
     rendering = scene.render(frame.state, camera, labels=True)
@@ -102,19 +101,19 @@ def unobserved_tissue(coverage: Coverage, scene: DrawableScene, frame: Frame) ->
     centers = pixel_centers(camera.height, camera.width)
     points = unproject_world(centers, _filled(rendering), camera)  # [h, w, 3]
     unobserved = torch.zeros_like(tissue)
-    unobserved[tissue] = ~coverage.seen(points[tissue])
+    unobserved[tissue] = ~coverage.observed(points[tissue])
     size = (frame.camera.width, frame.camera.height)
     return resize_mask(unobserved, *size), resize_mask(tissue, *size)
 
 
 def _small(camera: Camera) -> Camera:
-    """The camera at the resolution coverage is judged at."""
-    return camera.scaled(min(1.0, max(FACTOR, MIN_SIDE / min(camera.width, camera.height))))
+    """Return the camera at the resolution of the depth maps."""
+    return camera.scaled(min(1.0, max(SCALE, MIN_SIDE_PX / min(camera.width, camera.height))))
 
 
 def _filled(rendering: Rendering) -> Tensor:
-    """Depth [h, w] mm on the CPU, thin or empty pixels (alpha < 0.5) taking the nearest solid pixel's; as drawn if none
-    is solid."""
+    """Return the depth [h, w] mm on the CPU, thin or empty pixels (alpha < 0.5) with the nearest solid pixel's, if any
+    is."""
     depth, hollow = rendering.depth.cpu().float(), (rendering.alpha.cpu() < 0.5).numpy()
     if not hollow.any() or hollow.all():
         return depth

@@ -1,4 +1,4 @@
-"""How good a run is: every number, per split, at the given poses and at aligned ones."""
+"""Scores of a run, per split, at the given poses and at aligned ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
-from neeco.evaluation.mask_folders import Reference, load_reference, truth_names
+from neeco.evaluation.mask_folders import ReferenceMask, load_reference, truth_names
 from neeco.evaluation.mask_metrics import (
     PartTally,
     dice,
@@ -40,15 +40,15 @@ if TYPE_CHECKING:
     from neeco.training.run import TrainedRun
 
 EVALUATION_FILE = "evaluation.json"
-TIMED_DRAWS = 7
-TIMED_SECONDS = 10.0  # after which a slow scene is not drawn again
+N_TIMED = 7  # renderings
+MAX_TIMED_S = 10.0  # after which a slow scene is not rendered again
 LPIPS_KEYS = {"alexnet": "lpips", "vgg16": "lpips_vgg"}  # AlexNet is the one its authors score with
 Progress = Callable[[str, int, int], None]  # what, how many done, of how many
 
 
 @dataclass
 class _Tally:
-    """Scores of the frames of one split, drawn at one kind of pose."""
+    """Scores of the frames of one split, rendered at one kind of pose."""
 
     parts: PartTally
     rows: list[dict[str, Any]] = field(default_factory=list)  # of every frame: its name, fit and scores
@@ -57,7 +57,7 @@ class _Tally:
 
 @dataclass(frozen=True)
 class _Context:
-    """What is the same for every frame."""
+    """Inputs that all frames share."""
 
     scene: DrawableScene
     posed: GaussianScene | None  # `scene`, where its poses are fitted to the frames
@@ -68,12 +68,12 @@ class _Context:
 
 @dataclass(frozen=True)
 class _Recorded:
-    """A frame as recorded, with all that scoring needs; made once, used for the given and the aligned drawing."""
+    """A recorded frame with all that scoring needs, for the given and the aligned rendering."""
 
     image: Tensor  # [H, W, 3] in [0, 1]
     mask: Tensor | None  # [H, W] bool, False where pixels do not count
-    reference: Reference | None
-    unobserved: Tensor  # [H, W] bool, tissue that no training frame saw
+    reference: ReferenceMask | None
+    unobserved: Tensor  # [H, W] bool, tissue that no training frame observed
     tissue: Tensor  # [H, W] bool
     features: dict[str, list[Tensor]]  # LPIPS features by network name
 
@@ -89,12 +89,10 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Score a trained run on splits of its capture (see `held_out_splits`) and write `evaluation.json` into its folder.
 
-    Returns {"given": {split: numbers}, "aligned": {split: numbers} when `align`, "notes": [why a number is null],
-    "labels": {how masks were made and compared}, "per_frame": {kind: {split: [row]}}}, and of several tissues
-    "by_tissue": {kind: {split: {tissue: means of what a frame is scored by}}}. None is
-    "not known", never zero. psnr* in dB. networks: of `find_lpips`; they keep the threads that torch had when they were
-    found. How many the rest takes is the caller's to set (`open_run`). Raises NeecoError for unknown splits and
-    unreadable frames.
+    Returns {"given": {split: numbers}, "aligned": the same when `align`, "notes": [why a number is null], "labels":
+    {how masks were made and compared}, "per_frame": {kind: {split: [row]}}}, and of several tissues "by_tissue": {kind:
+    {split: {tissue: means}}}. None is "not known", never zero; psnr* in dB. networks: of `find_lpips`. The caller sets
+    the number of torch threads (`open_run`). Raises NeecoError for unknown splits and unreadable frames.
     """
     scene = run.scene
     capture = scene.recorded.completed(capture, scene.instruments)
@@ -107,10 +105,8 @@ def evaluate_run(
     kinds = ("given", "aligned") if align else ("given",)
     names = truth_names(capture.root)
     notes = _scene_notes(scene, networks, names)
-    result: dict[str, Any] = {kind: {} for kind in kinds}
-    pair_assignment: dict[str, Any] = {kind: {} for kind in kinds}
-    per_frame: dict[str, Any] = {kind: {} for kind in kinds}
-    by_tissue: dict[str, Any] = {kind: {} for kind in kinds}
+    sections: list[dict[str, Any]] = [{kind: {} for kind in kinds} for _ in range(4)]
+    result, pair_assignment, per_frame, by_tissue = sections
     for split in splits:
         frames = capture.split(split)
         tallies = {kind: _Tally(PartTally(names)) for kind in kinds}
@@ -139,7 +135,7 @@ def evaluate_run(
 
 
 def _coverage(scene: DrawableScene, frames: Sequence[Frame]) -> dict[str | None, Coverage]:
-    """What the training frames saw of each tissue."""
+    """Return the coverage of each tissue by the training frames."""
     tissues: tuple[str | None, ...] = scene.recorded.tissues or (None,)
     return {
         tissue: observed_depths(scene, [frame for frame in frames if frame.state.tissue == tissue])
@@ -148,7 +144,7 @@ def _coverage(scene: DrawableScene, frames: Sequence[Frame]) -> dict[str | None,
 
 
 def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tuple[str, ...]:
-    """The splits to score: `splits`, or all but `train`. Raises NeecoError for none, or one that the capture lacks."""
+    """Return the splits to score: `splits`, or all except `train`. Raises NeecoError for none or an unknown one."""
     if splits is None:
         splits = tuple(name for name in capture.splits if name != "train")
     if not splits:
@@ -163,7 +159,7 @@ def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tu
 
 
 def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) -> None:
-    """Draw one frame at its given poses and, where asked, at fitted ones; add the scores to the tallies."""
+    """Render one frame at its given poses and, where asked, at fitted ones; add the scores to the tallies."""
     scene = context.scene
     unobserved, tissue = unobserved_tissue(context.coverage[frame.state.tissue], scene, frame)
     reference = load_reference(context.capture, frame)
@@ -191,7 +187,7 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
 
 
 def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]) -> dict[str, float | None]:
-    """All numbers of one frame; None where there is nothing to compare with."""
+    """Return the scores of one frame; None where there is nothing to compare with."""
     image, target, mask, reference = drawing.image, recorded.image, recorded.mask, recorded.reference
     counted = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
     tissue = int((recorded.tissue & counted).sum())
@@ -217,7 +213,7 @@ def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]
 
 
 def _summary(scene: DrawableScene, tally: _Tally) -> tuple[dict[str, Any], dict[str, str]]:
-    """Means over the frames that have the number, and which way the scene's pairs of parts were matched."""
+    """Return means over the frames that have the number, and the assignment of the scene's pairs of parts."""
     numbers: dict[str, Any] = {key: mean_of([row[key] for row in tally.scores]) for key in tally.scores[0]}
     numbers["mask_frames"] = sum(row["psnr_instrument"] is not None for row in tally.scores)
     known = {part for _, part in scene.label_names}
@@ -232,7 +228,7 @@ def _summary(scene: DrawableScene, tally: _Tally) -> tuple[dict[str, Any], dict[
 
 
 def _by_tissue(frames: Sequence[Frame], scores: Sequence[dict[str, float | None]]) -> dict[str, Any]:
-    """Means over the frames of every tissue."""
+    """Return means over the frames of every tissue."""
     groups: dict[str, list[dict[str, float | None]]] = {}
     for frame, row in zip(frames, scores, strict=True):
         groups.setdefault(frame.state.tissue or "", []).append(row)
@@ -257,15 +253,15 @@ def _tissue_note(split: str, tissue: str, numbers: Mapping[str, Any]) -> str:
 
 @torch.no_grad()
 def _speed(scene: DrawableScene, frames: Sequence[Frame]) -> tuple[float, int | None]:
-    """Posed renderings per second (median of TIMED_DRAWS after two that do not count; of fewer where those take long)
-    and Gaussians drawn."""
+    """Return renderings per second (median of N_TIMED after two to warm up; of fewer where those take long) and the
+    number of Gaussians."""
     seconds: list[float] = []
-    for index in range(TIMED_DRAWS + 2):
+    for index in range(N_TIMED + 2):
         frame = frames[index % len(frames)]
         start = time.perf_counter()
         synchronise(scene.render(frame.state, frame.camera).color.device)
         seconds.append(time.perf_counter() - start)
-        if len(seconds) > 1 and sum(seconds) > TIMED_SECONDS:
+        if len(seconds) > 1 and sum(seconds) > MAX_TIMED_S:
             break
     return 1.0 / statistics.median(seconds[2:] or seconds[1:]), scene.num_gaussians
 

@@ -1,6 +1,6 @@
-"""How close a drawn image is to the recorded one: PSNR, SSIM, LPIPS, and pictures of where it is wrong.
+"""Metrics between rendered and recorded images: PSNR, SSIM and LPIPS, and pictures of the differences.
 
-LPIPS is Zhang et al., CVPR 2018, version 0.1, in plain torch; the weights are the user's, nothing is downloaded.
+LPIPS is Zhang et al., CVPR 2018, version 0.1, in plain torch; the user provides the weights, nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SSIM_SIGMA = 1.5  # px
 _C1, _C2 = 0.01**2, 0.03**2  # Wang et al. 2004, eq. 13, for a dynamic range of 1
 WEIGHTS_VARIABLE = "NEECO_LPIPS_WEIGHTS"
 MIN_SIZE = 32  # px; below it the pooled maps vanish
-FULL_SCALE = 0.25  # mean absolute difference of a pixel drawn in the brightest colour; fixed, so maps can be compared
+FULL_SCALE = 0.25  # mean absolute difference shown in the brightest colour; fixed, so that maps can be compared
 # black - violet - red - yellow - white: dark is right, bright is wrong; lightness rises evenly, for grey print
 _COLORS = np.array(
     [[0, 0, 4], [60, 15, 110], [150, 38, 103], [221, 81, 58], [251, 165, 10], [252, 255, 200]], np.float64
@@ -38,12 +38,12 @@ _COLORS = np.array(
 PART_COLORS = np.array(
     [[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [213, 94, 0], [240, 228, 66]],
     np.float64,
-)  # Okabe and Ito: told apart by colour-blind readers
+)  # Okabe and Ito: colour-blind readers can distinguish them
 LEGEND_HEIGHT, LEGEND_FONT = 14, 10  # px
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of `image` [H, W, 3] against `target` [H, W, 3], both in [0, 1].
+    """Return the peak signal-to-noise ratio in dB of `image` [H, W, 3] against `target` [H, W, 3], both in [0, 1].
 
     mask [H, W] bool: only its True pixels count. NaN when no pixel counts, infinity when the images are equal.
     """
@@ -57,13 +57,13 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Structural similarity of `image` [H, W, 3] and `target` [H, W, 3] in [0, 1], as 3DGS computes it.
+    """Return the structural similarity of `image` [H, W, 3] and `target` [H, W, 3] in [0, 1], as 3DGS computes it.
 
     11x11 Gaussian window, sigma 1.5 px, zero padding, mean over pixels and channels (Wang et al. 2004, eq. 13).
     mask [H, W] bool: ignored pixels are taken from `target` (so they disturb no window) and left out of the mean.
     NaN when no pixel counts.
     """
-    # not the loss's (`raster.losses.ssim_map`), which sums its window in another order: scores keep their last bits
+    # not `raster.losses.ssim_map`, which sums its window in another order and would change the last bits of scores
     if mask is not None:
         image = torch.where(mask[..., None], image, target)
     x = image.permute(2, 0, 1)  # [3, H, W]
@@ -88,13 +88,13 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 @dataclass(frozen=True)
 class Convolution:
-    """A convolution with ReLU. `pool`: (kernel, stride) of the max pooling before it. `tap`: its output is compared."""
+    """A convolution with ReLU."""
 
     kernel: int
     stride: int
     padding: int
-    pool: tuple[int, int] | None
-    tap: bool
+    pool: tuple[int, int] | None  # kernel and stride of the max pooling before it
+    tap: bool  # its output is compared
 
 
 NETWORKS: dict[str, tuple[Convolution, ...]] = {
@@ -115,7 +115,7 @@ NETWORKS: dict[str, tuple[Convolution, ...]] = {
 
 @dataclass(frozen=True)
 class Lpips:
-    """A perceptual distance: 0 for equal images, larger is further apart."""
+    """A perceptual distance: 0 for equal images, larger for less similar ones."""
 
     layers: tuple[Convolution, ...]
     weights: dict[str, Tensor]  # features.i.weight [O, I, k, k], features.i.bias [O], linear.j.weight [O]
@@ -123,7 +123,7 @@ class Lpips:
 
     @torch.no_grad()
     def features(self, image: Tensor) -> list[Tensor]:
-        """Unit-normalised feature maps, each [C, h, w], of an image [H, W, 3] in [0, 1]."""
+        """Return unit-normalised feature maps, each [C, h, w], of an image [H, W, 3] in [0, 1]."""
         image = image.float()
         shift = image.new_tensor([-0.030, -0.088, -0.188]).view(3, 1, 1)
         scale = image.new_tensor([0.458, 0.448, 0.450]).view(3, 1, 1)
@@ -141,10 +141,10 @@ class Lpips:
 
     @torch.no_grad()
     def between(self, first: list[Tensor], second: list[Tensor], mask: Tensor | None = None) -> float:
-        """Distance of two images given by their `features`.
+        """Return the distance of two images given by their `features`.
 
         mask [H, W] bool: each feature-map cell counts by the fraction of its image area that is True. The images should
-        agree where the mask is False, because receptive fields reach across its border.
+        agree where the mask is False, because receptive fields cross its border.
         """
         total = 0.0
         for index, (a, b) in enumerate(zip(first, second, strict=True)):
@@ -158,16 +158,16 @@ class Lpips:
         return total
 
     def distance(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-        """LPIPS of `image` [H, W, 3] against `target` [H, W, 3], both in [0, 1]; pixels outside `mask` do not count."""
+        """Return the LPIPS of `image` [H, W, 3] against `target` [H, W, 3], both in [0, 1], over pixels in `mask`."""
         if mask is not None:
             image = torch.where(mask[..., None], image, target)
         return self.between(self.features(image), self.features(target), mask)
 
 
 def find_lpips(folder: Path | None = None) -> dict[str, Lpips]:
-    """The networks whose weights lie in `folder`, else in the folder NEECO_LPIPS_WEIGHTS names; empty when neither is.
+    """Return the networks whose weights are in `folder`, else in the folder that NEECO_LPIPS_WEIGHTS names, if any.
 
-    Raises NeecoError when a folder is named but holds no usable weights: a wrong path must not look like a missing one.
+    Raises NeecoError when a folder is named but holds no usable weights.
     """
     source = "--lpips-weights"
     if folder is None:
@@ -207,10 +207,9 @@ def load_lpips(path: Path, network: str) -> Lpips:
 def difference_map(
     image: np.ndarray, target: np.ndarray, full_scale: float = FULL_SCALE, legend: bool = True
 ) -> Pixels:
-    """|image - target| averaged over colours, in a fixed colour map; [H, W, 3] float in [0, 1] both, uint8 out.
+    """Return |image - target| averaged over colours as uint8 colours; both inputs are [H, W, 3] floats in [0, 1].
 
-    Differences of `full_scale` and above take the brightest colour. `legend`: a labelled scale is drawn below the map,
-    which makes the result LEGEND_HEIGHT px taller.
+    Differences of `full_scale` and above take the brightest colour. legend: adds a labelled scale of LEGEND_HEIGHT px.
     """
     difference = np.abs(np.asarray(image, np.float64) - np.asarray(target, np.float64)).mean(axis=2)
     colored = _colored(difference / full_scale)
@@ -234,26 +233,26 @@ def overlay_parts(image: np.ndarray, parts: np.ndarray, opacity: float = 0.45) -
 
 
 def overlay_outline(image: Pixels, mask: np.ndarray, color: tuple[int, int, int] = (255, 255, 0)) -> Pixels:
-    """`image` uint8 [H, W, 3] with the outline of a second mask [H, W], such as the truth's, drawn over it."""
+    """Return `image` uint8 [H, W, 3] with the outline of a second mask [H, W], such as the truth's."""
     pixels = image.copy()
     pixels[outline(mask > 0)] = color
     return pixels
 
 
 def outline(mask: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels of the mask with a 4-neighbour outside it; the image's border is no outside."""
+    """Return bool [H, W]: pixels of the mask with a 4-neighbour in the image that is outside it."""
     return mask & ~binary_erosion(mask, border_value=1)
 
 
 def _colored(fraction: np.ndarray) -> Pixels:
-    """Colour map of values [H, W]; below 0 and above 1 are clipped."""
+    """Return the colours of values [H, W], which are clipped to [0, 1]."""
     position = np.clip(fraction, 0, 1)
     stops = np.linspace(0, 1, len(_COLORS))
     return _to_uint8(np.stack([np.interp(position, stops, _COLORS[:, channel]) for channel in range(3)], axis=-1))
 
 
 def _legend(width: int, full_scale: float) -> Pixels:
-    """A strip [LEGEND_HEIGHT, width, 3]: the colour scale with its ends and middle labelled."""
+    """Return a strip [LEGEND_HEIGHT, width, 3]: the colour scale with its ends and middle labelled."""
     strip = Image.new("RGB", (width, LEGEND_HEIGHT))
     strip.paste(Image.fromarray(_colored(np.linspace(0, 1, width)[None].repeat(4, 0))), (0, 1))
     pen, font = ImageDraw.Draw(strip), ImageFont.load_default(LEGEND_FONT)
@@ -267,5 +266,5 @@ def _to_uint8(pixels: np.ndarray) -> Pixels:
 
 
 def resize_mask(mask: Tensor, width: int, height: int) -> Tensor:
-    """Nearest-neighbour resize of a bool mask [H, W]."""
+    """Resize a bool mask [H, W] by nearest neighbours."""
     return interpolate(mask[None, None].float(), size=(height, width), mode="nearest-exact")[0, 0] > 0.5

@@ -1,4 +1,4 @@
-"""Masks to compare: a capture's truth or reference masks, and folders of masks, whoever made them.
+"""Masks to compare: a capture's truth or reference masks, and any folders of masks.
 
 For evaluation only: nothing that learns may read a capture's truth.
 """
@@ -19,15 +19,15 @@ from neeco.capture.readers import read_capture
 from neeco.errors import NeecoError
 from neeco.files import read_json, require_inside, visible_entries
 
-PARTS_SUFFIX, MASK_SUFFIX = "_parts", "_mask"  # what `neeco render` writes beside its images
-PARTS_FILE = "parts.json"  # what the ids of masks in a folder mean
+PARTS_SUFFIX, MASK_SUFFIX = "_parts", "_mask"  # of files that `neeco render` writes
+PARTS_FILE = "parts.json"  # names of the ids of masks in a folder
 USUAL_NAMES: Mapping[int, str] = {1: "shaft", 2: "wrist", 3: "jaw_left", 4: "jaw_right"}  # in folders without one
 REFERENCE_FOLDER = "reference_masks"
-MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)  # in which a frame's is looked for, in this order
+MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)  # of a capture, in order of preference
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceMask:
     """The instrument's true mask, and its parts where they are known."""
 
     mask: Tensor  # [H, W] bool
@@ -35,20 +35,20 @@ class Reference:
 
 
 def truth_file(root: Path, name: str) -> Path | None:
-    """The mask that the frame called `name` of the capture in `root` is scored against; None when it has none. Raises
+    """Return the true mask of the frame called `name` of the capture in `root`; None when it has none. Raises
     NeecoError where a link leads out of the capture."""
     file = next((file for folder in MASK_FOLDERS if (file := root / folder / f"{name}.png").is_file()), None)
     return None if file is None else require_inside(file, root)
 
 
 def truth_names(root: Path) -> Mapping[int, str]:
-    """Part by id in the truth of the capture in `root`: as `truth/masks/parts.json` says, else the usual ones. Raises
+    """Return parts by id in the truth of the capture in `root`, as its parts.json states, else the usual ones. Raises
     NeecoError."""
     return _stated_names(root / MASK_FOLDERS[0]) or USUAL_NAMES
 
 
-def load_reference(capture: Capture, frame: Frame) -> Reference | None:
-    """The mask to score a frame against: `truth/masks/<stem>.png` (parts), else `reference_masks/<stem>.png` (0/255).
+def load_reference(capture: Capture, frame: Frame) -> ReferenceMask | None:
+    """Return the true mask of a frame: `truth/masks/<stem>.png` (parts), else `reference_masks/<stem>.png` (0/255).
 
     None when the capture has neither. Raises NeecoError when the file is damaged or of another size than the frame.
     """
@@ -56,13 +56,13 @@ def load_reference(capture: Capture, frame: Frame) -> Reference | None:
     return None if file is None else _read_reference(file, frame)
 
 
-def _read_reference(file: Path, frame: Frame) -> Reference:
-    """What `truth_file` found of a frame: part ids (0 tissue; `truth_names`), or a mask."""
+def _read_reference(file: Path, frame: Frame) -> ReferenceMask:
+    """Read the `truth_file` of a frame: part ids (0 tissue; `truth_names`), or a mask."""
     size = frame.camera.width, frame.camera.height
     if file.parent.name == REFERENCE_FOLDER:
-        return Reference(read_mask(file, size), None)
+        return ReferenceMask(read_mask(file, size), None)
     parts = read_labels(file, size)
-    return Reference(parts > 0, parts)
+    return ReferenceMask(parts > 0, parts)
 
 
 @dataclass(frozen=True)
@@ -76,20 +76,20 @@ class Masks:
     frames: Mapping[str, Frame] = field(default_factory=dict)  # of a capture's truth: whose pixels may be ignored
 
     def load(self, name: str) -> np.ndarray:
-        """Ids [H, W] uint8 of the image of that name; 0 is tissue. Raises NeecoError."""
+        """Return the ids [H, W] uint8 of the image of that name; 0 is tissue. Raises NeecoError."""
         if name not in self.frames:
             return read_ids(self.files[name])
         reference = _read_reference(self.files[name], self.frames[name])
         return (reference.mask if reference.parts is None else reference.parts).numpy().astype(np.uint8)
 
     def counted(self, name: str) -> np.ndarray | None:
-        """bool [H, W], False where the image's pixels are to be ignored; None when all count. Raises NeecoError."""
+        """Return bool [H, W], False where the image's pixels are ignored; None when all count. Raises NeecoError."""
         mask = self.frames[name].load_mask() if name in self.frames else None
         return None if mask is None else mask.numpy()
 
 
 def parse_classes(words: Sequence[str], option: str) -> dict[int, str] | None:
-    """`shaft=1 wrist=2` as {1: "shaft", 2: "wrist"}; None when there are no words. Raises NeecoError."""
+    """Parse `shaft=1 wrist=2` as {1: "shaft", 2: "wrist"}; None when there are no words. Raises NeecoError."""
     names: dict[int, str] = {}
     for word in words:
         part, _, number = word.partition("=")
@@ -102,9 +102,9 @@ def parse_classes(words: Sequence[str], option: str) -> dict[int, str] | None:
 
 
 def read_ids(path: Path) -> np.ndarray:
-    """A mask as uint8 [H, W]: grey values, or a palette's indices (black and white palettes: 0 and 255).
+    """Read a mask as uint8 [H, W]: grey values, or a palette's indices (black and white palettes: 0 and 255).
 
-    Raises NeecoError for what cannot be read plainly: colours, transparency, more than 8 bits, other files than PNG.
+    Raises NeecoError for colours, transparency, more than 8 bits, and other files than PNG.
     """
     image = open_image(path)
     if image.format != "PNG":
@@ -126,11 +126,11 @@ def read_ids(path: Path) -> np.ndarray:
 
 
 def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str = "--classes") -> Masks:
-    """A folder of masks: `NAME_parts.png` where there are such files, else `NAME_mask.png`, else `NAME.png`.
+    """Open a folder of masks: `NAME_parts.png` where there are such files, else `NAME_mask.png`, else `NAME.png`.
 
-    classes: part by id; else what the folder's `parts.json` says; else ids 1 to 4 are shaft, wrist, jaw_left and
-    jaw_right, and only 0 and 255 (or 1) a mask of the instrument. option: what the user sets `classes` with.
-    Raises NeecoError.
+    classes: part by id; else as the folder's `parts.json` states; else ids 1 to 4 are shaft, wrist, jaw_left and
+    jaw_right, and only 0 and 255 (or 1) a mask of the instrument. option: that the user sets `classes` with. Raises
+    NeecoError.
     """
     if not path.is_dir():
         raise NeecoError(f"{path}: no such folder; give a folder of masks")
@@ -152,7 +152,7 @@ def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str
 
 
 def read_truth(path: Path) -> Capture | Path:
-    """The capture in the folder, or the folder itself where it holds masks and no capture. Raises NeecoError."""
+    """Read the capture in a folder; return the folder itself where it holds masks alone. Raises NeecoError."""
     if not path.is_dir():
         raise NeecoError(f"{path}: no such folder; give a capture or a folder of masks")
     is_capture = any((path / name).exists() for name in ("transforms.json", "truth", REFERENCE_FOLDER))
@@ -162,7 +162,7 @@ def read_truth(path: Path) -> Capture | Path:
 def open_truth(
     truth: Capture | Path, classes: Mapping[int, str] | None = None, splits: Sequence[str] | None = None
 ) -> Masks:
-    """The truth: a capture (`truth/masks`, else `reference_masks`, and its ignored pixels) or a folder of masks.
+    """Open the truth: a capture (`truth/masks`, else `reference_masks`, and its ignored pixels) or a folder of masks.
 
     splits: which frames of a capture; all that have a mask when None. Raises NeecoError.
     """
@@ -204,7 +204,7 @@ def _palette_ids(image: Image.Image, ids: np.ndarray) -> np.ndarray:
 
 
 def _stated_names(path: Path) -> dict[int, str] | None:
-    """What `parts.json` in the folder says of its ids, or None without one."""
+    """Return the names of ids in the folder's `parts.json`, or None without one."""
     file = path / PARTS_FILE
     if not file.is_file():
         return None
@@ -213,7 +213,7 @@ def _stated_names(path: Path) -> dict[int, str] | None:
         return {int(entry["id"]): str(entry["part"]) for entry in stated["ids"] if entry["id"]}
     except (KeyError, TypeError, ValueError):
         expected = 'expected [{"id": 1, "part": "shaft"}, …]'
-        raise NeecoError(f"{file}: ids: {expected}; mend it or give --classes") from None
+        raise NeecoError(f"{file}: ids: {expected}; correct it or give --classes") from None
 
 
 def _found_ids(file: Path) -> set[int]:
@@ -227,7 +227,7 @@ def _check_ids(files: Mapping[str, Path], known: set[int], meaning: str, option:
 
 
 def _guessed(path: Path, files: Mapping[str, Path], plain: bool, option: str) -> Masks:
-    """What unnamed ids mean, by the values that occur in the whole folder."""
+    """Return the masks with names for unnamed ids, guessed from the values in the whole folder."""
     found = {name: _found_ids(file) for name, file in files.items()}
     ids = set().union(*found.values())
     if plain and ids == {255}:

@@ -1,7 +1,4 @@
-"""How well masks agree: intersection over union, Dice, and the same per part; contours; boxes.
-
-Boundary F is computed on the contours of DAVIS, to the pixel; box AP is that of boxes without confidence.
-"""
+"""Metrics between masks: intersection over union and Dice, also per part; boundary F (DAVIS); box AP."""
 
 from __future__ import annotations
 
@@ -27,19 +24,19 @@ Pixels = TypeVar("Pixels", Tensor, np.ndarray)
 
 
 def iou(mask: Pixels, truth: Pixels, counted: Pixels | None = None) -> float:
-    """Intersection over union of bool masks [H, W]; NaN when both are empty. `counted` [H, W]: pixels that count."""
+    """Return the intersection over union of bool masks [H, W] over `counted` pixels; NaN when both are empty."""
     both, either = _overlap(mask, truth, counted)
     return both / either if either else math.nan
 
 
 def dice(mask: Pixels, truth: Pixels, counted: Pixels | None = None) -> float:
-    """Dice coefficient (F1 of the pixels) of two bool masks [H, W]; NaN when both are empty."""
+    """Return the Dice coefficient (F1 of the pixels) of two bool masks [H, W]; NaN when both are empty."""
     both, either = _overlap(mask, truth, counted)
     return 2 * both / (both + either) if either else math.nan
 
 
 def precision(mask: Pixels, truth: Pixels, counted: Pixels | None = None) -> float:
-    """Share of a bool mask [H, W] that is true; recall, the other way round. NaN when `mask` is empty."""
+    """Return the share of a bool mask [H, W] that is true; recall with masks swapped. NaN when `mask` is empty."""
     if counted is not None:
         mask = mask & counted
     marked = int(mask.sum())
@@ -63,8 +60,8 @@ def to_truth_ids(parts: Tensor, label_names: Sequence[tuple[str, str]], names: M
 
 
 def pairs_of(parts: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Parts whose names differ by left and right, by what both are called as one: {"jaws": ("jaw_left", "jaw_right")}.
-    Images alone do not tell which of them is called left."""
+    """Return parts whose names differ by left and right, by their common name: {"jaws": ("jaw_left", "jaw_right")}.
+    Images alone do not determine which of them is left."""
     names = tuple(parts)
     pairs = {}
     for left in names:
@@ -75,23 +72,23 @@ def pairs_of(parts: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def part_scores(names: Mapping[int, str]) -> tuple[str, ...]:
-    """The parts that are scored where `names` are those of the truth by id, and each pair as one."""
+    """Return the scored parts, where `names` are those of the truth by id, and each pair as one."""
     return *names.values(), *pairs_of(names.values())
 
 
 @dataclass
 class PartTally:
-    """Gathers per-part IoU over the frames of a split. names: part by id in the truth.
+    """IoU per part over the frames of a split. names: part by id in the truth.
 
-    A scene learned from images cannot know which of a pair is called left: both assignments are counted, and
-    the better one over the whole split is reported (never the better one per frame).
+    A scene learned from images cannot know which of a pair is left: the assignment that is better over the whole split
+    is reported (never the better one per frame).
     """
 
     names: Mapping[int, str]
     rows: list[dict[tuple[str, str], float]] = field(default_factory=list)  # of frames, by (part, part of the truth)
 
     def add(self, parts: Tensor, truth: Tensor, counted: Tensor | None = None) -> None:
-        """Count one frame: `parts` and `truth` [H, W] uint8, both in the truth's numbers."""
+        """Add one frame: `parts` and `truth` [H, W] uint8, both in the truth's numbers."""
         ours, theirs = ({part: ids == number for number, part in self.names.items()} for ids in (parts, truth))
         compared = [(part, part) for part in part_scores(self.names)]
         for pair, (left, right) in pairs_of(self.names.values()).items():
@@ -101,8 +98,8 @@ class PartTally:
         self.rows.append({(a, b): iou(ours[a], theirs[b], counted) for a, b in compared})
 
     def result(self) -> tuple[dict[str, float], dict[str, str]]:
-        """Mean IoU per part over the frames that show it (NaN when none does), and of each pair the assignment used,
-        "as named" or "swapped"."""
+        """Return the mean IoU per part over the frames that show it (NaN when none does), and the assignment of each
+        pair, "as named" or "swapped"."""
 
         def mean(ours: str, theirs: str) -> float:
             return mean_of([row[ours, theirs] for row in self.rows])
@@ -118,19 +115,18 @@ class PartTally:
 
 
 def total(values: Iterable[float]) -> float:
-    """Sum of the values that are numbers."""
+    """Return the sum of the values that are numbers."""
     return sum(value for value in values if not math.isnan(value))
 
 
 def mean_of(values: Sequence[float | None]) -> float:
-    """Mean of the values that are numbers; NaN when there are none."""
+    """Return the mean of the values that are numbers; NaN when there are none."""
     numbers = [value for value in values if value is not None and not math.isnan(value)]
     return sum(numbers) / len(numbers) if numbers else math.nan
 
 
 def boundary_pixels(mask: np.ndarray) -> np.ndarray:
-    """Contour of a bool mask [H, W], one pixel wide: pixels that differ from their right, lower or lower right
-    neighbour. What the image's edge cuts off is no contour."""
+    """Return the contour of a bool mask [H, W]: pixels that differ from their right, lower or lower right neighbour."""
     padded = np.pad(mask, ((0, 1), (0, 1)), mode="edge")
     right, lower, diagonal = padded[:-1, 1:], padded[1:, :-1], padded[1:, 1:]
     return (mask ^ right) | (mask ^ lower) | (mask ^ diagonal)
@@ -139,8 +135,9 @@ def boundary_pixels(mask: np.ndarray) -> np.ndarray:
 def boundary_f(
     mask: np.ndarray, truth: np.ndarray, counted: np.ndarray | None = None, tolerance: float = BOUNDARY_TOLERANCE
 ) -> float:
-    """F-measure of two contours: harmonic mean of the shares of each that lie near the other (Perazzi et al., "A
-    benchmark dataset and evaluation methodology for video object segmentation", CVPR 2016, section 4.1).
+    """Return the F-measure of two contours: the harmonic mean of the shares of each that are near the other.
+
+    As Perazzi et al., "A benchmark dataset and evaluation methodology for video object segmentation", CVPR 2016, 4.1.
 
     mask, truth [H, W] bool; near: at most ceil(tolerance * diagonal) pixels apart, centre to centre. counted [H, W]:
     contour pixels outside it need no counterpart, but may be one. NaN when neither mask has a pixel; 1 when there are
@@ -165,7 +162,7 @@ def boundary_f(
 
 
 def boxes_of(mask: np.ndarray, components: bool = False) -> np.ndarray:
-    """Boxes [n, 4] (x0, y0, x1, y1; px, x1 and y1 exclusive) about a bool mask [H, W].
+    """Return boxes [n, 4] (x0, y0, x1, y1; px, x1 and y1 exclusive) about a bool mask [H, W].
 
     One about all its pixels, or with `components` one about each group that touches by side or corner.
     """
@@ -175,7 +172,7 @@ def boxes_of(mask: np.ndarray, components: bool = False) -> np.ndarray:
 
 
 def box_ious(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Intersection over union [n, m] of boxes [n, 4] and [m, 4]."""
+    """Return the intersection over union [n, m] of boxes [n, 4] and [m, 4]."""
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     both = np.clip(high - low, 0, None).prod(axis=2)
@@ -186,11 +183,11 @@ def box_ious(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 def average_precision(
     predicted: Sequence[np.ndarray], truth: Sequence[np.ndarray], thresholds: Sequence[float] = COCO_THRESHOLDS
 ) -> float:
-    """Average precision over recalls 0, .01 … 1, mean over IoU `thresholds` (Lin et al., "Microsoft COCO", 2014).
+    """Return the average precision over recalls 0, 0.01 … 1, mean over IoU `thresholds` (Lin et al., COCO, 2014).
 
-    predicted, truth: boxes [n, 4] of each image. Masks carry no confidence, so all boxes rank alike: there is one
-    operating point, its precision holds up to its recall, and as many boxes are matched as the threshold allows
-    (COCO's greedy order would depend on nothing). NaN when no image has a true box.
+    predicted, truth: boxes [n, 4] of each image. Masks have no confidence, so that all boxes rank equally: there is one
+    operating point, its precision holds up to its recall, and as many boxes are matched as the threshold allows. NaN
+    when no image has a true box.
     """
     boxes, wanted = sum(map(len, predicted)), sum(map(len, truth))
     if not wanted:
@@ -201,5 +198,5 @@ def average_precision(
 
 
 def _matches(fits: np.ndarray) -> int:
-    """How many pairs can be made where each row and each column is used once at most."""
+    """Return the number of pairs in a maximum matching of rows and columns."""
     return int((maximum_bipartite_matching(sparse.csr_matrix(fits)) >= 0).sum()) if fits.any() else 0

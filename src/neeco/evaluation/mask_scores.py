@@ -1,4 +1,4 @@
-"""Score any folder of masks against the truth: overlap, contours and boxes, of the instrument and of each part."""
+"""Scores of any folder of masks against the truth: overlap, contours and boxes, per instrument and part."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Tables = Mapping[str, np.ndarray]  # bool [256] by region: which ids belong to i
 
 @dataclass(frozen=True)
 class Regions:
-    """What is compared: the instrument, the classes both sides tell apart, and each pair of left and right as one."""
+    """The compared regions: the instrument, the classes that both sides have, and each left-right pair as one."""
 
     classes: tuple[str, ...]  # without overlap; Challenge IoU is over these
     missing: tuple[str, ...]  # of `classes`, those that the prediction does not name
@@ -128,13 +128,13 @@ def _splits(frames: Iterable[Frame]) -> list[str]:
 
 
 def _predicted_splits(predicted: Masks, truth: Masks) -> list[str]:
-    """The splits of which there are predictions; all where there are none."""
+    """Return the splits that have predictions; all where none has."""
     found = _splits(frame for name, frame in truth.frames.items() if name in predicted.files)
     return found or _splits(truth.frames.values())
 
 
 def _shared_regions(predicted: Masks, truth: Masks) -> tuple[Regions, str | None]:
-    """The regions two folders can be compared in, and why there are no parts among them, if so.
+    """Return the regions in which two folders can be compared, and why they have no parts, if so.
 
     Where either side has one name for a pair (jaws), the other's two become one.
     """
@@ -184,14 +184,14 @@ def _score_image(name: str, predicted: Masks, truth: Masks, regions: Regions, co
 
 
 def _overlap(mask: np.ndarray, truth: np.ndarray, counted: np.ndarray | None) -> dict[str, float]:
-    """IoU, Dice and boundary F; NaN where neither mask has a pixel that counts."""
+    """Return IoU, Dice and boundary F; NaN where neither mask has a pixel that counts."""
     overlap = iou(mask, truth, counted)
     contours = math.nan if math.isnan(overlap) else boundary_f(mask, truth, counted)
     return {"iou": overlap, "dice": dice(mask, truth, counted), "boundary_f": contours}
 
 
 def _summary(images: Sequence[_Image], regions: Regions) -> dict[str, Any]:
-    """Numbers per region, and the names of pairs that fit the whole folder better (as `mask_metrics.PartTally`)."""
+    """Return numbers per region, pairs assigned as fits the whole folder better (see `mask_metrics.PartTally`)."""
     assignment: dict[str, str] = {}
     swap: dict[str, str] = {}
     for pair, (left, right) in regions.pairs.items():
@@ -237,7 +237,7 @@ def _pair_sum(images: Sequence[_Image], pair: Iterable[str], swap: Mapping[str, 
 
 
 def _challenge(images: Sequence[_Image], classes: Sequence[str], swap: Mapping[str, str]) -> tuple[float, float]:
-    """Challenge IoU, and the IoU that also counts classes only predicted (see `score_masks`)."""
+    """Return Challenge IoU, and the IoU that also counts classes only predicted (see `score_masks`)."""
     in_truth = [mean_of([image.iou(part, swap) for part in classes if image.shows(part)]) for image in images]
     in_either = [mean_of([image.iou(part, swap) for part in classes]) for image in images]
     return mean_of(in_truth), mean_of(in_either)

@@ -66,7 +66,7 @@ class Camera:
         pose = as_pose(self.world_from_camera, "Camera.world_from_camera", torch.float32)
         object.__setattr__(self, "world_from_camera", pose)
         try:
-            fault = camera_fault(self.fx, self.fy, self.cx, self.cy, self.width, self.height, self.near)
+            fault = camera_fault(self.fx, self.fy, self.cx, self.cy, self.width, self.height, near=self.near)
             shown = all(math.isfinite(number) for number in (*self.distortion, *(self.border or ())))
         except (TypeError, ValueError, OverflowError):
             raise NeecoError("Camera: expected numbers of px; correct them") from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -33,7 +33,7 @@ class Lens:
     cy: float
     distortion: tuple[float, ...] = ()
     size: tuple[int, int] | None = None
-    border: Border | None = None
+    border: Border | None = field(default=None, kw_only=True)
 
     @property
     def distorted(self) -> bool:
@@ -62,7 +62,7 @@ class Lens:
     def of(cls, camera: Camera) -> Lens:
         """The lens of a camera."""
         size = camera.width, camera.height
-        return cls(camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion, size, camera.border)
+        return cls(camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion, size, border=camera.border)
 
     def to_json(self) -> dict[str, Any]:
         """As a capture's transforms.json has it: w and h, px, and the intrinsics."""

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.capture.checks.masks import masks_fault, measure_hidden, sample_points
+from neeco.capture.checks.frames import masks_fault, measure_hidden, sample_points
 from neeco.capture.documents import ProblemReport, condensed
 from neeco.capture.images import read_mask, write_labels
 from neeco.capture.model import Capture, Frame, evenly_spaced

@@ -10,8 +10,9 @@ import numpy as np
 from neeco.capture.model import PointCloud
 from neeco.errors import NeecoError
 from neeco.ingest.cameras.sfm import StructureFromMotion
-from neeco.ingest.foreground.motion import ResidualFlow, RoughShape, best_lag, carve_shape, observations_on
-from neeco.ingest.foreground.passing import passing_masks
+from neeco.ingest.foreground.masks import passing_masks
+from neeco.ingest.foreground.residual_flow import ResidualFlow
+from neeco.ingest.foreground.rough_shape import RoughShape, best_lag, carve_shape, observations_on
 from neeco.ingest.frames.images import ChosenImages, undistort_images
 from neeco.ingest.frames.views import SfmResult, StageProgress, Views
 from neeco.ingest.recording.model import MIN_FRAMES

@@ -102,7 +102,9 @@ def finish(
     registered = registration is not None or set(data.parts[0].poses) <= set(data.world_from_base)
     lens = replace(images.lens, size=images.size, border=images.border)
     instruments = instruments_of(data.recording, shaft)
-    capture = Capture(images.folder, frames, instruments, world.tissue, registered, lens=lens, still=world.still)
+    capture = Capture(
+        images.folder, frames, instruments, world.tissue, registered=registered, lens=lens, still=world.still
+    )
     row_of = {row: index for index, row in enumerate(chosen.tolist())}
     return capture, IngestResult(
         capture=output,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from neeco.ingest.foreground.motion import RoughShape
+from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.timing.clock_search import ClockOffset

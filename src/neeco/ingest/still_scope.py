@@ -10,8 +10,10 @@ import numpy as np
 
 from neeco.capture.model import PointCloud, evenly_spaced
 from neeco.errors import NeecoError
-from neeco.ingest.cameras.still import LOOKED_AT, find_background, moving_masks, same_place, stands_still
+from neeco.ingest.cameras.still import N_FRAMES, same_place, stands_still
 from neeco.ingest.cameras.still_scene import RightCamera, look_behind, read_right_camera, still_cameras
+from neeco.ingest.foreground.background import find_background
+from neeco.ingest.foreground.masks import moving_masks
 from neeco.ingest.frames.images import ChosenImages
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.readers.columns import CAMERA
@@ -115,8 +117,8 @@ def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgre
     progress("comparing what the recordings show", 0, 0)
     backgrounds = {}
     for episode, rows in _rows_by_episode(data, images).items():
-        load = images.loader(rows[evenly_spaced(len(rows), LOOKED_AT)])
-        found = find_background(load, min(len(rows), LOOKED_AT))
+        load = images.loader(rows[evenly_spaced(len(rows), N_FRAMES)])
+        found = find_background(load, min(len(rows), N_FRAMES))
         backgrounds[episode] = np.clip(found.colors, 0, 255).astype(np.uint8)
     first, *others = backgrounds
     for episode in others:

@@ -9,7 +9,8 @@ import numpy as np
 
 from neeco.capture.model import PointCloud
 from neeco.ingest.cameras.still_scene import RightCamera
-from neeco.ingest.foreground.motion import ResidualFlow, RoughShape
+from neeco.ingest.foreground.residual_flow import ResidualFlow
+from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.frames.images import ChosenImages
 from neeco.ingest.frames.views import SfmResult, StageProgress, Views
 from neeco.ingest.registration.base import BaseRegistration

@@ -1,1 +1,1 @@
-"""What a drawing says of instruments and parts: which pixel is which, boxes, polygons, keypoints."""
+"""Labels of rendered instruments: of pixels (`labellers`), masks (`drawing`) and whole instruments (`annotation`)."""

@@ -1,4 +1,4 @@
-"""What a drawing says about each instrument: boxes, polygons, parts, visibility, keypoints, pose; all that as tensors.
+"""Labels of the instruments in a rendering: boxes, polygons, parts, visibility, keypoints and pose, also as tensors.
 
 Shapes are in pixel edges: the pixel in column x, row y covers [x, x + 1] x [y, y + 1].
 """
@@ -25,12 +25,13 @@ if TYPE_CHECKING:
     from neeco.scene import DrawableScene, GaussianScene
 
 SHAFT_ENDS = ("shaft_far", "shaft_near")  # keypoints; all others are of the working end
-OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2  # OUTSIDE: of the image, or the scene has nothing of the instrument
-OTHERS_MM = 1.0  # a surface of something else this much nearer than a keypoint hides it
-SELF_MM = 6.0  # keypoints lie inside their instrument: its own surface hides them only from this much nearer
-SIMPLIFY_PX = 0.8  # a straight edge drawn in pixels strays less than this from its line
-SIMPLIFY_AREA = 0.02  # a simpler polygon may change the area by this share
-FINE = 4  # magnification at which contours along pixel edges are found
+OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2  # OUTSIDE: of the image, or the instrument is not rendered at all
+OCCLUSION_MM = 1.0  # a surface of something else this much nearer than a keypoint hides it
+SELF_OCCLUSION_MM = 6.0  # the same of the instrument's own surface, inside which its keypoints lie
+SIMPLIFY_PX = 0.8  # the pixels of a straight edge deviate less than this from its line
+MAX_AREA_CHANGE = 0.02  # share by which a simpler polygon may change the area
+MAGNIFICATION = 4  # at which contours along pixel edges are found
+MIN_COMPONENT = 0.01  # of an instrument's largest component: smaller ones are not labelled, as by `synthesize`
 
 
 @dataclass(frozen=True)
@@ -53,17 +54,17 @@ class Keypoint(NamedTuple):
 
 @dataclass(frozen=True)
 class InstrumentLabel:
-    """Everything known of one instrument in one image."""
+    """The labels of one instrument in one image."""
 
     name: str
-    shape: Shape | None  # None: no pixel of it is seen
-    visibility: float  # pixels seen / pixels if nothing else were there
-    parts: dict[str, Shape]  # parts seen
+    shape: Shape | None  # None: no pixel of it is visible
+    visibility: float  # visible pixels / pixels if nothing else were there
+    parts: dict[str, Shape]  # visible parts
     keypoints: dict[str, Keypoint]
     camera_from_instrument: list[list[float]]  # 4x4 rigid, mm, OpenCV camera axes
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values, for files."""
+        """Return plain values for files."""
         return {
             "name": self.name,
             "visibility": self.visibility,
@@ -78,7 +79,7 @@ class InstrumentLabel:
 def annotate(
     scene: GaussianScene, drawing: LayeredDrawing, names: tuple[tuple[str, str], ...]
 ) -> list[InstrumentLabel]:
-    """Labels of every instrument of the drawn state; `names` are the (instrument, part) of the drawing's part ids."""
+    """Return the labels of every instrument of a drawing; names: (instrument, part) of its part ids."""
     keypoints = scene.keypoints(drawing.state)
     drawn_at = scene.registered(drawing.state)  # the pose that agrees with the pixels
     parts = drawing.parts.numpy()
@@ -104,7 +105,7 @@ def annotate(
 
 
 def shape_of(mask: np.ndarray) -> Shape | None:
-    """Box, minimum-area rectangle and polygons of a mask [H, W]; None when it is empty."""
+    """Return box, minimum-area rectangle and polygons of a mask [H, W]; None when it is empty."""
     rectangle = minimum_rectangle(mask)
     if rectangle is None:
         return None
@@ -112,24 +113,24 @@ def shape_of(mask: np.ndarray) -> Shape | None:
     return Shape(int(mask.sum()), bounding_box(mask), _rounded(rectangle, 2), polygons)
 
 
-def visibility(seen: np.ndarray, unoccluded: np.ndarray) -> float:
-    """Share of an instrument's pixels, were nothing else there, that are seen; 0 when it has none."""
-    whole = int((seen | unoccluded).sum())
-    return round(int(seen.sum()) / whole, 4) if whole else 0.0
+def visibility(visible: np.ndarray, unoccluded: np.ndarray) -> float:
+    """Return the share of an instrument's unoccluded pixels that are visible; 0 when it has none."""
+    whole = int((visible | unoccluded).sum())
+    return round(int(visible.sum()) / whole, 4) if whole else 0.0
 
 
 def place_in_image(point: np.ndarray, camera: Camera) -> tuple[float, float, float] | None:
-    """Position (x, y) px and depth mm of a world point [3] mm; None where the image does not show the place."""
+    """Return position (x, y) px and depth mm of a world point [3] mm; None where it is outside of the image."""
     local = (np.linalg.inv(to_numpy(camera.world_from_camera)) @ np.append(point, 1.0))[:3]
     x, y = project_seen(local, camera, nearest=camera.near)
-    seen = local[2] > camera.near and 0 <= x < camera.width and 0 <= y < camera.height
-    return (float(x), float(y), float(local[2])) if seen else None
+    inside = local[2] > camera.near and 0 <= x < camera.width and 0 <= y < camera.height
+    return (float(x), float(y), float(local[2])) if inside else None
 
 
 def project_keypoints(points: dict[str, Tensor], drawing: LayeredDrawing, instrument: str) -> dict[str, Keypoint]:
-    """Where an instrument's keypoints (world mm) fall, and whether anything stands before them.
+    """Return an instrument's keypoints (world mm) in the image, and whether anything hides them.
 
-    Of an instrument with no pixel even when drawn alone nothing is hidden: its keypoints are not labelled (OUTSIDE).
+    Keypoints of an instrument that has no pixel even alone are OUTSIDE.
     """
     camera = drawing.camera
     others = [drawing.tissue_depth] + [layer.depth for name, layer in drawing.layers.items() if name != instrument]
@@ -141,15 +142,15 @@ def project_keypoints(points: dict[str, Tensor], drawing: LayeredDrawing, instru
         if not absent and place is not None:
             x, y, z = place
             pixel = int(y), int(x)
-            hidden = any(0 < depth[pixel] < z - OTHERS_MM for depth in others)
-            hidden |= 0 < drawing.layers[instrument].depth[pixel] < z - SELF_MM
+            hidden = any(0 < depth[pixel] < z - OCCLUSION_MM for depth in others)
+            hidden |= 0 < drawing.layers[instrument].depth[pixel] < z - SELF_OCCLUSION_MM
             projected[name] = Keypoint(round(x, 2), round(y, 2), OCCLUDED if hidden else VISIBLE)
     return projected
 
 
 @torch.no_grad()
 def keypoint_names(scene: GaussianScene) -> tuple[str, ...]:
-    """Every keypoint that some instrument of the scene has."""
+    """Return the names of all keypoints of the scene's instruments."""
     if not scene.recorded.states:
         return ()
     known = scene.keypoints(scene.recorded.states[0]).values()
@@ -158,7 +159,7 @@ def keypoint_names(scene: GaussianScene) -> tuple[str, ...]:
 
 @torch.no_grad()
 def working_ends(scene: GaussianScene, state: State) -> dict[str, list[np.ndarray]]:
-    """Pivots and tips [3] mm of every instrument for which the scene knows any."""
+    """Return pivots and tips [3] mm of every instrument for which the scene has any."""
     ends = {
         instrument: [to_numpy(point) for name, point in points.items() if name not in SHAFT_ENDS]
         for instrument, points in scene.keypoints(state).items()
@@ -167,25 +168,25 @@ def working_ends(scene: GaussianScene, state: State) -> dict[str, list[np.ndarra
 
 
 def working_ends_or_origins(scene: GaussianScene, state: State) -> dict[str, list[np.ndarray]]:
-    """The `working_ends`; where none is known, every instrument's origin [3] mm."""
+    """Return the `working_ends`; without any, every instrument's origin [3] mm."""
     return working_ends(scene, state) or {
         name: [to_numpy(item.pose[:3, 3])] for name, item in scene.registered(state).instruments.items()
     }
 
 
 def any_in_image(camera: Camera, points: Mapping[str, Sequence[np.ndarray]]) -> bool:
-    """Whether any of the instruments' points [3] mm (world) projects into the image."""
+    """Return whether any of the instruments' points [3] mm (world) projects into the image."""
     return any(place_in_image(point, camera) is not None for some in points.values() for point in some)
 
 
 def bounding_box(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """The box (x, y, width, height) of the extreme pixels of a mask [H, W]; all 0 for an empty mask."""
+    """Return the box (x, y, width, height) of the extreme pixels of a mask [H, W]; all 0 for an empty mask."""
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     return x, y, width, height
 
 
 def minimum_rectangle(mask: np.ndarray) -> np.ndarray | None:
-    """Corners [4, 2] (x, y) of the smallest rectangle, in any direction, round all pixels of a mask; None when empty.
+    """Return the corners [4, 2] (x, y) of the smallest rectangle about all pixels of a mask; None when it is empty.
 
     The direction is OpenCV's, the extent along it computed here: cv2.minAreaRect works in float32 and leaves corners of
     pixels outside.
@@ -207,37 +208,37 @@ def minimum_rectangle(mask: np.ndarray) -> np.ndarray | None:
 
 
 def outer_polygons(mask: np.ndarray) -> list[np.ndarray]:
-    """The outer contour [P, 2] (x, y) of every component of a mask, largest first, simplified; holes are filled."""
+    """Return the simplified outer contour [P, 2] (x, y) of every component of a mask, largest first."""
     polygons = [_simplified(loop) for loop in _outer_loops(mask)] if mask.any() else []
     return sorted(polygons, key=lambda polygon: -abs(signed_area(polygon)))
 
 
 def signed_area(polygon: np.ndarray) -> float:
-    """Area of a polygon [P, 2], positive when it runs clockwise as seen in the image (y down)."""
+    """Return the area of a polygon [P, 2], positive when it is clockwise in the image (y down)."""
     x, y = polygon[:, 0], polygon[:, 1]
     return float(0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
 
 
 def _outer_loops(mask: np.ndarray) -> list[np.ndarray]:
-    """A closed loop of corners [P, 2] (x, y) round every (edge-connected) component of a mask, along pixel edges.
+    """Return a closed loop of corners [P, 2] (x, y) about every (edge-connected) component of a mask, on pixel edges.
 
-    OpenCV's contours join pixel centres, and pixels that touch at a corner only. In a mask magnified FINE times every
-    centre has one nearest corner; where two pixels touch at a corner only, the touching ones are cut away.
+    OpenCV's contours join pixel centres, and pixels that touch at a corner only. In a magnified mask every centre has
+    one nearest corner; where two pixels touch at a corner only, the touching ones are cut away.
     """
     x, y, width, height = bounding_box(mask)
     inside = mask[y : y + height, x : x + width].astype(np.uint8)
-    fine = inside.repeat(FINE, 0).repeat(FINE, 1)
+    fine = inside.repeat(MAGNIFICATION, 0).repeat(MAGNIFICATION, 1)
     upper_left, upper_right = inside[:-1, :-1], inside[:-1, 1:]
     lower_left, lower_right = inside[1:, :-1], inside[1:, 1:]
     touching = (upper_left == lower_right) & (upper_right == lower_left) & (upper_left != upper_right)
-    for row, column in FINE * (np.argwhere(touching) + 1):
+    for row, column in MAGNIFICATION * (np.argwhere(touching) + 1):
         fine[row - 1 : row + 1, column - 1 : column + 1] = 0
     contours, hierarchy = cv2.findContours(fine, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     loops = []
     for contour, (*_, parent) in zip(contours[::-1], hierarchy[0][::-1], strict=True):
         if parent >= 0:  # a hole
             continue
-        corners = (contour[::-1, 0] + FINE // 2) // FINE  # clockwise as seen
+        corners = (contour[::-1, 0] + MAGNIFICATION // 2) // MAGNIFICATION  # clockwise as seen
         corners = corners[(corners != np.roll(corners, 1, axis=0)).any(1)]
         first = np.lexsort(corners.T)[0]  # the leftmost of the top row
         loops.append(np.roll(corners, -first, axis=0) + np.array([x, y], dtype=float))
@@ -245,27 +246,24 @@ def _outer_loops(mask: np.ndarray) -> list[np.ndarray]:
 
 
 def _simplified(loop: np.ndarray) -> np.ndarray:
-    """The loop with fewer corners (Douglas and Peucker 1973), its area kept within SIMPLIFY_AREA."""
+    """Return the loop with fewer corners (Douglas and Peucker 1973), its area kept within MAX_AREA_CHANGE."""
     area = signed_area(loop)
     tolerance = SIMPLIFY_PX
     while tolerance > 0.1:
         simple = _approximated(loop, tolerance)
-        if len(simple) >= 3 and abs(signed_area(simple) - area) <= SIMPLIFY_AREA * area:
+        if len(simple) >= 3 and abs(signed_area(simple) - area) <= MAX_AREA_CHANGE * area:
             return simple
         tolerance /= 2
     return _approximated(loop, 1e-6)  # removes collinear corners only
 
 
 def _approximated(loop: np.ndarray, tolerance: float) -> np.ndarray:
-    """[P, 2] corners of a closed loop [N, 2] from which the others are at most `tolerance` px away."""
+    """Return the corners [P, 2] of a polygon from which a closed loop [N, 2] is at most `tolerance` px away."""
     return cv2.approxPolyDP(loop.astype(np.float32)[:, None], tolerance, True)[:, 0].astype(float)
 
 
 def _rounded(values: np.ndarray, digits: int) -> list[list[float]]:
     return (np.round(values, digits) + 0.0).tolist()
-
-
-MIN_COMPONENT = 0.01  # of an instrument's largest component: smaller ones are not labelled, as by `synthesize`
 
 
 @dataclass(frozen=True)
@@ -279,7 +277,7 @@ class RGBDImage:
         return f"RGBDImage({self.image.shape[1]}x{self.image.shape[0]} px)"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LabelledImage(RGBDImage):
     """An image with the labels of the I instruments that it shows, in the order of the scene's instruments.
 
@@ -287,7 +285,7 @@ class LabelledImage(RGBDImage):
     """
 
     parts: Tensor  # uint8 [H, W]: 0 tissue, else part_names[id - 1]
-    ignore: Tensor  # bool [H, W]: uncertain edges, and what no training frame saw; a loss had better ignore them
+    ignore: Tensor  # bool [H, W]: pixels that a loss should ignore, of uncertain edges and what no frame observed
     instruments: tuple[str, ...]  # names of the I instruments
     masks: Tensor  # bool [I, H, W]
     boxes: Tensor  # float32 [I, 4]: left, top, right, bottom
@@ -303,6 +301,7 @@ class LabelledImage(RGBDImage):
     @classmethod
     def of(
         cls,
+        *,
         image: Tensor,
         depth: Tensor,
         parts: Tensor,
@@ -311,23 +310,23 @@ class LabelledImage(RGBDImage):
         part_names: tuple[tuple[str, str], ...],
         keypoint_names: tuple[str, ...],
     ) -> LabelledImage:
-        """From pixels and the `labels` of a data set's record (`InstrumentLabel.to_json`)."""
-        seen = [label for label in labels if label["area"] > 0]
+        """Make one from pixels and the `labels` of a data set's record (`InstrumentLabel.to_json`)."""
+        visible = [label for label in labels if label["area"] > 0]
         ids = {name: [k + 1 for k, (owner, _) in enumerate(part_names) if owner == name] for name, _ in part_names}
-        masks = [torch.isin(parts, torch.tensor(ids[label["name"]], dtype=parts.dtype)) for label in seen]
-        boxes = [(x, y, x + width, y + height) for x, y, width, height in (label["box"] for label in seen)]
-        keypoints = [[label["keypoints"].get(name, (0, 0, 0)) for name in keypoint_names] for label in seen]
-        count = len(seen)
+        masks = [torch.isin(parts, torch.tensor(ids[label["name"]], dtype=parts.dtype)) for label in visible]
+        boxes = [(x, y, x + width, y + height) for x, y, width, height in (label["box"] for label in visible)]
+        keypoints = [[label["keypoints"].get(name, (0, 0, 0)) for name in keypoint_names] for label in visible]
+        count = len(visible)
         return cls(
             image=image.float(),
             depth=depth.float(),
             parts=parts,
             ignore=ignore,
-            instruments=tuple(label["name"] for label in seen),
+            instruments=tuple(label["name"] for label in visible),
             masks=torch.stack(masks) if masks else torch.zeros((0, *parts.shape), dtype=torch.bool),
             boxes=torch.tensor(boxes, dtype=torch.float32).reshape(count, 4),
             keypoints=torch.tensor(keypoints, dtype=torch.float32).reshape(count, len(keypoint_names), 3),
-            poses=torch.tensor([label["camera_from_instrument"] for label in seen]).float().reshape(count, 4, 4),
+            poses=torch.tensor([label["camera_from_instrument"] for label in visible]).float().reshape(count, 4, 4),
             part_names=part_names,
             keypoint_names=keypoint_names,
         )
@@ -340,14 +339,20 @@ class LabelledImage(RGBDImage):
         part_names: tuple[tuple[str, str], ...],
         keypoint_names: tuple[str, ...],
     ) -> LabelledImage:
-        """From a drawing and the `labels` that `annotate` finds in it."""
-        values = [label.to_json() for label in labels]
-        depth = torch.from_numpy(drawing.depth)
-        return cls.of(drawing.image, depth, drawing.parts, drawing.ignored, values, part_names, keypoint_names)
+        """Make one from a drawing and the `labels` that `annotate` finds in it."""
+        return cls.of(
+            image=drawing.image,
+            depth=torch.from_numpy(drawing.depth),
+            parts=drawing.parts,
+            ignore=drawing.ignored,
+            labels=[label.to_json() for label in labels],
+            part_names=part_names,
+            keypoint_names=keypoint_names,
+        )
 
     def targets(self) -> dict[str, Tensor]:
-        """As torchvision's detection models take it: image float32 [3, H, W], and `labels` int64 [I], counted from 1 in
-        the order of the scene's instruments; the other tensors as they are, by the names of their fields."""
+        """Return the tensors for torchvision's detection models: image float32 [3, H, W], and `labels` int64 [I],
+        counted from 1 in the order of the scene's instruments; others as they are, by the names of their fields."""
         classes = instruments_of(self.part_names)
         return {
             "image": self.image.permute(2, 0, 1).contiguous(),
@@ -370,7 +375,7 @@ def draw_labelled(
 def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bool) -> RGBDImage: ...
 @torch.no_grad()
 def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bool = True) -> RGBDImage:
-    """Draw `state` as `camera` sees it; with `labels` the result is a `LabelledImage`, without an `RGBDImage`.
+    """Render `state` for a camera; the result is a `LabelledImage` with `labels`, an `RGBDImage` without.
 
     Poses may be NumPy arrays or tensors: world_from_instrument and world_from_camera [4, 4], mm, OpenCV axes.
 

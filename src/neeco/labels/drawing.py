@@ -1,7 +1,6 @@
-"""Draw one state as a camera sees it, with the part that every pixel shows.
+"""Renderings of one state with their labels, on the CPU whatever device renders.
 
-`draw` is for looking and scoring; `draw_layers` also draws what labels need: the tissue and each instrument alone.
-Whatever device draws, a drawing is on the CPU.
+`draw` is for viewing and scoring; `draw_layers` also renders what labels need: the tissue and each instrument alone.
 """
 
 from __future__ import annotations
@@ -26,17 +25,17 @@ from neeco.raster.types import Rendering
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene, GaussianScene
 
-MOSTLY = 0.5  # of a pixel
+MAX_UNOBSERVED = 0.5  # of a pixel, above which it is ignored
 SURFACE_ALPHA = 0.5  # a pixel less opaque than this shows no surface
-# Of the image's diagonal: 3 px of 320 x 256. Measured on two rendered captures: without it the band has 36 and 66% more
+# Of the image's diagonal: 3 px of 320 x 256. Without it, on two rendered captures, the band has 36% and 66% more
 # pixels, nearly all of them rightly labelled (the instrument's shadow on the tissue, mostly).
-REACH = 0.008
-TOUCHING = np.ones((3, 3), np.uint8)  # at a corner, too: else the band of a slanted border is thinner than a pixel
+EDGE_WIDTH = 0.008
+NEIGHBOURS = np.ones((3, 3), np.uint8)  # with corners: else the band of a slanted border is thinner than a pixel
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A state as the scene draws it."""
+    """A rendered state."""
 
     image: Tensor  # [H, W, 3] in [0, 1]
     parts: Tensor | None  # [H, W] uint8, 0 tissue, else index into the label names + 1; None: the scene has no labels
@@ -44,13 +43,13 @@ class Drawing:
 
 @dataclass(frozen=True)
 class InstrumentLayer:
-    """One instrument drawn without the tissue and the other instruments."""
+    """One instrument rendered without the tissue and the other instruments."""
 
     mask: np.ndarray  # [H, W] bool
     depth: np.ndarray  # [H, W] mm, 0 = none
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LayeredDrawing(Drawing):
     """A labelled drawing with its layers; depths [H, W] in mm, 0 = none."""
 
@@ -59,22 +58,21 @@ class LayeredDrawing(Drawing):
     state: State
     camera: Camera
     depth: np.ndarray
-    tissue_depth: np.ndarray  # of the tissue drawn alone
-    tissue_image: Tensor | None  # [H, W, 3] in [0, 1] of the tissue drawn alone, where it was asked for
+    tissue_depth: np.ndarray  # of the tissue alone
+    tissue_image: Tensor | None  # [H, W, 3] in [0, 1] of the tissue alone, where it was asked for
     layers: dict[str, InstrumentLayer]  # by instrument
-    unobserved: Tensor  # [H, W] in [0, 1]: share of a pixel that no training frame saw, or not from about there
+    unobserved: Tensor  # [H, W] in [0, 1]: share of a pixel that no training frame observed from a similar direction
 
     @property
     def ignored(self) -> Tensor:
-        """[H, W] bool: pixels that a loss had better ignore: the uncertain edge of the instruments (see
-        `uncertain_edge`), and what is mostly unobserved."""
+        """[H, W] bool: pixels that a loss should ignore: the instruments' `uncertain_edge`, and unobserved pixels."""
         edge = torch.from_numpy(uncertain_edge(self.share.numpy(), self.parts.numpy() > 0))
-        return edge | (self.unobserved > MOSTLY)
+        return edge | (self.unobserved > MAX_UNOBSERVED)
 
 
 @torch.no_grad()
 def draw(scene: DrawableScene, state: State, camera: Camera) -> Drawing:
-    """Draw `state` as `camera`, of any size and lens, sees it, with the scene's own labels where it has any."""
+    """Render `state` for a `camera` of any size and lens, with the scene's own labels where it has any."""
     rendering = scene.render(state, scene.recorded.as_learned(camera), labels=True)
     parts = None if rendering.channels is None else composited_parts(rendering, threshold_of(scene)).cpu()
     return Drawing(rendering.color.clamp(0, 1).cpu(), parts)
@@ -89,10 +87,10 @@ def draw_layers(
     min_component: float,
     tissue_image: bool = False,
 ) -> LayeredDrawing:
-    """Draw `state` as `camera`, of any size and lens, sees it, labelled by `labeller`; tissue and instruments also
-    alone, for their depth, and with `tissue_image` for what the tissue looks like.
+    """Render `state` for a `camera` of any size and lens, labelled by `labeller`; tissue and instruments also alone.
 
-    Components of an instrument's mask smaller than `min_component` of its largest are not labelled.
+    Components of an instrument's mask smaller than `min_component` of its largest are not labelled. tissue_image: also
+    keep the image of the tissue.
     """
     camera = scene.recorded.as_learned(camera)
     gaussians = scene.at(state)
@@ -126,8 +124,8 @@ def draw_layers(
 def extended_silhouettes(
     scene: GaussianScene, labeller: Labeller, state: State, camera: Camera
 ) -> dict[str, np.ndarray]:
-    """Silhouette (bool [3 H, 3 W]) of every instrument drawn alone, by name, in the image of a pinhole `camera` and
-    beyond its border: the image is the middle ninth."""
+    """Return the silhouette (bool [3 H, 3 W]) of every instrument alone, by name, in the image of a pinhole `camera`
+    and beyond its border: the image is the middle ninth."""
     width, height = camera.width, camera.height
     wide = replace(camera, cx=camera.cx + width, cy=camera.cy + height, width=3 * width, height=3 * height)
     wide = scene.recorded.as_learned(wide)
@@ -142,28 +140,28 @@ def extended_silhouettes(
 
 
 def surface_depth(rendering: Rendering) -> np.ndarray:
-    """Expected depth [H, W] mm where something opaque was drawn, 0 elsewhere."""
+    """Return the expected depth [H, W] mm where the rendering is opaque, 0 elsewhere."""
     return to_numpy(rendering.depth * (rendering.alpha > SURFACE_ALPHA))
 
 
 def to_numpy(tensor: Tensor) -> np.ndarray:
-    """A tensor of any device as float64 numbers."""
+    """Return a tensor of any device as a float64 array."""
     return tensor.detach().cpu().double().numpy()
 
 
 def uncertain_edge(share: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """bool [H, W]: the pixels at the edge of a mask (bool [H, W]) that may well be on its other side.
+    """Return bool [H, W]: pixels at the edge of a mask (bool [H, W]) whose label is uncertain.
 
-    Those that touch the border from either side, since a border may be a pixel off even where the share of instrument
-    ([H, W] in [0, 1]) jumps; and those within REACH of them whose share is between CLEAR_SHARES. The image's own border
+    These touch the border from either side, since a border may be a pixel off even where the share of instrument
+    ([H, W] in [0, 1]) jumps, or are within EDGE_WIDTH of it with a share between CLEAR_SHARES. The image's own border
     is not an edge.
     """
     pixels = mask.astype(np.uint8)
-    border = cv2.dilate(pixels, TOUCHING) != cv2.erode(pixels, TOUCHING)
+    border = cv2.dilate(pixels, NEIGHBOURS) != cv2.erode(pixels, NEIGHBOURS)
     if not border.any():
         return border
     unclear = (share > CLEAR_SHARES[0]) & (share < CLEAR_SHARES[1])
-    reach = float(REACH * np.hypot(*mask.shape))
+    reach = float(EDGE_WIDTH * np.hypot(*mask.shape))
     x, y, width, height = cv2.boundingRect(border.astype(np.uint8))
     margin = math.ceil(reach)
     near = slice(max(0, y - margin), y + height + margin), slice(max(0, x - margin), x + width + margin)
@@ -173,7 +171,7 @@ def uncertain_edge(share: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def without_small_components(mask: np.ndarray, share: float) -> np.ndarray:
-    """The mask without the (edge-connected) components smaller than `share` of its largest."""
+    """Return the mask without the (edge-connected) components smaller than `share` of its largest."""
     components, count = ndimage.label(mask)
     if count < 2:
         return mask
@@ -183,11 +181,10 @@ def without_small_components(mask: np.ndarray, share: float) -> np.ndarray:
 
 
 def without_part_islands(parts: np.ndarray, ids: Sequence[int], share: float) -> np.ndarray:
-    """Part ids (uint8 [H, W]) in which small islands of an instrument's parts (`ids`) are of the part around them.
+    """Return part ids (uint8 [H, W]) in which small islands of an instrument's parts (`ids`) take the part around them.
 
     An island is an edge-connected component of a part smaller than `share` of the instrument's pixels that is not the
-    part's largest: such specks lie where two parts meet and the Gaussians of both are seen. It takes the part that
-    most pixels touching it have; one that touches no other part stays.
+    part's largest. It takes the part that most pixels touching it have; one that touches no other part stays.
     """
     smallest = share * np.isin(parts, ids).sum()
     cleaned = parts.copy()
@@ -202,7 +199,7 @@ def without_part_islands(parts: np.ndarray, ids: Sequence[int], share: float) ->
             x, y, width, height = statistics[k, : cv2.CC_STAT_AREA]
             around = slice(max(0, y - 1), y + height + 1), slice(max(0, x - 1), x + width + 1)
             island = components[around] == k
-            beside = cleaned[around][cv2.dilate(island.astype(np.uint8), TOUCHING).astype(bool) & ~island]
+            beside = cleaned[around][cv2.dilate(island.astype(np.uint8), NEIGHBOURS).astype(bool) & ~island]
             beside = beside[np.isin(beside, ids)]
             if len(beside):
                 cleaned[around][island] = np.bincount(beside).argmax()
@@ -210,10 +207,10 @@ def without_part_islands(parts: np.ndarray, ids: Sequence[int], share: float) ->
 
 
 def without_components(share: np.ndarray, remaining: np.ndarray, dropped: np.ndarray) -> np.ndarray:
-    """The share of instrument [H, W] with 0 in a mask's dropped components and in what fades around them.
+    """Return the share of instrument [H, W] with 0 in a mask's dropped components and their faint surroundings.
 
-    remaining, dropped: bool [H, W], together the mask. A pixel of neither that is not clearly instrument goes with the
-    component nearest to it.
+    remaining, dropped: bool [H, W], together the mask. A pixel of neither that is not clearly instrument belongs to the
+    nearest component.
     """
     if not dropped.any():
         return share
@@ -236,5 +233,5 @@ def _drop_small_components(
 
 
 def _distance_to(pixels: np.ndarray) -> np.ndarray:
-    """[H, W] px, between centres, to the nearest of the pixels (bool [H, W], at least one)."""
+    """Return distances [H, W] px, between centres, to the nearest of the pixels (bool [H, W], at least one)."""
     return cv2.distanceTransform((~pixels).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

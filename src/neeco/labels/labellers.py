@@ -1,8 +1,8 @@
-"""The two ways to say which pixel shows which part of which instrument.
+"""Labels of pixels: the instrument and part that each shows.
 
-`CompositedLabels` (the default, and what evaluation scores): every Gaussian carries the instrument and part that it
-belongs to, and compositing gets occlusion by tissue and other instruments right. `ThresholdLabels` (the paper's): what
-moves is the instrument; it knows neither parts nor what stands in front.
+`CompositedLabels` (the default, which evaluation scores): every Gaussian carries the instrument and part that it
+belongs to, and compositing handles occlusion by tissue and other instruments. `ThresholdLabels` (the paper's): what
+moves is the instrument, without parts and occlusion.
 """
 
 from __future__ import annotations
@@ -24,46 +24,46 @@ from neeco.scene.deformation import otsu
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene, GaussianScene
 
-# Of scenes without a threshold of their own: the instrument's moving shadow is learned with labels of .3 to .5, so
-# half is too low; .65 to .7 is best.
+# Of scenes without a threshold of their own: the instrument's moving shadow is learned with labels of 0.3 to 0.5, so
+# that 0.5 is too low; 0.65 to 0.7 is best.
 LABEL_THRESHOLD = 0.65
-SHADOWED_THRESHOLD = 0.55  # where the scene models that shadow: .65 then loses as much of the silhouette's border
+SHADOWED_THRESHOLD = 0.55  # where the scene models that shadow: 0.65 then loses as much of the silhouette's border
 # A share below the first is clearly tissue, one above the second clearly instrument. Measured by what a U-Net learns
-# beside the band: one from .15 leaves out mostly tissue, so that the model over-segments (IoU .93 instead of .96).
+# from the rest: a band from 0.15 leaves out mostly tissue, so that it over-segments (IoU 0.93 instead of 0.96).
 CLEAR_SHARES = 0.5, 0.9
 
-BLACK = 0.1  # RGB magnitude (norm) above which a pixel of the instrument drawn alone is the instrument
-THRESHOLD_STATES = 24  # recorded states that Otsu's method looks at
+MIN_BRIGHTNESS = 0.1  # RGB norm above which a pixel of the instrument rendered alone is the instrument
+N_THRESHOLD_STATES = 24  # recorded states for Otsu's method
 DELTAS = ("means", "quats", "scales")
 
 
 def threshold_of(scene: DrawableScene) -> float:
-    """The share of a pixel from which the scene's labels count it as instrument, unless a user says otherwise."""
+    """Return the scene's own label threshold: the share of a pixel above which it is labelled instrument."""
     if scene.label_threshold is not None:
         return scene.label_threshold
     return SHADOWED_THRESHOLD if scene.casts_shadow else LABEL_THRESHOLD
 
 
 def instruments_of(names: tuple[tuple[str, str], ...]) -> tuple[str, ...]:
-    """The instruments of (instrument, part) names, in order of first appearance."""
+    """Return the instruments of (instrument, part) names, in order of first appearance."""
     return tuple(dict.fromkeys(instrument for instrument, _ in names))
 
 
 def composited_parts(rendering: Rendering, threshold: float) -> Tensor:
-    """uint8 [H, W] part ids of an image drawn with `channels=scene.label_channels()` (see `composited_labels`)."""
+    """Return the part ids of `composited_labels`."""
     return composited_labels(rendering, threshold)[0]
 
 
 def composited_labels(rendering: Rendering, threshold: float) -> tuple[Tensor, Tensor]:
-    """Part ids (uint8 [H, W]) and share of instrument ([H, W]) of an image drawn with the scene's label channels.
+    """Return part ids (uint8 [H, W]) and share of instrument ([H, W]) of an image rendered with label channels.
 
-    The share is the sum of a pixel's label columns; where it exceeds `threshold`, the pixel's id is the index of its
-    largest column + 1, elsewhere 0 (tissue). Raises NeecoError when there are no such channels.
+    The share is the sum of a pixel's label columns. Where it exceeds `threshold`, the id is the index of the largest
+    column + 1, elsewhere 0 (tissue). Raises NeecoError when there are no such channels.
     """
     channels = rendering.channels
     if channels is None:
         raise NeecoError(
-            "labels: the image was drawn without label channels; draw it with channels=scene.label_channels()"
+            "labels: the image was rendered without label channels; render it with channels=scene.label_channels()"
         )
     channels = channels.detach()
     share = channels.sum(dim=-1)
@@ -74,7 +74,7 @@ def composited_labels(rendering: Rendering, threshold: float) -> tuple[Tensor, T
 
 
 class CompositedLabels:
-    """The labeller that goes by what every Gaussian carries (`scene.label_channels()`).
+    """Labels from what every Gaussian carries (`scene.label_channels()`).
 
     names: (instrument, part) of part id 1, 2, ...
     """
@@ -96,15 +96,17 @@ class CompositedLabels:
         self._owners = torch.where(per_instrument.sum(dim=1) > 0.5, owner, -1)
 
     def owners(self, state: State, posed: Gaussians) -> Tensor:
-        """[N] int64: index in `instruments_of(names)` of the instrument that holds most of a Gaussian, -1 where the
-        tissue holds half of it or more."""
+        """Return [N] int64: index in `instruments_of(names)` of the instrument that holds most of a Gaussian, -1 where
+        the tissue holds half of it or more."""
         return self._owners
 
     def draw(
         self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
     ) -> tuple[Rendering, Tensor, Tensor]:
-        """The whole scene drawn, its part ids [H, W] uint8 and the share of instrument of each pixel [H, W], in one
-        pass. Where `unobserved` [N] is given, it is the rendering's last channel."""
+        """Render the whole scene in one pass; return it, part ids [H, W] uint8 and shares of instrument [H, W].
+
+        unobserved [N]: becomes the rendering's last channel.
+        """
         channels = self.channels if unobserved is None else torch.cat([self.channels, unobserved[:, None]], 1)
         rendering = rasterize(gaussians, camera, channels=channels)
         assert rendering.channels is not None
@@ -124,14 +126,14 @@ class DeltaThresholds:
     scales: float | None
 
     def moved(self, magnitudes: dict[str, Tensor]) -> Tensor:
-        """[N] bool: which Gaussians exceed every threshold there is."""
+        """Return [N] bool: which Gaussians exceed every threshold there is."""
         tests = [magnitudes[kind] > limit for kind, limit in vars(self).items() if limit is not None]
         return torch.stack(tests).all(dim=0)
 
 
 class ThresholdLabels:
-    """The paper's labeller: Gaussians whose deltas exceed thresholds are drawn alone on black; what is not black is the
-    mask. The paper knows one instrument; of several, the nearest owns a moved Gaussian."""
+    """The paper's labels: Gaussians whose deltas exceed thresholds are rendered alone on black, whose other pixels are
+    the mask. The paper has one instrument; of several, the nearest owns a moved Gaussian."""
 
     def __init__(self, scene: GaussianScene, thresholds: DeltaThresholds | None = None) -> None:
         instruments = tuple(instrument.name for instrument in scene.instruments)
@@ -142,7 +144,7 @@ class ThresholdLabels:
         self.thresholds = thresholds or find_thresholds(scene)
 
     def owners(self, state: State, posed: Gaussians) -> Tensor:
-        """[N] int64: index in `names` of the instrument nearest to a Gaussian that moved, -1 for one that did not."""
+        """Return [N] int64: index in `names` of the instrument nearest to a Gaussian that moved, -1 for others."""
         moved = self.thresholds.moved(delta_magnitudes(self.scene, state))
         means = posed.means
         origins = torch.stack(
@@ -158,13 +160,13 @@ class ThresholdLabels:
     def draw(
         self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
     ) -> tuple[Rendering, Tensor, Tensor]:
-        """As that of `CompositedLabels`; ids and share (the alpha) from the moved Gaussians drawn alone."""
+        """Render as `CompositedLabels` does; ids and share (the alpha) are from the moved Gaussians alone."""
         moved = owners >= 0
         shares = torch.nn.functional.one_hot(owners[moved], len(self.names)).to(gaussians.means)
         alone = rasterize(gaussians.select(moved), camera, channels=shares)
         assert alone.channels is not None
         ids = alone.channels.argmax(dim=2) + 1
-        lit = alone.color.norm(dim=2) > BLACK
+        lit = alone.color.norm(dim=2) > MIN_BRIGHTNESS
         rendering = rasterize(gaussians, camera, channels=None if unobserved is None else unobserved[:, None])
         return rendering, torch.where(lit, ids, 0).to(torch.uint8), alone.alpha
 
@@ -174,18 +176,18 @@ Labeller = CompositedLabels | ThresholdLabels
 
 @torch.no_grad()
 def delta_magnitudes(scene: GaussianScene, state: State) -> dict[str, Tensor]:
-    """How far `state` moves each Gaussian from canonical: norms [N] of the deltas of "means", "quats", "scales"."""
+    """Return norms [N] of the deltas from canonical to `state`, of "means", "quats" and "scales"."""
     deltas = scene.deltas(state)
     return {kind: getattr(deltas, kind).norm(dim=1) for kind in DELTAS}
 
 
 def find_thresholds(scene: GaussianScene) -> DeltaThresholds:
-    """Thresholds by Otsu's method on the deltas' log-magnitude over recorded states (the paper leaves them open).
+    """Return thresholds by Otsu's method on the deltas' log-magnitude over recorded states (open in the paper).
 
-    Raises NeecoError when no kind of delta tells Gaussians apart, as in a scene in which nothing moves.
+    Raises NeecoError when no kind of delta separates Gaussians, as in a scene in which nothing moves.
     """
     states = scene.recorded.states
-    found = [delta_magnitudes(scene, states[k]) for k in evenly_spaced(len(states), THRESHOLD_STATES, floor=True)]
+    found = [delta_magnitudes(scene, states[k]) for k in evenly_spaced(len(states), N_THRESHOLD_STATES, floor=True)]
     limits = {
         kind: otsu_of_magnitudes(torch.cat([magnitudes[kind].cpu() for magnitudes in found])) if found else None
         for kind in DELTAS
@@ -198,7 +200,7 @@ def find_thresholds(scene: GaussianScene) -> DeltaThresholds:
 
 
 def otsu_of_magnitudes(magnitudes: Tensor) -> float | None:
-    """Otsu's threshold of log10 of magnitudes [N] >= 0, in the magnitudes' unit; None when they are all alike."""
+    """Return Otsu's threshold of log10 of magnitudes [N] >= 0, in the magnitudes' unit; None when all are similar."""
     values = magnitudes.double()
     largest = float(values.max()) if len(values) else 0.0
     if largest <= 0 or float(values.min()) > 0.999 * largest:

@@ -15,7 +15,7 @@ from neeco.capture.model import Capture, Frame, evenly_spaced
 from neeco.evaluation.image_metrics import outline
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_world
-from neeco.ingest.foreground.motion import RoughShape
+from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.report.charts import PALETTE, draw_dots, inline_svg, new_axes, page_style
 from neeco.report.page import MAX_WIDTH, jpeg, to_bytes
 

@@ -20,7 +20,7 @@ import neeco
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_begun, read_bytes, require_same, write_json
 from neeco.labels.annotation import keypoint_names
-from neeco.labels.drawing import REACH
+from neeco.labels.drawing import EDGE_WIDTH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels
 from neeco.registry import plugins
 from neeco.synthesis.camera_effects import read_effects
@@ -180,7 +180,7 @@ def description(
         "scene_sha256": _digest(run),
         "settings": settings,
         "soft": {"share_per_count": SHARE_PER_COUNT},
-        "ignore": {"ignored": IGNORED, "clear_shares": list(CLEAR_SHARES), "reach": REACH},
+        "ignore": {"ignored": IGNORED, "clear_shares": list(CLEAR_SHARES), "reach": EDGE_WIDTH},
         "scene": str(run.path),
     }
     if instrument_runs:

@@ -20,7 +20,7 @@ from numpy.random import Generator
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends
-from neeco.labels.drawing import MOSTLY, LayeredDrawing, draw_layers
+from neeco.labels.drawing import MAX_UNOBSERVED, LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.scene.io import load_gaussians
@@ -101,7 +101,7 @@ class Acceptance:
             return LEAVES_IMAGE
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
-        unobserved = drawing.unobserved > MOSTLY
+        unobserved = drawing.unobserved > MAX_UNOBSERVED
         if float(unobserved.float().mean()) > MAX_UNOBSERVED_IMAGE:
             return UNOBSERVED_TISSUE
         if float(unobserved[drawing.parts > 0].float().mean()) > self.max_unobserved:

@@ -328,8 +328,8 @@ class StoredImages(Dataset[Sample]):
         image = require_inside(self.folder / record["image"], self.folder)
         depth = np.asarray(open_image(files["depth"], size), np.float32) * np.float32(self._mm_per_count)
         labelled = LabelledImage.of(
-            read_image(image, size),
-            torch.from_numpy(depth),
+            image=read_image(image, size),
+            depth=torch.from_numpy(depth),
             parts=read_labels(files["parts"], size),
             ignore=read_labels(files["ignore"], size) == self._ignored,
             labels=record["labels"],

@@ -17,7 +17,7 @@ from neeco.capture.images import open_image
 from neeco.errors import NeecoError
 from neeco.ingest.posing.along_shaft import crop
 from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
-from neeco.ingest.posing.posed_capture import TEN, PosedCapture, Posing, half_turn
+from neeco.ingest.posing.posed_capture import N_SUGGESTED, PosedCapture, SolvedPosing, half_turn
 from neeco.labels.drawing import draw
 from neeco.training.run import load_run
 
@@ -99,7 +99,7 @@ class PosingSession:
         image = np.asarray(open_image(self.posed.capture.frames[index].image_path).convert("RGB"))
         return _encoded(self._along(posing, index, image, THUMB_PX if small else PICTURE_PX), ".jpg")
 
-    def _along(self, posing: Posing, index: int, image: np.ndarray, width: int) -> np.ndarray:
+    def _along(self, posing: SolvedPosing, index: int, image: np.ndarray, width: int) -> np.ndarray:
         """An image [H, W, C] of a frame along the shaft, `width` px wide."""
         left, right, top, bottom = self._window(posing)
         height = round(width * (bottom - top) / (right - left))
@@ -119,7 +119,7 @@ class PosingSession:
             now = datetime.datetime.now().strftime("%Y-%m-%d %H:%M")
             answer = HandPose(self.posed.frames[index], instrument, roll_deg, joints_deg, now)
             self._keep([*read_answers(self.posed.root), answer])
-            doubts = [doubt for doubt in self._posings[instrument].doubts() if doubt.frame == index]
+            doubts = [doubt for doubt in self._posings[instrument].outliers() if doubt.frame == index]
             return self._overview(instrument) | {"said": [str(doubt) for doubt in doubts]}
 
     def undo(self, instrument: str) -> dict[str, Any]:
@@ -140,14 +140,14 @@ class PosingSession:
         self.posed.write_states(posings)
         self._answers, self._posings = answers, posings
 
-    def _posing(self, instrument: str, index: int = 0) -> Posing:
+    def _posing(self, instrument: str, index: int = 0) -> SolvedPosing:
         if instrument not in self._posings:
             raise NeecoError(f"no instrument {instrument!r}; known: {', '.join(self._posings)}")
         if not 0 <= index < len(self.posed.frames):
             raise NeecoError(f"no frame {index}; there are {len(self.posed.frames)}")
         return self._posings[instrument]
 
-    def _window(self, posing: Posing) -> tuple[float, float, float, float]:
+    def _window(self, posing: SolvedPosing) -> tuple[float, float, float, float]:
         """Left, right (mm along the shaft), top and bottom (across) of a picture."""
         length = posing.shafts.working_length_mm
         return ALONG[0] * length, ALONG[1] * length, -ACROSS * length, ACROSS * length
@@ -156,7 +156,7 @@ class PosingSession:
         posing = self._posing(instrument)
         answered = {frame for frame, _ in posing.answers}
         doubts: dict[int, list[str]] = {}
-        for doubt in posing.doubts():
+        for doubt in posing.outliers():
             doubts.setdefault(doubt.frame, []).append(str(doubt))
         return {
             "ghost": self.scene is not None,
@@ -166,9 +166,9 @@ class PosingSession:
             "frames": len(self.posed.frames),
             "suggested": [
                 {"frame": item.frame, "name": self.posed.frames[item.frame], "reason": item.reason}
-                for item in posing.suggestions(max(1, TEN - len(answered)))
+                for item in posing.suggestions(max(1, N_SUGGESTED - len(answered)))
             ],
-            "of": max(TEN, len(answered)),
+            "of": max(N_SUGGESTED, len(answered)),
             "answered": [
                 {
                     "frame": frame,
@@ -180,7 +180,7 @@ class PosingSession:
                 for frame, answer in posing.answers
             ],
             "done": len(answered),
-            "sure": {name: [round(value, 1) for value in pair] for name, pair in posing.sureness().items()},
+            "sure": {name: [round(value, 1) for value in pair] for name, pair in posing.deviations().items()},
             "breaks": len(posing.breaks),
             "deviations": posing.rolls.deviations_deg.round(1).tolist(),
             "window": self._window(posing),
@@ -195,7 +195,7 @@ class PosingSession:
         }
 
 
-def _possible(posing: Posing, roll_deg: float, joints_deg: dict[str, float]) -> bool:
+def _possible(posing: SolvedPosing, roll_deg: float, joints_deg: dict[str, float]) -> bool:
     values = (roll_deg, *joints_deg.values())
     return set(joints_deg) == set(posing.joints) and all(abs(value) <= 360 for value in values)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
@@ -11,15 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from neeco.geometry.conventions import DVRK_ECM, OPENGL
 
-UNITS = {"centimetres": 10.0, "inches": 25.4, "metres": 1000.0}  # mm
+UNITS_MM = {"centimetres": 10.0, "inches": 25.4, "metres": 1000.0}
+N_BLOCKS = 12  # of frames that follow each other, whose gains count as independent
 SCALES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 2.0)
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """What is wrong with poses, what to do about it, and the poses [N, 4, 4] without it."""
+    """A mistake in poses, what to do about it, and the poses [N, 4, 4] without it."""
 
-    what: str
+    what: str  # with "{of}" where the message says whose poses they are
     remedy: str
     poses: np.ndarray
 
@@ -88,26 +89,29 @@ def placement_mistakes(poses: np.ndarray, world_from_camera: np.ndarray) -> Iter
 
 
 def camera_mistakes(world_from_camera: np.ndarray) -> Iterator[Mistake]:
-    """Mistakes of camera poses [N, 4, 4] (OpenCV axes), as they are stated with OpenGL axes in files."""
+    """Mistakes of camera poses [N, 4, 4] (OpenCV axes): axes, inverses, rotations, world axes, units."""
+    yield from camera_axes_mistakes(world_from_camera)
+    for given, restore in ((world_from_camera, np.asarray), (np.linalg.inv(world_from_camera), np.linalg.inv)):
+        for mistake in rotation_mistakes(given):
+            yield replace(mistake, poses=restore(mistake.poses))
+    for axes, remedy, turn in turned_axes():
+        yield Mistake(f"cameras have other world axes than the points: {axes}", remedy, turn @ world_from_camera)
+    yield from unit_mistakes(world_from_camera)
+
+
+def camera_axes_mistakes(world_from_camera: np.ndarray) -> Iterator[Mistake]:
+    """Camera poses [N, 4, 4] (OpenCV axes) that were written with other axes than OpenGL's, or inverted."""
     opengl = OPENGL.camera_to_opencv(world_from_camera)
     inverted = np.linalg.inv(opengl)
-    flip = "flip y and z: transform_matrix has OpenGL axes"
-    yield Mistake("camera axes are OpenCV's", flip, opengl)
+    yield Mistake("camera axes are OpenCV's", "flip y and z: transform_matrix has OpenGL axes", opengl)
     invert = "invert them: camera-to-world is expected"
     yield Mistake("camera matrices are world-to-camera", invert, OPENGL.camera_to_opencv(inverted))
     yield Mistake("camera matrices are world-to-camera with OpenCV axes", "invert them, then flip y and z", inverted)
-    for given, restore in ((world_from_camera, np.asarray), (np.linalg.inv(world_from_camera), np.linalg.inv)):
-        for mistake in rotation_mistakes(given):
-            yield Mistake(mistake.what.replace("{of}", "of the cameras"), mistake.remedy, restore(mistake.poses))
-    for axes, remedy, turn in turned_axes():
-        yield Mistake(f"cameras have other world axes than the points: {axes}", remedy, turn @ world_from_camera)
-    for mistake in unit_mistakes(world_from_camera):
-        yield Mistake(mistake.what.replace("{of}", "of the cameras"), mistake.remedy, mistake.poses)
 
 
-def unit_mistakes(poses: np.ndarray) -> Iterator[Mistake]:
+def unit_mistakes(poses: np.ndarray, units: Mapping[str, float] = UNITS_MM) -> Iterator[Mistake]:
     """Positions of poses [N, 4, 4] in another unit than mm, or all else in it."""
-    for unit, length in UNITS.items():
+    for unit, length in units.items():
         remedy = "give all lengths in mm"
         yield Mistake(f"positions {{of}} are in {unit}", remedy, with_positions(poses, length))
         what = f"positions {{of}} are in mm, the others in {unit}"
@@ -145,3 +149,9 @@ def with_positions(poses: np.ndarray, scale: float) -> np.ndarray:
     changed = poses.copy()
     changed[:, :3, 3] *= scale
     return changed
+
+
+def gain_certainty(gains: np.ndarray) -> float:
+    """Mean of gains [F] of frames in order, in standard errors over blocks of them."""
+    blocks = np.array([block.mean() for block in np.array_split(gains, min(N_BLOCKS, len(gains)))])
+    return float(blocks.mean() / max(blocks.std(ddof=1) / np.sqrt(len(blocks)), 1e-9))

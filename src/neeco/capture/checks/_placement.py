@@ -1,105 +1,75 @@
-"""Check that cameras, points and instruments fit together: distances, units, axes, and who sees what.
+"""Check that cameras, points and instruments fit together: distances, units, axes, and what is in view.
 
-A mistake of units or axes leaves things out of view. Where that happens the usual mistakes are tried, and one that
-brings things back into view is named: where images and points can tell, only if they confirm it.
+A mistake of units or axes moves things out of view. Where that happens the usual mistakes are tried, and one that
+brings things back into view is named: where images and points can confirm it, only if they do.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from neeco.capture.checks._cameras import CameraArrays
+from neeco.capture.checks._mistakes import camera_axes_mistakes, unit_mistakes
 from neeco.capture.checks.colors import agreements
 from neeco.capture.checks.motion import POSES, MotionVerdict, judge_motion
-from neeco.capture.checks.motion_evidence import Rays
+from neeco.capture.checks.motion_evidence import MotionEvidence
 from neeco.capture.documents import Node, errors_only, printable
 from neeco.capture.model import Instrument
 from neeco.capture.readers.parsed import Parsed
-from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lines import across_projectors
-from neeco.geometry.projection import project
+from neeco.plausible import Fault
 
 FEW_POINTS = 100
-FAR = 10.0  # in sizes of the scene
-SEEN_RARELY = 0.1  # a share of the points, or of the frames, that makes one look for a mistake
-SEEN_SURELY = 0.7  # a share that settles it
-COLORS_AGREE = 0.2  # correlation of the points' colours with the images' that confirms a mistake
-SEEN_AGAIN = 0.3  # a share that makes a mistake the likely one
-METRES = 1.0  # mm; an endoscope is never this close, nor an instrument's travel this short
-BEHIND = 1e-9  # mm; what is less deep is not in front of a camera
+MAX_SAMPLED_POINTS = 500
+MAX_DISTANCE = 10.0  # sizes of the scene
+MIN_VISIBLE = 0.1  # share of the points, or of the frames, below which a mistake is looked for
+MIN_EXPLAINED = 0.3  # share in view that a mistake must restore to be named
+MIN_BODY_VISIBLE = 0.7  # share of the frames that show a point fixed to the instrument: no mistake is needed
+MIN_COLOR_CORRELATION = 0.2  # of the points' colours with the images' that confirms a mistake
+MIN_DISTANCE_MM = 1.0  # an endoscope is never this close, nor an instrument's travel this short: lengths are in metres
 SENSOR_REACH_MM = 500.0  # how far from the visible part of an instrument its sensor may sit
 ALL_IN_MM = "give all lengths in mm"
-Mistake = tuple[str, str]  # what is wrong, what to do
 
 
 @dataclass(frozen=True)
-class _Cameras:
-    """Cameras of frames as arrays."""
+class _Extent:
+    """Where the points are and how far the cameras are from them, robust against outliers."""
 
-    poses: np.ndarray  # [F, 4, 4] world_from_camera, OpenCV axes
-    intrinsics: np.ndarray  # [F, 4] fx fy cx cy
-    sizes: np.ndarray  # [F, 2] width, height
-
-    @classmethod
-    def of(cls, parsed: Parsed) -> _Cameras:
-        cameras = [frame.camera for frame in parsed.frames]
-        return cls(
-            np.stack([camera.world_from_camera.double().numpy() for camera in cameras]),
-            np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras]),
-            np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64),
-        )
-
-    @property
-    def centers(self) -> np.ndarray:
-        """[F, 3]"""
-        return self.poses[:, :3, 3]
-
-    def sees(self, points: np.ndarray, poses: np.ndarray | None = None) -> np.ndarray:
-        """Which camera has which point in its image, bool [F, P]; points [P, 3], or [F, P, 3] one set per camera."""
-        poses = self.poses if poses is None else poses
-        local = np.einsum("fpi,fij->fpj", points - poses[:, None, :3, 3], poses[:, :3, :3])
-        fx, fy, cx, cy = self.intrinsics.T[..., None]  # each [F, 1]
-        width, height = self.sizes.T[..., None]
-        with np.errstate(all="ignore"):
-            u, v = project(local, fx, fy, cx, cy, nearest=BEHIND)
-            return (local[..., 2] > BEHIND) & (u > 0) & (u < width) & (v > 0) & (v < height)
-
-
-@dataclass(frozen=True)
-class _Scene:
-    """Where the points are and how far the cameras are from them, robust against strays."""
-
-    cameras: _Cameras
+    cameras: CameraArrays
     points: np.ndarray  # [P, 3], a sample
     center: np.ndarray  # [3]
-    spread: float  # mm, 90% of the points are within this of the centre
+    radius: float  # mm, 90% of the points are within this of the centre
     distance: float  # mm, of the median camera from the centre
 
     @classmethod
-    def of(cls, parsed: Parsed, points: np.ndarray) -> _Scene:
-        cameras = _Cameras.of(parsed)
+    def of(cls, parsed: Parsed, points: np.ndarray) -> _Extent:
+        cameras = CameraArrays.of([frame.camera for frame in parsed.frames])
         center = np.median(points, axis=0)
         distance = float(np.median(np.linalg.norm(cameras.centers - center, axis=1)))
-        return cls(cameras, points[:: max(1, len(points) // 500)], center, _spread(points), distance)
+        return cls(cameras, points[:: max(1, len(points) // MAX_SAMPLED_POINTS)], center, _radius(points), distance)
 
     @property
     def size(self) -> float:
-        return max(self.spread, self.distance)
+        return max(self.radius, self.distance)
 
 
-def check_geometry(parsed: Parsed) -> dict[str, MotionVerdict]:
-    """Check points, cameras against points, then instruments against both (not against cameras that are wrong). Returns
-    what the images say of instruments that are out of view, by name."""
+def check_placement(parsed: Parsed) -> dict[str, MotionVerdict]:
+    """Check points, cameras against points, then instruments against both (not against cameras that are wrong).
+
+    Returns what the images say of instruments that are out of view, by name.
+    """
     report = parsed.places[0].report
     before = len(errors_only(report.problems))
     points = _usable_points(parsed)
     placed = parsed.with_cameras()
-    scene = None if points is None or not placed.frames else _Scene.of(placed, points)
-    if scene is not None:
-        _check_cameras(placed, scene)
+    extent = None if points is None or not placed.frames else _Extent.of(placed, points)
+    if extent is not None:
+        _check_cameras(placed, extent)
     if placed.frames and len(errors_only(report.problems)) == before:
-        return _check_instruments(placed, scene)
+        return _check_instruments(placed, extent)
     return {}
 
 
@@ -118,82 +88,74 @@ def _usable_points(parsed: Parsed) -> np.ndarray | None:
     if len(points) < FEW_POINTS:
         message = f"few sparse points: {len(points)}, fewer than {FEW_POINTS}"
         place.warning(message, "give SfM's whole cloud if you can")
-    if _spread(points) < 1e-9:
+    if _radius(points) < 1e-9:
         place.error("all points are in one spot", "repair the point cloud")
         return None
     return points
 
 
-def _spread(points: np.ndarray) -> float:
-    """mm, 90% of the points [P, 3] are within this of their centre."""
+def _radius(points: np.ndarray) -> float:
+    """Radius, mm, about their centre that 90% of the points [P, 3] are within."""
     return float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
 
 
-def _check_cameras(parsed: Parsed, scene: _Scene) -> None:
+def _check_cameras(parsed: Parsed, extent: _Extent) -> None:
     """Report cameras far from the points, and mistakes in camera poses."""
     matrices = parsed.header("frames[*].transform_matrix")
-    if parsed.instruments and scene.distance < METRES:
-        message = f"cameras are {scene.distance:.3g} mm from the points: metres?"
+    if parsed.instruments and extent.distance < MIN_DISTANCE_MM:
+        message = f"cameras are {extent.distance:.3g} mm from the points: metres?"
         parsed.header("frames").error(message, "give cameras, points and poses in mm")
         return
-    seen = scene.cameras.sees(scene.points[None]).mean(axis=1)  # [F] share of the points in each image
-    mistake = _camera_mistake(parsed, scene, float(seen.mean())) if seen.mean() < SEEN_RARELY else None
-    if mistake is not None:
-        matrices.error(f"points are outside the images: {mistake[0]}", mistake[1])
+    visible = extent.cameras.sees(extent.points[None]).mean(axis=1)  # [F] share of the points in each image
+    fault = _camera_fault(parsed, extent, float(visible.mean())) if visible.mean() < MIN_VISIBLE else None
+    if fault is not None:
+        matrices.error(f"points are outside the images: {fault[0]}", fault[1])
         return
-    if not seen.any():
+    if not visible.any():
         remedy = "camera-to-world with OpenGL axes, in the points' frame and unit (mm), is expected"
         matrices.error("no camera has any point in its image", remedy)
         return
-    if scene.distance > 10 * FAR * scene.spread:
-        message = f"cameras are far from the points: {scene.distance:.4g} mm, the points span {2 * scene.spread:.4g} mm"
-        matrices.error(message, "metres for mm?")
+    if extent.distance > 10 * MAX_DISTANCE * extent.radius:
+        span = f"the points span {2 * extent.radius:.4g} mm"
+        matrices.error(f"cameras are far from the points: {extent.distance:.4g} mm, {span}", "metres for mm?")
         return
-    distances = np.linalg.norm(scene.cameras.centers - scene.center, axis=1)
-    for place, distance, share in zip(parsed.places, distances, seen, strict=True):
-        if distance > FAR * scene.size:
-            message = f"camera is far from the points: {distance:.4g} mm, others {scene.distance:.4g} mm"
+    distances = np.linalg.norm(extent.cameras.centers - extent.center, axis=1)
+    for place, distance, share in zip(parsed.places, distances, visible, strict=True):
+        if distance > MAX_DISTANCE * extent.size:
+            message = f"camera is far from the points: {distance:.4g} mm, others {extent.distance:.4g} mm"
             place.child("transform_matrix").error(message, "repair the pose or drop the frame")
         elif share == 0:
             remedy = "a wrong pose, or a part of the scene that SfM missed"
             place.child("transform_matrix").warning("the camera has no point in its image", remedy)
 
 
-def _camera_mistake(parsed: Parsed, scene: _Scene, given: float) -> Mistake | None:
-    """The mistake that best explains points out of view, or None. Where the points' colours can tell, they must."""
-    cameras, points = scene.cameras, scene.points[None]
-    opengl = swap_camera_axes(cameras.poses)  # as written in the file
-    if np.linalg.norm(opengl[:, :3, 3], axis=1).max() < METRES < 0.1 * scene.spread:
-        return "camera positions are in metres", ALL_IN_MM
-    inverted = np.linalg.inv(opengl)
-    farther = cameras.poses.copy()
-    farther[:, :3, 3] *= 1000.0
-    guesses = [
-        (opengl, "camera axes are OpenCV's", "flip y and z: transform_matrix has OpenGL axes"),
-        (swap_camera_axes(inverted), "matrices are world-to-camera", "invert them: camera-to-world is expected"),
-        (inverted, "matrices are world-to-camera with OpenCV axes", "invert them, then flip y and z"),
-        (farther, "camera positions are in metres", ALL_IN_MM),
-    ]
-    nearer = cameras.poses.copy()
-    nearer[:, :3, 3] /= 1000.0
-    guesses.append((nearer, "points are in metres", ALL_IN_MM))
-    colors = None if errors_only(parsed.places[0].report.problems) else agreements(parsed, [one[0] for one in guesses])
-    if colors is not None:
+def _camera_fault(parsed: Parsed, extent: _Extent, given: float) -> Fault | None:
+    """Name the mistake that best explains points out of view. Where the points' colours can confirm it, they must."""
+    cameras, points = extent.cameras, extent.points[None]
+    if np.linalg.norm(cameras.centers, axis=1).max() < MIN_DISTANCE_MM < 0.1 * extent.radius:
+        return "positions of the cameras are in metres", ALL_IN_MM
+    mistakes = [*camera_axes_mistakes(cameras.poses), *unit_mistakes(cameras.poses, {"metres": 1000.0})]
+    faults = [(mistake.what.format(of="of the cameras"), mistake.remedy) for mistake in mistakes]
+    clean = not errors_only(parsed.places[0].report.problems)
+    if clean and (colors := agreements(parsed, [mistake.poses for mistake in mistakes])) is not None:
         best = int(np.argmax(colors))
-        return guesses[best][1:] if colors[best] > COLORS_AGREE else None
-    return _likeliest({(what, remedy): cameras.sees(points, poses) for poses, what, remedy in guesses}, given)
+        return faults[best] if colors[best] > MIN_COLOR_CORRELATION else None
+    views = [CameraArrays(mistake.poses, cameras.intrinsics, cameras.sizes).sees(points) for mistake in mistakes]
+    return _likeliest(faults, views, given)
 
 
-def _likeliest(seen: dict[Mistake, np.ndarray], given: float) -> Mistake | None:
-    """The mistake that brings the greatest share back into view, if it explains much more than none does."""
-    shares = {mistake: float(visible.mean()) for mistake, visible in seen.items()}
-    best = max(shares, key=lambda mistake: shares[mistake])
-    return best if shares[best] > max(SEEN_AGAIN, 3 * given) else None
+def _likeliest(faults: Sequence[Fault], visible: Sequence[np.ndarray], given: float) -> Fault | None:
+    """The mistake without which the greatest share is in view, if that is much more than the share given."""
+    shares = [float(seen.mean()) for seen in visible]
+    best = int(np.argmax(shares))
+    return faults[best] if shares[best] > max(MIN_EXPLAINED, 3 * given) else None
 
 
-def _check_instruments(parsed: Parsed, scene: _Scene | None) -> dict[str, MotionVerdict]:
-    """Report instruments far from the scene or outside every image, and the mistakes behind it; returns what the images
-    say of them."""
+def _check_instruments(parsed: Parsed, extent: _Extent | None) -> dict[str, MotionVerdict]:
+    """Report instruments far from the scene or outside every image, and the mistakes behind it.
+
+    Returns what the images say of them, where they were compared.
+    """
     verdicts: dict[str, MotionVerdict] = {}
     if not parsed.registered and parsed.instruments:
         message = "instrument poses are 'unregistered': in a tracker's or robot's own frame, not the cameras' world"
@@ -201,7 +163,7 @@ def _check_instruments(parsed: Parsed, scene: _Scene | None) -> dict[str, Motion
             "where an instrument is in the images must be learned, and cannot be checked here; register it if you can"
         )
         parsed.header("instrument_frame").warning(message, remedy)
-    everyone = _Cameras.of(parsed)
+    cameras = CameraArrays.of([frame.camera for frame in parsed.frames])
     for instrument in parsed.instruments:
         found = parsed.states_of(instrument.name)
         if not found:
@@ -210,58 +172,61 @@ def _check_instruments(parsed: Parsed, scene: _Scene | None) -> dict[str, Motion
         poses = np.stack([state.pose.numpy() for _, state in found])  # [I, 4, 4]
         origins = poses[:, :3, 3]
         farthest = float(np.linalg.norm(origins, axis=1).max())
-        if np.ptp(origins, axis=0).max() > 0 and farthest < METRES:
+        if np.ptp(origins, axis=0).max() > 0 and farthest < MIN_DISTANCE_MM:
             message = f"positions of {name} stay within {farthest:.2g} mm of the frame's origin: metres?"
             parsed.header(POSES).error(message, "give them in mm")
         elif parsed.registered:
             has = np.array([instrument.name in frame.state.instruments for frame in parsed.frames])
-            cameras = _Cameras(everyone.poses[has], everyone.intrinsics[has], everyone.sizes[has])
-            verdict = _check_placement(parsed, instrument, cameras, scene, poses, [place for place, _ in found])
+            places = [place for place, _ in found]
+            verdict = _check_instrument(parsed, instrument, cameras[has], extent, poses, places)
             if verdict is not None:
                 verdicts[instrument.name] = verdict
     return verdicts
 
 
-def _check_placement(
+def _check_instrument(
     parsed: Parsed,
     instrument: Instrument,
-    cameras: _Cameras,
-    scene: _Scene | None,
+    cameras: CameraArrays,
+    extent: _Extent | None,
     poses: np.ndarray,
     places: list[Node],
 ) -> MotionVerdict | None:
-    """Check one registered instrument: the cameras, poses [I, 4, 4] and places of the frames that have it. Returns what
-    the images tell of it, where they were asked."""
-    name, all_poses = printable(instrument.name), parsed.header(POSES)
-    seen = cameras.sees(poses[:, None, :3, 3])[:, 0]  # [I]
-    outside = "every image" if not seen.any() else f"{len(seen) - int(seen.sum())} of {len(seen)} images"
-    mistake, verdict = None, None
-    if seen.mean() < SEEN_RARELY:
-        rays = _rays(parsed, instrument)
-        if rays is None:
-            mistake = _instrument_mistake(cameras, poses, float(seen.mean()))
+    """Check one registered instrument, given cameras, poses [I, 4, 4] and places of the frames that have it.
+
+    Returns what the images say of it, where they were compared.
+    """
+    name, all_poses, origins = printable(instrument.name), parsed.header(POSES), poses[:, :3, 3]
+    visible = cameras.sees(origins[:, None])[:, 0]  # [I]
+    outside = "every image" if not visible.any() else f"{len(visible) - int(visible.sum())} of {len(visible)} images"
+    fault, verdict = None, None
+    if visible.mean() < MIN_VISIBLE:
+        evidence = _motion_evidence(parsed, instrument)
+        if evidence is None:
+            fault = _instrument_fault(cameras, poses, float(visible.mean()))
         else:  # the images decide where they can
-            verdict = judge_motion(parsed, instrument, rays)
-            fault = verdict.fault
-            if fault is not None and fault.named and fault.field == POSES:
-                mistake = fault.message, fault.remedy
-    if mistake is not None:
-        all_poses.error(f"instrument {name} is outside {outside}: {mistake[0]}", mistake[1])
+            verdict = judge_motion(parsed, instrument, evidence)
+            found = verdict.fault
+            if found is not None and found.named and found.field == POSES:
+                fault = found.message, found.remedy
+    if fault is not None:
+        all_poses.error(f"instrument {name} is outside {outside}: {fault[0]}", fault[1])
         return None
-    if scene is not None:
-        distances = np.linalg.norm(poses[:, :3, 3] - scene.center, axis=1)
-        far = np.flatnonzero(distances > FAR * scene.size + SENSOR_REACH_MM * (scene.distance > METRES))
+    if extent is not None:
+        distances = np.linalg.norm(origins - extent.center, axis=1)
+        reach = SENSOR_REACH_MM * (extent.distance > MIN_DISTANCE_MM)
+        far = np.flatnonzero(distances > MAX_DISTANCE * extent.size + reach)
         for index in far:
             message = f"instrument {name} is far from the points: {distances[index]:.4g} mm"
             places[index].child("pose").error(message, "pose and points must share frame and unit (mm)")
         if len(far):
             return verdict
-    elif np.median(np.linalg.norm(poses[:, :3, 3] - cameras.centers, axis=1)) < METRES:
-        all_poses.error(f"instrument {name} is within {METRES:g} mm of the cameras: metres?", ALL_IN_MM)
+    elif np.median(np.linalg.norm(origins - cameras.centers, axis=1)) < MIN_DISTANCE_MM:
+        all_poses.error(f"instrument {name} is within {MIN_DISTANCE_MM:g} mm of the cameras: metres?", ALL_IN_MM)
         return verdict
     if verdict is not None and (verdict.supported or verdict.fault is not None):
         return verdict  # more than where an origin is
-    if not seen.any():  # a sensor away from the instrument's visible part, or a wrong frame
+    if not visible.any():  # a sensor away from the instrument's visible part, or a wrong frame
         (x, y, z), share = _visible_body_point(cameras, poses)
         if share > 0.5:
             point = f"({x:.0f}, {y:.0f}, {z:.0f})"
@@ -270,33 +235,32 @@ def _check_placement(
             expected = "world_from_instrument in mm, in the cameras' world, is expected"
             remedy = f"{expected} (quaternion order, axes, registration?)"
         (all_poses.warning if share > 0.5 else all_poses.error)(f"the origin of {name} is outside every image", remedy)
-    elif seen.mean() < SEEN_RARELY:
+    elif visible.mean() < MIN_VISIBLE:
         message = f"the origin of {name} is outside {outside}"
         all_poses.warning(message, "right if its sensor sits far behind")
     else:  # single poses far away from all others, and out of view: tracker drop-outs
-        origins = poses[:, :3, 3]
         distances = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
-        usual = max(float(np.median(distances)), METRES)
-        for index in np.flatnonzero((distances > FAR * usual) & ~seen):
+        usual = max(float(np.median(distances)), MIN_DISTANCE_MM)
+        for index in np.flatnonzero((distances > MAX_DISTANCE * usual) & ~visible):
             message = f"instrument {name} is {distances[index]:.4g} mm from where it usually is, and out of view"
             remedy = "a tracker drop-out or unit slip? repair the pose or drop the frame"
             places[index].child("pose").warning(message, remedy)
     return verdict
 
 
-def _rays(parsed: Parsed, instrument: Instrument) -> Rays | None:
-    """What moves in the images, where they can be read and show where the instrument is."""
-    states = [instrument.name in frame.state.instruments for frame in parsed.frames]
-    return None if errors_only(parsed.places[0].report.problems) or not all(states) else Rays.of(parsed)
+def _motion_evidence(parsed: Parsed, instrument: Instrument) -> MotionEvidence | None:
+    """The motion in the images, where they can be read and every frame has the instrument."""
+    everywhere = all(instrument.name in frame.state.instruments for frame in parsed.frames)
+    clean = not errors_only(parsed.places[0].report.problems)
+    return MotionEvidence.of(parsed) if everywhere and clean else None
 
 
-def _visible_body_point(cameras: _Cameras, poses: np.ndarray) -> tuple[np.ndarray, float]:
+def _visible_body_point(cameras: CameraArrays, poses: np.ndarray) -> tuple[np.ndarray, float]:
     """The point [3] fixed to the instrument, within a sensor's reach, that most images show, and the share that do.
 
     Least squares: the body point nearest to all optical axes.
     """
-    axes = cameras.poses[:, :3, 2]
-    across = across_projectors(axes)
+    across = across_projectors(cameras.poses[:, :3, 2])
     rows = (across @ poses[:, :3, :3]).reshape(-1, 3)
     target = (across @ (cameras.centers - poses[:, :3, 3])[:, :, None]).reshape(-1)
     point = np.linalg.lstsq(rows, target, rcond=1e-6)[0]
@@ -306,18 +270,19 @@ def _visible_body_point(cameras: _Cameras, poses: np.ndarray) -> tuple[np.ndarra
     return point, float(cameras.sees(world[:, None])[:, 0].mean())
 
 
-def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> Mistake | None:
-    """The mistake that best explains an instrument out of view, or None."""
+def _instrument_fault(cameras: CameraArrays, poses: np.ndarray, given: float) -> Fault | None:
+    """Name the mistake that best explains an instrument out of view, where the images cannot decide."""
     # a sensor behind the visible part needs no mistake to be out of view: where that explains things, nothing is wrong
-    if _visible_body_point(cameras, poses)[1] > SEEN_SURELY:
+    if _visible_body_point(cameras, poses)[1] > MIN_BODY_VISIBLE:
         return None
     origins = poses[:, :3, 3]
     in_camera = np.einsum("fij,fj->fi", cameras.poses[:, :3, :3], origins) + cameras.centers
     flipped = np.einsum("fij,fj->fi", cameras.poses[:, :3, :3], origins * [1, -1, -1]) + cameras.centers
     in_world = "turn the poses into the cameras' world frame"
-    inverted = np.linalg.inv(poses)[:, :3, 3]
-    guesses = {
-        ("poses are instrument-from-world", "invert them: world_from_instrument is expected"): inverted,
+    tried = {
+        ("poses are instrument-from-world", "invert them: world_from_instrument is expected"): (
+            np.linalg.inv(poses)[:, :3, 3]
+        ),
         ("its world has y and z flipped (OpenGL axes)", in_world): origins * [1, -1, -1],
         ("its world has y and z swapped (y up)", in_world): origins[:, [0, 2, 1]] * [1, -1, 1],
         ("its world has z and y swapped (z up)", in_world): origins[:, [0, 2, 1]] * [1, 1, -1],
@@ -326,5 +291,5 @@ def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> M
     }
     # shrinking puts everything at the world's origin, in view or not: a unit slip must also be far out to begin with
     if np.median(np.linalg.norm(origins, axis=1)) > 30 * np.linalg.norm(cameras.centers, axis=1).max():
-        guesses["cameras and points are in metres, its positions in mm", ALL_IN_MM] = origins / 1000.0
-    return _likeliest({mistake: cameras.sees(moved[:, None]) for mistake, moved in guesses.items()}, given)
+        tried["cameras and points are in metres, its positions in mm", ALL_IN_MM] = origins / 1000.0
+    return _likeliest(list(tried), [cameras.sees(moved[:, None]) for moved in tried.values()], given)

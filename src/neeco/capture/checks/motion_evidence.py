@@ -1,8 +1,9 @@
-"""Where instruments move in the images: what moves is told from the tissue, and compared with where poses say it is.
+"""Evidence of instrument motion in the images: moving pixels, and how well poses explain them.
 
-Each frame is predicted from others seen by cameras near its own, warped by the sparse points' depth. A point fixed to
-the instrument lies on what moves in all frames, if the poses are right. So each pixel that moves is asked: is there a
-depth at which what it shows, carried along by the poses, lies on moving pixels in the other frames?
+Each frame is predicted from frames of nearby cameras, warped by the sparse points' depth; where the prediction fails,
+something moves. If the poses are right, a point fixed to the instrument lies on moving pixels in all frames. The
+evidence of a moving pixel is therefore the share of the other frames in which the point that it shows, at its best
+depth and carried along by the poses, lies on moving pixels.
 """
 
 from __future__ import annotations
@@ -14,28 +15,28 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
+from neeco.capture.checks._cameras import MIN_DEPTH, CameraArrays
+from neeco.capture.checks._mistakes import gain_certainty
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.projection import project
 
-FRAMES = 84  # looked at, evenly spaced over the capture
-FEWEST_FRAMES = 12  # with fewer, chance decides
+MAX_FRAMES = 84  # compared, evenly spaced over the capture
+MIN_FRAMES = 12  # with fewer, chance decides
 WIDTH = 72  # px to which images are reduced: an instrument is some px wide, errors of depth are hidden
 NEIGHBOURS = 10  # frames that predict one
-NEAR_CAMERAS = 3 * NEIGHBOURS  # at least so many are near enough to choose from, or half of all
-DIFFERENT = (15.0, 50.0)  # of 255, from the prediction: a pixel begins to count as moving, and does wholly
-FEWEST_POINTS = 8  # in view of a camera, to tell depths by
-RAYS = 504  # moving pixels that are asked
+MIN_NEAR_CAMERAS = 3 * NEIGHBOURS  # at least so many are near enough to choose from, or half of all
+DIFFERENCE = (15.0, 50.0)  # of 255, from the prediction: where a pixel begins to count as moving, and counts fully
+MIN_POINTS = 8  # in view of a camera, to interpolate depths
+N_RAYS = 504  # moving pixels that are compared
 QUICK_RAYS, QUICK_DEPTHS = 4, 2  # every so many of the rays and their depths, for a first comparison
-DEPTHS = np.linspace(0.35, 1.0, 12)  # of the tissue's, at which they are
-TELLING = 0.4  # share of the rays that are compared: those which some poses explain best
-EXPLAINED = 0.1  # evidence of a ray that some poses explain
-BLOCKS = 12  # of frames that follow each other, whose answers count as independent
-BEHIND = 1e-3  # mm; what is less deep is not in front of a camera
+DEPTHS = np.linspace(0.35, 1.0, 12)  # at which rays may be, of the tissue's
+COMPARED_RAYS = 0.4  # share of the rays: those which some poses explain best
+MIN_EVIDENCE = 0.1  # of a ray that some poses explain
 
 
 class Timeline:
-    """Frames by steps of time: those of one time are one step (several cameras); where time goes back, another
+    """Frames in steps of time: frames of one time (several cameras) are one step; where time goes back, another
     recording begins."""
 
     def __init__(self, times: np.ndarray) -> None:
@@ -50,7 +51,7 @@ class Timeline:
         self.longest = int(np.bincount(self.recording[self.frame_at]).max())  # steps of the longest recording
 
     def by_steps(self, poses: np.ndarray, rows: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of poses [N, 4, 4] those so many steps after frames `rows` [F], and where the recording has one, [F]."""
+        """The poses, of [N, 4, 4], so many steps after frames `rows` [F], and where the recording has one, [F]."""
         wanted = self.step[rows] + steps
         found = self.frame_at[wanted.clip(0, len(self.frame_at) - 1)]
         inside = (wanted >= 0) & (wanted < len(self.frame_at)) & (self.recording[found] == self.recording[rows])
@@ -92,29 +93,33 @@ class _Views:
     def __init__(self, frames: list[Frame], rows: np.ndarray, points: np.ndarray) -> None:
         first = frames[0].camera
         self.width, self.height = WIDTH, max(8, round(WIDTH * first.height / first.width))
-        cameras = [frames[row].camera for row in rows]
-        scales = [(self.width / camera.width, self.height / camera.height) for camera in cameras]
-        self.intrinsics = np.array(
-            [(c.fx * x, c.fy * y, c.cx * x, c.cy * y) for c, (x, y) in zip(cameras, scales, strict=True)]
-        )
-        self.world_from_camera = np.stack([camera.world_from_camera.double().numpy() for camera in cameras])
+        cameras = CameraArrays.of([frames[row].camera for row in rows])
+        self.cameras = cameras.resized(np.full((len(rows), 2), (self.width, self.height), np.float64))
         depths = [self._tissue_depth(points, index) for index in range(len(rows))]
-        known = [index for index, depth in enumerate(depths) if depth is not None]
-        self.rows, self.intrinsics, self.world_from_camera = (
-            values[known] for values in (rows, self.intrinsics, self.world_from_camera)
-        )
+        known = np.array([index for index, depth in enumerate(depths) if depth is not None], int)
+        self.rows, self.cameras = rows[known], self.cameras[known]
         self.depths = np.array([depth for depth in depths if depth is not None])  # [F, h, w] mm
-        if len(known) >= FEWEST_FRAMES:
+        if len(known) >= MIN_FRAMES:
             self._find_motion([frames[row] for row in self.rows])
+
+    @property
+    def world_from_camera(self) -> np.ndarray:
+        """[F, 4, 4] mm."""
+        return self.cameras.poses
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """[F, 4] fx, fy, cx, cy px."""
+        return self.cameras.intrinsics
 
     def _find_motion(self, frames: list[Frame]) -> None:
         pictures = np.stack([self._reduced(frame.load_image_bytes().numpy()) for frame in frames])
         masks = [frame.load_mask() for frame in frames]
         full = np.ones((self.height, self.width), np.float32)
         shown = np.stack([full if mask is None else self._reduced(mask.numpy().astype(np.float32)) for mask in masks])
-        low, high = DIFFERENT
+        low, high = DIFFERENCE
         moving = [(self._difference(pictures, shown, index) - low) / (high - low) for index in range(len(frames))]
-        # [F, h, w] how surely a pixel moves, in [0, 1]
+        # [F, h, w] confidence in [0, 1] that a pixel moves
         self.moving = np.stack([cv2.blur(pixels.clip(0, 1), (3, 3)) for pixels in moving])
 
     def _reduced(self, image: np.ndarray) -> np.ndarray:
@@ -122,41 +127,41 @@ class _Views:
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
     def _tissue_depth(self, points: np.ndarray, index: int) -> np.ndarray | None:
-        """[h, w] mm, between the points [P, 3] that a camera has in view; None where these are too few."""
+        """Depth [h, w] mm interpolated between the points [P, 3] in a camera's view; None where these are too few."""
         pose, (fx, fy, cx, cy) = self.world_from_camera[index], self.intrinsics[index]
         local = (points - pose[:3, 3]) @ pose[:3, :3]
-        local = local[local[:, 2] > BEHIND]
+        local = local[local[:, 2] > MIN_DEPTH]
         pixels, depth = np.stack(project(local, fx, fy, cx, cy), -1), local[:, 2]
-        seen = (pixels > 0).all(1) & (pixels < (self.width, self.height)).all(1)
-        pixels, depth = pixels[seen], depth[seen]
-        if len(depth) < FEWEST_POINTS:
+        inside = (pixels > 0).all(1) & (pixels < (self.width, self.height)).all(1)
+        pixels, depth = pixels[inside], depth[inside]
+        if len(depth) < MIN_POINTS:
             return None
         down, across = np.mgrid[2 : self.height : 4, 2 : self.width : 4]
-        distances, near = cKDTree(pixels).query(np.stack([across, down], -1), k=FEWEST_POINTS)
+        distances, near = cKDTree(pixels).query(np.stack([across, down], -1), k=MIN_POINTS)
         weights = 1 / (distances**2 + 2)
         coarse = weights.sum(-1) / (weights / depth[near]).sum(-1)
         smooth = cv2.resize(coarse.astype(np.float32), (self.width, self.height), interpolation=cv2.INTER_LINEAR)
         return np.asarray(smooth)
 
     def _difference(self, pictures: np.ndarray, shown: np.ndarray, index: int) -> np.ndarray:
-        """[h, w] of 255, by how much a picture of pictures [F, h, w, 3] differs from what others predict of the still
-        scene, a px aside allowed; 0 where too few see the place, or masks [F, h, w] hide it."""
+        """Difference [h, w] of 255 of one of pictures [F, h, w, 3] from what others predict of the still scene, less
+        what a shift by one pixel explains; 0 where too few observe the place, or masks [F, h, w] hide it."""
         picture, pose, depth = pictures[index], self.world_from_camera[index], self.depths[index]
         fx, fy, cx, cy = self.intrinsics[index]
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         world = np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], -1) @ pose[:3, :3].T + pose[:3, 3]
-        predictions, times_seen = [], np.zeros(depth.shape, int)
+        predictions, observed = [], np.zeros(depth.shape, int)
         for other in self._neighbours(index):
-            seen_from = self.world_from_camera[other]
-            local = (world - seen_from[:3, 3]) @ seen_from[:3, :3]
+            other_pose = self.world_from_camera[other]
+            local = (world - other_pose[:3, 3]) @ other_pose[:3, :3]
             fx, fy, cx, cy = self.intrinsics[other]
-            x, y = (place.astype(np.float32) - 0.5 for place in project(local, fx, fy, cx, cy, BEHIND))
+            x, y = (place.astype(np.float32) - 0.5 for place in project(local, fx, fy, cx, cy, MIN_DEPTH))
             warped = cv2.remap(pictures[other], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             visible = cv2.remap(shown[other], x, y, cv2.INTER_LINEAR, borderValue=0) > 0.9
             predictions.append(np.where(visible[..., None], warped, picture))
-            times_seen += visible
+            observed += visible
         predicted = np.median(predictions, axis=0)
-        known = (times_seen >= 3) & (shown[index] > 0.9)
+        known = (observed >= 3) & (shown[index] > 0.9)
         if known.any():  # the camera's exposure and white balance may have changed
             predicted = predicted * np.median(picture[known] / predicted[known].clip(1), axis=0)
         below = cv2.erode(predicted, np.ones((3, 3))) - picture
@@ -170,44 +175,44 @@ class _Views:
         cosine = (np.einsum("ij,fij->f", pose[:3, :3], poses[:, :3, :3]) - 1) / 2
         apart = aside + np.arccos(cosine.clip(-1, 1))
         apart[index] = np.inf
-        near = np.sort(np.argsort(apart, kind="stable")[: min(len(poses) - 1, max(NEAR_CAMERAS, len(poses) // 2))])
+        near = np.sort(np.argsort(apart, kind="stable")[: min(len(poses) - 1, max(MIN_NEAR_CAMERAS, len(poses) // 2))])
         return near[evenly_spaced(len(near), NEIGHBOURS)].tolist()
 
 
-class Rays:
-    """Moving pixels of all frames, as points in them at several depths, and how well poses explain them."""
+class MotionEvidence:
+    """Moving pixels of all frames as rays, each with points at several depths, and how well poses explain them."""
 
     @classmethod
-    def of(cls, parsed: Parsed) -> Rays | None:
-        """Those of a capture; None without registered poses or measured points, or where too little can be seen."""
-        points, rows = parsed.points, np.array(evenly_spaced(len(parsed.frames), FRAMES))
-        if not parsed.registered or points is None or not points.measured or len(rows) < FEWEST_FRAMES:
+    def of(cls, parsed: Parsed) -> MotionEvidence | None:
+        """The evidence of a capture; None without registered poses or measured points, or where too little moves."""
+        points, rows = parsed.points, np.array(evenly_spaced(len(parsed.frames), MAX_FRAMES))
+        if not parsed.registered or points is None or not points.measured or len(rows) < MIN_FRAMES:
             return None
         views = _Views(parsed.frames, rows, points.positions.astype(np.float64))
-        rays = cls(views) if len(views.rows) >= FEWEST_FRAMES else None
-        return rays if rays is not None and len(np.unique(rays.frames)) >= FEWEST_FRAMES else None
+        rays = cls(views) if len(views.rows) >= MIN_FRAMES else None
+        return rays if rays is not None and len(np.unique(rays.frames)) >= MIN_FRAMES else None
 
     def __init__(self, views: _Views) -> None:
         self.views = views
         generator = np.random.default_rng(0)
-        each = -(-RAYS // len(views.rows))
+        each = -(-N_RAYS // len(views.rows))
         frames, places = [], []
         for index, pixels in enumerate(views.moving):
-            sure = np.flatnonzero(pixels > 0.5)
-            if len(sure) >= each:
+            moving = np.flatnonzero(pixels > 0.5)
+            if len(moving) >= each:
                 frames += [index] * each
-                places += generator.choice(sure, each, replace=False).tolist()
+                places += generator.choice(moving, each, replace=False).tolist()
         self.frames = np.array(frames, int)  # [R] index into `views`
         row, column = np.divmod(np.array(places, int), views.width)
         fx, fy, cx, cy = views.intrinsics[self.frames].T
         slopes = np.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones(len(row))], -1)  # [R, 3]
         depths = views.depths[self.frames, row, column][:, None] * DEPTHS
         self.points = slopes[:, None] * depths[..., None]  # [R, D, 3] mm, in the camera's frame
-        # what moves everywhere or always tells nothing
+        # what moves everywhere or always is no evidence
         self._evidence = (views.moving - views.moving.mean(0)).astype(np.float32).ravel()
         self._others = self.frames[:, None] != np.arange(len(views.rows))  # [R, F]
 
-    def thinned(self) -> Rays:
+    def thinned(self) -> MotionEvidence:
         """Fewer of the rays, at fewer depths, for a first comparison of many poses."""
         few = copy.copy(self)
         few.frames, few._others = self.frames[::QUICK_RAYS], self._others[::QUICK_RAYS]
@@ -227,9 +232,9 @@ class Rays:
         )
         x, y, z = (fixed @ turns[:, axis].T + moves[:, axis] for axis in range(3))  # each [R D, F] mm
         fx, fy, cx, cy = views.intrinsics.astype(np.float32).T
-        depth = z.clip(BEHIND)
+        depth = z.clip(MIN_DEPTH)
         u, v = x / depth * fx + cx, y / depth * fy + cy
-        inside = (z > BEHIND) & (u >= 0) & (u < views.width) & (v >= 0) & (v < views.height)
+        inside = (z > MIN_DEPTH) & (u >= 0) & (u < views.width) & (v >= 0) & (v < views.height)
         row, column = v.clip(0, views.height - 1).astype(np.int32), u.clip(0, views.width - 1).astype(np.int32)
         place = (np.arange(count, dtype=np.int32) * views.height + row) * views.width + column
         return (self._evidence[place] * inside).reshape(*self.points.shape[:2], count)
@@ -244,10 +249,10 @@ class Rays:
         """Mean evidence of poses [F, 4, 4], over the rays that they explain best and the frames they are of [F]."""
         inside = np.ones(len(poses), dtype=bool) if inside is None else inside
         counts = inside[self.frames]
-        if len(np.unique(self.frames[counts])) < FEWEST_FRAMES:
+        if len(np.unique(self.frames[counts])) < MIN_FRAMES:
             return 0.0
         explained = np.sort(self.explained(self.evidence(poses), inside)[counts])
-        return float(explained[int((1 - TELLING) * len(explained)) :].mean())
+        return float(explained[int((1 - COMPARED_RAYS) * len(explained)) :].mean())
 
     def travel(self, poses: np.ndarray) -> float:
         """Median over the rays of the standard deviation, of the image's width, by which their points move over all
@@ -257,8 +262,8 @@ class Rays:
         best = self.evidence(poses).mean(-1).argmax(1)
         points = np.einsum("rij,rj->ri", back[:, :3, :3], self.points[np.arange(len(best)), best]) + back[:, :3, 3]
         world = np.einsum("fij,rj->rfi", poses[:, :3, :3], points) + poses[:, :3, 3]
-        seen_from = views.world_from_camera[self.frames]
-        local = np.einsum("rfi,rij->rfj", world - seen_from[:, None, :3, 3], seen_from[:, :3, :3])
+        other_pose = views.world_from_camera[self.frames]
+        local = np.einsum("rfi,rij->rfj", world - other_pose[:, None, :3, 3], other_pose[:, :3, :3])
         fx, fy, cx, cy = views.intrinsics[self.frames].T[..., None]
         u, v = project(local, fx, fy, cx, cy, nearest=1.0)
         return float(np.median(np.hypot(u.std(1), v.std(1)))) / views.width
@@ -270,17 +275,15 @@ class Rays:
         `evidence` is given; its certainty in standard errors over blocks; their mean evidence. Over the rays that
         some poses explain best; or, of those explained at all, the half that they explain most differently."""
         counts = inside[self.frames]
-        if len(np.unique(self.frames[counts])) < FEWEST_FRAMES:
+        if len(np.unique(self.frames[counts])) < MIN_FRAMES:
             return 0.0, 0.0, 0.0
         other = self.explained(self.evidence(poses), inside)[counts]
         own = self.explained(given, inside)[counts]
         best = np.maximum(other, own)
-        telling = best >= np.quantile(best, 1 - TELLING)
-        if most_changed and (best > EXPLAINED).any():
+        compared = best >= np.quantile(best, 1 - COMPARED_RAYS)
+        if most_changed and (best > MIN_EVIDENCE).any():
             change = np.abs(other - own)
-            telling = (best > EXPLAINED) & (change >= np.median(change[best > EXPLAINED]))
-        other, own, frames = other[telling], own[telling], self.frames[counts][telling]
+            compared = (best > MIN_EVIDENCE) & (change >= np.median(change[best > MIN_EVIDENCE]))
+        other, own, frames = other[compared], own[compared], self.frames[counts][compared]
         gains = np.array([(other - own)[frames == frame].mean() for frame in np.unique(frames)])
-        blocks = np.array([block.mean() for block in np.array_split(gains, min(BLOCKS, len(gains)))])
-        error = max(float(blocks.std(ddof=1)) / np.sqrt(len(blocks)), 1e-9)
-        return float(other.mean() / max(own.mean(), 1e-9)), float(blocks.mean()) / error, float(other.mean())
+        return float(other.mean() / max(own.mean(), 1e-9)), gain_certainty(gains), float(other.mean())

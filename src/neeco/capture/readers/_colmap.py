@@ -141,7 +141,7 @@ def _camera(image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> C
             "--output CAPTURE (or `colmap image_undistorter`)"
         )
     pose = torch.from_numpy(_world_from_camera(image)).float()
-    return Camera(pose, fx, fy, cx, cy, width, height, distortion=distortion)
+    return Camera(pose, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion)
 
 
 def _world_from_camera(image: _Image) -> np.ndarray:

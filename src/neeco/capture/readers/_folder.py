@@ -63,7 +63,15 @@ def capture_of(parsed: Parsed) -> Capture:
             for item in instruments
         )
     return Capture(
-        parsed.root, frames, instruments, points, parsed.registered, parsed.timed, parsed.lens, parsed.still, tissues
+        parsed.root,
+        frames,
+        instruments,
+        points,
+        registered=parsed.registered,
+        timed=parsed.timed,
+        lens=parsed.lens,
+        still=parsed.still,
+        tissues=tissues,
     )
 
 

@@ -182,7 +182,7 @@ def parse_lens(node: Node) -> Lens | None:
     if (fault := size_fault(width, height) or focal_fault(fl_x, fl_y, width, height)) is not None:
         node.error(*fault)
         return None
-    lens = Lens(fl_x, fl_y, cx, cy, distortion, (width, height), border)
+    lens = Lens(fl_x, fl_y, cx, cy, distortion, (width, height), border=border)
     try:
         lens.pinhole((width, height))
     except NeecoError as error:
@@ -246,7 +246,7 @@ class CameraFields:
         except NeecoError as error:
             (stated.place or self._node("camera_model")).error_from(error)
             return None
-        return Camera(torch.eye(4), fx, fy, cx, cy, width, height, distortion=distortion)
+        return Camera(torch.eye(4), fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion)
 
     def _has(self, *keys: str) -> bool:
         return any(self.frame.has(key) or self.document.has(key) for key in keys)

@@ -74,7 +74,8 @@ def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
             continue
         rows.append(row)
         pose = torch.from_numpy(row.world_from_camera).float()
-        camera = Camera(pose, row.focal, row.focal, row.width / 2, row.height / 2, row.width, row.height)
+        width, height = row.width, row.height
+        camera = Camera(pose, fx=row.focal, fy=row.focal, cx=width / 2, cy=height / 2, width=width, height=height)
         split = "test" if order % TEST_EVERY == FIRST_TEST else "train"
         parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
         parsed.places.append(place)

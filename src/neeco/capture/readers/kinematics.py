@@ -70,7 +70,7 @@ def _parse_link(node: Node) -> Link | None:
     wrong = (node.has("parent") and parent is None) or (node.has("limits") and limits is None)
     if name is None or kind is None or origin is None or axis is None or value is None or offset is None or wrong:
         return None
-    return Link(name, parent, kind, origin, axis, value, offset, limits, body.value is not False)
+    return Link(name, parent, kind, origin, axis, value, offset=offset, limits=limits, body=body.value is not False)
 
 
 def _origin(node: Node) -> Array | None:

@@ -6,7 +6,7 @@ import os
 import unicodedata
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from neeco.capture.documents import Node, Problem, key_name, printable
 from neeco.capture.images import EXTENSIONS
@@ -17,7 +17,6 @@ from neeco.files import placeholder
 from neeco.geometry.lens import Lens
 from neeco.plausible import Fault
 
-CACHED = 16  # folders whose entries are looked through and remembered
 NOWHERE = "put it there or correct the path"
 
 
@@ -30,7 +29,7 @@ class ParsedTissue:
     place: Node  # of the points
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Parsed:
     """A capture as far as it could be read.
 
@@ -39,7 +38,7 @@ class Parsed:
     images (whose cameras say how) and absent ones (listed as `absent`) are no errors.
     """
 
-    root: Path
+    root: Path = field(kw_only=False)
     frames: list[Frame] = field(default_factory=list)
     places: list[Node] = field(default_factory=list)  # where each frame is described
     instruments: tuple[Instrument, ...] = ()
@@ -110,12 +109,12 @@ def inside(root: Path, folder: Path, text: str) -> Path:
 
 
 def relative_name(file: Path, root: Path) -> str:
-    """How messages call a file of the capture."""
+    """Name of a file of the capture in messages."""
     return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name
 
 
 def missing_file(folder: Path, text: str) -> Fault:
-    """What to say of a path, relative to `folder`, at which there is no file."""
+    """Return what is wrong with a path, relative to `folder`, at which there is no file, and what to do."""
     message, found = f"no such file: {printable(text)}", similar_file(folder, text)
     if found is None:
         return message, NOWHERE
@@ -128,48 +127,32 @@ def missing_file(folder: Path, text: str) -> Fault:
 
 
 def similar_file(folder: Path, text: str) -> str | None:
-    """A file under `folder` that differs from a path in separators, case, Unicode form, image extension or folder.
+    """Find a file under `folder` that differs from a path in separators, case, Unicode form, image extension or folder.
 
     Relative to `folder`; None where there is none.
     """
-    parts = [part for part in text.replace("\\", "/").split("/") if part not in ("", ".")]
-    if not parts or ".." in parts:
+    wanted = PurePosixPath(_normal(text.replace("\\", "/")))
+    if not wanted.parts or ".." in wanted.parts:
         return None
-    place: Path | None = folder
-    for part in parts:
-        place = None if place is None else _entry(place, part)
-    if place is None or not place.is_file():  # the same name in another folder
-        try:
-            folders = _folders(folder, os.stat(folder).st_mtime_ns)
-        except OSError:
-            return None
-        named = (_entry(other, parts[-1]) for other in folders)
-        place = next((entry for entry in named if entry is not None and entry.is_file()), None)
-    return None if place is None else place.relative_to(folder).as_posix()
-
-
-def _entry(folder: Path, name: str) -> Path | None:
     try:
-        entries = _entries(folder, os.stat(folder).st_mtime_ns)
+        names = _names_under(folder, os.stat(folder).st_mtime_ns)
     except OSError:
         return None
-    found = entries.get(name) or entries.get(_normal(name)) or entries.get(_without_extension(_normal(name)))
-    return None if found is None else folder / found
+    keys = (str(wanted), _without_extension(str(wanted)), wanted.name, _without_extension(wanted.name))
+    return next((names[key] for key in keys if key in names), None)
 
 
 @lru_cache(maxsize=1)
-def _folders(folder: Path, changed: int) -> list[Path]:
-    """The folder and the first folders in it. `changed`: when, for the cache."""
-    return [folder, *sorted(entry for entry in folder.iterdir() if entry.is_dir())][:CACHED]
-
-
-@lru_cache(maxsize=CACHED)
-def _entries(folder: Path, changed: int) -> dict[str, str]:
-    """A folder's entries by their names, normalised names, and those without an image's extension. `changed`: when,
+def _names_under(folder: Path, changed: int) -> dict[str, str]:
+    """Files under `folder` by their normalised paths and names, also without an image's extension. `changed`: when,
     for the cache."""
-    names = sorted(os.listdir(folder))
-    plain = {_without_extension(_normal(name)): name for name in names if name.endswith(EXTENSIONS)}
-    return plain | {_normal(name): name for name in names} | {name: name for name in names}
+    files = (entry.relative_to(folder) for entry in folder.rglob("*") if entry.is_file())
+    names: dict[str, str] = {}
+    for file in sorted(files, key=lambda file: (len(file.parts), file)):
+        for name in (file.as_posix(), file.name):
+            names.setdefault(_normal(name), file.as_posix())
+            names.setdefault(_without_extension(_normal(name)), file.as_posix())
+    return names
 
 
 def _normal(name: str) -> str:

@@ -142,7 +142,8 @@ def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body:
         of_driver = MM if TYPES.get(joints[driver].type) == PRISMATIC else 1.0
         gain = (1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)) * unit / of_driver
         offset = unit * float(joint.mimic.offset or 0.0)
-    return Link(joint.child, joint.parent, kind, origin, axis, {names.get(driver, driver): gain}, offset, limits, body)
+    value = {names.get(driver, driver): gain}
+    return Link(joint.child, joint.parent, kind, origin, axis, value, offset=offset, limits=limits, body=body)
 
 
 def _limits(limit: Any, unit: float, name: str, path: Path) -> tuple[float, float] | None:

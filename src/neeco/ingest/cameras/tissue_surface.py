@@ -17,7 +17,7 @@ from scipy.sparse.linalg import spsolve
 
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project
-from neeco.ingest.foreground.motion import RoughShape
+from neeco.ingest.foreground.rough_shape import RoughShape
 
 SPACING = 3  # px, of a reduced image, between points of the tissue
 CELL = 4  # px, of a reduced image, of the grid on which surfaces are smoothed

@@ -1,4 +1,4 @@
-"""Colours that tell an instrument from tissue: those seen where something moves, and hardly elsewhere."""
+"""Colour odds of instrument against tissue: how often a colour is where something moves, and elsewhere."""
 
 from __future__ import annotations
 
@@ -8,42 +8,42 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-LEVELS = 20  # of each colour, that are told apart
-BLUR = 0.7  # levels: colours alike
-RARE = 1e-7  # share of a colour that was never seen
+LEVELS = 20  # of each colour
+BLUR_LEVELS = 0.7  # of the histogram
+MIN_SHARE = 1e-7  # of a colour that never occurs
 
 
 @dataclass(frozen=True, eq=False)
 class ColorOdds:
-    """Of every colour, the logarithm of how much more often it is seen inside than outside: float32 [LEVELS**3]."""
+    """Log odds of every colour inside against outside: float32 [LEVELS**3]."""
 
     of_color: np.ndarray
 
     def smoothed(self, found: np.ndarray, px: float) -> np.ndarray:
-        """float32 [h, w] of the colours [h, w] of an image (`color_levels`), neighbours within px voting."""
+        """Log odds float32 [h, w] of the colours [h, w] of an image (`color_levels`), averaged over px."""
         return np.asarray(cv2.GaussianBlur(self.of_color[found], (0, 0), px))
 
 
 def color_levels(images: np.ndarray) -> np.ndarray:
-    """The colours [...] of images uint8 [..., 3], as numbers below LEVELS**3."""
+    """Number the colours [...] of images uint8 [..., 3], below LEVELS**3."""
     level = images.astype(np.int64) * LEVELS // 256
     return np.asarray((level[..., 0] * LEVELS + level[..., 1]) * LEVELS + level[..., 2])
 
 
 def color_odds(colors: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> ColorOdds:
-    """Odds from the colours [...] of images and what of them is inside and outside, bool [...]."""
+    """Estimate odds from the colours [...] of images and the pixels inside and outside, bool [...]."""
     return ColorOdds(np.log(_shares(colors[inside]) / _shares(colors[outside])).astype(np.float32))
 
 
 def _shares(colors: np.ndarray) -> np.ndarray:
-    """How often each colour is among those [P], and those like it."""
+    """Share of each colour, and of similar ones, in colours [P]."""
     counts = np.bincount(colors, minlength=LEVELS**3).reshape((LEVELS,) * 3).astype(np.float64)
-    return np.asarray(gaussian_filter(counts, BLUR) / max(len(colors), 1) + RARE).reshape(-1)
+    return np.asarray(gaussian_filter(counts, BLUR_LEVELS) / max(len(colors), 1) + MIN_SHARE).reshape(-1)
 
 
 def whole_pieces(mask: np.ndarray, smallest: float, moves: np.ndarray | None = None, share: float = 0.0) -> np.ndarray:
-    """A mask bool [h, w] without specks and holes: pieces larger than so much of the image, of which at least a share
-    lies where something `moves`, bool [h, w]."""
+    """Return a mask bool [h, w] without specks and holes: pieces larger than a share of the image, of which at least a
+    share lies where something `moves`, bool [h, w]."""
     whole = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     whole = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     count, labels, facts, _ = cv2.connectedComponentsWithStats(whole, connectivity=8)

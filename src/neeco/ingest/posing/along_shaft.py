@@ -1,4 +1,4 @@
-"""Pictures stabilised along an instrument's shaft, and its round part unrolled about its axis.
+"""Images stabilised along an instrument's shaft, and its cylindrical part unrolled about its axis.
 
 The instrument's frame: z along the shaft towards the tip, the origin where the shaft ends and the wrist begins. In
 every frame two unit vectors across the shaft belong to the view: `towards` the camera, and `across` = z x towards. Roll
@@ -16,14 +16,16 @@ import numpy as np
 
 from neeco.capture.model import Capture, Instrument
 from neeco.errors import NeecoError
+from neeco.geometry.lines import unit
+from neeco.geometry.projection import project
 
-NEAREST_MM = 1.0  # in front of the camera; nearer points are not drawn
+NEAREST_MM = 1.0  # in front of the camera
 Load = Callable[[int], np.ndarray]  # frame's index -> image uint8 [H, W, 3]
 
 
 @dataclass(frozen=True, eq=False)
 class Shafts:
-    """Where an instrument's shaft is in every frame, in the camera's axes (OpenCV)."""
+    """Poses of an instrument's shaft in every frame, in the camera's axes (OpenCV)."""
 
     origins: np.ndarray  # [F, 3] mm, on the axis where the shaft ends
     directions: np.ndarray  # [F, 3] unit, towards the tip
@@ -37,7 +39,8 @@ class Shafts:
 
     @classmethod
     def of(cls, capture: Capture, instrument: Instrument) -> Shafts:
-        """Those of an instrument found in the video. Raises NeecoError for one that was not, or not in every frame."""
+        """Return those of an instrument found in the video. Raises NeecoError for one that was not, or not in every
+        frame."""
         seen = instrument.from_video
         if seen is None:
             raise NeecoError(
@@ -79,15 +82,13 @@ class Shafts:
     def rotation(self, frame: int, roll: float) -> np.ndarray:
         """world_from_instrument [3, 3] of one frame at a roll, rad."""
         towards, across = (axis[frame] for axis in self.view_axes)
-        z = self.directions[frame] / np.linalg.norm(self.directions[frame])
-        x = np.cos(roll) * towards + np.sin(roll) * across
-        x = x - (x @ z) * z
-        x /= np.linalg.norm(x)
+        z, x = unit(self.directions[frame]), np.cos(roll) * towards + np.sin(roll) * across
+        x = unit(x - (x @ z) * z)
         return np.asarray(self.world_from_camera[frame] @ np.stack([x, np.cross(z, x), z], -1))
 
     def carried(self) -> np.ndarray:
-        """[F - 1] rad by which the roll changes from each frame to the next when the instrument turns about its shaft
-        as little as it can (parallel transport in the world): what of a roll's change is the view's alone."""
+        """Changes [F - 1] rad of the roll from each frame to the next under parallel transport in the world: the view's
+        share in a roll's change."""
         towards, across = (np.einsum("fij,fj->fi", self.world_from_camera, axis) for axis in self.view_axes)
         directions = np.einsum("fij,fj->fi", self.world_from_camera, self.directions)
         before, after, moved = directions[:-1], directions[1:], towards[:-1]
@@ -102,8 +103,7 @@ class Shafts:
         """Pixels [N, ..., 2] (centres at +0.5) of points [N, ..., 3] in the camera's axes of `frames` [N]; far outside
         the image where a point is not in front of the camera."""
         fx, fy, cx, cy = (value.reshape(-1, *[1] * (points.ndim - 2)) for value in self.intrinsics[frames].T)
-        depth = np.maximum(points[..., 2], NEAREST_MM)
-        pixels = np.stack([fx * points[..., 0] / depth + cx, fy * points[..., 1] / depth + cy], -1)
+        pixels = np.stack(project(points, fx, fy, cx, cy, nearest=NEAREST_MM), -1)
         return np.where(points[..., 2:] < NEAREST_MM, -1e4, pixels)
 
 

@@ -1,4 +1,4 @@
-"""`hand_posed.yaml` beside a capture: rolls and joints that people set by hand, frame by frame.
+"""`hand_posed.yaml` of a capture: rolls and joints that people set by hand, frame by frame.
 
     - {frame: '000123', instrument: maryland, roll_deg: 152.0, joints_deg: {jaw_angle: 31.0}, when: 2026-03-01 14:05}
 
@@ -31,7 +31,7 @@ REMEDY = "mend or remove that line"
 
 @dataclass(frozen=True)
 class HandPose:
-    """What somebody said of one instrument in one frame. frame: its image's name without the suffix."""
+    """An answer: roll and joints of one instrument in one frame. frame: its image's name without the suffix."""
 
     frame: str
     instrument: str
@@ -42,7 +42,7 @@ class HandPose:
 
 
 def read_answers(capture: Path) -> list[HandPose]:
-    """The answers beside a capture, in the file's order; none where there is no file. Raises NeecoError."""
+    """Read the answers of a capture, in the file's order; none where there is no file. Raises NeecoError."""
     path = capture / FILE
     if not path.exists():
         return []
@@ -62,8 +62,8 @@ def write_answers(capture: Path, answers: Iterable[HandPose]) -> None:
 def answers_for(
     answers: Sequence[HandPose], instrument: str, frames: Sequence[str], joints: Iterable[str], place: Path
 ) -> list[tuple[int, HandPose]]:
-    """Those of one instrument, each with the index of its frame. Raises NeecoError for a frame that the capture at
-    `place` has not, and for joints other than the instrument's."""
+    """Return those of one instrument, each with the index of its frame. Raises NeecoError for a frame that the capture
+    at `place` has not, and for joints other than the instrument's."""
     index = {name: number for number, name in enumerate(frames)}
     wanted = set(joints)
     found = []

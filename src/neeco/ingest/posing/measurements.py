@@ -1,4 +1,8 @@
-"""What the images say of roll and joints, measured once and kept in the capture: solving again then takes seconds."""
+"""Measurements of roll and joints in the images, kept in the capture: solving again then takes seconds.
+
+Roll is measured by pairs of textures (`roll_pairs`), joints by silhouettes beyond the wrist: their widths, and which of
+them are similar.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import save_file
@@ -15,25 +20,72 @@ from neeco.capture.images import open_image
 from neeco.capture.model import Capture
 from neeco.errors import NeecoError
 from neeco.files import require_content, require_like, write_atomically
-from neeco.ingest.posing.along_shaft import Load, Shafts
+from neeco.ingest.posing.along_shaft import Load, Shafts, crop
 from neeco.ingest.posing.roll_pairs import RollPairs, roll_pairs, unrolled_textures
-from neeco.ingest.posing.silhouette_shapes import Shapes, silhouette_shapes
 
 FILE = "from_video.safetensors"
 FORMAT = "neeco-from-video/1"
-JAWS = "jaw_angle"  # what a joint that nothing logged is called
-OPENS = 0.5  # of the shaft's diameter, by which silhouettes of jaws differ in width
+JAWS = "jaw_angle"  # name of a joint that nothing logged
+MIN_OPENING = 0.5  # of the shaft's diameter, by which silhouettes of jaws differ in width
+STEP_MM = 0.5  # between pixels of stabilised silhouettes
+ALONG = (0.3, 1.2)  # of the working length, from the origin: beyond the wrist
+ACROSS = 0.8  # of the working length, to either side
+MAX_DISTANCE_MM = 1.5  # from an outline, at which distances saturate
+WIDTH_RANK = 3  # of the widest cross sections: the first may be a glint on the tissue
+BLUR_MM = 1.0
+MEDIAN_FRAMES = 5  # of outlines: glints on the tissue stay behind when the instrument moves on
+N_COMPONENTS = 24  # principal ones
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """widths [F] mm of the silhouettes beyond the wrist, across the shaft; shapes [F, C]: principal components of the
+    stabilised outlines, mm."""
+
+    widths: np.ndarray
+    shapes: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Of one instrument: pairs of frames with turns between them, silhouettes, in which frames [F] its wrist is seen,
-    and the joints that nothing logged."""
+    """Measurements of one instrument: pairs of frames with turns between them, silhouettes, frames [F] that show its
+    wrist, and the joints that nothing logged."""
 
     pairs: RollPairs
     shapes: Shapes
     seen: np.ndarray
     joints: tuple[str, ...] = ()
+
+
+def silhouette_shapes(shafts: Shafts, load_mask: Load) -> Shapes:
+    """Measure silhouettes. load_mask: frame's index -> bool [H, W], where the instrument is, of any size in the image's
+    proportions."""
+    length = shafts.working_length_mm
+    along = np.arange(ALONG[0] * length, ALONG[1] * length, STEP_MM)
+    across = np.arange(-ACROSS * length, ACROSS * length + STEP_MM / 2, STEP_MM)
+    signed = np.empty((len(shafts), len(along), len(across)), np.float32)
+    for frame in range(len(shafts)):
+        inside = crop(shafts, frame, load_mask(frame).astype(np.uint8) * 255, along, across) > 127
+        signed[frame] = np.clip(_distance(inside) - _distance(~inside), -MAX_DISTANCE_MM, MAX_DISTANCE_MM)
+    half = MEDIAN_FRAMES // 2
+    padded = np.concatenate([signed[:1]] * half + [signed] + [signed[-1:]] * half)
+    widths = np.empty(len(shafts))
+    outlines = np.empty((len(shafts), signed[0].size), np.float32)
+    for frame in range(len(shafts)):
+        usual = np.median(padded[frame : frame + MEDIAN_FRAMES], 0)
+        inside = usual > 0
+        first, last = inside.argmax(1), inside.shape[1] - 1 - inside[:, ::-1].argmax(1)
+        widths[frame] = np.sort(np.where(inside.any(1), (last - first + 1) * STEP_MM, 0.0))[-WIDTH_RANK]
+        outlines[frame] = cv2.GaussianBlur(usual, (0, 0), BLUR_MM / STEP_MM).ravel()
+    outlines -= outlines.mean(0)
+    values, vectors = np.linalg.eigh((outlines @ outlines.T).astype(np.float64))
+    order = np.argsort(-values)[:N_COMPONENTS]
+    shapes = vectors[:, order] * np.sqrt(np.maximum(values[order], 0.0))
+    return Shapes(widths, shapes / np.sqrt(outlines.shape[1]))
+
+
+def _distance(inside: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 3) * STEP_MM)
 
 
 def measure(capture: Capture, load_mask: Mapping[str, Load]) -> dict[str, Measurements]:
@@ -53,7 +105,7 @@ def measure(capture: Capture, load_mask: Mapping[str, Load]) -> dict[str, Measur
         masks = load_mask[instrument.name]
         shapes = silhouette_shapes(shafts, masks)
         opened = np.quantile(shapes.widths, 0.95) - np.quantile(shapes.widths, 0.05)
-        jaws = not instrument.joints and opened > OPENS * shafts.diameter_mm
+        jaws = not instrument.joints and opened > MIN_OPENING * shafts.diameter_mm
         found[instrument.name] = Measurements(roll_pairs(textures, seen), shapes, seen, (JAWS,) if jaws else ())
     return found
 
@@ -78,7 +130,7 @@ def write_measurements(capture: Capture, measured: Mapping[str, Measurements]) -
 
 
 def read_measurements(capture: Capture) -> dict[str, Measurements]:
-    """What `write_measurements` wrote. Raises NeecoError where it is missing, damaged or of other frames."""
+    """Read what `write_measurements` wrote. Raises NeecoError where it is missing, damaged or of other frames."""
     path = capture.root / FILE
     again = "make the capture again with `neeco ingest`"
     if not path.is_file():
@@ -113,5 +165,5 @@ def read_measurements(capture: Capture) -> dict[str, Measurements]:
 
 
 def _frames(capture: Capture) -> str:
-    """What tells the capture's frames from others'."""
+    """Hash of the capture's frames."""
     return hashlib.sha256("\n".join(frame.name for frame in capture.frames).encode()).hexdigest()

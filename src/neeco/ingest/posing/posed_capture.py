@@ -1,5 +1,5 @@
-"""A capture whose roll and joints are solved from its video's measurements and hand-posed frames: what to ask next, how
-sure it all is, and its states written anew."""
+"""A capture whose roll and joints are solved from its video's measurements and hand-posed frames: suggested frames,
+uncertainties, and its states written anew."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from neeco.capture.readers import read_capture
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_json, write_json
 from neeco.ingest.posing.along_shaft import Load, Shafts
-from neeco.ingest.posing.chain import HAND_DEG, Solved, chain_breaks, solve_joint, solve_rolls
+from neeco.ingest.posing.angles import HAND_SD_DEG, AnglePosterior, chain_breaks, solve_joint, solve_rolls
 from neeco.ingest.posing.hand_posed import HandPose, answers_for, read_answers
 from neeco.ingest.posing.measurements import Measurements, measure, read_measurements, write_measurements
 
-JAW_LIMITS = (0.0, 2.1)  # rad, of jaws of which nothing is known
-TEN = 10  # frames that are suggested in all
+JAW_LIMITS = (0.0, 2.1)  # rad, of unknown jaws
+N_SUGGESTED = 10  # frames in all
 FRAME_S = 0.04  # from frame to frame, where the recording does not say
 NEAR_BREAK = 3  # frames
 EXTREME = 0.05  # share of the frames in which jaws are called widest or narrowest
-DOUBTED_DEG, DOUBTED_SHARE = 12.0, 3.0  # an answer is doubted from so many degrees on, and so many deviations
-FEW = 3  # answers from which on they contradict each other
+OUTLIER_DEG, OUTLIER_SD = 12.0, 3.0  # by which an answer must differ to count as one
+MIN_ANSWERS = 3  # from which on they can contradict each other
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Suggestion:
 
 
 @dataclass(frozen=True)
-class Doubt:
+class OutlierAnswer:
     """An answer that others contradict. degrees: by how much; against: "an earlier answer" or "its neighbours"."""
 
     frame: int
@@ -51,22 +51,22 @@ class Doubt:
 
 
 @dataclass(frozen=True, eq=False)
-class Posing:
-    """What is known of one instrument in all frames, given answers (frame's index, answer)."""
+class SolvedPosing:
+    """Roll and joints of one instrument in all frames, given answers (frame's index, answer)."""
 
     instrument: Instrument
     shafts: Shafts
     measured: Measurements
     answers: Sequence[tuple[int, HandPose]]
-    rolls: Solved
-    joints: dict[str, Solved]
+    rolls: AnglePosterior
+    joints: dict[str, AnglePosterior]
 
     @property
     def breaks(self) -> list[int]:
-        """Frames before which texture alone does not carry the roll on."""
+        """Frames before which texture alone does not determine the roll."""
         return chain_breaks(self.measured.pairs, self.rolls)
 
-    def suggestions(self, count: int = TEN) -> list[Suggestion]:
+    def suggestions(self, count: int = N_SUGGESTED) -> list[Suggestion]:
         """The frames whose answers would help most, each as if those before it were answered already."""
         solved = [self.rolls, *self.joints.values()]
         usable = self.measured.seen.copy()
@@ -74,10 +74,10 @@ class Posing:
         chosen: list[Suggestion] = []
         breaks = np.array(self.breaks)
         for _ in range(min(count, int(usable.sum()))):
-            doubt = np.asarray(sum(np.diag(some.covariance) for some in solved))
-            if not self.answers and not chosen:  # all are alike; open jaws show their hinge best
-                doubt = self.measured.shapes.widths
-            frame = int(np.argmax(np.where(usable, doubt, -np.inf)))
+            variance = np.asarray(sum(np.diag(some.covariance) for some in solved))
+            if not self.answers and not chosen:  # all are equal; open jaws show their hinge best
+                variance = self.measured.shapes.widths
+            frame = int(np.argmax(np.where(usable, variance, -np.inf)))
             chosen.append(
                 Suggestion(frame, self._reason(frame, [some.deviations_deg[frame] for some in solved], breaks))
             )
@@ -97,29 +97,29 @@ class Posing:
         least = int(np.argmax(deviations))
         return f"least sure: {names[least]} ± {deviations[least]:.0f}°"
 
-    def doubts(self) -> list[Doubt]:
+    def outliers(self) -> list[OutlierAnswer]:
         """Answers that differ from an earlier one of the same frame; and of roll and of each joint the one that differs
-        most from what all others say of its frame, as a wrong one makes others look wrong, too."""
+        most from the others' prediction, as a wrong one makes others look wrong, too."""
         found = []
         for what, solved in {"roll": self.rolls, **self.joints}.items():
-            worst, least = None, DOUBTED_SHARE
+            worst, least = None, OUTLIER_SD
             for position, (frame, answer) in enumerate(self.answers):
                 angle = _angle(answer, what)
                 earlier = next((old for other, old in self.answers[:position][::-1] if other == frame), None)
-                if earlier is not None and abs(apart := half_turn(angle - _angle(earlier, what))) > DOUBTED_DEG:
-                    found.append(Doubt(frame, what, apart, "an earlier answer"))
+                if earlier is not None and abs(apart := half_turn(angle - _angle(earlier, what))) > OUTLIER_DEG:
+                    found.append(OutlierAnswer(frame, what, apart, "an earlier answer"))
                 # leaving one answer out of a Gaussian posterior
-                left = max(1 - (float(solved.deviations[frame]) / math.radians(HAND_DEG)) ** 2, 0.02)
+                left = max(1 - (float(solved.deviations[frame]) / math.radians(HAND_SD_DEG)) ** 2, 0.02)
                 apart = half_turn(angle - math.degrees(solved.values[frame])) / left
-                far = abs(apart) * math.sqrt(left) / HAND_DEG
-                if len(self.answers) >= FEW and abs(apart) > DOUBTED_DEG and far > least:
-                    worst, least = Doubt(frame, what, half_turn(apart), "what its neighbours say"), far
+                far = abs(apart) * math.sqrt(left) / HAND_SD_DEG
+                if len(self.answers) >= MIN_ANSWERS and abs(apart) > OUTLIER_DEG and far > least:
+                    worst, least = OutlierAnswer(frame, what, half_turn(apart), "what its neighbours say"), far
             found += [] if worst is None else [worst]
         return found
 
-    def sureness(self) -> dict[str, tuple[float, float]]:
-        """Of roll and each joint: the standard deviations, degrees, that half and 95 % of the frames stay below; 180
-        where nothing is known."""
+    def deviations(self) -> dict[str, tuple[float, float]]:
+        """Median and 95 % quantile of the standard deviations, degrees, of roll and each joint; 180 where nothing is
+        known."""
         found = {}
         for name, solved in {"roll": self.rolls, **self.joints}.items():
             deviations = solved.deviations_deg
@@ -130,8 +130,8 @@ class Posing:
 
 
 def prepare(root: Path, load_mask: Mapping[str, Load]) -> None:
-    """Measure what the images of a new capture say of roll and joints, keep it there, declare joints that nothing
-    logged, and write the states that follow without any hand-posed frame. load_mask: as `measure` takes it. Raises
+    """Measure roll and joints in the images of a new capture, keep that there, declare unlogged joints, and write the
+    states that follow without any hand-posed frame. load_mask: as `measure` takes it. Raises
     NeecoError."""
     capture = read_capture(root)
     measured = measure(capture, load_mask)
@@ -167,8 +167,8 @@ class PosedCapture:
         self.times = times if self.capture.timed else np.arange(len(times)) * FRAME_S
         self.shafts = {name: Shafts.of(self.capture, item) for name, item in self.instruments.items()}
 
-    def solve(self, answers: Sequence[HandPose] | None = None) -> dict[str, Posing]:
-        """By instrument, what follows from the answers; those in the file where none are given. Raises NeecoError."""
+    def solve(self, answers: Sequence[HandPose] | None = None) -> dict[str, SolvedPosing]:
+        """Solve all instruments from the answers; those in the file where none are given. Raises NeecoError."""
         answers = read_answers(self.root) if answers is None else answers
         for answer in answers:
             if answer.instrument not in self.instruments:
@@ -184,11 +184,11 @@ class PosedCapture:
                 joint: solve_joint(measured.shapes, rolls, self.times, _by_frame(own, joint), instrument.joints[joint])
                 for joint in joints
             }
-            found[name] = Posing(instrument, shafts, measured, own, rolls, solved)
+            found[name] = SolvedPosing(instrument, shafts, measured, own, rolls, solved)
         return found
 
-    def write_states(self, posings: dict[str, Posing]) -> None:
-        """Write the solved rolls and joints, and how sure they are, into transforms.json, whole or not at all. Raises
+    def write_states(self, posings: dict[str, SolvedPosing]) -> None:
+        """Write the solved rolls and joints, and their uncertainties, into transforms.json, whole or not at all. Raises
         NeecoError."""
         path = self.root / "transforms.json"
         with own_folder(self.root, path):
@@ -199,7 +199,7 @@ class PosedCapture:
                         self._write_state(item, posings[item["name"]], index)
             write_json(path, document)
 
-    def _write_state(self, item: dict[str, Any], posing: Posing, frame: int) -> None:
+    def _write_state(self, item: dict[str, Any], posing: SolvedPosing, frame: int) -> None:
         pose = np.array(item["pose"], float)
         pose[:3, :3] = posing.shafts.rotation(frame, float(posing.rolls.values[frame]))
         item["pose"] = pose.tolist()
@@ -229,5 +229,5 @@ def _angle(answer: HandPose, what: str) -> float:
 
 
 def half_turn(degrees: float) -> float:
-    """The same angle, in degrees, between -180 and 180."""
+    """Return the same angle, in degrees, between -180 and 180."""
     return (degrees + 180) % 360 - 180

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from neeco.errors import NeecoError
-from neeco.ingest.foreground.motion import ResidualFlow
+from neeco.ingest.foreground.residual_flow import ResidualFlow
 from neeco.ingest.frames.views import Views
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.registration.hand_eye import Registration, register_with_laparoscope

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from neeco.capture.model import evenly_spaced
-from neeco.ingest.cameras.still import exposure, find_background
+from neeco.ingest.foreground.background import exposure, find_background
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, NEAREST_MM, moved_base, poses_at_clock
 
 MIN_LEVER_MM = 40.0  # from the instrument to its trocar

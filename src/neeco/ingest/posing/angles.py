@@ -1,8 +1,8 @@
 """Roll and joints of all frames at once, from texture pairs, silhouettes, smoothness and hand-posed frames.
 
-Each is a Gaussian process (Rasmussen and Williams 2006) over the frames, so what is not known has a standard deviation.
-A pair of frames has several hypotheses of how the roll differs, each right with some probability; which one is found
-together with the rolls, by expectation maximisation from vague to sharp (deterministic annealing).
+Each is a Gaussian process over the frames (Rasmussen and Williams 2006), whose posterior gives standard deviations. A
+pair of frames has several hypotheses of how the roll differs, each with a probability. They are weighed together with
+the rolls, by expectation maximisation with deterministic annealing.
 """
 
 from __future__ import annotations
@@ -13,135 +13,139 @@ from dataclasses import dataclass
 import numpy as np
 
 from neeco.capture.model import UNKNOWN_DEG
+from neeco.ingest.posing.measurements import Shapes
 from neeco.ingest.posing.roll_pairs import RollPairs
-from neeco.ingest.posing.silhouette_shapes import Shapes
 
-SMOOTH_S = 0.72  # over which a hand's motion stays alike
-ROLL_SWING = 0.7  # rad, standard deviation of the roll's changes over longer times
-JOINT_SWING = 0.2  # the same of a joint, beyond what silhouettes tell
-ANYWHERE = 1.4  # rad, standard deviation of the mean of either
-HAND_DEG = 3.5  # standard deviation of a hand-posed angle
-TEXTURE_DEG = 4.0  # of the roll that a texture shows in one frame: an axis .2 mm beside the true one turns it that far
-EXACT_DEG, VAGUE_DEG = 3.0, 8.0  # of a pair of correlation 1, and what is added towards 0
-TRUSTED_SCORE, SCORE_WIDTH = 0.5, 0.08  # correlation at which a hypothesis is as likely right as wrong, and its scale
-PAIR_WEIGHT = 0.01  # what shading is left shifts all pairs of the same two moments, some hundred, by the same angle
-SHOWN, SHOWN_PRIOR = (0.4, 1.2), 0.02  # share of a turn that textures show; weight of 1
-ENOUGH = 3  # answers that tell it
-ROUNDS, VAGUE_AT_FIRST = 8, 4.0  # of expectation maximisation; by how much the first ones widen what pairs say
-AGREEING_DEG, WEAK = 6.0, 12  # a pair that fits; fewer of them across a gap between two frames leave it open
-READING_SWING, SHAPE_SWING = 0.7, 0.35  # rad, what the silhouette's width and its whole shape tell of a joint
-READING_DEG = 3.0  # doubt of what a width says, where the hinge's axis points at the camera
-EDGE_ON = 0.35  # cosine of the roll from which an opening is seen well enough to be divided by it
-JOINT_DOUBT = 0.5  # deviations of joints are half of what these swings, which must leave room for any instrument, say
-ALIKE = 0.8  # of the median distance between two silhouettes
+CORRELATION_S = 0.72  # time scale of a hand's motion
+ROLL_SD = 0.7  # rad, of the roll's changes over longer times
+JOINT_SD = 0.2  # rad, of a joint's, beyond what silhouettes show
+MEAN_SD = 1.4  # rad, of the mean of either
+HAND_SD_DEG = 3.5  # of a hand-posed angle
+TEXTURE_SD_DEG = 4.0  # of the roll that a texture shows in one frame: from an axis 0.2 mm off
+PAIR_SD_DEG, UNCORRELATED_SD_DEG = 3.0, 8.0  # of a pair of correlation 1, and added towards correlation 0
+EVEN_SCORE, SCORE_SCALE = 0.5, 0.08  # correlation at which a hypothesis is as likely right as wrong, and its scale
+PAIR_WEIGHT = 0.01  # residual shading shifts some hundred pairs of the same two moments by the same angle
+GAIN_RANGE, GAIN_PRIOR = (0.4, 1.2), 0.02  # of a turn in textures; weight of the prior, which is 1
+MIN_GAIN_ANSWERS = 3  # hand-posed frames from which that gain is estimated
+N_ROUNDS, FIRST_WIDENING = 8, 4.0  # of expectation maximisation; factor on the pairs' deviations at first
+AGREEING_DEG, MIN_AGREEING = 6.0, 12  # a pair that fits; the number of them that must span a gap between frames
+WIDTH_SD, SHAPE_SD = 0.7, 0.35  # rad, of a joint by the silhouette's width and by its whole shape
+WIDTH_NOISE_DEG = 3.0  # standard deviation of an opening by its width, where the hinge's axis points at the camera
+MIN_COSINE = 0.35  # of the roll, by which an opening is divided
+JOINT_SD_SCALE = 0.5  # of the posterior: the priors above leave room for any instrument
+SHAPE_SCALE = 0.8  # of the median distance between two silhouettes
 JITTER = 1e-6  # rad^2, so that covariances can be inverted
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """Values [F] rad of one angle in all frames, and the covariance [F, F] rad^2 of what is not known of them."""
+class AnglePosterior:
+    """Values [F] rad of one angle in all frames, and their covariance [F, F] rad^2."""
 
     values: np.ndarray
     covariance: np.ndarray
 
     @property
     def deviations(self) -> np.ndarray:
-        """[F] rad."""
+        """Standard deviations [F] rad."""
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
     @property
     def deviations_deg(self) -> np.ndarray:
-        """[F] degrees, at most those of an angle of which nothing is known."""
+        """Standard deviations [F] degrees, at most those of an unknown angle."""
         return np.minimum(np.degrees(self.deviations), UNKNOWN_DEG)
 
-    def with_answer(self, frame: int) -> Solved:
-        """What would be known with one more hand-posed frame; the values stay."""
+    def with_answer(self, frame: int) -> AnglePosterior:
+        """Return the posterior with one more hand-posed frame; the values stay."""
         column = self.covariance[:, frame]
-        gained = np.outer(column, column) / (column[frame] + np.radians(HAND_DEG) ** 2)
-        return Solved(self.values, self.covariance - gained)
+        gained = np.outer(column, column) / (column[frame] + np.radians(HAND_SD_DEG) ** 2)
+        return AnglePosterior(self.values, self.covariance - gained)
 
 
 def solve_rolls(
     pairs: RollPairs, carried: np.ndarray, times: np.ndarray, posed: Mapping[int, Sequence[float]]
-) -> Solved:
-    """Rolls of all frames [F] at `times` [F] s, with hand-posed ones (frame -> answers, rad). carried [F - 1]: the
-    change of an instrument that turns as little as it can. Without hand-posed frames the first roll is called 0."""
+) -> AnglePosterior:
+    """Solve the rolls of all frames [F] at `times` [F] s, with hand-posed ones (frame -> answers, rad).
+
+    carried [F - 1]: the view's changes (`Shafts.carried`). Without hand-posed frames the first roll is called 0.
+    """
     view = np.concatenate([[0.0], np.cumsum(carried)])
     frames, angles = _answers(posed)
     alone = _chained(pairs, view, times, np.array([0]), np.array([0.0]))
     if not len(frames):
         return alone
-    # which of the turns an answer means: the nearest to what textures alone say, all answers together
-    beside = np.exp(1j * (angles - alone.values[frames])).mean()
-    expected = alone.values[frames] + np.angle(beside)
+    # the turn that an answer means: the nearest to the textures' alone, all answers together
+    difference = np.exp(1j * (angles - alone.values[frames])).mean()
+    expected = alone.values[frames] + np.angle(difference)
     return _chained(pairs, view, times, frames, expected + _wrapped(angles - expected))
 
 
-def _chained(pairs: RollPairs, view: np.ndarray, times: np.ndarray, frames: np.ndarray, angles: np.ndarray) -> Solved:
-    """Rolls of all frames, given those of some [A], which are not taken modulo a turn."""
+def _chained(
+    pairs: RollPairs, view: np.ndarray, times: np.ndarray, frames: np.ndarray, angles: np.ndarray
+) -> AnglePosterior:
+    """Solve the rolls of all frames, given those of some [A], which are not taken modulo a turn."""
     angles = angles - view[frames]
     center = angles.mean()
-    covariance = ROLL_SWING**2 * _alike(times, SMOOTH_S) + ANYWHERE**2
+    covariance = ROLL_SD**2 * _correlation(times, CORRELATION_S) + MEAN_SD**2
     precision = np.linalg.inv(covariance + JITTER * np.eye(len(times)))
     pull = np.zeros(len(times))
-    np.add.at(precision, (frames, frames), np.radians(HAND_DEG) ** -2)
-    np.add.at(pull, frames, (angles - center) * np.radians(HAND_DEG) ** -2)
+    np.add.at(precision, (frames, frames), np.radians(HAND_SD_DEG) ** -2)
+    np.add.at(pull, frames, (angles - center) * np.radians(HAND_SD_DEG) ** -2)
     rolls = np.linalg.solve(precision, pull)
-    own = np.eye(len(times)) * np.radians(TEXTURE_DEG) ** -2
+    own = np.eye(len(times)) * np.radians(TEXTURE_SD_DEG) ** -2
     shown, known, share = rolls, precision, 1.0
-    for sharpness in np.linspace(0.0, 1.6, ROUNDS).clip(max=1.0):
-        widened = VAGUE_AT_FIRST + (1 - VAGUE_AT_FIRST) * sharpness
+    for sharpness in np.linspace(0.0, 1.6, N_ROUNDS).clip(max=1.0):
+        widened = FIRST_WIDENING + (1 - FIRST_WIDENING) * sharpness
         weights, turns = _likely(pairs, shown, view, share, widened)
         between, toward = _differences(pairs, weights, turns, len(times))
-        # what textures show is the roll and an error of each frame's own, which is solved for, too
+        # textures show the roll and an error of each frame, which is solved for, too
         inner = np.linalg.solve(between + own, np.column_stack([own, toward]))
         known = precision + own - own @ inner[:, :-1]
         rolls = np.linalg.solve(known, pull + own @ inner[:, -1])
         shown = inner[:, :-1] @ rolls + inner[:, -1]
-        if len(frames) >= ENOUGH:
+        if len(frames) >= MIN_GAIN_ANSWERS:
             share = _share_shown(pairs, rolls + view, weights, turns, view, share)
-    return Solved(rolls + center + view, np.linalg.inv(known))
+    return AnglePosterior(rolls + center + view, np.linalg.inv(known))
 
 
 def solve_joint(
     shapes: Shapes,
-    rolls: Solved,
+    rolls: AnglePosterior,
     times: np.ndarray,
     posed: Mapping[int, Sequence[float]],
     limits: tuple[float, float] | None,
-) -> Solved:
-    """One joint of all frames, with hand-posed values (frame -> answers, rad), within its limits. Without hand-posed
-    frames: as wide as the silhouette is, of a usual range."""
-    seen = np.maximum(np.abs(np.cos(rolls.values)), EDGE_ON)
+) -> AnglePosterior:
+    """Solve one joint of all frames, with hand-posed values (frame -> answers, rad), within its limits. Without
+    hand-posed frames: by the silhouette's width, over a typical range."""
+    seen = np.maximum(np.abs(np.cos(rolls.values)), MIN_COSINE)
     opening = np.maximum(shapes.widths - np.quantile(shapes.widths, 0.03), 0.0) / seen
     opening /= max(np.quantile(opening, 0.95), 1e-6)
     apart = np.maximum(_squares(shapes.shapes), 0.0)
     covariance = (
-        READING_SWING**2 * np.outer(opening, opening)
-        + SHAPE_SWING**2 * np.exp(-0.5 * apart / max(ALIKE**2 * np.median(apart), 1e-9))
-        + JOINT_SWING**2 * _alike(times, SMOOTH_S * 2 / 3)
-        + np.diag((np.radians(READING_DEG) / seen) ** 2)
+        WIDTH_SD**2 * np.outer(opening, opening)
+        + SHAPE_SD**2 * np.exp(-0.5 * apart / max(SHAPE_SCALE**2 * np.median(apart), 1e-9))
+        + JOINT_SD**2 * _correlation(times, CORRELATION_S * 2 / 3)
+        + np.diag((np.radians(WIDTH_NOISE_DEG) / seen) ** 2)
     )
     frames, angles = _answers(posed)
     if not len(frames):
-        return Solved(_within(opening * READING_SWING, limits), JOINT_DOUBT**2 * covariance)
+        return AnglePosterior(_within(opening * WIDTH_SD, limits), JOINT_SD_SCALE**2 * covariance)
     center = angles.mean()
     covariance += 0.5
-    answered = covariance[np.ix_(frames, frames)] + np.eye(len(frames)) * np.radians(HAND_DEG) ** 2
+    answered = covariance[np.ix_(frames, frames)] + np.eye(len(frames)) * np.radians(HAND_SD_DEG) ** 2
     gain = np.linalg.solve(answered, covariance[frames]).T
     left = covariance - gain @ covariance[frames]
-    return Solved(_within(center + gain @ (angles - center), limits), JOINT_DOUBT**2 * left)
+    return AnglePosterior(_within(center + gain @ (angles - center), limits), JOINT_SD_SCALE**2 * left)
 
 
-def chain_breaks(pairs: RollPairs, rolls: Solved) -> list[int]:
-    """Frames before which the chain of rolls is broken: too few pairs that agree with the rolls span the gap."""
+def chain_breaks(pairs: RollPairs, rolls: AnglePosterior) -> list[int]:
+    """Frames before which the chain of rolls breaks: too few pairs that agree with the rolls span the gap."""
     found = rolls.values[pairs.second] - rolls.values[pairs.first]
     agree = np.abs(_wrapped(found[:, None] - pairs.turns)) < np.radians(AGREEING_DEG)
     good = (agree & (pairs.scores > 0)).any(1)
     spans = np.zeros(len(rolls.values) + 1)
     np.add.at(spans, pairs.first[good] + 1, 1)
     np.add.at(spans, pairs.second[good] + 1, -1)
-    weak = np.cumsum(spans)[1:-1] < WEAK
+    weak = np.cumsum(spans)[1:-1] < MIN_AGREEING
     # of a stretch of weak gaps the middle one
     edges = np.flatnonzero(np.diff(np.concatenate([[False], weak, [False]]).astype(int)))
     return [int(first + last + 1) // 2 for first, last in edges.reshape(-1, 2)]
@@ -153,7 +157,7 @@ def _answers(posed: Mapping[int, Sequence[float]]) -> tuple[np.ndarray, np.ndarr
     return np.array([frame for frame, _ in flat], int), np.array([angle for _, angle in flat], float)
 
 
-def _alike(times: np.ndarray, scale: float) -> np.ndarray:
+def _correlation(times: np.ndarray, scale: float) -> np.ndarray:
     return np.asarray(np.exp(-0.5 * ((times[:, None] - times) / scale) ** 2))
 
 
@@ -174,13 +178,13 @@ def _within(values: np.ndarray, limits: tuple[float, float] | None) -> np.ndarra
 def _share_shown(
     pairs: RollPairs, rolls: np.ndarray, weights: np.ndarray, turns: np.ndarray, view: np.ndarray, share: float
 ) -> float:
-    """How much of a turn textures show: shading that stays with the view holds them back, in all pairs alike. weights
-    and turns [P] of the pairs by the `share` so far."""
+    """Share of a turn that textures show: shading that stays with the view reduces it, in all pairs. weights and turns
+    [P] of the pairs by the `share` so far."""
     turned = rolls[pairs.second] - rolls[pairs.first]
     measured = (turns + view[pairs.second] - view[pairs.first]) * share
     together = (weights * turned**2).sum()
-    prior = SHOWN_PRIOR * together + 1e-12
-    return float(np.clip(((weights * measured * turned).sum() + prior) / (together + prior), *SHOWN))
+    prior = GAIN_PRIOR * together + 1e-12
+    return float(np.clip(((weights * measured * turned).sum() + prior) / (together + prior), *GAIN_RANGE))
 
 
 def _likely(
@@ -191,8 +195,8 @@ def _likely(
     apart = (rolls[pairs.second] - rolls[pairs.first])[:, None] - measured
     turns = measured + 2 * np.pi * np.round(apart / (2 * np.pi))
     apart = _wrapped(apart)
-    deviation = np.radians(EXACT_DEG + VAGUE_DEG * (1 - pairs.scores))
-    right = (pairs.scores > 0) / (1 + np.exp(-(pairs.scores - TRUSTED_SCORE) / SCORE_WIDTH))
+    deviation = np.radians(PAIR_SD_DEG + UNCORRELATED_SD_DEG * (1 - pairs.scores))
+    right = (pairs.scores > 0) / (1 + np.exp(-(pairs.scores - EVEN_SCORE) / SCORE_SCALE))
     # of several hypotheses one at most is right
     right = right / np.maximum(right.sum(1, keepdims=True), 1e-9) * right.max(1, keepdims=True)
     fits = right * np.exp(-0.5 * (apart / (deviation * widened)) ** 2) / (deviation * widened)

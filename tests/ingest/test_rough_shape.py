@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from neeco.geometry.lens import Lens
-from neeco.ingest.foreground.motion import STEP, ResidualFlow, best_lag, carve_shape, observations_on, project_mask
+from neeco.ingest.foreground.residual_flow import STEP_PX, ResidualFlow
+from neeco.ingest.foreground.rough_shape import best_lag, carve_shape, observations_on, project_mask
 from neeco.ingest.frames.views import SfmResult
 
 PINHOLE = Lens(60.0, 60.0, 32.0, 24.0, (), (64, 48))
@@ -23,9 +24,9 @@ def poses() -> np.ndarray:
 
 def moving_at(places: np.ndarray) -> np.ndarray:
     """[R, h, w] evidence of motion about one point [R, 3] mm of the camera's frame."""
-    evidence = np.zeros((len(places), 48 // STEP, 64 // STEP))
+    evidence = np.zeros((len(places), 48 // STEP_PX, 64 // STEP_PX))
     for pixels, (x, y, z) in zip(evidence, places, strict=True):
-        column, row = int((60 * x / z + 32) / STEP), int((60 * y / z + 24) / STEP)
+        column, row = int((60 * x / z + 32) / STEP_PX), int((60 * y / z + 24) / STEP_PX)
         pixels[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = 1.0
     return evidence
 
@@ -51,7 +52,7 @@ def test_poses_logged_late_fit_what_moves_at_another_lag(late: float) -> None:
 
 
 def test_motion_that_follows_no_pose_gives_no_shape() -> None:
-    evidence = np.random.default_rng(0).uniform(0, 0.2, (len(ROWS), 48 // STEP, 64 // STEP))
+    evidence = np.random.default_rng(0).uniform(0, 0.2, (len(ROWS), 48 // STEP_PX, 64 // STEP_PX))
     assert carve_shape(evidence, poses(), PINHOLE) is None
 
 
@@ -98,10 +99,10 @@ def test_what_moves_is_told_alike_in_small_and_large_images(times: int) -> None:
         300.0 * times, 300.0 * times, width * times / 2, height * times / 2, (), (times * width, times * height)
     )
     evidence = ResidualFlow(load, sfm, np.arange(4) / 25, lens, visible).moving_pixels(np.array([0]), 1.5)[0]
-    assert evidence.shape == (height // STEP, width // STEP)
-    assert np.isnan(evidence[:, : 40 // STEP]).all()
-    assert not np.isnan(evidence[:, 60 // STEP :]).any()
+    assert evidence.shape == (height // STEP_PX, width // STEP_PX)
+    assert np.isnan(evidence[:, : 40 // STEP_PX]).all()
+    assert not np.isnan(evidence[:, 60 // STEP_PX :]).any()
     inside = np.zeros(evidence.shape, bool)
-    inside[110 // STEP : 150 // STEP, 115 // STEP : 165 // STEP] = True
+    inside[110 // STEP_PX : 150 // STEP_PX, 115 // STEP_PX : 165 // STEP_PX] = True
     assert evidence[inside].mean() > 0.8
     assert np.nanmean(evidence[:20]) < 0.05

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 
-from neeco.ingest.foreground.passing import passing_masks
+from neeco.ingest.foreground.masks import passing_masks
 
 WIDTH, HEIGHT, FRAMES, STEP = 160, 128, 12, 4
 

@@ -1,0 +1,264 @@
+"""Checks of frames: splits, times, and image and mask files that are damaged, empty, repeated or inverted."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neeco.capture.documents import Node, printable
+from neeco.capture.images import is_repeated
+from neeco.capture.model import Frame
+from neeco.capture.points import PointCloud
+from neeco.capture.readers.parsed import Parsed
+from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import project_world
+from neeco.plausible import Fault, mask_fault
+
+MIN_TRAIN_FRAMES = 4  # fewer: nothing can be learned
+FEW_TRAIN_FRAMES = 20  # fewer: expect little
+MAX_STILL_CAMERAS = 2  # of a scope that stands still: one, or the two of a stereo scope
+COMPARED_WIDTH = 320  # px of the reduced images that are compared
+VISIBLE_MM, VISIBLE_ROTATION = 1.0, 0.03  # changes that an image shows: of a position; of rotations' entries, or rad
+LIT = 0.12  # brightness in [0, 1] of a pixel's brightest channel: a round field of view's dark border has less
+MIN_LIT = 0.02  # share of an image: with fewer lit pixels it is not counted
+MAX_SAMPLED_POINTS = 500
+
+
+def check_frames(parsed: Parsed) -> None:
+    """Report splits without frames, times missing or going backwards, and files listed twice."""
+    frames = parsed.header("frames")
+    counts = Counter(frame.split for frame in parsed.frames)
+    if not counts["train"]:
+        found = ", ".join(f"{printable(name)} ({count})" for name, count in counts.items())
+        frames.error(f"split 'train' is empty; found {found}", "give most frames the split 'train'")
+    elif counts["train"] < MIN_TRAIN_FRAMES:
+        message = f"too few frames: {counts['train']} to train on, at least {MIN_TRAIN_FRAMES} are needed"
+        frames.error(message, "record more")
+    elif counts["train"] < FEW_TRAIN_FRAMES:
+        message = f"few frames: {counts['train']} to train on, fewer than {FEW_TRAIN_FRAMES} give a poor scene"
+        frames.warning(message, "record more if you can")
+    for part in parsed.by_tissue():
+        _check_still(part)
+    trained = Counter(frame.state.tissue for frame in parsed.frames if frame.split == "train")
+    for tissue in parsed.tissues:
+        if not trained[tissue.name]:
+            message = f"no frame of split 'train' shows {printable(tissue.name)}"
+            parsed.header("tissues").error(message, "give it training frames, or leave it out")
+    if not counts["test"]:
+        frames.warning("split 'test' is empty", "without it nothing tells how good the scene is")
+    _check_times(parsed)
+    first: dict[Path, Node] = {}
+    for frame, place in zip(parsed.frames, parsed.places, strict=True):
+        earlier = first.setdefault(frame.image_path, place)
+        if earlier is not place:
+            message = f"is the same image as {earlier.field}: {printable(frame.image_path.name)}"
+            place.child("file_path").error(message, "list every image once")
+
+
+def _check_still(parsed: Parsed) -> None:
+    """Report a scope stated to stand still that has more cameras than a stereo scope."""
+    placed = parsed.with_cameras().frames
+    poses = {tuple(frame.camera.world_from_camera.double().numpy().round(6).ravel().tolist()) for frame in placed}
+    if parsed.still and len(poses) > MAX_STILL_CAMERAS:
+        message = f"is 'still', but the frames have {len(poses)} different cameras"
+        parsed.header("camera_motion").error(message, "write 'moving', or correct transform_matrix")
+
+
+def _check_times(parsed: Parsed) -> None:
+    frames = parsed.header("frames")
+    latest: dict[tuple[str, str | None], float] = {}
+    backwards = []
+    instants: dict[tuple[object, ...], Camera] = {}
+    for frame, place in zip(parsed.frames, parsed.places, strict=True):
+        time, poses = frame.state.time, [state.pose.numpy().tobytes() for state in frame.state.instruments.values()]
+        first = instants.setdefault((place.file, time, *poses), frame.camera)
+        if first is not frame.camera and not _same_view(first, frame.camera):
+            continue  # another camera at the same instant
+        if time < latest.get((place.file, frame.state.tissue), time):
+            backwards.append(place)
+        latest[place.file, frame.state.tissue] = time
+    if not parsed.timed:
+        frames.warning("not every frame has a time; the order stands in", "add `time` in seconds")
+    elif len(instants) > 1 and len({frame.state.time for frame in parsed.frames}) == 1:
+        time = parsed.frames[0].state.time
+        frames.warning(f"every frame has the time {time:g}, though states differ", "write seconds, or leave `time` out")
+    elif backwards:
+        more = f" (and {len(backwards) - 1} more times)" if len(backwards) > 1 else ""
+        remedy = "right if the capture joins recordings or cameras; else sort the frames"
+        backwards[0].child("time").warning(f"time goes backwards here{more}", remedy)
+
+
+def _same_view(one: Camera, other: Camera) -> bool:
+    intrinsics = [(camera.fx, camera.fy, camera.cx, camera.cy) for camera in (one, other)]
+    return intrinsics[0] == intrinsics[1] and torch.equal(one.world_from_camera, other.world_from_camera)
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """What one loss mask hides."""
+
+    pixels: float | None  # share of the lit pixels; None: too few are lit
+    points: int  # projected sparse points
+    points_in_view: int
+
+
+def measure_hidden(image: Tensor, mask: Tensor, camera: Camera | None, points: np.ndarray) -> Hidden:
+    """Count what a loss mask bool [H, W], False where ignored, hides of an image [H, W, 3] in [0, 1], and of points
+    [P, 3] mm in its camera (None: not known)."""
+    lit, ignored = (image.amax(-1) > LIT).numpy(), ~mask.numpy()
+    pixels = float(ignored[lit].mean()) if lit.mean() > MIN_LIT else None
+    if camera is None or not len(points):
+        return Hidden(pixels, 0, 0)
+    with np.errstate(all="ignore"):  # points on the camera's plane
+        places, depths = project_world(points, camera)
+    inside = (depths > camera.near) & (places >= 0).all(-1) & (places < [camera.width, camera.height]).all(-1)
+    column, row = places[inside].astype(int).T
+    return Hidden(pixels, int(ignored[row, column].sum()), int(inside.sum()))
+
+
+def sample_points(cloud: PointCloud | None) -> np.ndarray:
+    """[P, 3] float64 mm, some of the measured points; none where there are none."""
+    if cloud is None or not cloud.measured:
+        return np.zeros((0, 3))
+    return cloud.positions[:: max(1, len(cloud.positions) // MAX_SAMPLED_POINTS)].astype(np.float64)
+
+
+def masks_fault(found: Sequence[Hidden]) -> Fault | None:
+    """Return what is wrong with loss masks that hide what was found, and what to do."""
+    shares = [one.pixels for one in found if one.pixels is not None]
+    if not shares:
+        return None
+    in_view = sum(one.points_in_view for one in found)
+    points = sum(one.points for one in found) / in_view if in_view else None
+    return mask_fault(float(np.median(shares)), points)
+
+
+@dataclass(frozen=True)
+class _Decoded:
+    """What decoding one frame's files found."""
+
+    digest: bytes | None  # of the pixels; None when not readable
+    grey: np.ndarray | None  # uint8 [h, w], every few pixels
+    uniform: bool  # one colour
+    image_error: str
+    mask_error: str
+    hidden: Hidden | None  # by the mask; None: there is no usable one
+
+
+def check_files(parsed: Parsed) -> None:
+    """Decode every image and mask and report those damaged, of the wrong size, empty, or with the same pixels."""
+    clouds = {tissue.name: sample_points(tissue.points) for tissue in parsed.tissues}
+    shared = sample_points(parsed.points)
+    points = [clouds.get(str(frame.state.tissue), shared) for frame in parsed.frames]
+    cameras = [None if row in parsed.without_camera else frame.camera for row, frame in enumerate(parsed.frames)]
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        decoded = list(pool.map(_decode, parsed.frames, cameras, points))
+    # the reader may have reported an image whose size it wanted to know
+    reported = [place.child("file_path").reported for place in parsed.places]
+    first: dict[bytes, int] = {}
+    for index, (found, place) in enumerate(zip(decoded, parsed.places, strict=True)):
+        if found.image_error and not reported[index]:
+            place.child("file_path").error(*found.image_error.split("; ", 1))
+        if found.mask_error:
+            place.child("mask_path").error(*found.mask_error.split("; ", 1))
+        if found.uniform:
+            place.child("file_path").warning("every pixel of the image has one colour", "was the camera covered?")
+        elif found.digest is not None and first.setdefault(found.digest, index) != index:
+            _report_duplicate(parsed, first[found.digest], index)
+    _check_frozen(parsed, decoded)
+    without = [place for frame, place in zip(parsed.frames, parsed.places, strict=True) if frame.mask_path is None]
+    if without and len(without) < len(parsed.frames):
+        message = f"has no mask while other frames do ({len(without)} of {len(parsed.frames)} without)"
+        without[0].child("mask_path").warning(message, "its whole image counts in the loss")
+    if (fault := masks_fault([found.hidden for found in decoded if found.hidden is not None])) is not None:
+        parsed.header("frames[*].mask_path").warning(*fault)
+
+
+def _decode(frame: Frame, camera: Camera | None, points: np.ndarray) -> _Decoded:
+    """Decode a frame's image and mask, and measure what the mask hides. Errors name files without their folders."""
+    digest, grey, uniform, image_error, mask_error = None, None, False, "", ""
+    image, hidden = None, None
+    try:
+        image = frame.load_image()
+        digest = hashlib.blake2b(image.numpy().tobytes(), digest_size=16).digest()
+        uniform = bool((image == image[0, 0]).all())
+        step = max(1, image.shape[1] // COMPARED_WIDTH)
+        grey = np.rint(255 * image.numpy()[::step, ::step].mean(-1)).astype(np.uint8)
+    except NeecoError as error:
+        image_error = str(error).replace(str(frame.image_path), frame.image_path.name)
+    try:
+        mask = frame.load_mask()
+        if mask is not None and not torch.any(mask):
+            mask_error = "ignores every pixel (black is ignored); invert it, write 255 instead of 1, or drop the frame"
+        elif mask is not None and image is not None:
+            hidden = measure_hidden(image, mask, camera, points)
+    except NeecoError as error:
+        mask_error = str(error).replace(str(frame.mask_path), frame.mask_path.name if frame.mask_path else "")
+    return _Decoded(digest, grey, uniform, image_error, mask_error, hidden)
+
+
+def _check_frozen(parsed: Parsed, decoded: Sequence[_Decoded]) -> None:
+    """Warn of frames that show the image before them, coded again, though the camera or an instrument moved. Those with
+    the same pixels are reported as duplicates."""
+    when = [(str(place.file), frame.state.time) for frame, place in zip(parsed.frames, parsed.places, strict=True)]
+    order = sorted(range(len(decoded)), key=when.__getitem__)
+    frozen, source = [], order[0]
+    for index in order[1:]:
+        one, two = decoded[source], decoded[index]
+        if one.uniform or one.grey is None or two.grey is None or not is_repeated(one.grey, two.grey):
+            source = index
+        elif one.digest != two.digest and _moved(parsed.frames[source], parsed.frames[index]):
+            frozen.append(index)
+    if frozen:
+        count = f"{len(frozen)} of {len(decoded)} frames"
+        message = f"shows the picture before it while camera or state changed ({count} do)"
+        parsed.places[frozen[0]].child("file_path").warning(message, "the video was frozen there: drop these frames")
+
+
+def _moved(one: Frame, two: Frame) -> bool:
+    """Return True if the camera or an instrument moved so far that an image shows it."""
+    shared = one.state.instruments.keys() & two.state.instruments.keys()
+    joints = [(one.state.instruments[name].joints, two.state.instruments[name].joints) for name in shared]
+    readings = [(value, second.get(name, value)) for first, second in joints for name, value in first.items()]
+    if any(abs(after - before) > VISIBLE_ROTATION for before, after in readings):
+        return True
+    pairs = [(one.camera.world_from_camera, two.camera.world_from_camera)]
+    pairs += [(one.state.instruments[name].pose, two.state.instruments[name].pose) for name in shared]
+    changes = [(second - first).abs() for first, second in pairs]
+    return any(bool(change[:3, 3].norm() > VISIBLE_MM or change[:3, :3].max() > VISIBLE_ROTATION) for change in changes)
+
+
+def _report_duplicate(parsed: Parsed, first: int, second: int) -> None:
+    """Report two files with the same pixels: a warning only when camera and state are the same, too."""
+    one, two, place = parsed.frames[first], parsed.frames[second], parsed.places[second].child("file_path")
+    if one.image_path == two.image_path:
+        return  # reported as one file listed twice
+    message = f"duplicate frame: same pixels as {parsed.places[first].field} ({one.image_path.name!r})"
+    if one.split == two.split and _same_state(one, two):
+        place.warning(message, "drop one of them")
+    else:
+        reason = "in another split" if _same_state(one, two) else "with another camera or state"
+        place.error(f"{message}, {reason}", "drop one of them (a stalled video does this)")
+
+
+def _same_state(one: Frame, two: Frame) -> bool:
+    """Return True if two frames have the same camera pose and instrument states; time does not count."""
+    first, second = one.state.instruments, two.state.instruments
+    return (
+        torch.equal(one.camera.world_from_camera, two.camera.world_from_camera)
+        and first.keys() == second.keys()
+        and all(
+            torch.equal(first[name].pose, second[name].pose) and dict(first[name].joints) == dict(second[name].joints)
+            for name in first
+        )
+    )

@@ -1,0 +1,114 @@
+"""Foreground masks: pixels of a video that show instruments, of which nothing is known but that they move.
+
+Motion gives a first mask: against the background for a still scope, by optical flow for one that moves. Instruments
+also have colours that occur where something moves, and hardly elsewhere; these sharpen outlines and fill what motion
+leaves out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from neeco.ingest.foreground.background import find_background
+from neeco.ingest.foreground.colors import color_levels, color_odds, whole_pieces
+from neeco.ingest.foreground.residual_flow import ResidualFlow
+from neeco.ingest.frames.views import reduced
+
+# before a still scope
+MIN_AREA = 0.001  # share of the image
+MARGIN_PX, HIDDEN_PX = 4, 3  # about what moves: neither colour counts; the background does not
+MIN_ODDS, CERTAIN_ODDS, TISSUE_ODDS = 0.5, 1.0, -2.0  # logarithms
+SMOOTH_PX, OUTLINE_PX = 1.5, 0.7  # over which odds are averaged, at first and for outlines
+MOVING_SHARE = 0.2  # of a piece with the instrument's colours
+MIN_SEEN = 0.02  # share of images that show the background, without which it is unknown
+
+# before a scope that moves
+MAY_MOVE, MOVES, STILL = 0.3, 0.7, 0.2  # shares of neighbours in time against which a pixel moves
+REACH = np.ones((9, 9), np.uint8)  # px about what may move, in which the instrument is
+FLOW_MIN_ODDS, FLOW_OUTLINE_ODDS = 1.0, 0.5
+N_ROUNDS = 4  # each with the colours of the masks before
+FLOW_MIN_AREA = 0.004  # share of the image
+FLOW_OUTLINE_PX = 1.0
+FLOW_MOVING_SHARE = 0.3  # of a piece with the instrument's colours
+
+
+def moving_masks(
+    load: Callable[[int], np.ndarray], count: int, rows: np.ndarray, visible: np.ndarray | None = None
+) -> np.ndarray:
+    """Foreground before a still scope, in rows [R] of its `count` images: bool [R, h, w], of the images `reduced`.
+
+    load: one image uint8 [H, W, 3]; visible: bool [H, W], the field of view, where it has a border. A shaft that lies
+    in most images is background at first, and only its ends move. Its colours take it out of the background in a
+    second pass.
+    """
+    background = find_background(lambda row: reduced(load(row)), count)
+    images = np.stack([reduced(load(int(row))) for row in rows])
+    shown = _shown(images, visible)
+    moves = np.stack([whole_pieces(background.differs(image), MIN_AREA) for image in images]) & shown
+    colors = color_levels(images)
+    around = np.stack([_grown(mask, MARGIN_PX) for mask in moves])
+    odds = color_odds(colors, moves, ~around & shown)
+    hidden = np.stack([
+        _grown(mask | whole_pieces(odds.smoothed(found, SMOOTH_PX) > MIN_ODDS, MIN_AREA, mask, MOVING_SHARE), HIDDEN_PX)
+        for mask, found in zip(moves, colors, strict=True)
+    ])  # fmt: skip
+    background = find_background(lambda place: images[place], len(rows), lambda place: hidden[place])
+    unknown = background.seen < MIN_SEEN
+    masks = []
+    for image, found, covered in zip(images, colors, hidden, strict=True):
+        mask = whole_pieces(background.differs(image), MIN_AREA) | (covered & unknown)
+        likely = odds.smoothed(found, OUTLINE_PX)
+        mask_or_color = (mask & (likely > TISSUE_ODDS)) | (likely > CERTAIN_ODDS)
+        masks.append(whole_pieces(mask_or_color, MIN_AREA, mask, MOVING_SHARE))
+    return shown & np.stack(masks)
+
+
+def passing_masks(
+    load: Callable[[int], np.ndarray],
+    flow: ResidualFlow,
+    rows: np.ndarray,
+    moving_px: float,
+    visible: np.ndarray | None = None,
+) -> np.ndarray:
+    """Foreground before a scope that moves, in rows [R] of `flow.sfm`: bool [R, h, w], of the images `reduced`.
+
+    load(row): image uint8 [H, W, 3]; moving_px: of `ResidualFlow.moving_pixels`; visible: bool [H, W], the field of
+    view, where it has a border. Flow bleeds over outlines, and is 0 within an instrument without texture.
+    """
+    images = np.stack([reduced(load(row)) for row in rows.tolist()])
+    shown = _shown(images, visible)
+    evidence = np.nan_to_num(flow.moving_pixels(rows, moving_px)).astype(np.float32)
+    moves = np.stack([cv2.resize(share, images.shape[2:0:-1]) for share in evidence])  # [R, h, w]
+    candidates = np.stack([cv2.dilate((share > MAY_MOVE).astype(np.uint8), REACH) > 0 for share in moves]) & shown
+    colors = color_levels(images)
+    inside, outside = moves > MOVES, moves <= STILL
+    for _ in range(N_ROUNDS):
+        odds = color_odds(colors, inside & shown, outside & shown)
+        inside = np.stack([
+            whole_pieces((odds.smoothed(found, SMOOTH_PX) > FLOW_MIN_ODDS) & may, FLOW_MIN_AREA)
+            for found, may in zip(colors, candidates, strict=True)
+        ])  # fmt: skip
+        outside = ~inside
+    # what stood still for a while, and thin ends: of the same colours and in one piece with what moves
+    odds = color_odds(colors, inside & shown, outside & shown)
+    return np.stack([
+        whole_pieces(
+            (odds.smoothed(found, FLOW_OUTLINE_PX) > FLOW_OUTLINE_ODDS) & shown, FLOW_MIN_AREA, mask, FLOW_MOVING_SHARE
+        )
+        for found, mask in zip(colors, inside, strict=True)
+    ])  # fmt: skip
+
+
+def _shown(images: np.ndarray, visible: np.ndarray | None) -> np.ndarray:
+    """The field of view bool [h, w] of reduced images [R, h, w, 3]."""
+    if visible is None:
+        return np.ones(images.shape[1:3], bool)
+    return reduced(visible.astype(np.uint8) * 255) == 255
+
+
+def _grown(mask: np.ndarray, px: int) -> np.ndarray:
+    """A mask bool [h, w] dilated by so many px."""
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((2 * px + 1,) * 2, np.uint8)) > 0)

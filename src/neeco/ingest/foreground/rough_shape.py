@@ -1,0 +1,142 @@
+"""Rough shape of an instrument, carved in its tracked frame from pixels that move, and its projection into every frame:
+features on it must not hold up the cameras.
+
+Unlike `methods/carving`, which needs a scene of the tissue, it serves before there are cameras to train one with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from neeco.geometry.camera import Camera
+from neeco.geometry.lens import Lens
+from neeco.geometry.projection import project, project_world
+from neeco.ingest.foreground.residual_flow import STEP_PX
+from neeco.ingest.frames.views import SfmResult
+
+N_CELLS = 48  # of the carving grid, per side
+REACH = 0.4  # of the distance to the camera: half a side of that grid
+MIN_VISIBLE = 0.3  # share of the frames that must have a point in view
+MIN_AGREEMENT = 0.3  # share of the frames in which a point of the instrument lies on moving pixels
+MIN_RELATIVE = 0.85  # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
+LAG_CELLS, LAG_STEP_S, MAX_LAG_S = 16, 0.1, 60.0  # of the grid for lags, per side; lags that are tried
+MIN_KNOWN = 0.5  # share of the frames that need a pose at a lag
+LAG_GAIN = 1.1  # ratio of agreement to that at 0 and at all other lags
+LAG_PEAK, LAG_LOBE_S = 0.95, 0.5  # share of the best agreement, and s about its lag, of the weighted mean
+MARGIN_PX = 6  # about its projection
+NEAREST_MM = 1e-3  # in front of the camera
+
+PosesAt = Callable[[float], tuple[np.ndarray, np.ndarray]]  # lag s -> poses [N, 4, 4] mm, bool [N] where known
+
+
+@dataclass(frozen=True)
+class RoughShape:
+    """Points [K, 3] mm of an instrument in its tracked frame, the grid's spacing mm, and how often the images agree."""
+
+    points: np.ndarray
+    spacing: float
+    agreement: float  # share of frames in which a point of it lies on moving pixels, [0, 1]
+
+
+def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens) -> RoughShape | None:
+    """Carve the points of a grid about the tracked frame that lie on moving pixels most of the time they are in view.
+
+    evidence [R, h, w] from `ResidualFlow.moving_pixels` (NaN: hidden), camera_from_instrument [R, 4, 4] mm. None when
+    no point stands out: the instrument hardly moves, or its poses do not fit the cameras.
+    """
+    grid, spacing, share, enough = _agreement(evidence, camera_from_instrument, pinhole, N_CELLS)
+    best = float(np.quantile(share[enough], 0.999)) if enough.any() else 0.0
+    background = float(np.nanmean(evidence)) if not np.isnan(evidence).all() else 0.0
+    if best < 2 * background or best < MIN_AGREEMENT:
+        return None
+    belongs = share > max(MIN_RELATIVE * best, 2 * background)
+    return RoughShape(grid[belongs], spacing, best) if belongs.any() else None
+
+
+def best_lag(evidence: np.ndarray, poses_at: PosesAt, pinhole: Lens, longest: float) -> float:
+    """Lag s within +-longest (at most MAX_LAG_S) at which poses explain motion clearly better than at 0 and at all
+    others, else 0.
+
+    evidence [R, h, w] as for `carve_shape`; poses_at(lag): camera_from_instrument [R, 4, 4] mm that the log has `lag` s
+    later than its clock says, and bool [R] where it has one.
+    """
+    count = int(min(longest, MAX_LAG_S) / LAG_STEP_S)
+    lags = LAG_STEP_S * np.arange(-count, count + 1)
+    scores = np.zeros(len(lags))
+    for index, lag in enumerate(lags):
+        poses, known = poses_at(float(lag))
+        if known.sum() >= MIN_KNOWN * len(evidence):
+            _, _, share, enough = _agreement(evidence[known], poses[known], pinhole, LAG_CELLS)
+            scores[index] = np.quantile(share[enough], 0.99) if enough.any() else 0.0
+    best = float(scores.max())
+    lobe = np.abs(lags - lags[scores.argmax()]) < LAG_LOBE_S
+    rival = float(scores[~lobe].max(initial=0.0))  # motion that repeats fits at several lags
+    if best < MIN_AGREEMENT or best < LAG_GAIN * max(float(scores[count]), rival):
+        return 0.0
+    weights = np.clip(scores - LAG_PEAK * best, 0, None) * lobe
+    return float((weights * lags).sum() / weights.sum())
+
+
+def _agreement(
+    evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens, cells: int
+) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+    """A grid [G, 3] mm about the tracked frame, its spacing mm, the share [G] of the frames in which each of its points
+    lies on moving pixels, and where [G] enough frames have it in view."""
+    distance = float(np.median(camera_from_instrument[:, 2, 3])) if len(evidence) else 0.0
+    if distance <= 0:
+        return np.zeros((0, 3)), 0.0, np.zeros(0), np.zeros(0, dtype=bool)
+    axis = np.linspace(-REACH, REACH, cells) * distance
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)  # [G, 3]
+    total, seen = np.zeros(len(grid)), np.zeros(len(grid))
+    for pixels, pose in zip(evidence, camera_from_instrument, strict=True):
+        x, y, inside = _raster_cells(grid, pose, pinhole.intrinsics, pixels.shape)
+        inside &= ~np.isnan(pixels[y, x])
+        total[inside] += pixels[y[inside], x[inside]]
+        seen += inside
+    enough = seen > MIN_VISIBLE * len(evidence)
+    share = np.where(enough, total / np.maximum(seen, 1), 0.0)
+    return grid, float(axis[1] - axis[0]), share, enough
+
+
+def project_mask(shape: RoughShape, camera_from_instrument: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels bool [H, W] that the shape may cover in the camera's image, with a margin."""
+    small = (camera.height // STEP_PX + 1, camera.width // STEP_PX + 1)
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    x, y, inside = _raster_cells(shape.points, camera_from_instrument, intrinsics, small)
+    mask = np.zeros(small, dtype=bool)
+    mask[y[inside], x[inside]] = True
+    depth = float(camera_from_instrument[2, 3])
+    cell = shape.spacing * camera.fx / max(depth, 1.0)  # px between neighbouring points
+    mask = binary_dilation(mask, iterations=max(1, round((MARGIN_PX + cell / 2) / STEP_PX)))
+    return mask.repeat(STEP_PX, axis=0).repeat(STEP_PX, axis=1)[: camera.height, : camera.width]
+
+
+def observations_on(
+    shape: RoughShape, camera_from_instrument: np.ndarray, sfm: SfmResult, row: int, points: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """Mark observations bool [Q] of a row of `sfm` on the shape. points [P, 3] mm: its points in the world."""
+    mask = project_mask(shape, camera_from_instrument, camera)
+    mine = np.flatnonzero(sfm.observations[:, 0] == row)
+    pixels, _ = project_world(points[sfm.observations[mine, 1].astype(int)], camera, nearest=camera.near)
+    x = np.clip(pixels[:, 0].astype(int), 0, camera.width - 1)
+    y = np.clip(pixels[:, 1].astype(int), 0, camera.height - 1)
+    on = np.zeros(len(sfm.observations), dtype=bool)
+    on[mine] = mask[y, x]
+    return on
+
+
+def _raster_cells(
+    points: np.ndarray,
+    camera_from_instrument: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    shape: tuple[int, ...],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Column, row and visibility [K] of points on the STEP_PX-spaced raster of `shape` (rows, columns)."""
+    camera = points @ camera_from_instrument[:3, :3].T + camera_from_instrument[:3, 3]
+    x, y = (np.floor(place / STEP_PX) for place in project(camera, *intrinsics, nearest=NEAREST_MM))
+    inside = (camera[:, 2] > NEAREST_MM) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+    return np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int), inside
