@@ -31,7 +31,7 @@ def prepare(verbs: Sequence[str]) -> None:
 
     torch.set_num_threads(1)
     hasten_ingest()
-    machine.ROUNDS, machine.DRAWS = 1, 1
+    machine.N_ROUNDS, machine.TIMED_IMAGES = 1, 1
 
 
 def make_world(desk: Path, wanted: set[str]) -> None:

@@ -19,7 +19,7 @@ from neeco.capture.readers import read_urdf
 from neeco.errors import NeecoError
 from neeco.files import (
     LOCK,
-    MOST_VALUES,
+    MAX_VALUES,
     TEMPORARY,
     FastYamlLoader,
     YamlDumper,
@@ -176,9 +176,9 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        (BOMB, "its aliases unfold without measure"),
-        ("&a [*a]", "its aliases unfold without measure"),
-        ("[" * 5000, "its nesting is beyond all measure"),
+        (BOMB, "its aliases unfold to too many values"),
+        ("&a [*a]", "its aliases unfold to too many values"),
+        ("[" * 5000, "its nesting is too deep"),
         ("a: 2020-13-45", "not valid YAML"),
         ("a: !!float x", "not valid YAML"),
         ("a: !!timestamp x", "not valid YAML"),
@@ -205,13 +205,13 @@ def test_numbers_are_those_of_yaml_1_2(loader: type[yaml.SafeLoader]) -> None:
 
 def test_aliases_within_measure_are_read() -> None:
     assert parse_yaml(Path("x"), "a: &a [1, 2]\nb: *a", "") == {"a": [1, 2], "b": [1, 2]}
-    assert MOST_VALUES > 100_000
+    assert MAX_VALUES > 100_000
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' + "9" * 10_000 + "}"])
 def test_json_without_measure_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(text)
-    with pytest.raises(NeecoError, match=r"a.json: not usable JSON: a number or the nesting is beyond all measure"):
+    with pytest.raises(NeecoError, match=r"a.json: not usable JSON: a number or the nesting is too large"):
         read_json(tmp_path / "a.json")
 
 

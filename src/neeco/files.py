@@ -26,7 +26,7 @@ except ImportError:  # Windows has no such locks
 
 TEMPORARY = ".unfinished-"  # begins the names of files and folders that are still being written
 LOCK = ".neeco.lock"
-MOST_VALUES = 1_000_000  # in a YAML file, aliases written out
+MAX_VALUES = 1_000_000  # in a YAML file, aliases written out
 HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
 HEAD_BYTES = 1024  # read of a file to recognise what was stored in its place; Git LFS pointers are shorter
 _XML = rb"\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*"
@@ -46,7 +46,7 @@ PLACEHOLDERS = [(re.compile(start, re.DOTALL | re.IGNORECASE), problem) for star
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write(temporary_path)` produce a file beside `path`, sync it to disk and rename it to `path`.
+    """Let `write(temporary_path)` produce a file next to `path`, sync it to disk and rename it to `path`.
 
     The user's umask decides who may read and write it. On any failure the temporary file is removed, and `path` holds
     what it did, or all of the new content. Raises NeecoError naming `path` when the disk refuses.
@@ -97,7 +97,7 @@ def _sync_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[None]:
-    """Make folder `path` and those above it, as far as they are missing, and make sure that files can be written there.
+    """Make folder `path` and those above it, as far as they are missing, and check that files can be written there.
 
     When the block fails, folders made here that are still empty go again. Raises NeecoError when the disk refuses, and
     for a path that is not in UTF-8.
@@ -151,7 +151,7 @@ def sweep_unfinished(folder: Path) -> None:
 
 
 def is_vacant(path: Path) -> bool:
-    """Whether nothing whole is in folder `path`, or it is not there: at most what a killed process left."""
+    """Return True if folder `path` is absent or holds at most what a killed process left."""
     return not path.is_dir() or all(
         entry.name == LOCK or (entry.name.startswith(TEMPORARY) and not entry.is_dir()) for entry in path.iterdir()
     )
@@ -227,7 +227,7 @@ def require_inside(file: Path, folder: Path) -> Path:
     """`file`, whose path goes through `folder`. Raises NeecoError when a link on the way leads out of that, or in a
     circle."""
     try:
-        file.stat()  # `resolve` tells circles in Python 3.11 and 3.12 only
+        file.stat()  # `resolve` detects circles in Python 3.11 and 3.12 only
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise NeecoError(f"{file}: a link that leads in a circle; remove it") from None
@@ -251,8 +251,8 @@ def require_content(path: Path) -> None:
 
 
 def placeholder(path: Path) -> str | None:
-    """What a clone or a download left in a file's place (a Git LFS or git-annex pointer, a web page), and what to do;
-    None for content, and where there is no file to read."""
+    """Name what a clone or a download left in a file's place (a Git LFS or git-annex pointer, a web page), and the
+    remedy; None for content, and where there is no file to read."""
     try:
         if path.is_symlink() and not path.exists():
             return _ANNEX if "annex/objects/" in os.readlink(path).replace("\\", "/") else None
@@ -266,13 +266,13 @@ def placeholder(path: Path) -> str | None:
 
 
 def visible_entries(folder: Path, pattern: str = "*") -> list[Path]:
-    """What a folder holds under `pattern`, sorted, without hidden entries such as the `._left.png` that macOS writes
+    """Entries of a folder that match `pattern`, sorted, without hidden ones such as the `._left.png` that macOS writes
     next to `left.png`."""
     return sorted(entry for entry in folder.glob(pattern) if not entry.name.startswith("."))
 
 
 def read_bytes(path: Path, expected: str, missing: str = "no such file") -> bytes:
-    """What a file holds.
+    """Read a file's bytes.
 
     Raises NeecoError saying `missing` when it is absent, what was `expected` when it is a folder or a pipe, and why
     when it cannot be read.
@@ -310,9 +310,7 @@ def read_json(path: Path) -> Any:
     except json.JSONDecodeError as error:
         raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}; mend or write it anew") from None
     except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels
-        raise NeecoError(
-            f"{path}: not usable JSON: a number or the nesting is beyond all measure; write it anew"
-        ) from None
+        raise NeecoError(f"{path}: not usable JSON: a number or the nesting is too large; write it anew") from None
 
 
 class YamlLoader(yaml.SafeLoader):
@@ -338,24 +336,24 @@ def parse_yaml(path: Path, text: str, remedy: str, loader: type[yaml.SafeLoader]
     try:
         value = yaml.load(text, Loader=loader)
     except RecursionError:
-        raise NeecoError(f"{path}: not usable YAML: its nesting is beyond all measure; {remedy}") from None
+        raise NeecoError(f"{path}: not usable YAML: its nesting is too deep; {remedy}") from None
     # what is wrong inside a scalar is raised by whatever PyYAML builds it with
     except (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError, ArithmeticError) as error:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}: " if mark else ""
         reason = " ".join(str(getattr(error, "problem", None) or error).split())[:100]
         raise NeecoError(f"{path}: {place}not valid YAML ({reason}); {remedy}") from None
-    if _unfolded(value, {}) > MOST_VALUES:
-        raise NeecoError(f"{path}: its aliases unfold without measure; write the values out")
+    if _unfolded(value, {}) > MAX_VALUES:
+        raise NeecoError(f"{path}: its aliases unfold to too many values; write the values out")
     return value
 
 
 def _unfolded(value: Any, known: dict[int, int]) -> int:
-    """How many values there are when every alias is written out; `known`: of those met already."""
+    """Number of values when every alias is written out; `known`: of those met already."""
     if not isinstance(value, dict | list):
         return 1
     if id(value) not in known:
-        known[id(value)] = MOST_VALUES + 1  # until it is known: it would contain itself
+        known[id(value)] = MAX_VALUES + 1  # until it is known: it would contain itself
         inner = value.values() if isinstance(value, dict) else value
         known[id(value)] = 1 + sum(_unfolded(item, known) for item in inner)
     return known[id(value)]

@@ -1,7 +1,6 @@
-"""What no camera, joint, time or mask can be: one list of limits for all readers of files and the Python API.
+"""Limits of plausible cameras, joints, times and masks, for all readers of files and the Python API.
 
-Each function returns what is wrong and what to do, or None. What no pose can be, `neeco.geometry.rotations.rigid_fault`
-says.
+Each function returns what is wrong and what to do, or None. Poses: `neeco.geometry.rotations.rigid_fault`.
 """
 
 from __future__ import annotations
@@ -10,38 +9,38 @@ import math
 
 Fault = tuple[str, str]  # what is wrong, what to do
 
-LARGEST_SIZE = 65_535  # px along a side of an image
-WIDEST, LONGEST = 0.1, 50.0  # focal length of any lens, in lengths of the image's longer side
-MOST_ANAMORPHIC = 2.5  # ratio of the two focal lengths: single fields of interlaced video have 2
+MAX_SIZE_PX = 65_535  # px along a side of an image
+MIN_FOCAL, MAX_FOCAL = 0.1, 50.0  # focal length of any lens, in lengths of the image's longer side
+MAX_ANAMORPHIC = 2.5  # ratio of the two focal lengths: single fields of interlaced video have 2
 FULL_TURN = 2 * math.pi  # rad; a joint without stated limits turns no farther
-LONGEST_SLIDE = 1000.0  # mm; nor slides farther
+MAX_SLIDE_MM = 1000.0  # mm; nor slides farther
 LIMIT_TOLERANCE = 1e-3  # rad (mm of sliding joints) by which rounding and noise may exceed a limit
-LONGEST_TIME = 1e10  # s, beyond the seconds since 1970 that clocks give
-MOST_HIDDEN = 0.5  # share of the lit pixels of most images that a loss mask may hide
-MOST_POINTS_HIDDEN = 0.8  # share of the projected sparse points that loss masks may hide
+MAX_TIME_S = 1e10  # s, beyond the seconds since 1970 that clocks give
+MAX_HIDDEN = 0.5  # share of the lit pixels of most images that a loss mask may hide
+MAX_POINTS_HIDDEN = 0.8  # share of the projected sparse points that loss masks may hide
 
 
 def size_fault(width: float, height: float) -> Fault | None:
-    """Of an image of width x height px."""
+    """Check the size of an image, px."""
     sides = (width, height)
-    if not all(math.isfinite(side) and side % 1 == 0 and 1 <= side <= LARGEST_SIZE for side in sides):
+    if not all(math.isfinite(side) and side % 1 == 0 and 1 <= side <= MAX_SIZE_PX for side in sides):
         return f"image size {width:g} x {height:g} is not usable", "give whole numbers of pixels"
     return None
 
 
 def focal_fault(fx: float, fy: float, width: float, height: float) -> Fault | None:
-    """Of focal lengths in px on an image of width x height px."""
+    """Check focal lengths in px on an image of width x height px."""
     if not all(math.isfinite(focal) and focal > 0 for focal in (fx, fy)):
         return f"focal lengths {fx:g} and {fy:g} px are not positive numbers", "give them in pixels"
-    fits = all(WIDEST < focal / max(width, height) < LONGEST for focal in (fx, fy))
-    if not fits or max(fx, fy) > MOST_ANAMORPHIC * min(fx, fy):
+    fits = all(MIN_FOCAL < focal / max(width, height) < MAX_FOCAL for focal in (fx, fy))
+    if not fits or max(fx, fy) > MAX_ANAMORPHIC * min(fx, fy):
         message = f"focal lengths {fx:g} and {fy:g} px fit no lens on a {width:g}x{height:g} image"
         return message, "give them in pixels of this image (not in mm, nor as shares of its size)"
     return None
 
 
 def camera_fault(fx: float, fy: float, cx: float, cy: float, width: float, height: float, near: float) -> Fault | None:
-    """Of a camera's numbers, px and mm; its image may be cut out of a larger one, or enlarged."""
+    """Check a camera's numbers, px and mm; its image may be cropped from a larger one, or enlarged."""
     if (fault := size_fault(width, height)) is not None:
         return fault
     if not all(math.isfinite(number) and number > 0 for number in (fx, fy, near)):
@@ -52,26 +51,26 @@ def camera_fault(fx: float, fy: float, cx: float, cy: float, width: float, heigh
 
 
 def center_fault(cx: float, cy: float, width: float, height: float) -> Fault | None:
-    """Of a principal point in px on an image of width x height px."""
+    """Check a principal point in px on an image of width x height px."""
     if 0 < cx < width and 0 < cy < height:  # NaN compares false
         return None
     return f"principal point ({cx:g}, {cy:g}) lies outside the {width:g}x{height:g} image", "give it in pixels of it"
 
 
 def time_fault(time: float) -> Fault | None:
-    """Of a time in s."""
-    if abs(time) <= LONGEST_TIME:  # NaN compares false
+    """Check a time in s."""
+    if abs(time) <= MAX_TIME_S:  # NaN compares false
         return None
     return f"is {time:g} s", "give seconds (not milli- or nanoseconds)"
 
 
 def exceeds_limits(value: float, limits: tuple[float, float] | None) -> bool:
-    """Whether a joint's value exceeds its limits by more than rounding explains."""
+    """Return True if a joint's value exceeds its limits by more than rounding."""
     return limits is not None and not limits[0] - LIMIT_TOLERANCE <= value <= limits[1] + LIMIT_TOLERANCE
 
 
 def joint_fault(value: float, limits: tuple[float, float] | None, slides: bool, slack: float = 0.0) -> Fault | None:
-    """Of a joint's value, rad, or of a joint that slides mm. slack: share of its range by which it may exceed that."""
+    """Check a joint's value, rad, or mm of a sliding joint. slack: share of its range by which it may exceed that."""
     unit = "mm" if slides else "rad"
     if not math.isfinite(value):
         return f"is {value:g}, not a finite number", f"give it in {unit}"
@@ -81,7 +80,7 @@ def joint_fault(value: float, limits: tuple[float, float] | None, slides: bool, 
         message = f"is {value:g} {unit}, outside its limits {limits[0]:g} .. {limits[1]:g}"
         remedy = "repair the reading or the limits" if slides else "repair the reading (radians?) or the limits"
         return (message, remedy) if exceeds_limits(value, limits) else None
-    if abs(value) > (LONGEST_SLIDE if slides else FULL_TURN) * (1 + slack):
+    if abs(value) > (MAX_SLIDE_MM if slides else FULL_TURN) * (1 + slack):
         if slides:
             return f"is {value:g} mm, farther than any instrument slides", "give mm, or state the joint's limits"
         remedy = "give radians; state the joint's limits in the header if it does turn that far"
@@ -90,19 +89,19 @@ def joint_fault(value: float, limits: tuple[float, float] | None, slides: bool, 
 
 
 def limits_fault(limits: tuple[float, float], slides: bool) -> Fault | None:
-    """Of a joint's stated limits, rad or mm."""
+    """Check a joint's stated limits, rad or mm."""
     if slides or max(map(abs, limits)) <= 2 * FULL_TURN:
         return None
     return f"{limits[0]:g} .. {limits[1]:g} rad: degrees?", "give radians"
 
 
 def mask_fault(pixels: float, points: float | None) -> Fault | None:
-    """Of loss masks that hide these shares of the lit pixels in most images and of the projected sparse points (None:
-    there are none)."""
+    """Check loss masks by the shares that they hide: of the lit pixels in most images, and of the projected sparse
+    points (None: there are none)."""
     hides = []
-    if pixels > MOST_HIDDEN:
+    if pixels > MAX_HIDDEN:
         hides.append(f"{pixels:.0%} of most images")
-    if points is not None and points > MOST_POINTS_HIDDEN:
+    if points is not None and points > MAX_POINTS_HIDDEN:
         hides.append(f"{points:.0%} of the sparse points in view")
     if not hides:
         return None

@@ -54,7 +54,7 @@ class TaskEvent:
 
 @dataclass(frozen=True, kw_only=True)
 class Workers:
-    """How many workers share the tasks, and what each may use.
+    """The number of workers that share the tasks, and the resources of each.
 
     threads: None: an equal share of the cluster's CPUs. fresh: every task has a process of its own, so that its peak
     memory and settings are its own. gpu: every worker sees one GPU, which no other has. stop_s: time, in s, that an
@@ -233,7 +233,7 @@ def _serve(function: TaskFunction, shared: Any, threads: int, connection: Connec
 
 
 def _exit_with_parent() -> None:
-    """In a worker: exit at once when the parent was killed, so as not to write beside its successor."""
+    """In a worker: exit at once when the parent was killed, so as not to write while its successor does."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

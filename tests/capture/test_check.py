@@ -116,7 +116,7 @@ EDITS = [
     (_from_video({"shaft_diameter_mm": 5}), "instruments[0].from_video.working_length_mm", "expected a number"),
     (_head("cx", 900), "cx", "outside the image"),
     (_head("fl_x", 0), "fl_x", "positive"),
-    (_head("camera_model", "OPENCV_FISHEYE"), "camera_model", "only PINHOLE"),
+    (_head("camera_model", "OPENCV_FISHEYE"), "camera_model", "must be PINHOLE"),
     (_head("units", "m"), "units", "must be mm"),
     (_head("instrument_frame", "moon"), "instrument_frame", "'moon'"),
     (_head("ply_file_path", "../sparse.ply"), "ply_file_path", "leaves the capture's folder"),
@@ -386,7 +386,7 @@ def told(folder, field: str) -> list[str]:
         (_head("fl_x", -1), "fl_x", "is -1, must be positive, for 8 of 8 frames"),
         (_head("cy", "x"), "cy", "expected a number, found 'x', for 8 of 8 frames"),
         (_head("k1", 0.1), "k1", "the images are distorted, for 8 of 8 frames"),
-        (_head("camera_model", "FISHEYE"), "camera_model", "only PINHOLE is drawn"),
+        (_head("camera_model", "FISHEYE"), "camera_model", "cameras must be PINHOLE"),
     ],
 )
 def test_a_mistake_at_the_top_level_is_told_once_and_hides_nothing(folder, edit, field, words):

@@ -139,3 +139,7 @@ def views_of(times: np.ndarray, cameras: np.ndarray, lens: Lens, load: Callable[
         rows=rows, frames=rows, times=times, episodes=np.zeros(len(times), int), world_from_camera=cameras, load=load,
         pinhole=lens,
     )  # fmt: skip
+
+
+def silent(what: str, done: int, total: int) -> None:
+    """Progress that nobody watches."""

@@ -14,6 +14,7 @@ from ingest.base_world import (
     episodes,
     errors,
     make_world,
+    silent,
     views_of,
 )
 from scipy.spatial.transform import Rotation
@@ -23,7 +24,7 @@ from neeco.geometry.lens import Lens
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
-from neeco.ingest.registration.find_bases import place_bases
+from neeco.ingest.registration.find_bases import find_bases
 
 LENS = Lens(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (), (WIDTH, HEIGHT))
 STILL = np.tile(np.eye(4), (44, 1, 1))
@@ -50,24 +51,26 @@ def _no_masks(rows):
 def test_an_exact_base_is_taken_as_it_is():
     world = make_world(44)
     data = _data(world, StatedBase(WORLD_FROM_BASE))
-    placed = place_bases(data, _black(world), _no_masks)["psm1"]
-    assert np.array_equal(placed.world_from_base, WORLD_FROM_BASE)
-    assert placed.clock is None
+    placed, found = find_bases(data, _black(world), _no_masks, silent)
+    assert np.array_equal(placed.world_from_base["psm1"], WORLD_FROM_BASE)
+    assert placed.clock("ros") is None
+    assert found == {}
 
 
 def test_an_arm_that_says_nothing_of_its_base_is_left_alone():
     world = make_world(44)
-    assert place_bases(_data(world, None), _black(world), _no_masks) == {}
+    placed, _ = find_bases(_data(world, None), _black(world), _no_masks, silent)
+    assert placed.world_from_base == {}
 
 
 @pytest.mark.slow
 def test_a_rough_base_is_found_with_its_clock_and_told_in_a_note():
     world = make_world(44)
     data = _data(world, StatedBase(disturbed(8, 5, 1, world), 5.0, 3.0))
-    placed = place_bases(data, _black(world), lambda rows: world.masks[rows])["psm1"]
-    assert errors(placed.world_from_base, world.poses_at(0.0))[0] < 0.8
-    assert placed.clock.source == "found with the base"
-    assert abs(placed.clock.seconds - 0.03) < 0.008
+    placed, _ = find_bases(data, _black(world), lambda rows: world.masks[rows], silent)
+    assert errors(placed.world_from_base["psm1"], world.poses_at(0.0))[0] < 0.8
+    assert placed.clock("ros").source == "found with the base"
+    assert abs(placed.clock("ros").seconds - 0.03) < 0.008
     assert "its base was found from what moves in 44 frames" in data.notes.sentences[0]
     assert "mm and" in data.notes.sentences[0]
 
@@ -76,7 +79,7 @@ def test_what_shows_no_shaft_names_the_recording():
     world = make_world(44)
     data = _data(world, StatedBase())
     with pytest.raises(NeecoError, match=r"recording\.yaml: instrument 'psm1': camera_from_base"):
-        place_bases(data, _black(world), lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool))
+        find_bases(data, _black(world), lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool), silent)
     assert LENS.intrinsics == INTRINSICS
 
 
@@ -85,12 +88,12 @@ def test_a_rough_base_is_found_before_a_scope_that_moves():
     world = make_world(44, moving_camera=True)
     data = _data(world, StatedBase(disturbed(8, 5, 1, world), 5.0, 3.0, to_world=True))
     cameras = np.linalg.inv(world.camera_from_world)
-    placed = place_bases(data, _black(world, cameras), lambda rows: world.masks[rows])["psm1"]
-    assert errors(placed.world_from_base, world.poses_at(0.0))[0] < 1.2  # of 3.5 s in all
+    placed, _ = find_bases(data, _black(world, cameras), lambda rows: world.masks[rows], silent)
+    assert errors(placed.world_from_base["psm1"], world.poses_at(0.0))[0] < 1.2  # of 3.5 s in all
 
 
 def test_a_base_stated_to_the_world_is_not_taken_for_one_to_the_camera():
     world = make_world(44, moving_camera=True)
     data = _data(world, StatedBase(WORLD_FROM_BASE, to_world=True))
-    placed = place_bases(data, _black(world, np.linalg.inv(world.camera_from_world)), _no_masks)["psm1"]
-    assert np.array_equal(placed.world_from_base, WORLD_FROM_BASE)
+    placed, _ = find_bases(data, _black(world, np.linalg.inv(world.camera_from_world)), _no_masks, silent)
+    assert np.array_equal(placed.world_from_base["psm1"], WORLD_FROM_BASE)

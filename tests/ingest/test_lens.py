@@ -171,7 +171,7 @@ def test_a_field_of_view_is_a_focal_length(world):
         ("a.yaml", ROS.replace("plumb_bob", "equidistant"), "a fisheye lens has 4 coefficients, not 5"),
         ("a.json", "{}", "fl_x: missing"),
         ("a.json", '{"fl_x": "x", "cx": 1, "cy": 1}', "'x' is not a usable number"),
-        ("a.json", json.dumps(FISHEYE | {"fl_x": 90, "fl_y": 90}), "sees farther than 80 degrees off its axis"),
+        ("a.json", json.dumps(FISHEYE | {"fl_x": 90, "fl_y": 90}), "covers more than 80 degrees off its axis"),
         ("a.json", json.dumps(FISHEYE | {"k1": -0.9}), "or folds the image over"),
         ("a.yaml", "!!python/object/apply:os.system [ls]", "not valid YAML"),
     ],

@@ -70,7 +70,7 @@ def test_the_same_capture_comes_of_it(recorded, sets, tmp_path):
 
 def test_where_motion_does_not_tell_the_clock_that_of_the_file_is_taken(recorded, sets, tmp_path, monkeypatch):
     def refuse(*given):
-        raise NeecoError("its clock cannot be told from the images; give it")
+        raise NeecoError("its clock cannot be determined from the images; give it")
 
     monkeypatch.setattr("neeco.ingest.registration.hand_eye.clock_from_turning", refuse)
     recording = read_recording(recorded.folder / "lerobot" / "v2.1" / "recording.yaml")

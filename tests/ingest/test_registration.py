@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from neeco.errors import NeecoError
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.registration.hand_eye import register_with_laparoscope
-from neeco.ingest.timing.clock_search import GIVEN, STEP, ClockOffset, _best_rate, clock_from_instrument, correlate
+from neeco.ingest.timing.clock_search import GIVEN, STEP_S, ClockOffset, _best_rate, clock_from_instrument, correlate
 
 HAND_EYE = np.eye(4)
 HAND_EYE[:3, :3] = Rotation.from_euler("xyz", [20, -10, 35], degrees=True).as_matrix()
@@ -111,7 +111,7 @@ def test_a_scope_that_does_not_turn_cannot_be_calibrated() -> None:
 def test_a_log_of_another_recording_is_refused() -> None:
     times, log = recorded(offset=0.0)
     other = replace(log, quats=np.roll(log.quats[::-1], 101, axis=0))
-    with pytest.raises(NeecoError, match="its clock cannot be told"):
+    with pytest.raises(NeecoError, match="its clock cannot be determined"):
         register_with_laparoscope(in_sfm(scope_path(times)), times, other, None)
 
 
@@ -163,15 +163,15 @@ def test_the_instruments_motion_tells_another_frame_rate(rate: float) -> None:
 def test_rates_are_found_in_long_recordings_too() -> None:
     length = 150.0
     known = np.random.default_rng(2).normal(size=int(length / 0.5))
-    speed = np.abs(np.interp(np.arange(0, length, STEP), np.arange(len(known)) * 0.5, known))
-    video = np.interp(np.arange(0, 120, STEP) * 1.01 + 20, np.arange(0, length, STEP), speed)
+    speed = np.abs(np.interp(np.arange(0, length, STEP_S), np.arange(len(known)) * 0.5, known))
+    video = np.interp(np.arange(0, 120, STEP_S) * 1.01 + 20, np.arange(0, length, STEP_S), speed)
     rate, lags, scores = _best_rate(video, speed)
     assert rate == pytest.approx(1.01, abs=0.001)
-    assert lags[scores.argmax()] * STEP == pytest.approx(20, abs=0.1)
+    assert lags[scores.argmax()] * STEP_S == pytest.approx(20, abs=0.1)
 
 
 def test_motion_of_something_else_tells_no_clock() -> None:
     times = np.arange(0, 11, 0.04)
     other = np.random.default_rng(5).gamma(2.0, 1.0, len(times) - 1)
-    with pytest.raises(NeecoError, match=r"tool\.csv: its clock cannot be told"):
+    with pytest.raises(NeecoError, match=r"tool\.csv: its clock cannot be determined"):
         clock_from_instrument(other, times, instrument_log(0.0))

@@ -51,16 +51,10 @@ def made(folder: Path, **changes) -> IngestResult:
     times = np.array([frame.state.time for frame in capture.frames])
     clock = ClockOffset(0.0388, 0.0012, "scope motion")
     registration = Registration(
-        4.4,
-        np.eye(3),
-        np.zeros(3),
-        np.eye(4),
-        clock,
-        0.004,
-        np.full(count, 0.5),
-        np.full(count, 0.003),
-        np.arange(count),
-    )
+        scale=4.4, rotation=np.eye(3), translation=np.zeros(3), camera_from_sensor=np.eye(4), clock=clock,
+        scale_sd=0.004, position_residual=np.full(count, 0.5), rotation_residual=np.full(count, 0.003),
+        used=np.arange(count),
+    )  # fmt: skip
     dropped = tuple((frame, f"blurred: {frame % 50}% of its neighbours' sharpness") for frame in (96, 97, 98, 105))
     result = IngestResult(
         capture=folder, recording="rec <1>.yaml", video_frames=106, video_fps=25.0, size=(240, 192),

@@ -16,6 +16,7 @@ from rod_world import CAMERA, FakeRun, rod_state
 
 from neeco.capture.model import State
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene import GaussianScene
@@ -39,7 +40,6 @@ from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import SampleGenerator
 from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.settings import Settings
-from neeco.synthesis.states import rigid
 
 SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0)
 
@@ -82,7 +82,7 @@ def test_a_file_may_say_a_number_a_range_or_for_which_share(tmp_path: Path) -> N
         ("- gamma", "names no effect"),
         ("gamma: [1, 2", r"line 1: not valid YAML \(expected"),
         ("gamma: " + "9" * 400, r"gamma: 9+ is out of range"),
-        ("gamma: [1, 2, &a [*a]]", "its aliases unfold without measure"),
+        ("gamma: [1, 2, &a [*a]]", "its aliases unfold to too many values"),
         ("gama: 1", "gama: no such effect; there are shutter_s"),
         ("gamma: often", "gamma: 'often' is no range"),
         ("gamma: [1]", r"gamma: \[1\] is no range"),

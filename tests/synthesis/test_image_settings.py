@@ -105,7 +105,7 @@ def test_everything_in_a_data_set_agrees_with_its_size_and_format(run, tmp_path)
 def test_what_is_drawn_through_the_lens_is_the_undistorted_drawing_once_it_is_undistorted(lens_scene, state):
     """At four times the size, so that edges are no more than a few pixels of many."""
     pinhole = lens_scene.recorded.cameras[0].resized(256, 192)
-    bent = LENS.before(lens_scene.recorded.cameras[0]).resized(256, 192)
+    bent = LENS.distorted_camera(lens_scene.recorded.cameras[0]).resized(256, 192)
     lens = Lens.of(bent)
     labeller = CompositedLabels(lens_scene)
     straight, drawn = (draw_layers(lens_scene, labeller, state(y=8.0), camera, 0.01) for camera in (pinhole, bent))

@@ -12,6 +12,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.capture.readers import read_states
 from neeco.capture.writer import state_to_json
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid
 from neeco.synthesis.samplers import SIMILAR, OrbitViews, PerturbedViews, RecordedViews, instrument_axes, make_sampler
 from neeco.synthesis.states import (
     ExtrapolatedStates,
@@ -20,7 +21,6 @@ from neeco.synthesis.states import (
     JointRange,
     PathStates,
     interpolate_pose,
-    rigid,
     turn_about,
     with_poses,
 )

@@ -1,4 +1,4 @@
-"""What all readers share: values that know their place in a file, the problems found in them, and what was read."""
+"""Values of JSON and YAML files that know their place, and reports of the problems found in them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from neeco.errors import NeecoError
 from neeco.geometry.rotations import rigid_fault
 
-MANY_ALIKE = 3  # problems like another one, from which they are counted instead of listed
+MIN_CONDENSED = 3  # problems similar to another one, from which they are counted instead of listed
 VARYING = re.compile(
     r"'(?:[^'\\]|\\.)*'|\S+\.(?:png|jpe?g)\b|[-+]?\d[\d.]*(?:e[-+]?\d+)?|\b(?:nan|inf)\b", re.IGNORECASE
 )
@@ -21,14 +21,14 @@ VARYING = re.compile(
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong: which file and field, what is wrong there, and what to do about it."""
+    """A fault of a file: its place, what is wrong there, and what to do about it."""
 
     severity: Literal["error", "warning"]
     file: str
     field: str
     message: str
     remedy: str
-    contradicted: bool = False  # a warning: the images say that what is recorded is wrong
+    contradicted: bool = False  # a warning: the images contradict what is recorded
 
     def __str__(self) -> str:
         place = f"{self.file}: {self.field}" if self.field else self.file
@@ -41,14 +41,14 @@ def errors_only(problems: list[Problem]) -> list[Problem]:
 
 
 def condensed(problems: Sequence[Problem]) -> list[Problem]:
-    """The problems, those that differ in their numbers and quoted names alone as one with its count."""
+    """Merge problems that differ only in numbers and quoted names into one with its count."""
     groups: dict[tuple[str, ...], list[Problem]] = {}
     for problem in problems:
         key = (VARYING.sub("#", part) for part in (problem.file, problem.field, problem.message, problem.remedy))
         groups.setdefault((problem.severity, *key), []).append(problem)
     found = []
     for first, *others in groups.values():
-        many = len(others) >= MANY_ALIKE
+        many = len(others) >= MIN_CONDENSED
         found.append(replace(first, message=f"{first.message} (and {len(others)} more like it)") if many else first)
         found += [] if many else others
     return found
@@ -134,11 +134,11 @@ class Node:
 
     @property
     def reported(self) -> bool:
-        """Whether a problem of this place is known already."""
+        """True if a problem of this place is reported already."""
         return any((problem.file, problem.field) == (self.file, self.field) for problem in self.report.problems)
 
     def has(self, key: str) -> bool:
-        """Whether the object has this key with a value other than null."""
+        """Return True if the object has this key with a value other than null."""
         return isinstance(self.value, dict) and self.value.get(key) is not None
 
     def child(self, key: str) -> Node:
@@ -161,7 +161,7 @@ class Node:
             yield self.item(index)
 
     def is_object(self) -> bool:
-        """Whether this is an object; reports an error otherwise."""
+        """Return True if this is an object; report an error otherwise."""
         if isinstance(self.value, dict):
             return True
         self.error(f"expected an object, found {printable(self.value)}")
@@ -211,7 +211,7 @@ class Node:
         return found if len(found) == count else None
 
     def range(self, unit: str) -> tuple[float, float] | None:
-        """Least and greatest of something."""
+        """A range: two numbers, the least first."""
         ends = self.numbers(2, f"least and greatest, {unit}")
         if ends is None:
             return None

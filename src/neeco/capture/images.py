@@ -36,8 +36,8 @@ def read_image(path: Path, size: tuple[int, int] | None = None, background: floa
 
 
 def read_image_bytes(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> Tensor:
-    """As `read_image`, as uint8 [H, W, 3]; without a float image between where the file has 8 bits, which would leave
-    holes of three times its size in the memory of whoever reads many."""
+    """`read_image` as uint8 [H, W, 3]. Files of 8 bits are read without a float image, which would fragment the memory
+    of a process that reads many."""
     image = open_image(path, size)
     if image.mode in ("RGB", "L", "P") and not _is_transparent(image):
         return torch.from_numpy(np.array(image.convert("RGB")))
@@ -82,7 +82,7 @@ def exif_orientation(path: Path) -> int:
 
 
 def has_alpha(path: Path) -> bool:
-    """Whether an image file has transparency. Raises NeecoError."""
+    """Return True if an image file has transparency. Raises NeecoError."""
     with _opened(path) as image:
         return _is_transparent(image)
 

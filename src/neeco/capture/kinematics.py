@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from neeco.errors import NeecoError
-from neeco.geometry.rotations import rigid_fault, rotation_from_vector
+from neeco.geometry.rotations import rigid, rigid_fault, rotation_from_vector
 
 FIXED, REVOLUTE, PRISMATIC = "fixed", "revolute", "prismatic"
 JOINT_TYPES = (FIXED, REVOLUTE, PRISMATIC)
@@ -49,13 +49,11 @@ class Link:
         """[4, 4] mm at a state's readings."""
         if self.type == FIXED:
             return self.origin
-        value, moved = self.joint_value(readings), np.eye(4)
+        motion = self.joint_value(readings) * self.axis
         if self.type == PRISMATIC:
-            moved[:3, 3] = value * self.axis
-            return moved @ self.origin
-        moved[:3, :3] = rotation_from_vector(torch.from_numpy(value * self.axis)).numpy()
-        moved[:3, 3] = self.origin[:3, 3] - moved[:3, :3] @ self.origin[:3, 3]
-        return moved @ self.origin
+            return rigid(np.eye(3), motion) @ self.origin
+        turn = rotation_from_vector(torch.from_numpy(motion)).numpy()
+        return rigid(turn, self.origin[:3, 3] - turn @ self.origin[:3, 3]) @ self.origin
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,14 +139,14 @@ class KinematicTree:
         return np.array(rows, np.float64).reshape(len(self.joints), len(self.bodies))
 
     def carries(self, joint: Link, body: Link) -> bool:
-        """Whether `body` moves with the joint of `joint`."""
+        """Return True if `body` moves with the joint of `joint`."""
         link: Link | None = body
         while link is not None and link.name != joint.name:
             link = None if link.parent is None else self.links[self._index[link.parent]]
         return link is not None
 
     def to_json(self) -> dict[str, Any]:
-        """What `neeco.capture.readers.kinematics` reads."""
+        """The `kinematics` block that `neeco.capture.readers.kinematics` reads."""
         written: dict[str, Any] = {"links": [_link_to_json(link) for link in self.links]}
         return written if self.pose_of is None else {"pose_of": self.pose_of} | written
 

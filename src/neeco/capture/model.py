@@ -35,16 +35,16 @@ MIN_DEVIATION = 1e-9  # coordinates that vary less in the recording do not count
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How far an instrument's state may be off: standard deviations."""
+    """Standard deviations of an instrument's state."""
 
     translation_mm: tuple[float, float, float]  # of the origin, in the camera's axes: across, across, depth
-    rotation_deg: tuple[float, float, float]  # about the instrument's x, y, z: tilt, tilt, roll; 180: nobody knows it
+    rotation_deg: tuple[float, float, float]  # about the instrument's x, y, z: tilt, tilt, roll; 180: unknown
     joints_deg: Mapping[str, float] = field(default_factory=dict)  # name -> degrees (mm for sliding joints)
 
 
 @dataclass(frozen=True)
 class InstrumentState:
-    """Where one instrument is and how its joints stand.
+    """Pose and joint values of one instrument.
 
     The pose may be given as a tensor, an array or nested lists; what is no tensor becomes float64. Raises NeecoError
     when it is not 4x4, or given so and no rotation and translation, and for joints that are not finite numbers.
@@ -52,8 +52,8 @@ class InstrumentState:
 
     pose: Tensor  # [4, 4] float64, world_from_instrument, mm
     joints: Mapping[str, float] = field(default_factory=dict)  # name -> rad (mm for sliding joints, named *_mm)
-    trust: float | None = None  # in [0, 1], how far `track` trusts it; None: it was recorded
-    uncertainty: Uncertainty | None = None  # None: nobody said
+    trust: float | None = None  # in [0, 1], confidence of `track`; None: it was recorded
+    uncertainty: Uncertainty | None = None  # None: not stated
 
     if TYPE_CHECKING:  # what may be given
 
@@ -136,7 +136,7 @@ class State:
 
 @dataclass(frozen=True)
 class FromVideo:
-    """What is known of a rigid instrument whose poses were found in the images, from its shaft.
+    """Dimensions of a rigid instrument whose poses were estimated from its shaft in the images.
 
     Its frame then has +z along the shaft, from the handle towards the tip, and its origin on the shaft's axis,
     `working_length_mm` behind the tip as the silhouette shows it."""
@@ -164,7 +164,7 @@ class Instrument:
         return f"Instrument({self.name!r}, joints: {', '.join(self.joints) or 'none'})"
 
     def joint_fault(self, joint: str, value: float, slack: float = 0.0) -> Fault | None:
-        """What is wrong with a value, rad or mm, of a joint, and what to do; None: it may be right. slack: see
+        """Return what is wrong with a value, rad or mm, of a joint, and what to do; None: it may be right. slack: see
         `neeco.plausible.joint_fault`."""
         if joint in self.joints:
             return joint_fault(value, self.joints[joint], self.slides(joint), slack)
@@ -178,7 +178,7 @@ class Instrument:
         return 0.0 if limits is None else (limits[0] + limits[1]) / 2
 
     def slides(self, joint: str) -> bool:
-        """Is a joint's reading a length in mm? As its kinematics state, else by its name."""
+        """Return True if a joint's reading is a length in mm, by its kinematics, else by its name."""
         tree = self.kinematics
         if tree is None or joint not in tree.readings:
             return joint.endswith("_mm")
@@ -194,7 +194,7 @@ class Frame:
     state: State
     split: str  # train, test, unseen, or any other name
     mask_path: Path | None = None  # black pixels are ignored by the loss
-    background: float = 1.0  # what shows through transparent pixels: 0 black, 1 white
+    background: float = 1.0  # colour behind transparent pixels: 0 black, 1 white
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image_path", Path(self.image_path))
@@ -204,7 +204,7 @@ class Frame:
 
     @property
     def name(self) -> str:
-        """The image file's stem; it names everything drawn for this frame."""
+        """The image file's stem; it names everything rendered for this frame."""
         return self.image_path.stem
 
     def load_image(self) -> Tensor:
@@ -259,7 +259,7 @@ class Capture:
         return tuple(frame for frame in self.frames if frame.split == name)
 
     def over(self, tissue: str) -> Capture:
-        """What was recorded over one of several tissues, as a capture of one."""
+        """The capture of one of several tissues."""
         frames = tuple(frame for frame in self.frames if frame.state.tissue == tissue)
         points = next(item.points for item in self.tissues if item.name == tissue)
         return replace(self, frames=frames, points=points, tissues=())
@@ -278,21 +278,21 @@ def _is_finite(value: object) -> bool:
 
 
 def _is_readable(value: object, only_cheaply: bool) -> bool:
-    """Whether a number or tensor may be read; `only_cheaply`: without waiting for a GPU, and none with gradients."""
+    """Return True if a number or tensor may be read; `only_cheaply`: without waiting for a GPU, nor gradients."""
     if not isinstance(value, Tensor):
         return True
     return not value.is_meta and not (only_cheaply and (value.requires_grad or value.device.type != "cpu"))
 
 
 def share_lamps(cameras: Sequence[Camera], states: Sequence[State]) -> tuple[Camera, ...]:
-    """The cameras of a still scope, of which the first (over each tissue, as `states` say) has the lamps beside it: a
-    second one, of a stereo scope, has none of its own."""
+    """Give the cameras of a still scope the lamps of the first one over each tissue: the second camera of a stereo
+    scope has none of its own."""
     shared = []
     firsts: dict[str | None, Tensor] = {}
     for camera, state in zip(cameras, states, strict=True):
         first = firsts.setdefault(state.tissue, camera.world_from_camera)
-        beside = torch.equal(camera.world_from_camera, first)
-        shared.append(camera if beside else replace(camera, world_from_lamps=first))
+        has_lamps = torch.equal(camera.world_from_camera, first)
+        shared.append(camera if has_lamps else replace(camera, world_from_lamps=first))
     return tuple(shared)
 
 
@@ -314,7 +314,7 @@ class RecordedStates:
 
     @property
     def still(self) -> bool:
-        """Whether nothing moved, so that no state is nearer than another."""
+        """True if nothing moved, so that no state is nearer than another."""
         return not self._moving.any()
 
     def distances(self, state: State) -> np.ndarray:

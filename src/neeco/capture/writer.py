@@ -1,4 +1,4 @@
-"""Write a capture as neeco-capture/1, and tell one capture from another by a fingerprint."""
+"""Write a capture as neeco-capture/1, and compute its fingerprint."""
 
 from __future__ import annotations
 
@@ -95,12 +95,14 @@ def fingerprint(capture: Capture) -> str:
             "state": state_to_json(frame.state),
             "background": frame.background,
         }
-        sure = {
+        uncertainties = {
             name: uncertainty_to_json(state.uncertainty)
             for name, state in frame.state.instruments.items()
             if state.uncertainty is not None
         }
-        description |= {"uncertainty": sure} if sure else {}  # captures without keep their older fingerprint
+        description |= (
+            {"uncertainty": uncertainties} if uncertainties else {}
+        )  # captures without keep their older fingerprint
         digest.update(json.dumps(description).encode())
         for path in (frame.image_path, frame.mask_path):
             digest.update(b"-" if path is None else hashlib.sha256(read_bytes(path, "an image")).digest())
@@ -123,7 +125,7 @@ def fingerprint(capture: Capture) -> str:
 
 
 def state_to_json(state: State) -> dict[str, Any]:
-    """The state as `read_states` takes it."""
+    """The line of a state that `read_states` reads."""
     return ({} if state.tissue is None else {"tissue": state.tissue}) | {
         "time": state.time,
         "instruments": [
@@ -138,13 +140,13 @@ def camera_to_json(world_from_camera: np.ndarray) -> list[list[float]]:
     return (swap_camera_axes(world_from_camera) + 0.0).tolist()  # + 0.0: no negative zeros
 
 
-def from_video_to_json(seen: FromVideo) -> dict[str, float]:
-    """As `parse_from_video` takes it."""
-    return asdict(seen)
+def from_video_to_json(shaft: FromVideo) -> dict[str, float]:
+    """The `from_video` block that `parse_from_video` reads."""
+    return asdict(shaft)
 
 
 def uncertainty_to_json(uncertainty: Uncertainty) -> dict[str, Any]:
-    """As `parse_uncertainty` takes it."""
+    """The `uncertainty` block that `parse_uncertainty` reads."""
     written: dict[str, Any] = {
         "translation_mm": [float(value) for value in uncertainty.translation_mm],
         "rotation_deg": [float(value) for value in uncertainty.rotation_deg],

@@ -1,4 +1,4 @@
-"""`neeco compare`: several methods on the same frames, under the same budget."""
+"""`neeco compare`: methods compared on the same frames, under the same budget."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Compare:
     output: Path
     """Folder to write; absent, empty, or of this comparison begun earlier."""
     seeds: int = 1
-    """How many seeds of each method, from 0; with 2 or more the tables tell mean and standard deviation."""
+    """How many seeds of each method, from 0; with 2 or more the tables have mean and standard deviation."""
     minutes: float | None = None
     """Each run trains so long by the clock on the wall."""
     cpu_minutes: float | None = None

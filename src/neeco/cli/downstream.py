@@ -35,11 +35,11 @@ class Downstream:
     models: tuple[str, ...] = ("unet",)
     """unet (MONAI's U-Net, masks), dfine (a small D-FINE, boxes), yolo (your own ultralytics program, boxes)."""
     num_real: tuple[str, ...] = ("0", "20", "all")
-    """How many recorded training frames are labelled: numbers or all; 0 teaches with sets alone."""
+    """How many recorded training frames are labelled: numbers or all; 0 trains on sets alone."""
     folds: int = 5
     """Each takes other labelled frames and another seed; intervals are over folds."""
     conditions: tuple[str, ...] = ()
-    """What to teach with, such as real, real+augment, SET, SET+real, SET+soft; default: these but the last."""
+    """Training data, such as real, real+augment, SET, SET+real, SET+soft; default: these but the last."""
     labels: Path | None = None
     """Folder of masks named as the frames, for the recorded training frames; default: the capture's truth."""
     classes: Literal["instrument", "parts"] = "instrument"
@@ -51,7 +51,7 @@ class Downstream:
     steps: int | None = None
     """Optimisation steps of every training; default: the model's own."""
     size: int | None = None
-    """Longer side in pixels of images as a model sees them; default: the model's own. Scores are at full size."""
+    """Longer side in pixels of a model's input images; default: the model's own. Scores are at full size."""
     batch: int | None = None
     """Images in a step; default: the model's own."""
     weights: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()

@@ -1,4 +1,4 @@
-"""The camera of an image: OpenCV axes, pinhole, with the lens and the round border of an endoscope where asked for."""
+"""The camera of an image: a pinhole with OpenCV axes, optionally with distortion and an endoscope's round border."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from neeco.errors import NeecoError
 from neeco.geometry.rotations import as_pose, number_text, position_text
 from neeco.plausible import camera_fault
 
-COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # how many distortion coefficients OpenCV's models have
+COEFFICIENT_COUNTS = (0, 4, 5, 8, 12, 14)  # of OpenCV's distortion models
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5. Gradients reach the pose.
+    """A camera with OpenCV axes (x right, y down, z forward) and pixel centres at +0.5. Gradients reach the pose.
 
-    A pinhole, unless it is given OpenCV's distortion or a round border, black beyond, as an endoscope has. `learned_fx`
-    asks that an image of another size than the learned one show the same picture, larger or smaller (see `draw_through`
-    in neeco.raster.resampling); `Scene.draw` sees to it. The pose may also be given as an array or nested lists, which
-    become float32 (`as_pose`). Raises NeecoError when it is not 4x4, or given so and no rotation and translation, for a
-    size that is not whole and positive, and for other numbers that are not finite.
+    It is a pinhole unless it has OpenCV's distortion or an endoscope's round border, black outside. With `learned_fx`
+    an image of another size than the learned one shows the same picture, larger or smaller (`draw_through` in
+    neeco.raster.resampling; `Scene.draw` sets it). The pose may be an array or nested lists, which become float32
+    (`as_pose`). Raises NeecoError for a pose that is not rigid, a size that is not whole and positive, and other
+    numbers that are not finite.
 
         neeco.Camera(np.eye(4), fx=290, fy=290, cx=160, cy=128, width=320, height=256)
     """
@@ -41,7 +41,7 @@ class Camera:
     distortion: tuple[float, ...] = ()  # k1, k2, p1, p2[, k3, ...]
     border: tuple[float, float, float] | None = None  # px: centre x, y and radius of what the lens shows
     learned_fx: float | None = None  # px, of the images that Gaussians were learned from; None: of ones like this
-    # [4, 4] rigid, mm: the camera that the lamps are beside, where it is another: a stereo scope has lamps once
+    # [4, 4] rigid, mm: the camera next to the lamps, where it is another one: a stereo scope has lamps once
     world_from_lamps: Tensor | None = None
 
     if TYPE_CHECKING:  # what may be given
@@ -72,19 +72,19 @@ class Camera:
             raise NeecoError("Camera: expected numbers of px; correct them") from None
         if fault is not None:
             raise NeecoError(f"Camera: {fault[0]}; {fault[1]}")
-        if len(self.distortion) not in COEFFICIENTS:
+        if len(self.distortion) not in COEFFICIENT_COUNTS:
             raise NeecoError(
                 f"Camera.distortion: has {len(self.distortion)} coefficients; OpenCV has 4, 5, 8, 12 or 14"
             )
         if not shown or (self.border is not None and self.border[2] <= 0):
             raise NeecoError("Camera: distortion, border: must be finite, the radius positive; correct them")
+        object.__setattr__(self, "width", int(self.width))
+        object.__setattr__(self, "height", int(self.height))
 
     def __repr__(self) -> str:
         lens = ", distorted" if self.distortion else ""
         size = f"{self.width}x{self.height} px, fx={number_text(self.fx)}, fy={number_text(self.fy)}"
         return f"Camera({size}, at {position_text(self.world_from_camera)}{lens})"
-        object.__setattr__(self, "width", int(self.width))
-        object.__setattr__(self, "height", int(self.height))
 
     def to(self, device: torch.device | str) -> Camera:
         """The same camera, its pose and that of its lamps on `device`."""
@@ -93,12 +93,12 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether straight lines are straight, and the image has no border."""
+        """True without distortion and border: straight lines are straight."""
         return self.border is None and not any(self.distortion)
 
     @property
     def is_resampled(self) -> bool:
-        """Whether its image is made of that of another camera (see `draw_through` in neeco.raster.resampling)."""
+        """True if its image is resampled from another camera's (`draw_through` in neeco.raster.resampling)."""
         return self.learned_fx is not None or not self.is_pinhole
 
     def resized(self, width: int, height: int) -> Camera:

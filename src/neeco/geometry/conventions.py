@@ -1,4 +1,4 @@
-"""Axis conventions of cameras, by producer, and how each becomes OpenCV's, which this program uses everywhere else.
+"""Axis conventions of cameras, by producer, and their conversion to OpenCV's, which the rest of the program uses.
 
 Two producers may call a frame by one name and mean other axes, so readers name the producer. Frames of robots' bases
 and of trackers have no axes known relative to a camera: registration finds how they stand. `docs/capture.md` shows the

@@ -1,4 +1,4 @@
-"""What a lens makes of an image: OpenCV's distortion, and the round border of an endoscope's field of view."""
+"""Distortion of images by a lens: OpenCV's models, and the round border of an endoscope's field of view."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ import numpy as np
 
 from neeco.geometry.camera import Camera
 
-STEEPEST = 3.0  # slope (72 degrees) of a ray that a lens may bend into the image
-MISSED_PX = 0.05  # by which a ray bent again may miss the pixel that it was found for
-NEWTON_STEPS = 6
-STEP = 4  # px between the pixels whose rays are found; the others' lie between, to a hundredth of a pixel
-NEAR = 1e-6  # slope, over which the derivative of a distortion is taken
+MAX_SLOPE = 3.0  # (72 degrees) of a ray that a lens may bend into the image
+MAX_MISS_PX = 0.05  # distance of a distorted ray from the pixel that it was found for
+N_NEWTON_STEPS = 6
+NODE_SPACING_PX = 4  # between pixels whose rays are computed; the others are interpolated, to 0.01 px
+DERIVATIVE_STEP = 1e-6  # slope, over which the derivative of a distortion is taken
 
 
 class LensField(NamedTuple):
-    """What a camera shows through its lens."""
+    """Rays that a camera shows through its lens."""
 
-    slopes: np.ndarray  # float32 [H, W, 2]: x/z, y/z of the ray seen by every pixel; NaN where none is
-    lowest: np.ndarray  # [2] of them
+    slopes: np.ndarray  # float32 [H, W, 2]: x/z, y/z of the ray of every pixel; NaN where there is none
+    lowest: np.ndarray  # [2] of the slopes
     highest: np.ndarray
 
 
 def distorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    """Slopes [P, 2] (x/z, y/z) as a lens with OpenCV's coefficients k1, k2, p1, p2[, k3, ...] shows them."""
+    """Distort slopes [P, 2] (x/z, y/z) by OpenCV's coefficients k1, k2, p1, p2[, k3, ...]."""
     if not len(slopes) or not any(distortion):
         return slopes
     points = np.concatenate([slopes, np.ones((len(slopes), 1))], 1)
@@ -36,28 +36,28 @@ def distorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
 
 
 def undistorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    """The inverse of `distorted`, by Newton's method. Where the lens shows no ray, anything.
+    """Invert `distorted` by Newton's method; the result is arbitrary where the lens shows no ray.
 
-    cv2.undistortPoints stops after five steps that each gain a digit at most, and takes no more of them in OpenCV 4.
+    cv2.undistortPoints stops after five steps, each of which gains one digit at most.
     """
     if not len(slopes) or not any(distortion):
         return slopes
     found = slopes.astype(np.float64)
     with np.errstate(all="ignore"):
-        for _ in range(NEWTON_STEPS):
+        for _ in range(N_NEWTON_STEPS):
             here = distorted(found, distortion)
             (a, c), (b, d) = (
-                ((distorted(found + NEAR * axis, distortion) - here) / NEAR).T for axis in np.eye(2)
+                ((distorted(found + DERIVATIVE_STEP * axis, distortion) - here) / DERIVATIVE_STEP).T
+                for axis in np.eye(2)
             )  # columns of the Jacobian
             x, y = (slopes - here).T
             found = found + (np.stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)).T
-            found = np.clip(np.nan_to_num(found), -2 * STEEPEST, 2 * STEEPEST)
+            found = np.clip(np.nan_to_num(found), -2 * MAX_SLOPE, 2 * MAX_SLOPE)
     return found
 
 
 def pixels_of_rays(slopes: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels [P, 2] in which `camera` shows the rays of slopes [P, 2] through its lens; NaN where it shows them
-    nowhere."""
+    """Pixels [P, 2] in which `camera` shows rays of slopes [P, 2] through its lens; NaN outside its field of view."""
     field = lens_field(camera)
     margin = 1 / camera.fx  # to the edges of the outermost pixels
     with np.errstate(invalid="ignore"):
@@ -73,14 +73,14 @@ def rays_of_pixels(pixels: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def within(pixels: np.ndarray, border: tuple[float, float, float]) -> np.ndarray:
-    """[...] bool: which pixels [..., 2] lie within a round border (centre x, y and radius, px)."""
+    """Mask [...] bool of pixels [..., 2] within a round border (centre x, y and radius, px)."""
     x, y, radius = border
     return np.hypot(pixels[..., 0] - x, pixels[..., 1] - y) < radius
 
 
 def field_pinhole(camera: Camera) -> Camera:
-    """The pinhole at the same place and of the same focal lengths that sees all that `camera` sees through its lens;
-    where there is no distortion, in the same pixels."""
+    """The pinhole camera of the same pose and focal lengths whose image covers all that `camera` shows through its
+    lens; without distortion, in the same pixels."""
     if camera.is_pinhole:
         return camera
     field = lens_field(camera)
@@ -99,7 +99,7 @@ def field_pinhole(camera: Camera) -> Camera:
 
 
 def lens_field(camera: Camera) -> LensField:
-    """What `camera` shows through its lens. The same arrays are given to everyone who asks."""
+    """Rays that `camera` shows through its lens. The arrays are cached and must not be changed."""
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     return _lens_field(intrinsics, camera.width, camera.height, camera.distortion, camera.border)
 
@@ -113,10 +113,10 @@ def _lens_field(
     border: tuple[float, float, float] | None,
 ) -> LensField:
     focal, center = np.array(intrinsics[:2]), np.array(intrinsics[2:])
-    nodes = _centers(width // STEP + 2, height // STEP + 2, STEP)
+    nodes = _centers(width // NODE_SPACING_PX + 2, height // NODE_SPACING_PX + 2, NODE_SPACING_PX)
     slopes = undistorted((nodes.reshape(-1, 2) - center) / focal, distortion)
     again = distorted(slopes, distortion) * focal + center
-    shown = (np.abs(slopes) <= STEEPEST).all(1) & (np.abs(again - nodes.reshape(-1, 2)) < MISSED_PX).all(1)
+    shown = (np.abs(slopes) <= MAX_SLOPE).all(1) & (np.abs(again - nodes.reshape(-1, 2)) < MAX_MISS_PX).all(1)
     slopes = np.where(shown[:, None], slopes, np.nan).reshape(nodes.shape).astype(np.float32)
     slopes = _between(_between(slopes, height).transpose(1, 0, 2), width).transpose(1, 0, 2)
     if border is not None:
@@ -127,13 +127,13 @@ def _lens_field(
 
 
 def _centers(width: int, height: int, step: int = 1) -> np.ndarray:
-    """[height, width, 2] centres of an image's pixels, or of every `step`-th."""
+    """Centres [height, width, 2] of an image's pixels, or of every `step`-th."""
     rows, columns = np.mgrid[0:height, 0:width] * step + 0.5
     return np.stack([columns, rows], -1)
 
 
 def _between(nodes: np.ndarray, count: int) -> np.ndarray:
-    """[count, ...] linear between nodes [N, ...] that are STEP apart; NaN beside a node that is."""
-    place = np.arange(count) // STEP
-    share = (np.arange(count) % STEP / np.float32(STEP)).astype(np.float32)[:, None, None]
+    """Interpolate [count, ...] linearly between nodes [N, ...] NODE_SPACING_PX apart; NaN next to NaN nodes."""
+    place, rest = np.divmod(np.arange(count), NODE_SPACING_PX)
+    share = (rest / np.float32(NODE_SPACING_PX)).astype(np.float32)[:, None, None]
     return (1 - share) * nodes[place] + share * nodes[place + 1]

@@ -1,4 +1,4 @@
-"""The lens that a recording was made through: undistorted at ingest, kept so that images can be drawn as it sees."""
+"""The lens of a recording: images are undistorted at ingest; the lens is kept to render images as it shows them."""
 
 from __future__ import annotations
 
@@ -23,17 +23,15 @@ Border = tuple[float, float, float]  # centre x, y and radius, px
 
 @dataclass(frozen=True)
 class Lens:
-    """Focal lengths and principal point, px, pixel centres at +0.5; distortion: OpenCV's k1, k2, p1, p2[, k3, ...],
-    empty for a pinhole; size: (width, height) of the images it was measured on, None when nothing says it; border: of
-    the round field of view in its images, None where they have none."""
+    """Intrinsics, distortion and field of view of a lens. Pixel centres are at +0.5."""
 
-    fl_x: float
+    fl_x: float  # px
     fl_y: float
     cx: float
     cy: float
-    distortion: tuple[float, ...] = ()
-    size: tuple[int, int] | None = None
-    border: Border | None = field(default=None, kw_only=True)
+    distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2[, k3, ...]; empty: a pinhole
+    size: tuple[int, int] | None = None  # (width, height) of the images it was measured on; None: unknown
+    border: Border | None = field(default=None, kw_only=True)  # of a round field of view
 
     @property
     def distorted(self) -> bool:
@@ -45,18 +43,18 @@ class Lens:
         return self.fl_x, self.fl_y, self.cx, self.cy
 
     def camera(self, world_from_camera: np.ndarray) -> Camera:
-        """A pinhole's camera at a pose [4, 4] with OpenCV axes."""
+        """Camera of a lens without distortion at a pose [4, 4], OpenCV axes."""
         assert self.size is not None
         assert not self.distorted
         return Camera(torch.from_numpy(world_from_camera.copy()), *self.intrinsics, *self.size)
 
-    def before(self, pinhole: Camera) -> Camera:
-        """The camera that recorded what `pinhole` sees once it is undistorted."""
+    def distorted_camera(self, pinhole: Camera) -> Camera:
+        """The camera with this lens that recorded what `pinhole` shows after undistortion."""
         assert self.size is not None
         fx, fy, cx, cy = self.intrinsics
         width, height = self.size
-        seen = replace(pinhole, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
-        return replace(seen, distortion=self.distortion, border=self.border)
+        camera = replace(pinhole, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+        return replace(camera, distortion=self.distortion, border=self.border)
 
     @classmethod
     def of(cls, camera: Camera) -> Lens:
@@ -65,18 +63,18 @@ class Lens:
         return cls(camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion, size, border=camera.border)
 
     def to_json(self) -> dict[str, Any]:
-        """As a capture's transforms.json has it: w and h, px, and the intrinsics."""
+        """The `lens` block of transforms.json: w and h, px, and the intrinsics."""
         assert self.size is not None
         return {"w": self.size[0], "h": self.size[1], **self.intrinsics_json()}
 
     def intrinsics_json(self) -> dict[str, Any]:
-        """fl_x, fl_y, cx, cy, px, and where there are any k1, k2, p1, p2, k3 ... and border {cx, cy, radius}, px."""
+        """Intrinsics fl_x, fl_y, cx, cy, px, and where given k1, k2, p1, p2, k3 ... and border {cx, cy, radius}, px."""
         found: dict[str, Any] = dict(zip(INTRINSICS, self.intrinsics, strict=True))
         found |= dict(zip(COEFFICIENT_NAMES, self.distortion, strict=False))
         return found if self.border is None else found | {"border": dict(zip(BORDER, self.border, strict=True))}
 
     def check_size(self, size: tuple[int, int], source: object) -> None:
-        """Raise NeecoError when measured on images of another size than (width, height). source: named in it."""
+        """Raise NeecoError naming `source` when the lens was measured on images of another size (width, height)."""
         if self.size is not None and self.size != tuple(size):
             measured, found = "x".join(map(str, self.size)), "x".join(map(str, size))
             raise NeecoError(
@@ -88,8 +86,8 @@ class Lens:
             raise NeecoError(f"{source}: {fault[0]}; {fault[1]}")
 
     def pinhole(self, size: tuple[int, int]) -> Lens:
-        """The pinhole of undistorted images (width, height): zoomed so that every pixel shows something. Raises
-        NeecoError when the distortion folds the image over."""
+        """Pinhole of undistorted images (width, height), zoomed so that every pixel is defined. Raises NeecoError when
+        the distortion folds the image over."""
         if not self.distorted:
             return Lens(*self.intrinsics, (), size)
         matrix, _ = cv2.getOptimalNewCameraMatrix(self._matrix(), self._coefficients(), size, 0.0)
@@ -101,11 +99,11 @@ class Lens:
         return found
 
     def undistort(self, image: np.ndarray) -> np.ndarray:
-        """An image uint8 [H, W, 3] (or [H, W]) as `pinhole` sees it, bilinear."""
+        """Undistort an image uint8 [H, W, 3] (or [H, W]) to that of `pinhole`, bilinear."""
         return self._remap(image, cv2.INTER_LINEAR)
 
     def undistort_mask(self, mask: np.ndarray) -> np.ndarray:
-        """A mask bool [H, W] as `pinhole` sees it."""
+        """Undistort a mask bool [H, W] to that of `pinhole`."""
         return self._remap(mask.astype(np.uint8), cv2.INTER_NEAREST) > 0
 
     def _remap(self, image: np.ndarray, interpolation: int) -> np.ndarray:
@@ -115,17 +113,17 @@ class Lens:
         return cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_CONSTANT)
 
     def _folds(self, pinhole: Lens, size: tuple[int, int]) -> bool:
-        """Whether somewhere in the undistorted image a ray farther out is not seen farther out."""
+        """Return True if anywhere in the undistorted image a ray farther out is not distorted farther out."""
         x = np.array([-pinhole.cx, size[0] - pinhole.cx]) / pinhole.fl_x
         y = np.array([-pinhole.cy, size[1] - pinhole.cy]) / pinhole.fl_y
         r2 = np.linspace(0, np.hypot(np.abs(x).max(), np.abs(y).max()), 200) ** 2
         k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *[0.0] * 8)[:8]
         with np.errstate(all="ignore"):
-            seen = np.sqrt(r2) * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        return not bool((np.diff(seen) > 0).all())
+            distorted = np.sqrt(r2) * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return not bool((np.diff(distorted) > 0).all())
 
     def _matrix(self) -> np.ndarray:
-        """K [3, 3] as OpenCV means it: the first pixel's centre at 0."""
+        """K [3, 3] in OpenCV's convention: the first pixel's centre at 0."""
         return np.array([[self.fl_x, 0, self.cx - 0.5], [0, self.fl_y, self.cy - 0.5], [0, 0, 1]])
 
     def _coefficients(self) -> np.ndarray:

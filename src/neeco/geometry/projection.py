@@ -1,4 +1,4 @@
-"""Where points fall in the image of a camera, for torch tensors and numpy arrays alike."""
+"""Projection of points to images and back, for torch tensors and numpy arrays."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def project(points: Array, fx: Any, fy: Any, cx: Any, cy: Any, nearest: float | 
     """Columns and rows [...] px of points [..., 3] mm in a camera's frame (OpenCV axes, pixel centres at +0.5).
 
     fx, fy, cx, cy: px, numbers or what broadcasts with [...]. Points less deep than `nearest` mm, those behind the
-    camera among them, are taken to be that deep; without it a point on the camera's plane becomes infinite and one
-    behind is mirrored. In this order of operations, for results that stay the same to the last bit: x / z * fx + cx.
+    camera among them, count as that deep; without it a point on the camera's plane becomes infinite and one
+    behind is mirrored. The order of operations, x / z * fx + cx, keeps results the same to the last bit.
     """
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     if nearest is not None:
@@ -37,14 +37,14 @@ def project_world(points: Array, camera: Camera, nearest: float | None = None) -
     if isinstance(points, np.ndarray):
         pose = camera.world_from_camera.detach().cpu().double().numpy()
         local = (points - pose[:3, 3]) @ pose[:3, :3]
-        return np.stack(project_seen(local, camera, nearest), axis=-1), local[..., 2]
+        return np.stack(project_local(local, camera, nearest), axis=-1), local[..., 2]
     view = camera.world_from_camera.to(points)
-    seen = (points - view[:3, 3]) @ view[:3, :3]
-    return torch.stack(project_seen(seen, camera, nearest), dim=-1), seen[..., 2]
+    local = (points - view[:3, 3]) @ view[:3, :3]
+    return torch.stack(project_local(local, camera, nearest), dim=-1), local[..., 2]
 
 
 def unproject_world(pixels: Tensor, depths: Tensor, camera: Camera) -> Tensor:
-    """Points [..., 3] mm of the world seen at pixels [..., 2] in depths [...] mm: what `project_world` takes back."""
+    """Points [..., 3] mm of the world at pixels [..., 2] and depths [...] mm: the inverse of `project_world`."""
     pose = camera.world_from_camera.to(depths)
     u, v = pixels.unbind(-1)
     if camera.is_pinhole:
@@ -57,25 +57,25 @@ def unproject_world(pixels: Tensor, depths: Tensor, camera: Camera) -> Tensor:
 
 
 def pixel_centers(rows: int, columns: int) -> Tensor:
-    """[rows, columns, 2] middles of an image's pixels, column before row."""
+    """Centres [rows, columns, 2] of an image's pixels, column before row."""
     down, across = torch.meshgrid(torch.arange(rows) + 0.5, torch.arange(columns) + 0.5, indexing="ij")
     return torch.stack([across, down], -1)
 
 
 def in_image(points: Tensor, camera: Camera) -> Tensor:
-    """[P] bool: which points [P, 3] mm of the world fall into the camera's image, whatever stands before them."""
+    """Mask [P] bool of points [P, 3] mm of the world that project into the image, whether occluded or not."""
     pixels, depths = project_world(points, camera)
     u, v = pixels.unbind(-1)
     return (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (depths > camera.near)
 
 
-def project_seen(points: Array, camera: Camera, nearest: float | None = None) -> tuple[Array, Array]:
-    """`project` of points [..., 3] mm in the camera's frame by its own numbers, through its lens: NaN where it does not
-    show them. No gradients through a lens."""
+def project_local(points: Array, camera: Camera, nearest: float | None = None) -> tuple[Array, Array]:
+    """Columns and rows [...] px of points [..., 3] mm in the camera's frame, through its lens; NaN outside its field of
+    view. No gradients through a lens."""
     if camera.is_pinhole:
         return project(points, camera.fx, camera.fy, camera.cx, camera.cy, nearest)
     if isinstance(points, Tensor):
-        u, v = project_seen(points.detach().cpu().double().numpy(), camera, nearest)
+        u, v = project_local(points.detach().cpu().double().numpy(), camera, nearest)
         return torch.from_numpy(u).to(points), torch.from_numpy(v).to(points)
     slopes = np.stack(project(points, 1.0, 1.0, 0.0, 0.0, nearest), -1)
     pixels = pixels_of_rays(slopes.reshape(-1, 2), camera).reshape(slopes.shape)
@@ -83,9 +83,9 @@ def project_seen(points: Array, camera: Camera, nearest: float | None = None) ->
 
 
 def field_slopes(camera: Camera, camera_means: Tensor) -> Tensor:
-    """x/z and y/z [N, 2] of means [N, 3] (mm, camera frame), brought into the field of view and its margin.
+    """Slopes x/z and y/z [N, 2] of means [N, 3] (mm, camera frame), clamped to the field of view and its margin.
 
-    A Gaussian beside the camera, whose slopes are enormous, may still reach into the image.
+    A Gaussian at the side of the camera has enormous slopes and may still reach into the image.
     """
     margin_x = FIELD_MARGIN * 0.5 * camera.width / camera.fx
     margin_y = FIELD_MARGIN * 0.5 * camera.height / camera.fy

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -10,8 +10,10 @@ from torch import Tensor
 
 from neeco.errors import NeecoError
 
+Array = TypeVar("Array", Tensor, np.ndarray)
+
 RIGID_TOLERANCE = 2e-3  # of R^T R - I; JSON with three decimals passes, a scale of 1.001 passes, a shear does not
-LARGEST = 1e9  # of any entry of a pose
+MAX_ENTRY = 1e9  # of a pose
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
@@ -89,8 +91,12 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
     return axis * torch.where(sine > 1e-8, angle / sine.clamp_min(1e-12), torch.full_like(sine, 2.0))
 
 
-def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
-    """Assemble [..., 4, 4] from rotations [..., 3, 3] and translations [..., 3]."""
+def rigid(rotation: Array, translation: Array) -> Array:
+    """Assemble poses [..., 4, 4] from rotations [..., 3, 3] and translations [..., 3], tensors or float64 arrays."""
+    if isinstance(rotation, np.ndarray):
+        pose = np.zeros((*rotation.shape[:-2], 4, 4))
+        pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, translation, 1
+        return pose
     top = torch.cat([rotation, translation[..., None]], -1)
     bottom = torch.zeros_like(top[..., :1, :])
     bottom[..., 3] = 1
@@ -103,8 +109,7 @@ def rigid_from_vector(vector: Tensor) -> Tensor:
 
 
 def rotate_about(points: Tensor, axis: Tensor, pivot: Tensor, angle: Tensor) -> Tensor:
-    """Turn points [M, 3] by `angle` [M] rad about the line through `pivot` [3] along the unit `axis` [3]
-    (Rodrigues)."""
+    """Rotate points [M, 3] by `angle` [M] rad about the line through `pivot` [3] along unit `axis` [3] (Rodrigues)."""
     arm = points - pivot
     cosine, sine = angle.cos()[:, None], angle.sin()[:, None]
     along = (arm @ axis)[:, None] * axis
@@ -119,7 +124,7 @@ def axis_angle_quat(axis: Tensor, angle: Tensor) -> Tensor:
 
 
 def spread_directions(count: int) -> Tensor:
-    """[count, 3] float64 unit directions, evenly spread (a spiral by the golden angle)."""
+    """Unit directions [count, 3] float64, evenly spread (a spiral by the golden angle)."""
     k = torch.arange(count, dtype=torch.float64)
     z, turn = 1 - (2 * k + 1) / count, k * torch.pi * (3 - 5**0.5)
     ring = (1 - z * z).sqrt()
@@ -127,16 +132,16 @@ def spread_directions(count: int) -> Tensor:
 
 
 def rotation_error(matrices: np.ndarray) -> np.ndarray:
-    """How far matrices [..., 3, 3] are from orthonormal: the largest entry of R^T R - I, [...]."""
+    """Deviation [...] of matrices [..., 3, 3] from orthonormal: the largest entry of R^T R - I."""
     return np.abs(np.swapaxes(matrices, -1, -2) @ matrices - np.eye(3)).max(axis=(-2, -1))
 
 
 def rigid_fault(matrix: np.ndarray) -> tuple[str, str] | None:
-    """Why a matrix [4, 4] float64 is no rigid transform, and what to do; None when it is one."""
+    """Return why a matrix [4, 4] float64 is no rigid transform, and what to do; None when it is one."""
     if not np.isfinite(matrix).all():
         return "contains NaN or infinity", "drop the frame or repair its pose"
-    if np.abs(matrix).max() > LARGEST:
-        return f"has entries beyond {LARGEST:g}", "repair the pose; lengths are millimetres"
+    if np.abs(matrix).max() > MAX_ENTRY:
+        return f"has entries beyond {MAX_ENTRY:g}", "repair the pose; lengths are millimetres"
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         transposed = np.abs(matrix[:, 3] - [0, 0, 0, 1]).max() <= 1e-6
         remedy = "transpose it: the translation is the last column" if transposed else "repair the matrix"
@@ -153,11 +158,11 @@ def rigid_fault(matrix: np.ndarray) -> tuple[str, str] | None:
 
 
 def as_pose(value: Any, field: str, dtype: torch.dtype) -> Tensor:
-    """A rigid transform [4, 4] given as a tensor, an array or nested lists, as a tensor.
+    """Return a rigid transform [4, 4], a tensor, an array or nested lists, as a tensor.
 
-    A tensor of floats is taken as it is: its type, device and gradients stay, only its shape is checked. All else is
-    copied to `dtype` on the CPU. Raises NeecoError naming `field` for another shape, and for numbers (of what is no
-    tensor) that are no rotation and translation.
+    A tensor of floats is returned with its type, device and gradients; only its shape is checked. Anything else is
+    copied to `dtype` on the CPU. Raises NeecoError naming `field` for another shape, and for arrays and lists that are
+    not a rotation and translation.
     """
     if isinstance(value, Tensor) and value.is_floating_point():
         if value.shape != (4, 4):

@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ import torch
 
 from neeco.capture.checks.frames import masks_fault, measure_hidden, sample_points
 from neeco.capture.documents import ProblemReport, condensed
-from neeco.capture.images import read_mask, write_labels
+from neeco.capture.images import read_mask, write_image, write_labels
 from neeco.capture.model import Capture, Frame, evenly_spaced
 from neeco.capture.readers import capture_of, parse_capture
 from neeco.capture.readers.endonerf import MASKS, folder_images
@@ -23,13 +23,12 @@ from neeco.capture.readers.parsed import Parsed
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY, new_folder, own_folder
-from neeco.geometry.lens import Border
+from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
-from neeco.ingest.cameras.undistortion import undistort_frames
 
 
 def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
-    """Write `folder` as a neeco-capture/1 at `output` and say what it lacks, one sentence each.
+    """Write `folder` as a neeco-capture/1 at `output`; return what it lacks, one sentence each.
 
     Images are copied bit by bit; distorted ones are undistorted, and their lens is kept. Frames without an image are
     left out. EndoNeRF's tool masks become loss masks that ignore the tool; where no frame has a mask, an endoscope's
@@ -60,7 +59,7 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
         undistorted = undistort_frames(frames, work / "undistorted", border)
         notes += undistorted.notes
         capture = replace(capture, frames=undistorted.frames, lens=undistorted.lens or capture.lens)
-        notes += _doubtful_masks(capture)
+        notes += _inverted_masks(capture)
         write_capture(capture, work / "capture")
     settled = ("instruments", "units")  # warnings that `_lacking` says; converting settles those of masks
     warnings = [problem for problem in report.problems if problem.severity == "warning" and problem.file != f"{MASKS}/"]
@@ -69,15 +68,15 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
 
 
 def _absent_images(parsed: Parsed) -> list[str]:
-    """What to say of frames whose images are not there."""
+    """Return notes on frames whose images are missing."""
     if not (count := len(parsed.absent)):
         return []
     total, first = count + len(parsed.frames), parsed.absent[0]
     return [f"Left out: {count} of {total} frames, which have no image ({first.field}: {first.message})."]
 
 
-def _doubtful_masks(capture: Capture) -> list[str]:
-    """What to say of loss masks that may be inverted."""
+def _inverted_masks(capture: Capture) -> list[str]:
+    """Return notes on loss masks that may be inverted."""
     masked = [frame for frame in capture.frames if frame.mask_path is not None]
     found = []
     for index in evenly_spaced(len(masked), MAX_BORDER_FRAMES, floor=True):
@@ -90,7 +89,7 @@ def _doubtful_masks(capture: Capture) -> list[str]:
 
 
 def _shared_border(frames: Sequence[Frame]) -> Border | None:
-    """The endoscope's dark border that all frames share; None where there is none or they differ in size. Raises
+    """Return the endoscope's dark border that all frames share; None without one, or where they differ in size. Raises
     NeecoError when an image cannot be read."""
     if len({(frame.camera.width, frame.camera.height) for frame in frames}) != 1:
         return None
@@ -99,7 +98,7 @@ def _shared_border(frames: Sequence[Frame]) -> Border | None:
 
 
 def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
-    """Each frame's tool mask, in the order of the sorted names; [] where there are none."""
+    """Return each frame's tool mask, in the order of the sorted names; [] without any."""
     paths = folder_images(parsed.root, MASKS, report)
     if paths and len(paths) != len(parsed.frames):
         message = f"has {len(paths)} masks for {len(parsed.frames)} images"
@@ -108,9 +107,9 @@ def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
 
 
 def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path) -> tuple[list[Frame], list[str]]:
-    """The frames with loss masks that ignore the tool, and notes on the masks.
+    """Return the frames with loss masks that ignore the tool, and notes on the masks.
 
-    White is the tool, as EndoNeRF writes it, unless that would be more than MOST_HIDDEN of the lit pixels of most
+    White is the tool, as EndoNeRF writes it, unless that would be more than MAX_HIDDEN of the lit pixels of most
     images: then black is the tool, as in StereoMIS. Raises NeecoError for a damaged mask.
     """
     sizes = [(frame.camera.width, frame.camera.height) for frame in frames]
@@ -135,7 +134,7 @@ def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path)
 
 
 def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:
-    """What the capture lacks, and what that costs."""
+    """Return notes on what the capture lacks, and what that costs."""
     sentences = []
     if not parsed.instruments:
         sentences.append(
@@ -158,14 +157,61 @@ def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:
     if masked:
         sentences.append("Tool masks became loss masks: the tool's pixels are ignored, so the tool is not learned.")
     if all(frame.split != "test" for frame in parsed.frames):
-        sentences.append("No test frames: nothing will tell how good the scene is.")
+        sentences.append("No test frames: nothing measures how good the scene is.")
     return sentences
+
+
+@dataclass(frozen=True)
+class Undistorted:
+    """Frames as pinholes see them."""
+
+    frames: tuple[Frame, ...]
+    lens: Lens | None  # through which all of them were recorded; None: there is no distortion, or several lenses
+    notes: list[str]
+
+
+def undistort_frames(frames: Sequence[Frame], folder: Path, border: Border | None) -> Undistorted:
+    """Undistort the frames whose cameras are distorted into `folder`, as PNG; return all.
+
+    border: of the round field of view in the images as recorded. Raises NeecoError for an image that cannot be read and
+    a distortion that folds the image over, naming the image.
+    """
+    count = sum(bool(frame.camera.distortion) for frame in frames)
+    if not count:
+        return Undistorted(tuple(frames), None, [])
+    first, *others = {Lens.of(frame.camera): None for frame in frames}
+    lens = None if others else replace(first, border=border)
+    note = f"of their {1 + len(others)} lenses none is kept" if lens is None else "their lens is kept"
+    straight = [_undistort(frame, folder / str(order)) for order, frame in enumerate(frames)]
+    return Undistorted(tuple(straight), lens, [f"{count} of {len(frames)} images are undistorted; {note}."])
+
+
+def _undistort(frame: Frame, folder: Path) -> Frame:
+    if not frame.camera.distortion:
+        return frame
+    lens = Lens.of(frame.camera)
+    assert lens.size is not None
+    try:
+        pinhole = lens.pinhole(lens.size)
+    except NeecoError as error:
+        raise NeecoError(f"{frame.image_path}: {error}") from None
+    # the parent's name stays: where two images share a stem it tells them apart
+    image = folder / frame.image_path.parent.name / f"{frame.name}.png"
+    pixels = lens.undistort(frame.load_image_bytes().numpy())
+    write_image(image, torch.from_numpy(pixels.astype(np.float32) / 255))
+    mask, mask_path = frame.load_mask(), None
+    if mask is not None:
+        mask_path = folder / "mask.png"
+        write_labels(mask_path, torch.from_numpy(lens.undistort_mask(mask.numpy()).astype(np.uint8) * 255))
+    camera = pinhole.camera(frame.camera.world_from_camera.numpy())
+    return replace(frame, image_path=image, camera=camera, mask_path=mask_path)
 
 
 @contextmanager
 def staged(output: Path) -> Iterator[Path]:
-    """A temporary folder beside `output`, on the same disk, gone afterwards whatever happens (after SIGKILL: when
-    the same `output` is asked for again). What the block leaves in its `capture` becomes `output`.
+    """Yield a temporary folder on the disk of `output`, whose `capture` becomes `output` after the block.
+
+    It is removed whatever happens (after SIGKILL: when the same `output` is asked for again).
 
     Raises NeecoError when something other than an empty folder is at `output`, when another process is making it, and
     when the disk refuses.
@@ -189,7 +235,7 @@ def staged(output: Path) -> Iterator[Path]:
 
 @contextmanager
 def _emptied(folder: Path, place: Path) -> Iterator[None]:
-    """An empty folder of this process's own, gone afterwards, to make `place` in."""
+    """Hold an empty folder of this process's own, to make `place` in; remove it afterwards."""
     try:
         with own_folder(folder, place):
             _clear(folder)

@@ -1,4 +1,4 @@
-"""Footage that is a video: `ingest` finds its cameras, as of a recording without logs."""
+"""Footage given as a video: `ingest` finds its cameras, as for a recording without logs."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from neeco.scene import GaussianScene
 from neeco.tracking.footage_tissue import Report
 from neeco.tracking.track import FOOTAGE
 
-SOURCE = "source.json"  # in it: which video that is
-FARTHEST = 0.5  # quantile of the tissue's distances that is what ingest takes for the whole
+SOURCE = "source.json"  # states the video's hash
+DISTANCE_QUANTILE = 0.5  # of the tissue's distances: what ingest takes for the tissue's distance
 
 
 def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, report: Report) -> Capture:
-    """The footage at `path`: a capture, or a video file, which becomes the capture `FOOTAGE` in the folder `output`.
+    """Read the footage at `path`: a capture, or a video file, which becomes the capture `FOOTAGE` in `output`.
 
-    No video tells lengths: those of a moving scope are such that the tissue lies as far from it as from the cameras
+    A video has no scale: lengths of a moving scope are such that the tissue lies as far from it as from the cameras
     that `scene` remembers. Raises NeecoError for what is neither, a video without cameras, and an `output` that is not
     empty (without `resume`) or holds another video.
     """
@@ -64,7 +64,7 @@ def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, r
 
 
 def _distance(scene: GaussianScene) -> float:
-    """mm, of the tissue from the recorded cameras."""
+    """Return the distance of the tissue from the recorded cameras, mm."""
     tissue = scene.canonical.means[: scene.canonical.counts[0]].cpu()
     places = torch.stack([camera.world_from_camera[:3, 3].float().cpu() for camera in scene.recorded.cameras])
-    return float(torch.cdist(tissue, places).quantile(FARTHEST, dim=0).median())
+    return float(torch.cdist(tissue, places).quantile(DISTANCE_QUANTILE, dim=0).median())

@@ -17,8 +17,8 @@ from neeco.ingest.frames.images import ChosenImages, undistort_images
 from neeco.ingest.frames.views import SfmResult, StageProgress, Views
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.registration.base import BaseRegistration
-from neeco.ingest.registration.clocks import register
-from neeco.ingest.registration.find_bases import check_frames, require_no_base
+from neeco.ingest.registration.clocks import find_instrument_clocks, register
+from neeco.ingest.registration.find_bases import check_frames, find_bases, require_no_base
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.shaft.video_instruments import find_in_video, on_masks
 from neeco.ingest.timing.episodes import Episodes
@@ -28,8 +28,6 @@ from neeco.ingest.world import (
     check_motion,
     longest_lag,
     residual_flow,
-    with_bases,
-    with_instrument_clocks,
 )
 
 
@@ -63,7 +61,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         return passing_masks(views.load, flow, rows, settings.moving_px, views.visible)
 
     data, registration = register(data, views)
-    data = with_instrument_clocks(data, flow, views, progress)
+    data = find_instrument_clocks(data, flow, views, progress)
     bases: dict[str, BaseRegistration] = {}
     shapes: dict[str, RoughShape] = {}
     evidence: dict[int, np.ndarray] = {}
@@ -72,7 +70,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     if registration is None:
         require_no_base(data)
     else:
-        data, bases = with_bases(data, _registered(views, registration), foreground, progress)
+        data, bases = find_bases(data, _registered(views, registration), foreground, progress)
         data = data.with_assumed_clocks()
         progress("finding the instrument", 0, 0)
         on_instruments, shapes, evidence = _carve_instruments(data, sfm, views, flow, registration)

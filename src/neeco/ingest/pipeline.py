@@ -33,7 +33,7 @@ from neeco.ingest.posing.posed_capture import prepare
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.registration.clocks import note_frame_rates
 from neeco.ingest.result import IngestResult
-from neeco.ingest.shaft.video_instruments import NOT_SEEN, instruments_of, uncertainties
+from neeco.ingest.shaft.video_instruments import NOT_VISIBLE, instruments_of, uncertainties
 from neeco.ingest.splits import LEFT_OUT, split_frames
 from neeco.ingest.still_scope import find_still_world, is_still
 from neeco.ingest.timing.compatibility import separate
@@ -143,7 +143,7 @@ def _left_out(world: World, splits: np.ndarray) -> dict[int, str]:
     why = dict.fromkeys(found, "no camera: too few of its features match other frames")
     for row in np.flatnonzero(~world.usable).tolist():
         unseen = shaft is not None and not shaft.known[row]
-        why[int(views.frames[row])] = NOT_SEEN if unseen else "no instrument state at its time (gap in a log)"
+        why[int(views.frames[row])] = NOT_VISIBLE if unseen else "no instrument state at its time (gap in a log)"
     return why | dict.fromkeys(views.frames[world.usable & (splits == LEFT_OUT)].tolist(), "beside an unseen frame")
 
 

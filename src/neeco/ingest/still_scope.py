@@ -18,7 +18,8 @@ from neeco.ingest.frames.images import ChosenImages
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.recording.model import STILL
-from neeco.ingest.registration.find_bases import check_frames
+from neeco.ingest.registration.clocks import find_instrument_clocks
+from neeco.ingest.registration.find_bases import check_frames, find_bases
 from neeco.ingest.shaft.video_instruments import find_in_video
 from neeco.ingest.timing.episodes import Episodes
 from neeco.ingest.world import (
@@ -27,8 +28,6 @@ from neeco.ingest.world import (
     check_motion,
     longest_lag,
     residual_flow,
-    with_bases,
-    with_instrument_clocks,
 )
 
 SAME_PLACE = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
@@ -72,10 +71,10 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     def moving(rows: np.ndarray) -> np.ndarray:
         return moving_masks(views.load, count, rows, views.visible)
 
-    data = with_instrument_clocks(data, residual_flow(cameras, views), views, progress)
+    data = find_instrument_clocks(data, residual_flow(cameras, views), views, progress)
     in_camera = [name for name, log in data.parts[0].poses.items() if log.frame == CAMERA]
     data = replace(data, world_from_base={name: np.eye(4) for name in in_camera})
-    data, bases = with_bases(data, views, moving, progress)
+    data, bases = find_bases(data, views, moving, progress)
     if unplaced := [name for name in data.parts[0].poses if name not in data.world_from_base]:
         data.notes.add(
             f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}, "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,10 +12,8 @@ from neeco.ingest.cameras.still_scene import RightCamera
 from neeco.ingest.foreground.residual_flow import ResidualFlow
 from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.frames.images import ChosenImages
-from neeco.ingest.frames.views import SfmResult, StageProgress, Views
+from neeco.ingest.frames.views import SfmResult, Views
 from neeco.ingest.registration.base import BaseRegistration
-from neeco.ingest.registration.clocks import find_instrument_clocks, has_open_clocks
-from neeco.ingest.registration.find_bases import find_bases
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.shaft.from_video import FoundShaft
 from neeco.ingest.timing.episodes import Episodes, States
@@ -54,27 +52,6 @@ class World:
 def residual_flow(sfm: SfmResult, views: Views) -> ResidualFlow:
     """Return the optical flow between the views that a still scene does not explain."""
     return ResidualFlow(views.load, sfm, views.times, views.pinhole, visible=views.visible, episodes=views.episodes)
-
-
-def with_instrument_clocks(data: Episodes, flow: ResidualFlow, views: Views, progress: StageProgress) -> Episodes:
-    """Return the episodes with the clocks that the scope did not give, from the instruments' motion in the images."""
-    if not has_open_clocks(data):
-        return data
-    progress("finding the instrument's clock", 0, 0)
-    return find_instrument_clocks(data, flow, views)
-
-
-def with_bases(
-    data: Episodes, views: Views, moving: Callable[[np.ndarray], np.ndarray], progress: StageProgress
-) -> tuple[Episodes, dict[str, BaseRegistration]]:
-    """Return the episodes with the bases that the recording states or that are found from what moves; and the latter.
-
-    views: in mm; moving(rows): masks bool [R, h, w] of what moves in rows of them.
-    """
-    if all(item.base is None for item in data.recording.instruments):
-        return data, {}
-    progress("finding the robot's base", 0, 0)
-    return find_bases(data, views, moving)
 
 
 def longest_lag(data: Episodes) -> float:

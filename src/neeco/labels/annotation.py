@@ -16,7 +16,7 @@ from torch import Tensor
 
 from neeco.capture.model import State
 from neeco.geometry.camera import Camera
-from neeco.geometry.projection import project_seen
+from neeco.geometry.projection import project_local
 from neeco.labels.drawing import LayeredDrawing, draw_layers, surface_depth, to_numpy
 from neeco.labels.labellers import CompositedLabels, instruments_of
 from neeco.scene.gaussian_scene import require_gaussians
@@ -122,7 +122,7 @@ def visibility(visible: np.ndarray, unoccluded: np.ndarray) -> float:
 def place_in_image(point: np.ndarray, camera: Camera) -> tuple[float, float, float] | None:
     """Return position (x, y) px and depth mm of a world point [3] mm; None where it is outside of the image."""
     local = (np.linalg.inv(to_numpy(camera.world_from_camera)) @ np.append(point, 1.0))[:3]
-    x, y = project_seen(local, camera, nearest=camera.near)
+    x, y = project_local(local, camera, nearest=camera.near)
     inside = local[2] > camera.near and 0 <= x < camera.width and 0 <= y < camera.height
     return (float(x), float(y), float(local[2])) if inside else None
 

@@ -20,12 +20,12 @@ from neeco.ingest.recording.template import holds_streams, write_template
 from neeco.ingest.sources import RECORDING
 from neeco.report.charts import page_style
 
-FRAMES = 3  # shown
+N_FRAMES = 3  # shown
 MARGIN = 0.15  # of an image's sides, shown around it
 AXIS_SHARE = 0.2  # of a body's distance, that its axes are drawn long
 COLORS = ("#d62728", "#2ca02c", "#1f77b4")  # x, y, z
-LINES = 24  # of a shaft, drawn
-MOST_ROWS = 10  # of choices
+N_LINES = 24  # of a shaft, drawn
+MAX_ROWS = 10  # of choices
 CHOICES = "recording_choices.png"
 
 
@@ -50,8 +50,11 @@ def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
 
 @page_style()
 def write_choice_picture(source: Path, picture: Path) -> bool:
-    """Write a PNG of every way to read the poses in `source` of which something is not said, on three frames as in the
-    camera's frame, and beside them their shaft's lines; False where nothing is open. Raises NeecoError."""
+    """Write a PNG of every way to read the poses in `source` of which something is not stated.
+
+    Each is shown on N_FRAMES frames, as in the camera's frame, and by its shaft's lines. Return False where nothing is
+    open. Raises NeecoError.
+    """
     bodies = open_poses(source)
     rows = [(poses, reading) for poses in bodies for reading in poses.readings]
     if not rows:
@@ -65,8 +68,8 @@ def write_choice_picture(source: Path, picture: Path) -> bool:
         width, height = video.size
         how = "" if lens else ", focal length assumed to be the image's width"
         scene = _Scene(video, lens.intrinsics if lens else (width, width, width / 2, height / 2))
-    shown = rows[:MOST_ROWS]
-    columns = FRAMES + 1
+    shown = rows[:MAX_ROWS]
+    columns = N_FRAMES + 1
     figure = Figure(figsize=(3.6 * columns, 3.1 * len(shown) + 0.7), dpi=80, layout="constrained")
     grid = figure.subplots(len(shown), columns, squeeze=False)
     for axes, (poses, reading) in zip(grid, shown, strict=True):
@@ -82,7 +85,7 @@ def write_choice_picture(source: Path, picture: Path) -> bool:
 
 
 def _draw_frames(row: np.ndarray, poses: OpenPoses, reading: Reading, scene: _Scene | None) -> None:
-    """Three frames with the body's axes on them."""
+    """Draw the body's axes on N_FRAMES frames."""
     for axes in row:
         axes.set_axis_off()
     row[0].set_title(f"{poses.title}\n{reading.title}, frame: {poses.frame}", fontsize=9, loc="left")
@@ -104,14 +107,14 @@ def _draw_frames(row: np.ndarray, poses: OpenPoses, reading: Reading, scene: _Sc
 
 
 def _draw_body(axes: Axes, place: np.ndarray, quat: np.ndarray, scene: _Scene) -> str:
-    """Axes of a body as a camera at the origin sees them (OpenCV's axes); returns where it is, in words,
-    where it is not in view."""
+    """Draw the axes of a body in front of a camera at the origin (OpenCV's axes); return words where it is out of
+    view."""
     if place[2] <= 0:
         return "behind the camera in "
-    start = scene.seen(place)
+    start = scene.pixel(place)
     for axis, color in enumerate(COLORS):
         point = place + AXIS_SHARE * place[2] * axis_directions(quat[None], axis)[0]
-        ends = np.stack([start, scene.seen(point)]).T
+        ends = np.stack([start, scene.pixel(point)]).T
         axes.plot(*ends, color="white", linewidth=4)
         axes.plot(*ends, color=color, linewidth=2.2)
     inside = (start >= 0).all() and (start < scene.video.size).all()
@@ -120,31 +123,31 @@ def _draw_body(axes: Axes, place: np.ndarray, quat: np.ndarray, scene: _Scene) -
 
 @dataclass(frozen=True)
 class _Scene:
-    """The images and what they were taken through. lens: fl_x, fl_y, cx, cy px."""
+    """The images and their lens: fl_x, fl_y, cx, cy px."""
 
     video: VideoSource
     lens: tuple[float, float, float, float]
 
-    def seen(self, point: np.ndarray) -> np.ndarray:
-        """[2] px of a point [3] before the camera."""
+    def pixel(self, point: np.ndarray) -> np.ndarray:
+        """Return px [2] of a point [3] in front of the camera."""
         return np.array(self.lens[:2]) * point[:2] / max(float(point[2]), 1e-9) + self.lens[2:]
 
     def samples(self, poses: OpenPoses) -> list[int]:
-        """Of each part of the poses, the sample whose place is seen nearest to the middle of the image; the part's
+        """Return the sample of each of N_FRAMES parts of the poses that is nearest to the image's middle; the part's
         middle one where all are behind the camera."""
         depths = np.maximum(poses.positions[:, 2:], 1e-9)
         off = np.linalg.norm(np.array(self.lens[:2]) * poses.positions[:, :2] / depths, axis=1)
         off[poses.positions[:, 2] <= 0] = np.inf
         if not np.isfinite(off).any():
             off = np.abs(np.linspace(-1, 1, len(off)))
-        parts = np.array_split(np.arange(len(off)), FRAMES)
+        parts = np.array_split(np.arange(len(off)), N_FRAMES)
         return [int(part[off[part].argmin()]) for part in parts if len(part)]
 
 
 def _draw_lines(axes: Axes, poses: OpenPoses, reading: Reading) -> None:
-    """The tool's path and lines along that of its axes whose lines pass nearest to one point."""
+    """Draw the tool's path, and lines along that of its axes whose lines pass nearest to one point."""
     shaft = shaft_of(poses.positions, reading.quats)
-    chosen = np.unique(np.linspace(0, len(poses.positions) - 1, LINES).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(poses.positions) - 1, N_LINES).round().astype(int))
     directions = axis_directions(reading.quats, shaft.axis)
     middle = poses.positions.mean(0)
     # the plane that shows most of the path and of the lines

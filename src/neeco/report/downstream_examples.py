@@ -1,4 +1,4 @@
-"""What trained models predict on the same recorded frames: where synthetic images help most, and where least."""
+"""Predictions of trained models on the same recorded frames: where synthetic images help most, and least."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def example_sections(experiment: Experiment, capture: Capture, output: Path) -> 
 
 
 def _shown_jobs(experiment: Experiment, model: Mapping[str, Any], split: str) -> list[Job]:
-    """Of one fold: the best job with synthetic images, its reference (itself where there is none), and all that are
-    shown: these two and others with as many labelled frames."""
+    """Select from one fold the best job with synthetic images, its reference (itself where there is none), and all that
+    are shown: these two and others with as many labelled frames."""
     jobs = [job for job in experiment["jobs"] if job["model"] == model["name"] and split in job["splits"]]
     best, reference = _compared(experiment, model, split)
     names = {entry["name"] for entry in experiment["sets"]}
@@ -79,8 +79,8 @@ def _shown_jobs(experiment: Experiment, model: Mapping[str, Any], split: str) ->
 
 
 def _compared(experiment: Experiment, model: Mapping[str, Any], split: str) -> tuple[Key | None, Key | None]:
-    """What gains most by synthetic images, and the labelled frames alone that it gains over. Where no difference is
-    known, the best condition with synthetic images, twice."""
+    """Return the arm that gains most by synthetic images, and the labelled frames alone as its reference. Where no
+    difference is known, the best condition with synthetic images, twice."""
     names = {entry["name"] for entry in experiment["sets"]}
     rows = [
         row
@@ -146,7 +146,7 @@ def _sections_of(
 
 
 class _Predictions:
-    """What one job predicted for a split, with a score by frame. predicts: "masks" or "boxes"."""
+    """The predictions of one job for a split, with a score by frame. predicts: "masks" or "boxes"."""
 
     def __init__(self, output: Path, job: Job, split: str, samples: Sequence[RecordedSample], predicts: str) -> None:
         self.title = title_of(*_key(job))

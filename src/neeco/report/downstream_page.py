@@ -1,4 +1,4 @@
-"""The one-page report of a downstream study: do synthetic images teach a model what recorded frames ask of it?"""
+"""The one-page report of a downstream study: whether synthetic images improve a model on recorded frames."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def write_downstream_report(output: Path, experiment: Experiment, capture: Captu
 
 
 def question(row: Row, experiment: Experiment) -> str:
-    """Which of QUESTIONS a paired difference answers."""
+    """Return the one of QUESTIONS that a paired difference answers."""
     names = {entry["name"] for entry in experiment["sets"]}
     words, others = row["condition"].split("+"), row["against"].split("+")
     synthetic, reference = ([word for word in some if word in names] for some in (words, others))
@@ -109,7 +109,8 @@ def question(row: Row, experiment: Experiment) -> str:
 
 
 def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
-    """Whether synthetic images beside labelled frames help, over all differences to these alone; what is missing."""
+    """Return the headlines: effect of synthetic images with labelled frames against these alone, and what is
+    missing."""
     sentences = [] if experiment["complete"] else ["Not all trainings are finished: these are the numbers so far."]
     rows = [row for pair in models_and_splits(experiment) for row in main_differences(experiment, *pair)]
     counts = Counter(verdict(row) for row in rows if question(row, experiment) == "beside")
@@ -144,7 +145,7 @@ def _findings(experiment: Experiment) -> list[tuple[str, Markup]]:
 
 
 def _family(condition: str) -> str:
-    """A set alone and beside labelled frames are of one family, and share a colour."""
+    """Return the family of a condition: a set alone and with labelled frames share one, and a colour."""
     return "+".join(sorted(word for word in condition.split("+") if word != REAL))
 
 
@@ -240,7 +241,7 @@ def _draw_interval(axes: Axes, y: float, row: Row, reach: float, color: str) -> 
 
 
 def _trainings(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
-    """How trainings went: validation curves, and a line per arm, means over folds."""
+    """Return the section on training: validation curves, and a line per arm, means over folds."""
     done = [job for job in experiment["jobs"] if "error" not in job]
     rows = []
     for arm in arms_of(done):
@@ -331,7 +332,7 @@ def _facts(experiment: Experiment, capture: Capture) -> list[tuple[str, str]]:
 
 
 def _set_words(entry: Row) -> str:
-    """How many images of where, and how they were synthesized."""
+    """Return the size and source of a set, in words."""
     images, made = f"{entry['images']:,} images of {entry['path']}", entry["made_by"]
     if made is None:
         return f"{images}; how they were made is not known: it has no dataset.json"

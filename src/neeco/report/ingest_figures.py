@@ -1,4 +1,4 @@
-"""Pictures of an ingested capture: sample frames with the tracked poses drawn over them, and the tracks in 3D."""
+"""Pictures of an ingested capture: sample frames with the tracked poses over them, and the tracks in 3D."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.report.charts import PALETTE, draw_dots, inline_svg, new_axes, page_style
 from neeco.report.page import MAX_WIDTH, jpeg, to_bytes
 
-SAMPLES = 12  # frames shown
+N_SAMPLES = 12  # frames shown
 AXIS_COLORS = ("#ff5252", "#4cd964", "#4aa8ff")  # x, y, z
 MAIN_AXIS_COLOR = "#ff6bff"
 OUTLINE_COLOR = "#ffe14a"
-NEAR = 1.0  # mm: nearer points are not drawn
+MIN_DEPTH_MM = 1.0  # mm: nearer points are not drawn
 AXIS_SHARE = 0.16  # of the image's width: how long the drawn frame axes are
 ORIGIN = np.zeros((1, 3))
 SHAFT_DIAMETERS = 30.0  # of a shaft found in video that are drawn
 
 WIDTH, HEIGHT, MARGIN = 420, 320, 16  # of a view of the tracks, view box units
-SVG_POINTS, CANVAS_POINTS = 1500, 4000
+MAX_SVG_POINTS, MAX_CANVAS_POINTS = 1500, 4000
 STRAY = 0.01  # share of the points at either end that may lie outside the view
 GAP = 4.0  # median time steps: a longer one breaks the line
-RAYS = 10  # cameras drawn with the direction they look in
+N_RAYS = 10  # cameras drawn with the direction they look in
 LINE_COLORS = ("phase", "good", "bad")  # of the instruments; the camera's is accent
 
 
@@ -49,7 +49,7 @@ class MainAxis:
 
 
 def main_axes(capture: Capture, shapes: Mapping[str, RoughShape]) -> dict[str, MainAxis]:
-    """The long axis of each shape, through its points' mean along their first principal component.
+    """Return the long axis of each shape, through its points' mean along their first principal component.
 
     An instrument comes in from outside the image, so the tip is the end that more frames have in view, or else the one
     nearer to the image's middle. Shapes without an instrument in the capture, or of fewer than 3 points, have none.
@@ -72,41 +72,41 @@ def main_axes(capture: Capture, shapes: Mapping[str, RoughShape]) -> dict[str, M
 
 
 def sample_frames(capture: Capture) -> list[Frame]:
-    """Up to SAMPLES frames, evenly spread over time."""
+    """Return up to N_SAMPLES frames, evenly spread over time."""
     frames = sorted(capture.frames, key=lambda frame: frame.state.time)
-    return [frames[index] for index in evenly_spaced(len(frames), SAMPLES)]
+    return [frames[index] for index in evenly_spaced(len(frames), N_SAMPLES)]
 
 
 def axis_length(capture: Capture) -> float:
-    """A round number of mm that spans about AXIS_SHARE of the image at the instruments' median depth."""
+    """Return a round number of mm that spans about AXIS_SHARE of the image at the instruments' median depth."""
     sizes = []
     for frame in capture.frames:
         for state in frame.state.instruments.values():
             _, (depth,) = _project(ORIGIN, state.pose, frame.camera)
-            if depth > NEAR:
+            if depth > MIN_DEPTH_MM:
                 sizes.append(AXIS_SHARE * frame.camera.width / frame.camera.fx * depth)
     return round_length(float(np.median(sizes)) if sizes else 10.0)
 
 
 def in_view(capture: Capture, name: str) -> float:
-    """Share of an instrument's frames in which its tracked origin lies inside the image."""
+    """Return the share of an instrument's frames in which its tracked origin lies inside the image."""
     frames = [frame for frame in capture.frames if name in frame.state.instruments]
     return sum(shows(frame, frame.state.instruments[name].pose) for frame in frames) / max(len(frames), 1)
 
 
 def shows(frame: Frame, pose: Tensor) -> bool:
-    """Whether the origin of an instrument at `pose`, world_from_instrument [4, 4], lies inside the image."""
+    """Return whether the origin of an instrument at `pose`, world_from_instrument [4, 4], lies inside the image."""
     ((x, y),), (depth,) = _project(ORIGIN, pose, frame.camera)
-    return bool(depth > NEAR and 0 <= x < frame.camera.width and 0 <= y < frame.camera.height)
+    return bool(depth > MIN_DEPTH_MM and 0 <= x < frame.camera.width and 0 <= y < frame.camera.height)
 
 
 def _visibility(point: np.ndarray, name: str, frames: list[Frame]) -> float:
-    """How well a point of an instrument is in view over the frames: more is better."""
+    """Return a score of how well a point of an instrument is in view over the frames: more is better."""
     score = 0.0
     for frame in frames:
         (place,), (depth,) = _project(point[None], frame.state.instruments[name].pose, frame.camera)
         off = np.abs(place / [frame.camera.width, frame.camera.height] - 0.5).max()  # 0.5 at the border
-        score += 0.0 if depth <= NEAR else float(off < 0.5) + 0.1 * max(0.0, 1 - off)
+        score += 0.0 if depth <= MIN_DEPTH_MM else float(off < 0.5) + 0.1 * max(0.0, 1 - off)
     return score
 
 
@@ -118,9 +118,11 @@ def posed_picture(
     length: float,
     shafts: Mapping[str, float],
 ) -> str:
-    """A frame as a data URI, with what is known of instruments at poses, world_from_instrument [4, 4], drawn over it;
-    their axes are `length` mm long. `shafts`: diameters in mm, of those whose z goes along a shaft that ends at their
-    origin. Raises NeecoError when the image cannot be read."""
+    """Draw instruments at poses, world_from_instrument [4, 4], over a frame; return a data URI.
+
+    length: of their axes, mm; shafts: diameters in mm, of those whose z goes along a shaft that ends at their origin.
+    Raises NeecoError when the image cannot be read.
+    """
     # drawn at twice the size shown, then shrunk: smooth lines
     scale = 2 * MAX_WIDTH / frame.camera.width
     fx, fy, cx, cy = (scale * value for value in (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy))
@@ -140,11 +142,11 @@ def posed_picture(
 
 
 def _draw_outline(image: Image.Image, shape: RoughShape, pose: Tensor, camera: Camera) -> None:
-    """The outline of the shape's points, each as large as the grid cell it stands for."""
+    """Draw the outline of the shape's points, each as large as its grid cell."""
     mask = Image.new("L", image.size)
     painter = ImageDraw.Draw(mask)
     for (x, y), z in zip(*_project(shape.points, pose, camera), strict=True):
-        radius = 0.75 * shape.spacing * camera.fx / z if z > NEAR else 0.0
+        radius = 0.75 * shape.spacing * camera.fx / z if z > MIN_DEPTH_MM else 0.0
         if radius and -radius < x < image.width + radius and -radius < y < image.height + radius:
             painter.ellipse((x - radius, y - radius, x + radius, y + radius), fill=255)
     edge = Image.fromarray(outline(np.asarray(mask) > 0).astype(np.uint8) * 255).filter(ImageFilter.MaxFilter(3))
@@ -152,14 +154,14 @@ def _draw_outline(image: Image.Image, shape: RoughShape, pose: Tensor, camera: C
 
 
 def _draw_shaft(painter: ImageDraw.ImageDraw, diameter: float, pose: Tensor, camera: Camera) -> None:
-    """The two contours of a shaft and where it ends."""
+    """Draw the two contours of a shaft and its end."""
     along = np.linspace(-SHAFT_DIAMETERS, 0, 61)[:, None] * diameter * np.array([0.0, 0.0, 1.0])  # [61, 3]
     centre = np.linalg.inv(pose.numpy()) @ camera.world_from_camera.double().numpy()[:, 3]  # of the camera, [4] mm
     aside = np.cross(centre[:3] - along, [0.0, 0.0, 1.0])
     aside *= diameter / 2 / np.linalg.norm(aside, axis=1, keepdims=True)
     pixels, depth = zip(*(_project(along + side * aside, pose, camera) for side in (-1, 1)), strict=True)
     lines = [
-        [tuple(place) for place, z in zip(places, depths, strict=True) if z > NEAR]
+        [tuple(place) for place, z in zip(places, depths, strict=True) if z > MIN_DEPTH_MM]
         for places, depths in zip(pixels, depth, strict=True)
     ]
     for line in (*lines, [line[-1] for line in lines if line]):
@@ -169,11 +171,11 @@ def _draw_shaft(painter: ImageDraw.ImageDraw, diameter: float, pose: Tensor, cam
 
 def _draw_main_axis(painter: ImageDraw.ImageDraw, axis: MainAxis, pose: Tensor, camera: Camera) -> None:
     pixels, depth = _project(np.linspace(axis.tail, axis.tip, 33), pose, camera)
-    visible = [tuple(place) for place, z in zip(pixels, depth, strict=True) if z > NEAR]
+    visible = [tuple(place) for place, z in zip(pixels, depth, strict=True) if z > MIN_DEPTH_MM]
     if len(visible) > 1:
         painter.line(visible, fill="#000000", width=7)
         painter.line(visible, fill=MAIN_AXIS_COLOR, width=4)
-    if depth[-1] > NEAR:
+    if depth[-1] > MIN_DEPTH_MM:
         x, y = pixels[-1]
         painter.ellipse((x - 10, y - 10, x + 10, y + 10), outline="#000000", width=7)
         painter.ellipse((x - 9, y - 9, x + 9, y + 9), outline=MAIN_AXIS_COLOR, width=4)
@@ -181,26 +183,26 @@ def _draw_main_axis(painter: ImageDraw.ImageDraw, axis: MainAxis, pose: Tensor, 
 
 def _draw_frame(painter: ImageDraw.ImageDraw, pose: Tensor, camera: Camera, length: float) -> None:
     pixels, depth = _project(np.concatenate([ORIGIN, length * np.eye(3)]), pose, camera)
-    if depth[0] <= NEAR:
+    if depth[0] <= MIN_DEPTH_MM:
         return
     x, y = start = tuple(pixels[0])
     for width, colors in ((10, ("#000000",) * 3), (6, AXIS_COLORS)):
         for end, z, color in zip(pixels[1:], depth[1:], colors, strict=True):
-            if z > NEAR:
+            if z > MIN_DEPTH_MM:
                 painter.line([start, tuple(end)], fill=color, width=width)
     painter.ellipse((x - 7, y - 7, x + 7, y + 7), fill="#ffffff", outline="#000000", width=2)
 
 
 def _project(points: np.ndarray, pose: Tensor, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """[N, 2] px and [N] depth of points [N, 3] of an instrument at `pose`; pixels behind the camera mean nothing."""
+    """Return px [N, 2] (undefined behind the camera) and depth [N] of points [N, 3] of an instrument at `pose`."""
     world_from_instrument = pose.numpy()
     world = points @ world_from_instrument[:3, :3].T + world_from_instrument[:3, 3]
-    return project_world(world, camera, nearest=NEAR)
+    return project_world(world, camera, nearest=MIN_DEPTH_MM)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tracks:
-    """Everything in one frame: x right, y down, z forward as the cameras look on average; mm."""
+    """Tracks and points in the mean camera's axes (x right, y down, z forward), mm."""
 
     points: np.ndarray  # [P, 3]
     colors: np.ndarray  # [P, 3] in [0, 1]
@@ -212,7 +214,7 @@ class Tracks:
 
 
 def read_tracks(capture: Capture) -> Tracks:
-    """The tracks of a capture. Unregistered instruments are left out: their frame is not the cameras'."""
+    """Return the tracks of a capture, without unregistered instruments: their frame is not the cameras'."""
     frames = sorted(capture.frames, key=lambda frame: frame.state.time)
     poses = np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames])
     axes = _mean_axes(poses)  # [3, 3] columns right, down, forward
@@ -252,7 +254,7 @@ def _mean_axes(poses: np.ndarray) -> np.ndarray:
 
 @page_style()
 def view(tracks: Tracks, title: str, across: np.ndarray, down: np.ndarray) -> str:
-    """The tracks seen along across x down, as inline SVG; both [3] in the tracks' frame."""
+    """Return the tracks projected along across x down, as inline SVG; both [3] in the tracks' frame."""
     plane = np.stack([across, down], axis=1).astype(np.float64)  # [3, 2]
     low, high = _extent(tracks, plane)
     scale = min((WIDTH - 2 * MARGIN) / max(high[0] - low[0], 1e-9), (HEIGHT - 3 * MARGIN) / max(high[1] - low[1], 1e-9))
@@ -265,12 +267,12 @@ def view(tracks: Tracks, title: str, across: np.ndarray, down: np.ndarray) -> st
     axes.set_axis_off()
     axes.set(xlim=(0, WIDTH), ylim=(HEIGHT, 0))
     axes.text(12, 18, title, color=PALETTE["ink"], fontsize=12)
-    step = -(-len(tracks.points) // SVG_POINTS) or 1
+    step = -(-len(tracks.points) // MAX_SVG_POINTS) or 1
     dots = place(tracks.points[::step])
     inside = ((dots > 0) & (dots < [WIDTH, HEIGHT])).all(axis=1)
     draw_dots(axes, dots[inside], gid="points", color=PALETTE["soft"], linewidth=1.7, alpha=0.55)
     _draw_line(axes, place(tracks.camera), tracks.breaks, "accent", 1.8)
-    chosen = np.unique(np.linspace(0, len(tracks.camera) - 1, RAYS).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(tracks.camera) - 1, N_RAYS).round().astype(int))
     ends = tracks.camera[chosen] + 0.12 * float(np.linalg.norm(high - low)) * tracks.looking[chosen]
     rays = np.stack([place(tracks.camera[chosen]), place(ends)], axis=1).reshape(-1, 2)
     _draw_line(axes, rays, np.arange(1, len(rays)) % 2 == 0, "accent", 1.0)
@@ -284,34 +286,34 @@ def view(tracks: Tracks, title: str, across: np.ndarray, down: np.ndarray) -> st
 
 
 def _extent(tracks: Tracks, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[2] low and high of the picture: all tracks, and the points but for strays."""
-    seen = [tracks.camera @ plane, *(track[np.isfinite(track[:, 0])] @ plane for track in tracks.instruments.values())]
+    """Return low and high [2] of the picture: all tracks, and the points but for strays."""
+    shown = [tracks.camera @ plane, *(track[np.isfinite(track[:, 0])] @ plane for track in tracks.instruments.values())]
     if len(tracks.points):
-        seen.append(np.quantile(tracks.points @ plane, [STRAY, 1 - STRAY], axis=0))
-    all_of = np.concatenate(seen)
+        shown.append(np.quantile(tracks.points @ plane, [STRAY, 1 - STRAY], axis=0))
+    all_of = np.concatenate(shown)
     return all_of.min(axis=0), all_of.max(axis=0)
 
 
 def _draw_line(axes: Axes, places: np.ndarray, breaks: np.ndarray, color: str, width: float) -> None:
-    """A line through [F, 2], interrupted at breaks [F - 1] and where a place is unknown."""
+    """Draw a line through [F, 2], interrupted at breaks [F - 1] and where a place is unknown."""
     line = np.insert(places, np.flatnonzero(breaks) + 1, np.nan, axis=0)
     axes.plot(line[:, 0], line[:, 1], color=PALETTE[color], linewidth=width, clip_on=False)
 
 
 def round_length(wanted: float) -> float:
-    """The greatest of 1, 2, 5, 10, 20, ... that is not above `wanted`."""
+    """Return the greatest of 1, 2, 5, 10, 20, ... that is not above `wanted`."""
     power = 10.0 ** np.floor(np.log10(max(wanted, 1e-9)))
     return float(max(step * power for step in (1, 2, 5) if step * power <= wanted * 1.000001))
 
 
 def turning_data(tracks: Tracks) -> dict[str, object]:
-    """What the canvas needs that turns when it is dragged (templates/turning.js)."""
-    step = -(-len(tracks.points) // CANVAS_POINTS) or 1
+    """Return the data of the canvas that turns when it is dragged (templates/turning.js)."""
+    step = -(-len(tracks.points) // MAX_CANVAS_POINTS) or 1
     low, high = _extent(tracks, np.eye(3))
     centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-9)
 
     def packed(positions: np.ndarray) -> str:
-        """Little-endian int16 of positions in units of size / 16000; unknown ones as -32768."""
+        """Return positions as little-endian int16 in units of size / 16000; unknown ones as -32768."""
         units = np.clip((positions - centre) / size * 16000, -32000, 32000)
         whole = np.where(np.isfinite(units), np.rint(np.nan_to_num(units)), -32768).astype("<i2")
         return base64.b64encode(whole.tobytes()).decode("ascii")

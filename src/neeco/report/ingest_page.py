@@ -1,4 +1,4 @@
-"""The page that tells how good an ingest is, before anyone trains on it: one file, offline."""
+"""The page on the quality of an ingest: one file, offline."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, capture: Capture | None = None) -> None:
-    """Write one HTML file about an ingest: style, pictures, curves and the view in 3D are inside it.
+    """Write one HTML file about an ingest, with style, pictures and charts inside.
 
     verdict: of `assess_ingest`; capture: what lies at `result.capture`, read here unless given. Raises NeecoError when
     it or one of the images shown cannot be read, or the page cannot be written.
@@ -54,7 +54,7 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
 
 
 def _residuals(result: IngestResult) -> dict[str, Any]:
-    """How far each camera is from where the laparoscope's tracker puts it: root mean squares and charts."""
+    """Return distances between cameras and the laparoscope's tracker: root mean squares and charts."""
     registration = result.registration
     if registration is None:
         return {"residuals": []}
@@ -74,24 +74,24 @@ def _residuals(result: IngestResult) -> dict[str, Any]:
 def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
     rows = []
     for name, clock in result.clocks.items():
-        sure = f"±{clock.sd * 1000:.1f}" if np.isfinite(clock.sd) and clock.sd > 0 else "–"
+        sd = f"±{clock.sd * 1000:.1f}" if np.isfinite(clock.sd) and clock.sd > 0 else "–"
         moved = clock_cost_mm(name, clock.sd, capture)
         cost = f"{moved:.2f}" if moved else "–"
         offset = f"{clock.seconds * 1000:+.1f}".replace("-", "−")
         rate = "1" if clock.rate == 1 else f"{clock.rate:.5f} ±{clock.rate_sd:.5f}"
-        rows.append([name, offset, sure, rate, cost, clock.source])
+        rows.append([name, offset, sd, rate, cost, clock.source])
     return rows
 
 
 def _frames(result: IngestResult, capture: Capture, axes: dict[str, figures.MainAxis]) -> dict[str, Any]:
-    """Sample frames as (picture, picture before registration, which frame, its second, its split), and the key to what
-    is drawn over them. The second is empty where nobody knows."""
+    """Return sample frames as (picture, picture before registration, frame, its second, its split), and the key to the
+    overlays. The second picture is empty where there is none."""
     length = figures.axis_length(capture)
     rows = {time: row for row, time in enumerate(np.round(result.selected_times, 6).tolist())}
     start = min(frame.state.time for frame in capture.frames)
     samples, shown_before = [], 0
-    seen = {item.name: item.from_video for item in capture.instruments}
-    shafts = {name: video.shaft_diameter_mm for name, video in seen.items() if video is not None}
+    in_video = {item.name: item.from_video for item in capture.instruments}
+    shafts = {name: video.shaft_diameter_mm for name, video in in_video.items() if video is not None}
     for frame in figures.sample_frames(capture):
         row = rows.get(round(frame.state.time, 6))
         poses = {name: state.pose for name, state in frame.state.instruments.items() if capture.registered}
@@ -119,7 +119,7 @@ def _frames(result: IngestResult, capture: Capture, axes: dict[str, figures.Main
 
 
 def _unregistered(result: IngestResult, frame: Frame, row: int) -> dict[str, Tensor]:
-    """world_from_instrument [4, 4] of every instrument before registration, in the frame of a row of `selected`."""
+    """Return world_from_instrument [4, 4] of every instrument before registration, in the frame `selected[row]`."""
     poses = {name: torch.from_numpy(poses[row]) for name, poses in result.unregistered.items()}
     return {
         name: frame.camera.world_from_camera.double() @ pose for name, pose in poses.items() if pose.isfinite().all()
@@ -145,7 +145,7 @@ def _tracks(capture: Capture) -> dict[str, Any]:
 
 
 def _coverage(capture: Capture, axes: dict[str, figures.MainAxis]) -> dict[str, Any]:
-    """Which states there are: sentences on where training ends, and the charts of every instrument."""
+    """Return the range of states: sentences on where training ends, and charts by instrument."""
     degrees = degrees_of_freedom(capture, {name: axis.direction for name, axis in axes.items()})
     named = [name for name in capture.splits if name in SPLIT_COLORS]
     others = ", ".join(name for name in capture.splits if name not in named)
@@ -168,7 +168,7 @@ def _coverage(capture: Capture, axes: dict[str, figures.MainAxis]) -> dict[str, 
 
 
 def _dropped(result: IngestResult) -> list[list[str]]:
-    """Rows of reason, count and frames; reasons that differ in a number only are one."""
+    """Return rows of reason, count and frames; reasons that differ in a number only are one."""
     groups: dict[str, list[tuple[int, str]]] = {}
     for frame, why in result.dropped:
         groups.setdefault(_NUMBER.sub("…", why), []).append((frame, why))
@@ -181,6 +181,6 @@ def _dropped(result: IngestResult) -> list[list[str]]:
 
 
 def _ranges(frames: np.ndarray) -> str:
-    """`3, 7–12, 40` of increasing numbers."""
+    """Return increasing numbers as `3, 7–12, 40`."""
     runs = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
     return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)

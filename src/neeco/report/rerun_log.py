@@ -21,7 +21,7 @@ WORLD, CAMERA, RIGHT_CAMERA = "world", "world/camera", "world/right_camera"
 
 
 def require_rerun() -> Any:
-    """The package rerun. Raises NeecoError where it is not installed."""
+    """Return the package rerun. Raises NeecoError where it is not installed."""
     try:
         import rerun
     except ImportError:
@@ -64,7 +64,7 @@ def write_rrd(result: IngestResult, capture: Capture, path: Path) -> None:
 
 
 def _log_still(rerun: Any, stream: Any, result: IngestResult, capture: Capture) -> None:
-    """What holds for the whole recording: points, shapes, axes, clocks."""
+    """Log what holds for the whole recording: points, shapes, axes, clocks."""
     stream.log(WORLD, rerun.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
     points = rerun.Points3D(capture.points.positions, colors=capture.points.colors)
     stream.log(f"{WORLD}/tissue", points, static=True)
@@ -87,7 +87,7 @@ def _log_still(rerun: Any, stream: Any, result: IngestResult, capture: Capture) 
 
 
 def _log_camera(rerun: Any, stream: Any, frame: Frame, place: str) -> None:
-    """A frame's image and camera at a place in the viewer, at the time that is set."""
+    """Log a frame's image and camera at a place in the viewer, at the time that is set."""
     camera = frame.camera
     matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
     stream.log(place, _transform(rerun, camera.world_from_camera.double().numpy()))
@@ -99,7 +99,7 @@ def _log_camera(rerun: Any, stream: Any, frame: Frame, place: str) -> None:
 
 
 def _log_states(rerun: Any, stream: Any, frame: Frame, registered: bool) -> None:
-    """A frame's instrument states, at the time that is set."""
+    """Log a frame's instrument states, at the time that is set."""
     for name, state in frame.state.instruments.items():
         stream.log(_place(name, registered), _transform(rerun, state.pose.numpy()))
         for joint, value in state.joints.items():
@@ -107,14 +107,14 @@ def _log_states(rerun: Any, stream: Any, frame: Frame, registered: bool) -> None
 
 
 def _log_moving(rerun: Any, stream: Any, moving: np.ndarray, frame: Frame) -> None:
-    """What moves [h, w] in [0, 1] (NaN: nobody knows), over the frame's image."""
+    """Log what moves [h, w] in [0, 1] (NaN: unknown), over the frame's image."""
     grey = Image.fromarray(np.nan_to_num(255 * moving).astype(np.uint8))
     full = np.asarray(grey.resize((frame.camera.width, frame.camera.height), Image.Resampling.BILINEAR))
     stream.log(f"{CAMERA}/image/moving", rerun.Image(full, opacity=0.5).compress(jpeg_quality=85))
 
 
 def _place(name: str, registered: bool) -> list[object]:
-    """Where an instrument is found in the viewer, by parts: its name may hold any character."""
+    """Return the place of an instrument in the viewer, by parts: its name may hold any character."""
     return [WORLD if registered else "unregistered", name]
 
 
@@ -123,5 +123,5 @@ def _transform(rerun: Any, pose: np.ndarray) -> Any:
 
 
 def _rgb(color: str) -> tuple[int, ...]:
-    """Of `#rrggbb`."""
+    """Return the numbers of `#rrggbb`."""
     return tuple(bytes.fromhex(color.removeprefix("#")))

@@ -1,4 +1,4 @@
-"""The pages of `compare` and `ablate`: one offline file each, the numbers of its figures inside it and beside it."""
+"""The pages of `compare` and `ablate`: one offline file each, the numbers of its figures inside it and as CSV files."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Section:
     """A part of a study's page, shown in the order of these fields; what is empty is left out."""
 
     title: str
-    split: str = ""  # of usual names the meaning is shown beside the title
+    split: str = ""  # of usual names the meaning is shown with the title
     level: int = 2  # of the heading
     anchor: str = ""
     text: str = ""
@@ -98,8 +98,8 @@ class Section:
 def write_comparison_report(output: Path, comparison: ComparisonResult, capture: Capture) -> Path:
     """Write `report.html` and `data/*.csv` into `output`, the folder of a comparison, and return the page's path.
 
-    comparison: what `compare` returned; the runs are taken from `output`. Every frame shown is drawn once per method.
-    Raises NeecoError when a run cannot be opened, an image not be read or the page not be written.
+    comparison: what `compare` returned; the runs are taken from `output`. Every frame shown is rendered once per
+    method. Raises NeecoError when a run cannot be opened, an image not be read or the page not be written.
     """
     images, frames = _frame_images(comparison, capture, output)
     files = {"summary.csv": comparison_csv(comparison), "frames.csv": frames, **data_files(comparison)}
@@ -192,7 +192,7 @@ def leader(rows: Sequence[Mapping[str, Any]], key: str, title: str, unit: str, d
 
 
 def _result_sections(comparison: ComparisonResult) -> list[Section]:
-    """Of each table the scores of images, and apart those of masks, with the methods that have a number in it."""
+    """Return sections of image scores and of mask scores for each table, with the methods that have a number in it."""
     sections = []
     for table in tables_of(comparison):
         for of_masks, title in ((False, table.title), (True, f"{table.title}: masks")):
@@ -220,7 +220,8 @@ def median_frame(comparison: ComparisonResult, capture: Capture, split: str) -> 
 
 
 def _frame_images(comparison: ComparisonResult, capture: Capture, output: Path) -> tuple[list[Section], str]:
-    """The median frame of every split, recorded and drawn by each method's first finished seed; PSNR as CSV."""
+    """Return the median frame of every split, recorded and rendered by each method's first finished seed; PSNR as
+    CSV."""
     chosen = [frame for split in comparison.splits if (frame := median_frame(comparison, capture, split))]
     images: list[list[Images]] = [[] for _ in chosen]
     scores: list[list[dict[str, Any]]] = [[] for _ in chosen]

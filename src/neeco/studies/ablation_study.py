@@ -108,7 +108,7 @@ class AblationTable:
 
 @dataclass(frozen=True, kw_only=True)
 class AblationResult:
-    """What ablation.json holds."""
+    """The contents of ablation.json."""
 
     schema: str
     version: str
@@ -255,7 +255,7 @@ def _with_room_to_grow(config: TrainConfig) -> TrainConfig:
 
 
 def _shortcomings(method: str, steps: int, log_interval: int) -> list[str]:
-    """What runs of so many steps are too short to show."""
+    """Return notes on what runs of so many steps are too short to show."""
     notes = []
     if method == "neeco" and PHASE_1_SHARE * steps < log_interval:
         notes.append(
@@ -285,8 +285,8 @@ def _label_scores(
     """Scores by run of both ways to label it, for the runs whose table asks; and what could not be scored."""
     scores: dict[str, LabelScores] = {}
     failures = []
-    asked = (entry.variant.name for table in chosen for entry in table.entries if entry.label_way)
-    for name in dict.fromkeys(asked):
+    wanted = (entry.variant.name for table in chosen for entry in table.entries if entry.label_way)
+    for name in dict.fromkeys(wanted):
         if name not in folders:
             continue
         file = folders[name] / LABELS_FILE
@@ -340,7 +340,7 @@ def table_of(
 
 
 def primary_split(splits: Sequence[str]) -> str:
-    """The held-out split that the paper's test numbers are set beside."""
+    """Return the held-out split that the paper's test numbers are compared with."""
     return "test" if "test" in splits else splits[0]
 
 
@@ -373,7 +373,7 @@ def _row(
 
 
 def direction(ours: float | None, paper: float) -> str | None:
-    """Whether two differences point the same way: "yes", "no", "even" when ours is below EVEN_DB, None unknown."""
+    """Compare the signs of two differences: "yes", "no", "even" when ours is below EVEN_DB, None unknown."""
     if ours is None:
         return None
     if abs(ours) < EVEN_DB:
@@ -476,7 +476,7 @@ def _cells(row: AblationRow, measure: str, judged: bool) -> list[str]:
 
 
 def agreement(table: AblationTable) -> str:
-    """How many of the paper's directions ours shows, in words; "" for a table that judges nothing."""
+    """Return how many of the paper's directions ours shows, in words; "" for a table that judges nothing."""
     counts = Counter(agrees for row in table.rows for agrees in row.agrees.values())
     if not counts:
         return ""

@@ -1,4 +1,4 @@
-"""What `neeco ablate` is asked for, and what the tables in ablations.yaml are made of. Imports nothing heavy."""
+"""Arguments of `neeco ablate`, and the schema of the tables in ablations.yaml. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ class Ablation:
 
     @property
     def entries(self) -> list[Entry]:
-        """Those of all its comparisons."""
+        """The entries of all its comparisons."""
         return [entry for comparison in self.comparisons for entry in comparison.entries]
 
 

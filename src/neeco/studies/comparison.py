@@ -87,8 +87,8 @@ ABSENT = {  # why nobody has a number
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonSpec:
-    """What to compare. `seeds`: how many, from 0. `splits` None: all but `train`. `masks`: folders of masks by name.
-    `assignments`: NAME=VALUE, fields of the training config that are changed for every method."""
+    """The request of a comparison. `seeds`: how many, from 0. `splits` None: all but `train`. `masks`: folders of masks
+    by name. `assignments`: NAME=VALUE, fields of the training config that are changed for every method."""
 
     capture: Path
     output: Path
@@ -123,7 +123,7 @@ class ComparisonPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonResult:
-    """What comparison.json holds, valid at every moment."""
+    """The contents of comparison.json, valid at every moment."""
 
     schema: str
     version: str
@@ -139,7 +139,7 @@ class ComparisonResult:
     jobs: list[Result]
     summary: list[dict[str, Any]]  # of `summarise`
     curves: list[dict[str, Any]]  # held-out PSNR of the finished jobs at about ten moments
-    distance: list[dict[str, Any]]  # every held-out frame's scores beside its distance from the training states
+    distance: list[dict[str, Any]]  # every held-out frame's scores and its distance from the training states
     speed: dict[str, Any]  # of `measure_speed`
     masks: list[dict[str, Any]]  # scores of masks by name, seed and split
     notes: list[str]
@@ -226,7 +226,7 @@ def compare(
 
 
 def read_comparison(folder: Path) -> ComparisonResult:
-    """What comparison.json in `folder` holds. Raises NeecoError when it is no comparison of this version."""
+    """Read comparison.json in `folder`. Raises NeecoError when it is no comparison of this version."""
     file, names = folder / COMPARISON_FILE, [field.name for field in fields(ComparisonResult)]
     stored = read_json(file)
     if not isinstance(stored, dict) or stored.get("schema") != COMPARISON_SCHEMA or not stored.keys() >= set(names):
@@ -405,7 +405,7 @@ def tables_of(comparison: ComparisonResult) -> list[ResultTable]:
 
 
 def absent_notes(comparison: ComparisonResult) -> list[str]:
-    """What the tables lack, and why."""
+    """Return notes on what the tables lack, and why."""
     notes = list(comparison.notes)
     for key in SPLIT_METRICS:
         known = any(row[key]["n"] for row in comparison.summary)
@@ -417,7 +417,7 @@ def absent_notes(comparison: ComparisonResult) -> list[str]:
 
 
 def budget_words(comparison: ComparisonResult) -> str:
-    """What every run was given, and how often."""
+    """Return the budget and the number of seeds, in words."""
     seeds = len(comparison.seeds)
     return f"{Budget(**comparison.budget)} each, {seeds} seed{'s' if seeds > 1 else ''}"
 
@@ -440,7 +440,7 @@ def comparison_csv(comparison: ComparisonResult) -> str:
 
 
 def data_files(comparison: ComparisonResult) -> dict[str, str]:
-    """The CSV files of `data/` by name: every run's numbers, and what the figures are drawn from."""
+    """The CSV files of `data/` by name: every run's numbers, and the data of the figures."""
     job_columns = ["name", "method", "seed", "split", *SPLIT_METRICS, "frames", *RUN_METRICS, "error"]
     jobs = [
         {**job, **numbers, "split": split}

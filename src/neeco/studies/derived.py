@@ -80,13 +80,13 @@ def _frames(capture: Capture, derived: Derived, seed: int) -> tuple[Frame, ...]:
 
 
 def _seen_from(first: Frame, frame: Frame) -> Frame:
-    """`frame` with the instruments' poses as its camera sees them, stated as if that stood where `first`'s does."""
+    """Return `frame` with the poses of its instruments relative to its camera, stated in the camera pose of `first`."""
     moved = first.camera.world_from_camera.double() @ frame.camera.world_from_camera.double().inverse()
-    seen = {
+    moved_poses = {
         name: InstrumentState(moved @ given.pose.double(), given.joints)
         for name, given in frame.state.instruments.items()
     }
-    return replace(frame, state=replace(frame.state, instruments=seen))
+    return replace(frame, state=replace(frame.state, instruments=moved_poses))
 
 
 def _with_noise(state: State, level: float, rng: np.random.Generator) -> State:

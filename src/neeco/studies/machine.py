@@ -1,4 +1,4 @@
-"""The machine that numbers are taken on: what it is, how much memory a piece of work takes, how fast runs draw."""
+"""The machine of a study: its description, peak memory of a piece of work, rendering speed of runs."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ STATUS = Path("/proc/self/status")
 CLEAR = Path("/proc/self/clear_refs")
 RESET_PEAK = "5"  # proc(5): resets the high-water mark of the resident memory
 
-WARM_UP = 3  # images drawn before any is timed
-ROUNDS = 3  # every run is drawn in turn, so often: a slow moment of the machine meets them all
-DRAWS = 7  # timed per run and round
-PATIENCE = 5.0  # s per run and round, half of it to warm up: slow methods are timed by fewer images
+WARM_UP_IMAGES = 3  # rendered before any is timed
+N_ROUNDS = 3  # every run is rendered in turn: a slow moment of the machine affects them all
+TIMED_IMAGES = 7  # per run and round
+MAX_ROUND_S = 5.0  # per run and round, half of it to warm up: slow methods are timed by fewer images
 
 
 def machine(device: torch.device, workers: int | None = None) -> dict[str, Any]:
@@ -50,7 +50,7 @@ def machine(device: torch.device, workers: int | None = None) -> dict[str, Any]:
 
 
 def hardware_words(machine: Mapping[str, Any]) -> str:
-    """What computed, of what `machine` returned: the GPU, if it was one, and the processor."""
+    """Return the GPU, if there was one, and the processor, from what `machine` returned."""
     gpu = f"{machine['gpu']}, " if machine.get("gpu") else ""
     return f"{gpu}{machine['cpu']}, {machine['cores']} cores"
 
@@ -98,7 +98,7 @@ def reset_peak_memory() -> bool:
 
 
 def peak_memory_mb() -> float | None:
-    """Most resident memory of this process since the last reset, in MiB; None where the system does not tell."""
+    """Most resident memory of this process since the last reset, in MiB; None where the system does not report it."""
     try:
         found = re.search(r"^VmHWM:\s+(\d+)", STATUS.read_text(encoding="ascii", errors="replace"), re.MULTILINE)
     except OSError:
@@ -116,7 +116,7 @@ def measure_speed(
     """Frames per second of every (name, seed, run) on the CPU and, if it is another, on `device`, posing included.
 
     All are measured side by side, in turn. Moves the scenes. Returns {"rows": [{name, seed, method, backend, fps,
-    milliseconds, draws, num_gaussians}], "image": [width, height], "frames": how many states were drawn in turn,
+    milliseconds, draws, num_gaussians}], "image": [width, height], "frames": how many states were rendered in turn,
     "machine", "how"}. fps is 1 / the median.
     """
     frames = [frame for frame in capture.frames if frame.split != "train"] or list(capture.frames)
@@ -124,11 +124,11 @@ def measure_speed(
     devices = dict.fromkeys((torch.device("cpu"), device))
     cases = [(index, device) for device in devices for index in range(len(runs))]
     times: dict[tuple[int, torch.device], list[float]] = {case: [] for case in cases}
-    for step in range(ROUNDS):
+    for step in range(N_ROUNDS):
         for number, (index, where) in enumerate(cases):
-            report(step * len(cases) + number, ROUNDS * len(cases))
+            report(step * len(cases) + number, N_ROUNDS * len(cases))
             times[index, where] += _timed(runs[index][2], frames, where)
-    report(ROUNDS * len(cases), ROUNDS * len(cases))
+    report(N_ROUNDS * len(cases), N_ROUNDS * len(cases))
     rows = []
     for (index, where), seconds in times.items():
         (name, seed, run), median = runs[index], statistics.median(seconds)
@@ -141,8 +141,8 @@ def measure_speed(
         "image": [camera.width, camera.height],
         "frames": len(frames),
         "machine": machine(device),
-        "how": f"Posing and drawing held-out frames in turn, 1 / median, {ROUNDS} rounds of up to {DRAWS} draws per "
-        f"run after up to {WARM_UP} to warm up",
+        "how": f"Posing and drawing held-out frames in turn, 1 / median, {N_ROUNDS} rounds of up to {TIMED_IMAGES} "
+        f"draws per run after up to {WARM_UP_IMAGES} to warm up",
     }
 
 
@@ -150,11 +150,11 @@ def _timed(run: TrainedRun, frames: Sequence[Frame], device: torch.device) -> li
     """Seconds of each timed image."""
     seconds: list[float] = []
     scene = run.scene.to(device)
-    with scene.torch_threads():  # each as it would be drawn by itself, though they are drawn in turn
-        for count, patience in ((WARM_UP, PATIENCE / 2), (DRAWS, PATIENCE)):
+    with scene.torch_threads():  # each as it would be rendered by itself, though they take turns
+        for count, limit_s in ((WARM_UP_IMAGES, MAX_ROUND_S / 2), (TIMED_IMAGES, MAX_ROUND_S)):
             seconds.clear()
             began = time.perf_counter()
-            while len(seconds) < count and time.perf_counter() - began < patience:
+            while len(seconds) < count and time.perf_counter() - began < limit_s:
                 start = time.perf_counter()
                 frame = frames[len(seconds) % len(frames)]
                 synchronise(scene.render(frame.state, frame.camera).color.device)

@@ -27,7 +27,7 @@ LabelScores = dict[str, dict[str, float | None]]  # mask IoU by label way and sp
 
 
 def splits_with_truth(capture: Capture, splits: Sequence[str]) -> tuple[str, ...]:
-    """Those of `splits` in which at least one frame has a true or reference mask."""
+    """Return the splits in which at least one frame has a true or reference mask."""
     return tuple(
         split for split in splits if any(truth_file(capture.root, frame.name) for frame in capture.split(split))
     )
@@ -118,7 +118,7 @@ def score_label_ways(run: GaussianRun, capture: Capture, splits: Sequence[str]) 
     for way, kind in (("composited", CompositedLabels), ("threshold", ThresholdLabels)):
         try:
             labeller: Labeller = kind(scene)
-        except NeecoError:  # it has no labels, or its deltas tell nothing apart: a finding, not a failure
+        except NeecoError:  # it has no labels, or its deltas separate nothing: a finding, not a failure
             scores[way] = dict.fromkeys(splits)
             continue
         scores[way] = {}

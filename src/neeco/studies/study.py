@@ -2,7 +2,7 @@
 
 A study is a list of jobs (`Job`), each with a folder of its own, and one JSON file that is valid at every moment.
 
-- `check_output` tells whether the output folder is free, or holds the same study begun earlier.
+- `check_output` checks that the output folder is free, or holds the same study begun earlier.
 - `run_jobs` runs all jobs, in this process or in workers, and returns their results in order; `run_and_record` also
   writes the JSON file after each job. A job that fails does not stop the others: its result has an "error".
 - `spread` is mean, standard deviation and count over repetitions (seeds, folds).
@@ -48,7 +48,7 @@ class Job(Protocol):
 
     @property
     def folder(self) -> Path:
-        """Where it writes."""
+        """The folder that it writes."""
 
     @property
     def device(self) -> str:
@@ -59,7 +59,7 @@ class Job(Protocol):
         """Its name in messages."""
 
     def identity(self) -> dict[str, Any]:
-        """What tells it from the other jobs; part of its result, whether it finishes or fails."""
+        """Return what distinguishes it from the other jobs; part of its result, whether it finishes or fails."""
 
     def check(self) -> None:
         """Raises NeecoError when it cannot be run, or its folder holds the work of another job."""
@@ -86,9 +86,9 @@ class JobEvent:
 
 
 def check_output(output: Path, file: str, schema: str, capture: Path, noun: str, about: str) -> dict[str, Any] | None:
-    """What a study begun earlier in `output` wrote into its `file`; None where nothing was begun.
+    """Return what a study begun earlier in `output` wrote into its `file`; None where nothing was begun.
 
-    noun, about: what it is called and how it speaks of its capture, in messages. Raises NeecoError when `output` is no
+    noun, about: names of the study and of its use of the capture, for messages. Raises NeecoError when `output` is no
     folder, holds something else, or the study of another capture.
     """
     if output.exists() and not output.is_dir():
@@ -153,7 +153,7 @@ def run_jobs(
 
 
 def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:
-    """`job.run`; a failure becomes its result. One that no user can cause leaves its traceback beside the folder."""
+    """`job.run`; a failure becomes its result. One that no user can cause leaves its traceback next to the folder."""
     record = job.folder.with_name(job.folder.name + ".error.txt")
     try:
         with readable_failures():
@@ -202,7 +202,7 @@ def _end(index: int, total: int, job: Job, result: Result) -> JobEvent:
 
 
 def _run_here(index: int, jobs: Sequence[Job], capture: Capture | None, report: Callable[[JobEvent], None]) -> Result:
-    """One of the jobs in this process."""
+    """Run one of the jobs in this process."""
     job, total = jobs[index], len(jobs)
 
     def progress(stage: str, share: float, text: str) -> None:

@@ -41,7 +41,7 @@ JOB_FILE = "job.json"  # the result of a finished job
 BEGUN_FILE = "begun.json"  # what the training took so far
 CURVE_FILE = "curve.jsonl"  # held-out PSNR over the training
 UNLIMITED = 1_000_000_000  # iterations: minutes end the run long before
-CURVE_POINTS = (0.03, *(step / 10 for step in range(1, 11)))  # shares of the run at which held-out frames are drawn
+CURVE_POINTS = (0.03, *(step / 10 for step in range(1, 11)))  # shares of the run at which held-out frames are rendered
 CURVE_FRAMES = 4  # of each split, evenly spaced: the whole split is scored at the end
 FIELD_CURVE_POINTS = (0.1, 0.4, 1.0)  # a field takes seconds for an image
 FIELD_CURVE_FRAMES = 2
@@ -61,7 +61,7 @@ CURVE_ROW = {"iteration": int, "seconds": float, "processor_seconds": float, "pr
 
 @dataclass(frozen=True)
 class Budget:
-    """How long every job may train: minutes on `clock`, or iterations; the other is None.
+    """The training budget of every job: minutes on `clock`, or iterations; the other is None.
 
     "wall" is the time that passes; "processor" is CPU time of all threads of the process, which others' work on the
     same machine does not change. Drawing the curve is counted by neither.
@@ -83,7 +83,7 @@ class Budget:
             raise NeecoError(f"budget: clock {self.clock!r} is unknown; choose one of {', '.join(CLOCKS)}")
 
     def applied(self, config: TrainConfig, seed: int) -> TrainConfig:
-        """`config` under this budget: with minutes no method is held back by its iterations."""
+        """Return `config` under this budget: with minutes no method is limited by its iterations."""
         return replace(config, minutes=self.minutes, iterations=self.iterations or UNLIMITED, seed=seed)
 
     def __str__(self) -> str:
@@ -95,7 +95,7 @@ class Budget:
 class TrainingJob:
     """One run to train and score. `config`'s seed, minutes and iterations are replaced by the job's.
 
-    `splits`: those to score (None: all but `train`). `folder` becomes a run folder with the job's files beside.
+    `splits`: those to score (None: all but `train`). `folder` becomes a run folder with the job's files in it.
     """
 
     name: str
@@ -119,7 +119,7 @@ class TrainingJob:
         return self.budget.applied(self.config, self.seed)
 
     def identity(self) -> dict[str, Any]:
-        """What a folder must agree with to be this job's, besides the settings of the training."""
+        """Return what a folder must agree with to be this job's, in addition to the settings of the training."""
         return {
             "name": self.name,
             "method": self.config.method,
@@ -166,7 +166,7 @@ class TrainingJob:
         """Train, score, write `folder`/job.json last, and return what it holds; at once when it is there already.
 
         A begun training goes on from its checkpoint, and ends in the scene that it would have without the interruption
-        (unless minutes end it). A finished one is only scored again when other splits or LPIPS networks are asked for.
+        (unless minutes end it). A finished one is only scored again when other splits or LPIPS networks are requested.
         capture: the job's, where it is read and checked already. Raises NeecoError when `folder` is another job's, and
         what `train` and `evaluate_run` raise.
         """
@@ -206,7 +206,7 @@ class TrainingJob:
 
 
 def read_result(file: Path) -> Result:
-    """What a finished job wrote. Raises NeecoError when the file is damaged."""
+    """Return what a finished job wrote. Raises NeecoError when the file is damaged."""
     return dict(require_like(read_json(file), RESULT, str(file), ANEW))
 
 
@@ -238,8 +238,8 @@ def check_settings(assignments: Sequence[str], methods: Collection[str], seed_op
 
 
 def settings_for(method: str, assignments: Sequence[str]) -> list[str]:
-    """Those of `assignments`, one list for several methods, that `method` has: `deformation.FIELD` is a method's own,
-    all others are everybody's."""
+    """Select from `assignments`, one list for several methods, those that `method` has: `deformation.FIELD` is a
+    method's own, all others are everybody's."""
     kind = method_class(method).Settings
     own = {field.name for field in dataclasses.fields(kind)}
     groups = [assignment.partition("=")[0].partition(".") for assignment in assignments]
@@ -310,10 +310,10 @@ class HeldOutFrames:
 
 
 class TrainingRecorder:
-    """What a training took, over all its interruptions (`totals`), and its curve of held-out PSNR (`rows`).
+    """Records the cost of a training over all its interruptions (`totals`) and its held-out PSNR (`rows`).
 
     `clock` is the one that the budget is counted on, by which the session counts its seconds. Seconds on the other
-    clock are those of the session times how fast the other ran beside it.
+    clock are those of the session times the ratio of the clocks.
     """
 
     def __init__(self, folder: Path, held_out: HeldOutFrames, clock: str, identity: dict[str, Any]) -> None:
@@ -330,7 +330,7 @@ class TrainingRecorder:
         self.times = _read_clocks()
 
     def after_step(self, session: Session) -> None:
-        """Count the step's time; where a point of the curve is due also draw the held-out frames, uncounted."""
+        """Count the step's time; where a point of the curve is due also render the held-out frames, uncounted."""
         self._count(session.seconds)
         self.totals["iteration"] = session.iteration
         if not self.started:

@@ -1,6 +1,6 @@
 """`neeco annotate`: recorded frames, labelled by the scene, each with how far to trust its label.
 
-What trust is: `neeco.evaluation.trust`.
+Trust is estimated in `neeco.evaluation.trust`.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ if TYPE_CHECKING:
     from neeco.scene import GaussianScene
     from neeco.training.run import GaussianRun
 
-REFERENCE_FRAMES = 16  # training frames that tell how well pixels are usually explained
+N_REFERENCE_FRAMES = 16  # training frames from which the usual errors are estimated
 FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # the start is near: no coarse search
 NOT_TRUSTED = "not trusted"
-NOT_RECORDED = 0.01  # of a pixel: more than this outside the recorded image, and it is ignored
+MAX_UNRECORDED_SHARE = 0.01  # of a pixel: more than this outside the recorded image, and it is ignored
 
 
 @dataclass(frozen=True)
 class Annotated:
-    """What was made: the records of all frames, those of frames that are not trusted without an image."""
+    """The records of all frames; those of frames that are not trusted have no image."""
 
     output: Path
     capture: Capture
@@ -50,7 +50,7 @@ class Annotated:
 
     @property
     def written(self) -> int:
-        """How many frames were trusted."""
+        """Number of frames that were trusted."""
         return len(with_image(self.records))
 
 
@@ -67,7 +67,7 @@ def annotate_capture(
 ) -> Annotated:
     """Label every frame of `capture`, a recording of the run's instruments over its tissue (None: the run's own), and
     write those that can be trusted as a data set: the recorded images with the labels that the scene draws at poses
-    fitted to them. Both are resized and seen through the recording's lens as `images` ask for; what the recorded image
+    fitted to them. Both are resized and distorted by the recording's lens as `images` request; what the recorded image
     does not show of the lens's field, since undistorting left it out, is black and ignored.
 
     Frame k of the capture is image k of the data set, whichever are written. Interrupted (Ctrl-C) or failing, it keeps
@@ -164,8 +164,8 @@ class _Annotator:
         return write_sample(self.output, index, drawing, labels, facts=facts, quality=self.images.jpeg_quality)
 
     def _as_written(self, drawing: LayeredDrawing, image: Tensor) -> tuple[LayeredDrawing, Tensor | None]:
-        """The recorded `image` with the labels of `drawing`, as the images asked for, and where it shows nothing of a
-        lens's field, bool [H, W]."""
+        """The recorded `image` with the labels of `drawing`, at the requested size and lens, and where it shows nothing
+        of a lens's field, bool [H, W]."""
         recorded = drawing.camera
         wanted = self.cameras(recorded)
         if wanted is recorded:
@@ -180,7 +180,7 @@ class _Annotator:
         shown = resampled(torch.ones(field.height, field.width, 1), field, fine, wanted)[..., 0]
         known = torch.cat([image, torch.ones_like(image[..., :1])], -1)
         found = resampled(known, recorded, fine, wanted)
-        missing = found[..., 3] < shown - NOT_RECORDED
+        missing = found[..., 3] < shown - MAX_UNRECORDED_SHARE
         drawing = replace(
             drawing,
             image=found[..., :3],
@@ -217,8 +217,8 @@ def typical_errors(scene: GaussianScene, labeller: CompositedLabels, trained_on:
     """The scene's errors on the frames that it was trained on."""
     frames = trained_on.split("train")
     drawings = []
-    for k in range(min(REFERENCE_FRAMES, len(frames))):
-        frame = frames[round(k * (len(frames) - 1) / (REFERENCE_FRAMES - 1))]
+    for k in range(min(N_REFERENCE_FRAMES, len(frames))):
+        frame = frames[round(k * (len(frames) - 1) / (N_REFERENCE_FRAMES - 1))]
         image = frame.load_image()
         drawings.append((fitted(scene, labeller, frame, image, None)[1], image, frame.load_mask()))
     return typical_errors_of(drawings)

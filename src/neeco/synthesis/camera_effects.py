@@ -1,4 +1,4 @@
-"""Camera effects of a data set: the ranges they are drawn from, motion blur, and what lens, sensor and file do.
+"""Camera effects of a data set: sampled ranges, motion blur, and the effects of lens, sensor and file.
 
 Light is linear, an image is stored by the sRGB curve: "stored" images and "linear" light are [H, W, 3] float32, 1 is
 white. Motion while the shutter is open is that of a recorded frame with a like state.
@@ -23,10 +23,10 @@ from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_text
 from neeco.geometry.camera import Camera
+from neeco.geometry.rotations import rigid
 from neeco.labels.annotation import place_in_image, working_ends
 from neeco.labels.drawing import LayeredDrawing, to_numpy
 from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
-from neeco.synthesis.states import rigid
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene, Recorded
@@ -42,14 +42,14 @@ MAX_GAP_S = 0.5  # between recorded frames; a speed over a longer one means noth
 
 @dataclass(frozen=True)
 class Effect:
-    """One value that is drawn for every image."""
+    """A value that is sampled for every image."""
 
     lowest: float
     highest: float
     meaning: str
 
 
-# in the order in which they are drawn: a new one goes to the end, or old files give other images
+# in the order in which they are sampled: a new one goes to the end, or old files give other images
 EFFECTS = {
     "shutter_s": Effect(0, 0.2, "s for which the shutter is open; instrument and camera go on moving as recorded"),
     "smoke": Effect(0, 0.95, "share of the light that smoke takes away over 100 mm"),
@@ -79,7 +79,7 @@ class Range:
 
 @dataclass(frozen=True)
 class CameraEffects:
-    """What an effects file asks for. `soft_masks`: the `soft` images show the middle of the exposure or the mean over
+    """The contents of an effects file. `soft_masks`: the `soft` images show the middle of the exposure or the mean over
     it."""
 
     ranges: Mapping[str, Range]
@@ -87,12 +87,12 @@ class CameraEffects:
 
     @property
     def moves(self) -> bool:
-        """Whether anything moves while the shutter is open."""
+        """Return whether anything moves while the shutter is open."""
         return "shutter_s" in self.ranges
 
     def draw(self, rng: Generator) -> dict[str, float]:
-        """The effects of one image by name. Always draws as many numbers, so that a value depends on no other's
-        range."""
+        """Sample the effects of one image by name. Always takes as many random numbers, so that a value depends on no
+        other's range."""
         values = {}
         for name in EFFECTS:
             applies, place = rng.random(), rng.random()
@@ -102,7 +102,7 @@ class CameraEffects:
         return values
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values, for dataset.json."""
+        """Return plain values, for dataset.json."""
         ranges = {name: [item.low, item.high, item.share] for name, item in sorted(self.ranges.items())}
         return {"ranges_and_shares": ranges, SOFT_MASKS: self.soft_masks}
 
@@ -164,9 +164,9 @@ def average_exposure(images: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def apply_effects(image: np.ndarray, depth: np.ndarray, values: Mapping[str, float], rng: Generator) -> np.ndarray:
-    """A drawn image as a camera with these effects (see EFFECTS) would have stored it.
+    """Return a rendered image as a camera with these effects (see EFFECTS) would have stored it.
 
-    depth [H, W] mm, 0 = none (taken as the image's farthest). Noise is drawn from `rng`.
+    depth [H, W] mm, 0 = none (taken as the image's farthest). Noise is sampled from `rng`.
     """
     if not set(values) - {"shutter_s", "smoke_grey"}:
         return image
@@ -246,7 +246,7 @@ class Motion:
 
 
 class RecordedMotion:
-    """Draws motions: those of one of the recorded frames whose instruments stood most like the drawn ones."""
+    """Samples motions from the recorded frames whose states are most similar to the given one."""
 
     def __init__(self, recorded: Recorded) -> None:
         known = recorded.states
@@ -261,20 +261,20 @@ class RecordedMotion:
 
     @property
     def known(self) -> bool:
-        """Whether the recording says how anything moved."""
+        """Return whether the recording has any two frames close enough in time to give a motion."""
         return bool(self._motions)
 
     def any(self, rng: Generator) -> Motion:
-        """That of any recorded frame."""
+        """Return the motion of any recorded frame."""
         return self._motions[self._frames.any(rng)]
 
     def __call__(self, state: State, rng: Generator) -> Motion:
-        """How everything moves in `state`."""
+        """Return a motion for `state`."""
         return self._motions[self._frames.like(state, rng)]
 
 
 class MixedMotion:
-    """Draws motions of instruments and a camera that were not recorded together: each from a frame of its own
+    """Samples motions of instruments and a camera that were not recorded together: each from a frame of its own
     recording."""
 
     def __init__(self, tissue: Recorded, instruments: Sequence[Recorded]) -> None:
@@ -283,11 +283,11 @@ class MixedMotion:
 
     @property
     def known(self) -> bool:
-        """Whether every recording says how anything moved."""
+        """Return whether every recording has a motion."""
         return self._tissue.known and all(recorded.known for recorded in self._instruments)
 
     def __call__(self, state: State, rng: Generator) -> Motion:
-        """How everything moves in `state`."""
+        """Return a motion for `state`."""
         motions = [recorded.any(rng) for recorded in self._instruments]
         return Motion(
             {name: twist for motion in motions for name, twist in motion.instruments.items()},

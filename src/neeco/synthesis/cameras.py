@@ -1,4 +1,4 @@
-"""The cameras that images are drawn with: the recorded ones, of the size asked for, through the recording's lens."""
+"""The cameras that render images: the recorded ones at the requested size, with the recording's lens on request."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from neeco.synthesis.settings import RECORDED_SIZE, ImageSettings, SizeSettings
 
 @dataclass(frozen=True)
 class DrawnCameras:
-    """Makes of a camera with recorded intrinsics the one that is drawn with. `lens`: the recording's, where it is to be
-    seen."""
+    """Maps cameras with recorded intrinsics to those that render. `lens`: the recording's, where distortion is
+    wanted."""
 
     size: SizeSettings
     lens: Lens | None = None
 
     @classmethod
     def of(cls, images: ImageSettings, recorded: Recorded, cameras: Iterable[Camera]) -> DrawnCameras:
-        """What `images` ask for. Raises NeecoError where they make no sense, the recording tells of no lens, or what
-        one of `cameras` recorded has another shape."""
+        """Return the cameras that `images` request. Raises NeecoError for invalid settings, a recording without a lens,
+        and a camera among `cameras` whose images have another shape."""
         images.check()
         if images.lens and recorded.lens is None:
             raise NeecoError(
@@ -37,7 +37,7 @@ class DrawnCameras:
 
     def __call__(self, camera: Camera) -> Camera:
         """The camera in the place of `camera`, a pinhole."""
-        seen = camera if self.lens is None else self.lens.before(camera)
+        seen = camera if self.lens is None else self.lens.distorted_camera(camera)
         size = self.size.of(seen.width, seen.height)
         return seen if size == (seen.width, seen.height) else seen.resized(*size)
 

@@ -1,4 +1,4 @@
-"""`neeco synthesize`: draw many states, write the acceptable ones with labels; and what any data set has as a whole.
+"""`neeco synthesize`: render many states and write the acceptable ones with labels; files of a data set as a whole.
 
 dataset.json says how it was made, and decides whether one begun may be continued. Index files, README.md and preview
 are written from the records of its images.
@@ -37,7 +37,7 @@ from neeco.synthesis.generator import (
 )
 from neeco.synthesis.parallel import draw_in_workers
 from neeco.synthesis.preview import write_preview
-from neeco.synthesis.samplers import SIMILAR, states_fingerprint
+from neeco.synthesis.samplers import N_SIMILAR, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import (
@@ -70,7 +70,7 @@ REMEDIES = {  # where every given state was refused
 
 @dataclass(frozen=True)
 class Synthesized:
-    """What was made, and where it lies."""
+    """The data set that was written."""
 
     output: Path
     images: int
@@ -94,11 +94,11 @@ def synthesize(
     its tissue under the instruments of those runs.
 
     Image `index` depends on (scene, settings, index) alone, however many `workers` share the work: processes started
-    anew, so that a script needs `if __name__ == "__main__"` about its own start.
-    Interrupted (Ctrl-C) or failing, it keeps and indexes what is done, for `resume`; where no image was drawn at all,
-    `output` is left as it was found. `on_progress` gets how many images are done. How many threads torch takes is the
-    caller's to set (`open_run`). Raises NeecoError for bad settings, an output that is not empty (without `resume`) or
-    was made with other settings, and when no acceptable state is found.
+    anew, so that a script needs `if __name__ == "__main__"` about its own start. Interrupted (Ctrl-C) or failing, it
+    keeps and indexes what is done, for `resume`; where no image was rendered at all, `output` is left as it was found.
+    `on_progress` gets how many images are done. How many threads torch takes is the caller's to set (`open_run`).
+    Raises NeecoError for bad settings, an output that is not empty (without `resume`) or was made with other settings,
+    and when no acceptable state is found.
     """
     settings.check()
     check_workers(workers)
@@ -111,7 +111,7 @@ def synthesize(
     identity = settings.identity() | {
         **settings.image_identity(recorded.width, recorded.height),
         "states_sha256": states_fingerprint(settings.states),
-        "similar_views": SIMILAR,
+        "similar_views": N_SIMILAR,
         "camera_effects": effects,
     }
     info = description(run, identity, instrument_runs)
@@ -163,7 +163,7 @@ def synthesize(
 def _draw_all(
     generator: SampleGenerator, spec: GeneratorSpec, output: Path, missing: list[int], workers: int
 ) -> Iterator[Record]:
-    """The records of the missing images, as they are drawn."""
+    """Yield the records of the missing images as they are rendered."""
     if missing and (workers > 1 or address()):
         return draw_in_workers(spec, output, missing, workers)
     return (draw_to_folder(generator, output, index) for index in missing)
@@ -172,8 +172,8 @@ def _draw_all(
 def description(
     run: GaussianRun, settings: dict[str, Any], instrument_runs: Sequence[GaussianRun] = ()
 ) -> dict[str, Any]:
-    """How a data set of the run's scene, or of its tissue under the instruments of `instrument_runs`, is made: what
-    dataset.json begins with. `settings` must stay the same for it to be continued."""
+    """Return what dataset.json begins with: how a data set of the run's scene, or of its tissue under the instruments
+    of `instrument_runs`, is made. `settings` must stay the same for it to be continued."""
     info = {
         "schema": SCHEMA,
         "version": neeco.__version__,
@@ -195,7 +195,8 @@ def _digest(run: GaussianRun) -> str:
 
 
 def check_output(output: Path, description: dict[str, Any], resume: bool) -> bool:
-    """Whether a data set was begun in `output` in the same way. Raises NeecoError when it may not be written to."""
+    """Return whether a data set was begun in `output` in the same way. Raises NeecoError when it may not be written
+    to."""
     begun = read_begun(output, INFO, resume, "a data set")
     if begun is None:
         return False
@@ -203,7 +204,7 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
         raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
     settings = begun["settings"]
     compared = [(key, begun.get(key), description[key]) for key in ("schema", "version", "scene_sha256")]
-    # a version that wrote neither of these folders named neither: all its images are drawn anew
+    # a version that wrote neither of these folders named neither: all its images are rendered anew
     compared += [(key, begun[key], description[key]) for key in ("soft", "ignore") if begun.get(key) is not None]
     compared += [(f"settings.{key}", settings.get(key), value) for key, value in description["settings"].items()]
     require_same(str(output / INFO), compared)
@@ -313,7 +314,7 @@ def check_formats(formats: Sequence[str], settings: ImageSettings) -> None:
 
 
 def part_ids(names: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
-    """What part ids mean, for files; names: (instrument, part) of part id 1, 2, ..."""
+    """Return the meaning of part ids, for files; names: (instrument, part) of part id 1, 2, ..."""
     return [{"id": 0, "part": "tissue"}] + [
         {"id": k, "instrument": instrument, "part": part} for k, (instrument, part) in enumerate(names, 1)
     ]
@@ -330,7 +331,7 @@ def skipped(records: Iterable[Record]) -> list[int]:
 
 
 def refusals(records: Iterable[Record]) -> dict[str, int]:
-    """How many states were refused, by reason."""
+    """Count the refused states by reason."""
     refused: Counter[str] = Counter()
     for record in records:
         refused.update(record["refused"])

@@ -1,6 +1,6 @@
-"""Draws the samples of a data set: sample a state and a view, draw, judge, apply camera effects, annotate.
+"""Renders the samples of a data set: sample a state and a view, render, check, apply camera effects, annotate.
 
-Sample `index` depends on scene, settings and index alone: in whichever process and order it is drawn, it is the same.
+Sample `index` depends on scene, settings and index alone: it is the same in whichever process and order.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ if TYPE_CHECKING:
     from neeco.scene import GaussianScene
 
 VERB = "synthesize"
-EFFECTS_STREAM = 1  # of an image's random numbers: camera effects do not change which state and view are drawn
+EFFECTS_STREAM = 1  # of an image's random numbers: camera effects do not change which state and view are sampled
 BURIED_SHARE = 0.05  # of an instrument's pixels that may lie deeper than the tolerance: edges are uncertain
-TOLERANCE_MM = (2.0, 5.0)  # range of tolerances found from the recording
-TOLERANCE_STATES = 12  # recorded states from which the tolerance is found
-APART_MM = 6.0  # surfaces of two instruments nearer than about a shaft's thickness: the instruments intersect
-CROSSING = 5  # px nearer than that: instruments are taken to intersect
-MAX_UNOBSERVED_IMAGE = 0.25  # of an image's pixels
+TOLERANCE_RANGE_MM = (2.0, 5.0)  # range of tolerances found from the recording
+N_TOLERANCE_STATES = 12  # recorded states from which the tolerance is found
+MIN_GAP_MM = 6.0  # surfaces of two instruments nearer than about a shaft's thickness: the instruments intersect
+MIN_CROSSING_PX = 5  # px nearer than that: instruments are taken to intersect
+MAX_UNOBSERVED_SHARE = 0.25  # of an image's pixels
 LEAVES_IMAGE, ENTERS_TISSUE, ENTERS_ANOTHER = "leaves the image", "enters the tissue", "enters another"
 UNOBSERVED_TISSUE = "stands before tissue that no frame saw"
 UNOBSERVED_SIDE = "shows sides that no frame saw"
 
 
 class StatesRefused(NeecoError):
-    """No state drawn for an image was acceptable; `refused`: how many were refused, by reason."""
+    """No state sampled for an image was acceptable; `refused`: how many were refused, by reason."""
 
     def __init__(self, message: str, refused: Mapping[str, int] = MappingProxyType({})) -> None:
         super().__init__(message)
@@ -69,21 +69,23 @@ class LabelledSample:
     """One labelled image of a data set, in memory."""
 
     index: int
-    drawing: LayeredDrawing  # `image` as the camera with its effects sees it
+    drawing: LayeredDrawing  # `image` with the camera effects
     labels: list[InstrumentLabel]
     refused: Mapping[str, int]  # states refused before this one, by reason
-    facts: Mapping[str, Any] = field(default_factory=dict)  # what else its record says, such as its camera effects
+    facts: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # additional entries of its record, such as its camera effects
 
 
 @dataclass(frozen=True)
 class Acceptance:
-    """Which drawn states to refuse.
+    """The limits beyond which sampled states are refused.
 
     min_share: of the image's pixels that the instruments must cover together. tolerance_mm: how deep an instrument may
-    lie behind the tissue surface, as this camera sees it (see `buried_depth`); None: any depth. A single view cannot
-    tell "inside the tissue" from "behind a fold of it": both are refused. max_unobserved: share of the instruments'
-    pixels that may be mostly unobserved. recorded_together: groups of instruments; only those of one group may touch;
-    empty: all may.
+    lie behind the tissue surface in this camera (see `buried_depth`); None: any depth. A single view cannot distinguish
+    "inside the tissue" from "behind a fold of it": both are refused. max_unobserved: share of the instruments' pixels
+    that may be mostly unobserved. recorded_together: groups of instruments; only those of one group may touch; empty:
+    all may.
     """
 
     min_share: float
@@ -102,7 +104,7 @@ class Acceptance:
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
         unobserved = drawing.unobserved > MAX_UNOBSERVED
-        if float(unobserved.float().mean()) > MAX_UNOBSERVED_IMAGE:
+        if float(unobserved.float().mean()) > MAX_UNOBSERVED_SHARE:
             return UNOBSERVED_TISSUE
         if float(unobserved[drawing.parts > 0].float().mean()) > self.max_unobserved:
             return UNOBSERVED_SIDE
@@ -113,7 +115,7 @@ class Acceptance:
 
 @dataclass(frozen=True, kw_only=True)
 class SampleGenerator:
-    """Draws the samples of one data set; writes nothing."""
+    """Renders the samples of one data set; writes nothing."""
 
     scene: GaussianScene
     labeller: Labeller
@@ -129,8 +131,8 @@ class SampleGenerator:
     def of(
         cls, scene: GaussianScene, settings: Settings, instrument_scenes: Sequence[GaussianScene] = ()
     ) -> SampleGenerator:
-        """What `settings` ask for: images of `scene`, or of its tissue under the instruments of `instrument_scenes`.
-        Raises NeecoError where the scenes cannot give it."""
+        """Return the generator that `settings` describe, of `scene` or of its tissue under the instruments of
+        `instrument_scenes`. Raises NeecoError where the scenes do not support them."""
         cameras = DrawnCameras.of(settings, scene.recorded, scene.recorded.cameras)
         sampler: Sampler | TissueSampler | MixedSampler
         groups: tuple[frozenset[str], ...] = ()
@@ -169,10 +171,10 @@ class SampleGenerator:
         )
 
     def draw(self, index: int) -> LabelledSample:
-        """Draw sample `index`.
+        """Render sample `index`.
 
-        A random state is drawn again until one is acceptable, `settings.max_attempts` times at most. A prescribed state
-        is only drawn from other views. Raises StatesRefused where none was acceptable.
+        A random state is sampled again until one is acceptable, `settings.max_attempts` times at most. A prescribed
+        state is only rendered from other views. Raises StatesRefused where none was acceptable.
         """
         rng = np.random.default_rng(np.random.SeedSequence([self.settings.seed, index, EFFECTS_STREAM]))
         effects = {} if self.effects is None else self.effects.draw(rng)
@@ -204,7 +206,7 @@ class SampleGenerator:
         )
 
     def _through_camera(self, drawing: LayeredDrawing, effects: Mapping[str, float], rng: Generator) -> LayeredDrawing:
-        """The drawing as a camera with these effects sees it; labels stay those of the middle of the exposure."""
+        """Apply the camera effects; labels stay those of the middle of the exposure."""
         if not effects:
             return drawing
         drawing = self._motion_blurred(drawing, effects.get("shutter_s", 0.0), rng)
@@ -230,8 +232,8 @@ class SampleGenerator:
 
 @dataclass(frozen=True)
 class GeneratorSpec:
-    """Scene files and how to draw them: small enough to be sent to another process. `instrument_scenes`: those whose
-    instruments are drawn over the tissue of `scene`, instead of its own."""
+    """Scene files and settings: small enough to be sent to another process. `instrument_scenes`: those whose
+    instruments are rendered over the tissue of `scene`, instead of its own."""
 
     scene: Path
     settings: Settings
@@ -247,15 +249,14 @@ class GeneratorSpec:
 
 
 def limit_threads(threads: int) -> None:
-    """In a process of its own that draws: kernels use `threads` threads, torch one; freed memory is kept for the next
-    sample."""
+    """Set up a worker process: kernels use `threads` threads, torch one; freed memory is kept for the next sample."""
     set_threads(threads)
     torch.set_num_threads(1)
     keep_freed_memory()
 
 
 def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:
-    """Draw sample `index` and write it to `output`; returns its record, which for a prescribed state that was refused
+    """Render sample `index` and write it to `output`; returns its record, which for a prescribed state that was refused
     says so. Raises NeecoError where no random state was acceptable, or the files cannot be written."""
     try:
         sample = generator.draw(index)
@@ -270,7 +271,7 @@ def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Reco
 
 
 def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
-    """The tolerance, in mm, under which nine of ten recorded states are acceptable, between 2 and 5 mm.
+    """Find the tolerance, in mm, under which nine of ten recorded states are acceptable, between 2 and 5 mm.
 
     No recorded instrument was in the tissue: where the model says so, that is the model's error. More than 5 mm is no
     such error: there, tissue stood before the instrument.
@@ -278,13 +279,13 @@ def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
     recorded = scene.recorded
     depths = [
         buried_depth(scene, draw_layers(scene, labeller, recorded.states[k], recorded.cameras[k], min_component=0.0))
-        for k in evenly_spaced(len(recorded.states), TOLERANCE_STATES, floor=True)
+        for k in evenly_spaced(len(recorded.states), N_TOLERANCE_STATES, floor=True)
     ]
-    return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *TOLERANCE_MM)) / 100)
+    return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *TOLERANCE_RANGE_MM)) / 100)
 
 
 def buried_depth(scene: GaussianScene, drawing: LayeredDrawing) -> float:
-    """How far, in mm, the worst instrument lies behind the tissue surface that this camera sees; 0 for none.
+    """Return the depth, in mm, of the deepest instrument behind the tissue surface in this camera; 0 for none.
 
     All but the deepest BURIED_SHARE of an instrument's pixels are above this depth, and all keypoints of its working
     end.
@@ -310,12 +311,12 @@ def format_counts(refused: Mapping[str, int]) -> str:
 
 
 def _intersect(drawing: LayeredDrawing, some: frozenset[str], others: frozenset[str]) -> bool:
-    """Whether any of `some` instruments comes so near any of the `others` that they must intersect, as far as this
-    camera sees it."""
+    """Return whether any of `some` instruments is so near one of the `others`, in this camera, that they must
+    intersect."""
     for a, b in product(sorted(some & drawing.layers.keys()), sorted(others & drawing.layers.keys())):
         first, second = drawing.layers[a], drawing.layers[b]
         both = first.mask & second.mask & (first.depth > 0) & (second.depth > 0)
-        if int((np.abs(first.depth - second.depth)[both] < APART_MM).sum()) >= CROSSING:
+        if int((np.abs(first.depth - second.depth)[both] < MIN_GAP_MM).sum()) >= MIN_CROSSING_PX:
             return True
     return False
 
@@ -323,7 +324,7 @@ def _intersect(drawing: LayeredDrawing, some: frozenset[str], others: frozenset[
 def _motion(
     scene: GaussianScene, instrument_scenes: Sequence[GaussianScene], settings: Settings
 ) -> RecordedMotion | MixedMotion:
-    """How everything moves while a shutter is open. Raises NeecoError where the recordings do not tell."""
+    """Return the motion while a shutter is open. Raises NeecoError where the recordings have none."""
     motion: RecordedMotion | MixedMotion = RecordedMotion(scene.recorded)
     if instrument_scenes:
         motion = MixedMotion(scene.recorded, [given.recorded for given in instrument_scenes])
@@ -336,7 +337,7 @@ def _motion(
 
 
 def _within_circle(drawing: LayeredDrawing, radius: float) -> LayeredDrawing:
-    """Labelled only where the camera's image circle shows anything."""
+    """Remove the labels outside the camera's image circle."""
     height, width = drawing.depth.shape
     shown = torch.from_numpy(image_circle(height, width, radius) > 0.5)
     return replace(

@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from neeco.synthesis.settings import Settings
 
 DEPTH_SCALE = 0.25  # of the image's size, at which the depth of tissue is looked up
-RECORDED_FRAMES = 24  # frames that the mixed scene has as if they had been recorded
-GAINS = (0.6, 1.6)  # range of the change of colours: beyond that, the shafts differ in make
-SOLID = 0.5  # least opacity of Gaussians that tell a shaft's colour
+N_RECORDED_FRAMES = 24  # frames that the mixed scene has as if they had been recorded
+GAIN_RANGE = (0.6, 1.6)  # range of the change of colours: beyond that, the shafts differ in make
+MIN_SHAFT_OPACITY = 0.5  # least opacity of Gaussians from which a shaft's colour is estimated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +130,7 @@ class Mixture:
     def _recorded(self) -> Recorded:
         """Frames spread over the tissue's cameras, with the instrument scenes' recorded states placed before them."""
         cameras = self.tissue.recorded.cameras
-        count = min(RECORDED_FRAMES, len(cameras))
+        count = min(N_RECORDED_FRAMES, len(cameras))
         chosen, states = [], []
         for k in range(count):
             camera = cameras[round(k * (len(cameras) - 1) / max(1, count - 1))]
@@ -205,7 +205,7 @@ def tissue_depth(tissue: Gaussians, camera: Camera, point: np.ndarray) -> float:
 def _merged(
     tissue: GaussianScene, instrument_scenes: Sequence[GaussianScene], gains: Sequence[tuple[float, float, float]]
 ) -> GaussianScene:
-    """One scene of the tissue of `tissue` and the instruments of `instrument_scenes`."""
+    """Build one scene of the tissue of `tissue` and the instruments of `instrument_scenes`."""
     instruments = tuple(instrument for scene in instrument_scenes for instrument in scene.instruments)
     deformation = tissue.deformation.combined([scene.deformation for scene in instrument_scenes])
     bodies = [_body(tissue, 0, deformation)]
@@ -228,7 +228,7 @@ def _merged(
 
 
 def _body(scene: GaussianScene, index: int, deformation: Deformation) -> CanonicalGaussians:
-    """One body alone, with what the mixed scene's `deformation` knows of each Gaussian, and how well it was seen."""
+    """Return one body alone, with the extras of the mixed scene's `deformation` and its visibility."""
     canonical, rows = scene.canonical, scene.canonical.body(index)
     seen = scene.visibility()[rows]
     extras = deformation.fit_extras({name: tensor[rows] for name, tensor in canonical.extras.items()})
@@ -243,13 +243,13 @@ def _brightened(body: CanonicalGaussians, gain: tuple[float, float, float]) -> C
 
 
 def _gain(tissue: GaussianScene, instruments: GaussianScene) -> tuple[float, float, float]:
-    """By what the colours of `instruments` are multiplied to look as under the light of `tissue`'s capture, going by
-    the shafts, grey of a like kind in both. 1 where the tissue's run has no instrument to compare with, or it is the
+    """Estimate the colour gains that make `instruments` look as under the light of `tissue`'s capture, from the shafts,
+    which are of a similar grey in both. 1 where the tissue's run has no instrument to compare with, or it is the
     same run."""
     if tissue is instruments or not tissue.instruments:
         return 1.0, 1.0, 1.0
     ratio = _shaft_color(tissue) / _shaft_color(instruments).clamp_min(1e-3)
-    red, green, blue = (float(value) for value in ratio.clamp(*GAINS))
+    red, green, blue = (float(value) for value in ratio.clamp(*GAIN_RANGE))
     return red, green, blue
 
 
@@ -257,6 +257,6 @@ def _shaft_color(scene: GaussianScene) -> Tensor:
     """[3] the mean colour, at 100 mm, of what is solid of the instruments' shafts."""
     labels = scene.label_channels()
     shaft = [k for k, (_, part) in enumerate(scene.label_names) if part in ("shaft", "instrument")]
-    weight = labels[:, shaft].sum(1) * (torch.sigmoid(scene.canonical.opacity_logits) > SOLID)
+    weight = labels[:, shaft].sum(1) * (torch.sigmoid(scene.canonical.opacity_logits) > MIN_SHAFT_OPACITY)
     color = (scene.canonical.sh_dc[:, 0] * SH_C0 + 0.5).clamp(0, 1)
     return (weight[:, None] * color).sum(0) / weight.sum().clamp_min(1e-6)

@@ -44,7 +44,7 @@ class PackedSpec:
             paths["effects.yaml"] = Path(spec.settings.camera_effects)
         if spec.settings.states not in SAMPLERS:
             paths["states.jsonl"] = states_file(spec.settings.states)
-        files = {name: read_bytes(path, "a file of what is drawn") for name, path in paths.items()}
+        files = {name: read_bytes(path, "a scene or settings file") for name, path in paths.items()}
         content = b"".join(hashlib.sha256(files[name]).digest() for name in sorted(files))
         return cls(spec, files, hashlib.sha256(content + repr(spec.settings).encode()).hexdigest())
 

@@ -1,4 +1,4 @@
-"""A contact sheet: a look at the data set with its labels drawn over the images."""
+"""preview.png: a contact sheet of the data set, its labels drawn over the images."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def write_preview(
 
 
 def draw_tile(root: Path, record: Record, bones: Sequence[tuple[str, str]] = ()) -> Image.Image:
-    """One image with its labels drawn over it, and a caption below; `bones` join keypoints."""
+    """Return one image with its labels drawn over it, and a caption below; `bones` join keypoints."""
     with Image.open(root / record["image"]) as stored:
         pixels = np.asarray(stored.convert("RGB"), dtype=float)
     with Image.open(root / "parts" / f"{stem(record['index'])}.png") as stored:
@@ -117,7 +117,7 @@ def _tag(canvas: ImageDraw.ImageDraw, x: float, y: float, text: str) -> None:
 
 
 def _caption(record: Record) -> tuple[list[str], list[str]]:
-    """Which image with which joint values, and what is seen of each instrument."""
+    """Return two lines: the image with its joint values, and the visible share of each instrument."""
     joints = [
         f"{joint} {value:.2f}" for instrument in record["instruments"] for joint, value in instrument["joints"].items()
     ]

@@ -1,4 +1,4 @@
-"""`neeco render`: draw the frames of a split, or given states, with part ids and masks."""
+"""`neeco render`: render the frames of a split, or given states, with part ids and masks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STATES_FOLDER = "states"
 
 @dataclass(frozen=True)
 class Rendered:
-    """What was drawn, and where it lies."""
+    """The rendered images: their folder and number."""
 
     folder: Path
     images: int
@@ -41,7 +41,7 @@ class Rendered:
 
 
 class View(NamedTuple):
-    """One image to draw."""
+    """An image to render."""
 
     name: str
     state: State

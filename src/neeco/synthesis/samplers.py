@@ -1,4 +1,4 @@
-"""Samplers of views, and what draws the state and the camera of image `index` as the user asked for them.
+"""Samplers of views, and of the state and camera of image `index`.
 
 Views: recorded cameras, cameras near them, cameras in orbit about the tissue.
 """
@@ -22,6 +22,7 @@ from neeco.errors import NeecoError
 from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import rays_of_pixels
+from neeco.geometry.rotations import rigid
 from neeco.labels.annotation import any_in_image, working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
@@ -33,25 +34,24 @@ from neeco.synthesis.states import (
     ListedStates,
     PathStates,
     StateSampler,
-    rigid,
     turn_about,
 )
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
 
-SIMILAR = 10  # recorded frames whose cameras may see a drawn state
-VIEW_ATTEMPTS = 50  # views drawn until one has the instrument in the image
-STILL_DEGREES, STILL_MM = 1.0, 1.0  # by which perturbed views differ from those of a still scope: it saw one side
-SURFACE_VIEWS = 5  # recorded views that decide where the surface's middle is
+N_SIMILAR = 10  # recorded frames whose cameras may observe a sampled state
+MAX_VIEW_ATTEMPTS = 50  # views sampled until one has the instrument in the image
+STILL_DEGREES, STILL_MM = 1.0, 1.0  # by which perturbed views differ from those of a still scope: it observed one side
+N_SURFACE_VIEWS = 5  # recorded views that decide where the surface's middle is
 
 # Draws a camera for a state; intrinsics and image size are always those of a recorded camera.
 ViewSampler = Callable[[State, Generator], Camera]
 
 
 class SimilarFrames:
-    """Picks one of `count` recorded frames (its index): of the SIMILAR whose instruments stood most like the drawn
-    ones, or any where nothing tells them apart. states: the frames'; empty: nothing does."""
+    """Picks one of `count` recorded frames (its index): among the N_SIMILAR ones with the most similar states, or any
+    where all states are equal. states: those of the frames; empty: none are known."""
 
     def __init__(self, states: Sequence[State], count: int, joints: bool) -> None:
         common = set.intersection(*(set(state.instruments) for state in states)) if states else set()
@@ -60,22 +60,22 @@ class SimilarFrames:
         self._count = count
 
     def any(self, rng: Generator) -> int:
-        """Any frame."""
+        """Return any frame."""
         return int(rng.integers(self._count))
 
     def like(self, state: State, rng: Generator) -> int:
-        """A frame whose instruments stood like those of `state`."""
+        """Return a frame whose state is similar to `state`."""
         if self._recorded is None or not set(self._recorded.instruments) <= set(state.instruments):
             return self.any(rng)
-        nearest = np.argsort(self._recorded.distances(state), kind="stable")[:SIMILAR]
+        nearest = np.argsort(self._recorded.distances(state), kind="stable")[:N_SIMILAR]
         return int(nearest[rng.integers(len(nearest))])
 
 
 class RecordedViews:
-    """The camera of a recorded frame, one of the SIMILAR whose instruments stood most like the drawn ones.
+    """The camera of a recorded frame, one of the N_SIMILAR with the most similar states.
 
-    A camera that follows its instrument saw it there: drawn so, instruments stand in the image as recorded ones do,
-    which is what a detector learns from (docs/benchmarks.md). states: the recorded frames'; empty: any camera.
+    A camera that follows its instrument observed it there: instruments stand in the image as recorded ones do, which
+    is what a detector learns from (docs/benchmarks.md). states: the recorded frames'; empty: any camera.
     """
 
     def __init__(self, cameras: Sequence[Camera], states: Sequence[State] = ()) -> None:
@@ -129,7 +129,7 @@ class OrbitViews:
 
 @dataclass(frozen=True)
 class Sampler:
-    """Draws (state, camera) of image `index`."""
+    """Samples (state, camera) of image `index`."""
 
     scene: GaussianScene
     states: StateSampler
@@ -138,18 +138,18 @@ class Sampler:
 
     @property
     def prescribed(self) -> bool:
-        """Whether the state of an index is given rather than random."""
+        """Return whether the state of an index is given rather than random."""
         return self.states.prescribed
 
     def fixed(self, index: int) -> bool:
-        """Whether both state and camera of image `index` are given: another draw would be the same."""
+        """Return whether both state and camera of image `index` are given: another sample would be the same."""
         return self.prescribed and self.cameras[index % len(self.cameras)] is not None
 
     def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
-        """The next (state, camera) for image `index`.
+        """Return the next (state, camera) for image `index`.
 
-        Most views of a moving camera do not show the instrument, and drawing is costly: views are drawn until one has
-        the instrument in the image, VIEW_ATTEMPTS times at most.
+        Most views of a moving camera do not show the instrument, and rendering is costly: views are sampled until one
+        has the instrument in the image, MAX_VIEW_ATTEMPTS times at most.
         """
         state = self.states(index, rng)
         given = self.cameras[index % len(self.cameras)]
@@ -157,7 +157,7 @@ class Sampler:
             return state, given
         points = working_ends_or_origins(self.scene, state)
         camera = self.views(state, rng)
-        for _ in range(VIEW_ATTEMPTS):
+        for _ in range(MAX_VIEW_ATTEMPTS):
             if any_in_image(camera, points):
                 break
             camera = self.views(state, rng)
@@ -166,21 +166,21 @@ class Sampler:
 
 @dataclass(frozen=True)
 class TissueSampler:
-    """Draws (state, camera) of image `index` over several tissues in turn, each by the sampler of its own recording."""
+    """Samples (state, camera) of image `index` over several tissues in turn, by the sampler of each recording."""
 
     samplers: tuple[Sampler, ...]
 
     @property
     def prescribed(self) -> bool:
-        """As `Sampler.prescribed`."""
+        """See `Sampler.prescribed`."""
         return self.samplers[0].prescribed
 
     def fixed(self, index: int) -> bool:
-        """As `Sampler.fixed`: no camera is given where a sampler draws."""
+        """Return False: no camera is given where states are sampled."""
         return False
 
     def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
-        """The next (state, camera) for image `index`."""
+        """Return the next (state, camera) for image `index`."""
         number, turn = divmod(index, len(self.samplers))
         return self.samplers[turn](number, rng)
 
@@ -299,7 +299,7 @@ def surface_centre(scene: GaussianScene) -> np.ndarray:
     """The median [3] mm of the surface points that recorded cameras see."""
     recorded = scene.recorded
     points = []
-    for k in evenly_spaced(len(recorded.cameras), SURFACE_VIEWS, floor=True):
+    for k in evenly_spaced(len(recorded.cameras), N_SURFACE_VIEWS, floor=True):
         camera = recorded.cameras[k]
         points.append(surface_points(surface_depth(rasterize(scene.at(recorded.states[k]), camera)), camera))
     seen = np.concatenate(points)

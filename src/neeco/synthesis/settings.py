@@ -1,4 +1,4 @@
-"""What a data set is to be. Imports nothing heavy, so that `neeco synthesize --help` is quick."""
+"""Settings of data sets. Imports nothing heavy, so that `neeco synthesize --help` is quick."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ DEFAULT_FORMATS = ("coco", "yolo")
 WRITERS = "neeco.writers"  # the group of entry points of others'
 PATH_PREFIX = "path:"
 SIZE = re.compile(r"[1-9]\d{0,5}[xX][1-9]\d{0,5}")
-SAMPLERS = ("interpolate", "extrapolate", "grid")  # what `states` may be beside a file
+SAMPLERS = ("interpolate", "extrapolate", "grid")  # values of `states` other than a file
 
 MAX_PIXELS = 2**26  # of an image
-JPEG_QUALITY = 95  # of 100, where none is asked for
+JPEG_QUALITY = 95  # of 100, by default
 
 MIN_TRUST = 0.8  # of a recorded frame's label, below which `annotate` does not write it
 
@@ -32,7 +32,7 @@ ImageFormat = Literal["png", "jpg"]
 
 @dataclass(frozen=True, kw_only=True)
 class SizeSettings:
-    """How large the images are to be."""
+    """Size of the images."""
 
     size: str | None = None
     """WIDTHxHEIGHT of the images, px, in the shape of the recorded ones; theirs when not given."""
@@ -50,7 +50,7 @@ class SizeSettings:
 
     def of(self, width: int, height: int) -> tuple[int, int]:
         """Width and height, px, of images that were recorded `width` x `height` px large. Raises NeecoError where these
-        have another shape than the size asked for, or no image can be so large."""
+        have another shape than the requested size, or no image can be so large."""
         found = width, height
         if self.scale is not None:
             scale = min(self.scale, MAX_PIXELS)
@@ -72,10 +72,10 @@ class SizeSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageSettings(SizeSettings):
-    """How images are drawn and stored, whatever they show."""
+    """Rendering and storage of images, whatever they show."""
 
     lens: bool = False
-    """Draw with the recording's own distortion and round border, labels too; else undistorted."""
+    """Render with the recording's own distortion and round border, labels too; else undistorted."""
     image_format: ImageFormat = "png"
     """Of the images; labels and depth are PNG always."""
     quality: int = JPEG_QUALITY
@@ -95,8 +95,8 @@ class ImageSettings(SizeSettings):
         return self.quality if self.image_format == "jpg" else None
 
     def image_identity(self, width: int, height: int) -> dict[str, Any]:
-        """Of images recorded `width` x `height` px large, what must stay the same for a data set to be continued: None
-        where it is as versions made them that could do nothing else."""
+        """Return the settings of images recorded `width` x `height` px large that must stay the same for a data set to
+        be continued; None where they are the only ones that earlier versions had."""
         size = self.of(width, height)
         return {
             "size": None if size == (width, height) else "x".join(map(str, size)),
@@ -120,7 +120,7 @@ RECORDED_SIZE, AS_RECORDED = SizeSettings(), ImageSettings()
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(ImageSettings):
-    """What decides the pixels and labels of a data set, apart from the scene. Every field goes into dataset.json."""
+    """Everything that decides the pixels and labels of a data set, apart from the scene; stored in dataset.json."""
 
     count: int
     """How many images."""
@@ -132,9 +132,9 @@ class Settings(ImageSettings):
     margin: float = 0.2
     """How far `extrapolate` goes, as a share of the recorded range at either end."""
     views: Views = "recorded"
-    """Cameras: of a recorded frame with a like state, near such ones, or from there in orbit about the tissue."""
+    """Cameras: of a recorded frame with a similar state, near such ones, or from there in orbit about the tissue."""
     labels: LabelWay = "composited"
-    """composited: what compositing says, occlusion-correct. threshold: the paper's, from what moves."""
+    """composited: from compositing, occlusion-correct. threshold: the paper's, from Gaussians that move."""
     label_threshold: float | None = None
     """Share of a pixel that must be instrument (composited); the project's measured best when not given."""
     delta_thresholds: tuple[float, float, float] | None = None
@@ -150,9 +150,9 @@ class Settings(ImageSettings):
     max_unobserved: float = 0.25
     """Refuse images in which more of the instruments' pixels than this share shows what no training frame saw."""
     camera_effects: str | None = None
-    """YAML file of blur, noise, smoke and the like, and the ranges they are drawn from (docs/synthesis.md)."""
+    """YAML file of blur, noise, smoke and the like, and the ranges they are sampled from (docs/synthesis.md)."""
     max_attempts: int = 50
-    """How often to draw a state anew when it is refused."""
+    """How often to sample a state anew when it is refused."""
 
     @classmethod
     def from_values(cls, owner: str, **values: Any) -> Settings:
@@ -191,8 +191,8 @@ class Settings(ImageSettings):
             raise NeecoError(f"--min-component: {self.min_component} is not a share; give 0 or more and less than 1")
 
     def identity(self) -> dict[str, Any]:
-        """What must stay the same for a data set to be continued: all but the count, unless a path spreads over it, and
-        beside `image_identity`."""
+        """Return the settings that must stay the same for a data set to be continued, other than `image_identity`: all
+        but the count, unless a path spreads over it."""
         values = asdict(self)
         del values["max_attempts"]  # more of them change no image that was made
         for field in fields(ImageSettings):

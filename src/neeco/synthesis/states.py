@@ -1,7 +1,7 @@
 """Samplers of instrument states.
 
 A sampler turns (index, random generator) into a state. The generator is seeded by (seed, index) alone, so any image of
-a data set can be drawn without the others, in any order, and comes out the same.
+a data set can be rendered without the others, in any order, with the same result.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
 
-AT_ZERO = 0.05  # of a joint's range: what lies past 0 by less is noise of its sensor
-JITTER = 0.02  # of the recorded spread: keeps a sample off the exact line between two recorded states
+ZERO_SHARE = 0.05  # of a joint's range: what lies past 0 by less is noise of its sensor
+JITTER_SHARE = 0.02  # of the recorded spread: keeps a sample off the exact line between two recorded states
 
 
 @dataclass(frozen=True)
 class JointRange:
-    """Where a joint may go, in rad."""
+    """The range of a joint, rad."""
 
     lower: float
     upper: float
@@ -39,9 +40,9 @@ class JointRange:
         states none, a range on one side of 0 stays there: an angle of 0 is a closed jaw."""
         length = self.upper - self.lower
         reach = margin * length
-        if limits is None and self.lower >= -AT_ZERO * length:
+        if limits is None and self.lower >= -ZERO_SHARE * length:
             limits = 0.0, math.inf
-        elif limits is None and self.upper <= AT_ZERO * length:
+        elif limits is None and self.upper <= ZERO_SHARE * length:
             limits = -math.inf, 0.0
         lower, upper = self.lower - reach, self.upper + reach
         if limits is not None:
@@ -49,13 +50,6 @@ class JointRange:
             lower = min(self.lower, max(lower, limits[0]))
             upper = max(self.upper, min(upper, limits[1]))
         return JointRange(lower, upper)
-
-
-def rigid(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """The pose [4, 4] of a rotation [3, 3] and a position [3] mm."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, position
-    return pose
 
 
 def turn_about(point: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
@@ -133,8 +127,8 @@ class InterpolatedStates:
             self.bounds[name] = positions.min(0), positions.max(0)
             turns.append(float((Rotation.from_matrix(mean).inv() * rotations).magnitude().max()))
         spans = [upper - lower for lower, upper in self.bounds.values()]
-        self.jitter_mm = JITTER * float(np.linalg.norm(np.mean(spans, axis=0)))
-        self.jitter_rad = JITTER * float(np.mean(turns))
+        self.jitter_mm = JITTER_SHARE * float(np.linalg.norm(np.mean(spans, axis=0)))
+        self.jitter_rad = JITTER_SHARE * float(np.mean(turns))
 
     def __call__(self, index: int, rng: Generator) -> State:
         first, second = (self.states[k] for k in rng.integers(len(self.states), size=2))
@@ -160,7 +154,7 @@ class ExtrapolatedStates(InterpolatedStates):
     """States from the recorded range widened by `margin`.
 
     Joints are uniform over their range widened by that fraction at either end, within the limits the capture states;
-    poses are drawn as `InterpolatedStates` does and then moved away from the mean recorded pose by a factor in
+    poses are sampled as `InterpolatedStates` does and then moved away from the mean recorded pose by a factor in
     [1, 1 + 2 margin], as the half range either side of the mean grows by that much; all instruments of a state by the
     same factor.
     """
@@ -235,7 +229,7 @@ class PathStates:
 
 
 class ListedStates:
-    """The given states in order; from the start again when more images are asked for than states are given."""
+    """The given states in order; from the start again when more images than states are requested."""
 
     prescribed = True
 

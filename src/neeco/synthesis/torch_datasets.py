@@ -1,4 +1,4 @@
-"""Labelled images as torch data sets: drawn on the fly, or read from a folder that `neeco synthesize` wrote.
+"""Labelled images as torch data sets: rendered on the fly, or read from a folder that `neeco synthesize` wrote.
 
 A sample is a dict; H x W is the image's size, I the number of instruments that it shows, K that of keypoint names:
 
@@ -15,7 +15,7 @@ A sample is a dict; H x W is the image's size, I the number of instruments that 
     camera     Camera: intrinsics (px) and world_from_camera (mm, OpenCV axes)
     index      int
 
-Teach a segmenter on images that are drawn while it learns, nothing written:
+Train a segmenter on images that are rendered on the fly, nothing written:
 
     import neeco
     from torch.utils.data import DataLoader
@@ -87,7 +87,7 @@ STACKED = ("image", "parts", "depth", "ignore")  # of one shape in a batch; the 
 RANDOM = ("interpolate", "extrapolate")  # samplers that draw anew what is refused
 MAX_REFUSED = 1000  # given states refused in a row, before a stream ends with an error
 ASKED_BY = "LabelledImages"  # in error messages
-READ = ("parts", "ignore", "depth")  # folders of the files that a sample is made of beside its image
+READ = ("parts", "ignore", "depth")  # folders of the files of a sample, in addition to its image
 REMEDY = "give a folder that `neeco synthesize` wrote"
 INFO_LIKE = {
     "ids": [{"id": int, "part": str}],
@@ -119,8 +119,8 @@ def sample_states(
     """`count` instrument states, each with a camera to see it from, as `neeco synthesize` draws them at first.
 
     scene: a run, its folder, a scene, or its file. states: interpolate, extrapolate, grid, path:FILE.jsonl or
-    FILE.jsonl; views: recorded, perturbed or orbit (see `Settings`). Nothing is drawn, so none is refused for what the
-    image shows. The same seed gives the same states. Raises NeecoError for settings or a scene that do not fit.
+    FILE.jsonl; views: recorded, perturbed or orbit (see `Settings`). Nothing is rendered, so none is refused for what
+    the image shows. The same seed gives the same states. Raises NeecoError for settings or a scene that do not fit.
 
         for state, camera in neeco.sample_states("runs/sample", 3, states="extrapolate"):
             print(state.instruments["maryland"].joints, camera.width, camera.height)
@@ -131,8 +131,8 @@ def sample_states(
 
 
 class _Generated:
-    """What draws the samples of a data set. To another process it goes as the scene's file where there is one, else as
-    the file's bytes, and is opened there when the first sample is drawn."""
+    """The generator of a data set's samples. Other processes get the scene's file where there is one, else the file's
+    bytes, and open it for the first sample."""
 
     collate = staticmethod(collate)
 
@@ -173,10 +173,10 @@ class _Generated:
 
 
 class LabelledImages(_Generated, Dataset[Sample]):
-    """A map-style data set of `count` labelled images, drawn when they are asked for: nothing is written.
+    """A map-style data set of `count` labelled images, rendered on access: nothing is written.
 
     scene: a run (`neeco.load`), its folder, a scene, or its file. instruments: runs or scenes whose instruments are
-    drawn over the scene's tissue, instead of its own. states: interpolate, extrapolate, grid, path:FILE.jsonl or
+    rendered over the scene's tissue, instead of its own. states: interpolate, extrapolate, grid, path:FILE.jsonl or
     FILE.jsonl; views: recorded, perturbed or orbit; labels: composited or threshold; camera_effects: a YAML file;
     `settings`: any other field of `neeco.synthesis.settings.Settings`, such as size="1280x1024", scale=2.0 or
     lens=True. transform: sample -> sample, such as an augmentation. Samples are described in this module's docstring.
@@ -186,8 +186,8 @@ class LabelledImages(_Generated, Dataset[Sample]):
     worker uses one thread; it opens the scene's file when it draws its first sample (a scene without a file is sent to
     it). Drawing on a GPU needs spawned workers, or none.
 
-    Raises NeecoError for a scene or settings that do not fit, and, when a sample is drawn, StatesRefused (a NeecoError)
-    where no state is acceptable.
+    Raises NeecoError for a scene or settings that do not fit, and, when a sample is rendered, StatesRefused (a
+    NeecoError) where no state is acceptable.
 
         images = neeco.LabelledImages("runs/sample", 100, seed=1)
         sample = images[0]
@@ -230,8 +230,8 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
     """An endless stream of the samples `start`, `start` + 1, ... of `LabelledImages`, which see for the arguments.
 
     The workers of a DataLoader share the indices: of W workers the k-th draws start + k, start + k + W, ...; `shard` =
-    (rank, world size) shares them among processes in the same way first. So no sample is drawn twice, and each is the
-    same whoever draws it. Prescribed states that are refused are left out; path:FILE.jsonl, which has an end, is not
+    (rank, world size) shares them among processes in the same way first. So no sample is rendered twice, and each is
+    the same in any worker. Prescribed states that are refused are left out; path:FILE.jsonl, which has an end, is not
     for a stream.
 
         stream = neeco.LabelledStream("runs/sample", seed=1)
@@ -347,7 +347,7 @@ class StoredImages(Dataset[Sample]):
         )
         lens = parse_lens(place)
         assert lens is not None
-        camera = lens.before(Camera(world_from_camera, *lens.intrinsics, *size))
+        camera = lens.distorted_camera(Camera(world_from_camera, *lens.intrinsics, *size))
         found = labelled.targets() | {"state": state, "camera": camera, "index": record["index"]}
         return found if self.transform is None else self.transform(found)
 

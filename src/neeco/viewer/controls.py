@@ -12,10 +12,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
 from neeco.scene.gaussian_scene import is_gaussian
 from neeco.synthesis.samplers import instrument_axes
-from neeco.synthesis.states import JointRange, interpolate_pose, joint_ranges, rigid, turn_about
+from neeco.synthesis.states import JointRange, interpolate_pose, joint_ranges, turn_about
 
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene

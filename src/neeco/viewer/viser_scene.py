@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import evenly_spaced
 from neeco.geometry.camera import Camera
+from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
-from neeco.synthesis.states import rigid
 from neeco.viewer.runs import DISTANCE_UNITS, LoadedRun
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ named only if the correlation is clearly higher without it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -52,12 +52,12 @@ LUMA = np.array([0.299, 0.587, 0.114])  # of red, green, blue
 Pixels = tuple[np.ndarray, np.ndarray]  # columns and rows, px
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Hypothesis:
     """A mistake, what to do about it, and what cameras and pixels are without it."""
 
-    message: str = field(default="", kw_only=False)
-    remedy: str = field(default="", kw_only=False)
+    message: str = ""
+    remedy: str = ""
     cameras: CameraArrays | None = None  # of all frames; None: as given
     pixels: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Pixels] | None = None  # u, v, width, height
     distortion: float = 0.0  # k1

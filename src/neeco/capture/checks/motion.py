@@ -8,14 +8,14 @@ explains it, only the contradiction is reported.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.checks._mistakes import placement_mistakes, rotation_mistakes
-from neeco.capture.checks.motion_evidence import MotionEvidence, Timeline
+from neeco.capture.checks.motion_evidence import MotionEvidence, TimeSteps
 from neeco.capture.documents import printable
 from neeco.capture.model import Instrument, InstrumentState
 from neeco.capture.readers.parsed import Parsed
@@ -55,7 +55,7 @@ class _Threshold(NamedTuple):
 TURNED, SHIFTED, ELSEWHERE = _Threshold(1.1, 3.0, 0.15), _Threshold(1.15, 5.0, 0.2), _Threshold(1.5, 5.0, 0.2)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Hypothesis:
     """Poses [F, 4, 4] without a mistake, and which frames have them, [F]."""
 
@@ -65,6 +65,7 @@ class _Hypothesis:
     inside: np.ndarray
     threshold: _Threshold
     kind: str
+    _: KW_ONLY
     steps: int = 0  # by which states are shifted
     in_time: bool = False  # by so many median steps of time, not by rows
 
@@ -236,14 +237,9 @@ def _turned(judged: _Judged) -> Iterator[_Hypothesis]:
         return
     states = [judged.states[row] for row in judged.rows]
     for mistake in rotation_mistakes(np.stack([state.pose.numpy() for state in states])):
-        yield _Hypothesis(
-            message=f"{mistake.what.format(of=judged.of)}: turned back, they fit what moves in the images better",
-            remedy=mistake.remedy,
-            poses=root_poses(judged.instrument, mistake.poses, states),
-            inside=judged.everywhere,
-            threshold=TURNED,
-            kind="rotations",
-        )
+        message = f"{mistake.what.format(of=judged.of)}: turned back, they fit what moves in the images better"
+        poses = root_poses(judged.instrument, mistake.poses, states)
+        yield _Hypothesis(message, mistake.remedy, poses, judged.everywhere, TURNED, "rotations")
 
 
 def _clearly_turned(motion: MotionEvidence, given: np.ndarray, other: _Hypothesis) -> bool:
@@ -258,14 +254,9 @@ def _placed(judged: _Judged) -> Iterator[_Hypothesis]:
     frames = [judged.parsed.frames[row] for row in judged.rows]
     cameras = np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames])
     for mistake in placement_mistakes(judged.given, cameras):
-        yield _Hypothesis(
-            message=f"{mistake.what.format(of=judged.of)}: corrected, they lie on what moves in the images",
-            remedy=mistake.remedy,
-            poses=mistake.poses,
-            inside=judged.everywhere,
-            threshold=ELSEWHERE,
-            kind=mistake.what.split()[0],
-        )
+        message = f"{mistake.what.format(of=judged.of)}: corrected, they lie on what moves in the images"
+        kind = mistake.what.split()[0]
+        yield _Hypothesis(message, mistake.remedy, mistake.poses, judged.everywhere, ELSEWHERE, kind)
 
 
 class _Shifts:
@@ -273,7 +264,7 @@ class _Shifts:
 
     def __init__(self, judged: _Judged) -> None:
         self.judged, self.poses, self.rows = judged, judged.poses, judged.rows
-        self.timeline = Timeline(np.array([frame.state.time for frame in judged.parsed.frames]))
+        self.timeline = TimeSteps(np.array([frame.state.time for frame in judged.parsed.frames]))
         self.longest = int(self.timeline.longest * MAX_SHIFT)
 
     def likeliest(self, few: MotionEvidence) -> list[_Hypothesis]:
@@ -285,16 +276,9 @@ class _Shifts:
             near = _likeliest((self._by_time(step, nearest=True) for step in steps), few)
             found += [self._by_time(one.steps) for one in near]
         found += _likeliest((self._by_rate(rate) for rate in RATES), few)
-        backwards, inside = self.timeline.backwards(self.poses, self.rows)
-        reverse = _Hypothesis(
-            message=f"states {self.judged.of} are in reverse order: turned round, they fit the images",
-            remedy="list them in the images' order",
-            poses=backwards,
-            inside=inside,
-            threshold=ELSEWHERE,
-            kind="backwards",
-        )
-        return [*found, reverse]
+        message = f"states {self.judged.of} are in reverse order: turned round, they fit the images"
+        remedy, backwards = "list them in the images' order", self.timeline.backwards(self.poses, self.rows)
+        return [*found, _Hypothesis(message, remedy, *backwards, ELSEWHERE, "backwards")]
 
     def refined(self, found: _Hypothesis) -> _Hypothesis:
         """The best of the shifts near to one, on the frames for which all of them have poses."""
@@ -316,18 +300,12 @@ class _Shifts:
     def _shift(self, steps: int, amount: str, poses: np.ndarray, inside: np.ndarray) -> _Hypothesis:
         direction = "earlier" if steps > 0 else "later"  # than the images they are listed with
         small = abs(steps) <= min(SMALL_SHIFT, self.timeline.longest // 5)
-        return _Hypothesis(
-            message=f"states {self.judged.of} fit the images better {amount} {direction}",
-            remedy=f"move them {amount} {direction} (a clock's offset, frames dropped or counted from another one?)",
-            poses=poses,
-            inside=inside,
-            threshold=SHIFTED if small else ELSEWHERE,
-            kind="shift",
-            steps=steps,
-        )
+        message = f"states {self.judged.of} fit the images better {amount} {direction}"
+        remedy = f"move them {amount} {direction} (a clock's offset, frames dropped or counted from another one?)"
+        return _Hypothesis(message, remedy, poses, inside, SHIFTED if small else ELSEWHERE, "shift", steps=steps)
 
     def _by_rate(self, rate: float) -> _Hypothesis:
-        poses, inside = self.timeline.by_time(self.poses, self.rows, rate=rate, nearest=True)
+        found = self.timeline.by_time(self.poses, self.rows, rate=rate, nearest=True)
         message = f"states {self.judged.of} fit the images better on a clock that runs {rate:.3g} times as fast"
         remedy = "correct their times, or the images' (24, 25 or 30 frames a second?)"
-        return _Hypothesis(message=message, remedy=remedy, poses=poses, inside=inside, threshold=SHIFTED, kind="rate")
+        return _Hypothesis(message, remedy, *found, SHIFTED, "rate")

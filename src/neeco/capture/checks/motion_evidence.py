@@ -35,7 +35,7 @@ COMPARED_RAYS = 0.4  # share of the rays: those which some poses explain best
 MIN_EVIDENCE = 0.1  # of a ray that some poses explain
 
 
-class Timeline:
+class TimeSteps:
     """Frames in steps of time: frames of one time (several cameras) are one step; where time goes back, another
     recording begins."""
 
@@ -102,16 +102,6 @@ class _Views:
         if len(known) >= MIN_FRAMES:
             self._find_motion([frames[row] for row in self.rows])
 
-    @property
-    def world_from_camera(self) -> np.ndarray:
-        """[F, 4, 4] mm."""
-        return self.cameras.poses
-
-    @property
-    def intrinsics(self) -> np.ndarray:
-        """[F, 4] fx, fy, cx, cy px."""
-        return self.cameras.intrinsics
-
     def _find_motion(self, frames: list[Frame]) -> None:
         pictures = np.stack([self._reduced(frame.load_image_bytes().numpy()) for frame in frames])
         masks = [frame.load_mask() for frame in frames]
@@ -128,7 +118,7 @@ class _Views:
 
     def _tissue_depth(self, points: np.ndarray, index: int) -> np.ndarray | None:
         """Depth [h, w] mm interpolated between the points [P, 3] in a camera's view; None where these are too few."""
-        pose, (fx, fy, cx, cy) = self.world_from_camera[index], self.intrinsics[index]
+        pose, (fx, fy, cx, cy) = self.cameras.poses[index], self.cameras.intrinsics[index]
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         local = local[local[:, 2] > MIN_DEPTH]
         pixels, depth = np.stack(project(local, fx, fy, cx, cy), -1), local[:, 2]
@@ -146,15 +136,15 @@ class _Views:
     def _difference(self, pictures: np.ndarray, shown: np.ndarray, index: int) -> np.ndarray:
         """Difference [h, w] of 255 of one of pictures [F, h, w, 3] from what others predict of the still scene, less
         what a shift by one pixel explains; 0 where too few observe the place, or masks [F, h, w] hide it."""
-        picture, pose, depth = pictures[index], self.world_from_camera[index], self.depths[index]
-        fx, fy, cx, cy = self.intrinsics[index]
+        picture, pose, depth = pictures[index], self.cameras.poses[index], self.depths[index]
+        fx, fy, cx, cy = self.cameras.intrinsics[index]
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         world = np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], -1) @ pose[:3, :3].T + pose[:3, 3]
         predictions, observed = [], np.zeros(depth.shape, int)
         for other in self._neighbours(index):
-            other_pose = self.world_from_camera[other]
+            other_pose = self.cameras.poses[other]
             local = (world - other_pose[:3, 3]) @ other_pose[:3, :3]
-            fx, fy, cx, cy = self.intrinsics[other]
+            fx, fy, cx, cy = self.cameras.intrinsics[other]
             x, y = (place.astype(np.float32) - 0.5 for place in project(local, fx, fy, cx, cy, MIN_DEPTH))
             warped = cv2.remap(pictures[other], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             visible = cv2.remap(shown[other], x, y, cv2.INTER_LINEAR, borderValue=0) > 0.9
@@ -170,7 +160,7 @@ class _Views:
 
     def _neighbours(self, index: int) -> list[int]:
         """Frames whose cameras are near that of `index`, spread over the time that they span."""
-        poses, pose = self.world_from_camera, self.world_from_camera[index]
+        poses, pose = self.cameras.poses, self.cameras.poses[index]
         aside = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.median(self.depths[index])
         cosine = (np.einsum("ij,fij->f", pose[:3, :3], poses[:, :3, :3]) - 1) / 2
         apart = aside + np.arccos(cosine.clip(-1, 1))
@@ -204,7 +194,7 @@ class MotionEvidence:
                 places += generator.choice(moving, each, replace=False).tolist()
         self.frames = np.array(frames, int)  # [R] index into `views`
         row, column = np.divmod(np.array(places, int), views.width)
-        fx, fy, cx, cy = views.intrinsics[self.frames].T
+        fx, fy, cx, cy = views.cameras.intrinsics[self.frames].T
         slopes = np.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones(len(row))], -1)  # [R, 3]
         depths = views.depths[self.frames, row, column][:, None] * DEPTHS
         self.points = slopes[:, None] * depths[..., None]  # [R, D, 3] mm, in the camera's frame
@@ -223,7 +213,7 @@ class MotionEvidence:
         """float32 [R, D, F] at the rays' points, carried to every frame by poses [F, 4, 4], world_from_instrument; 0
         where they are out of view."""
         views, count = self.views, len(self.views.rows)
-        camera_from_instrument = np.linalg.inv(views.world_from_camera) @ poses
+        camera_from_instrument = np.linalg.inv(views.cameras.poses) @ poses
         back = np.linalg.inv(camera_from_instrument)[self.frames]
         points = np.einsum("rij,rdj->rdi", back[:, :3, :3], self.points) + back[:, None, :3, 3]
         fixed = points.reshape(-1, 3).astype(np.float32)
@@ -231,7 +221,7 @@ class MotionEvidence:
             part.astype(np.float32) for part in (camera_from_instrument[:, :3, :3], camera_from_instrument[:, :3, 3])
         )
         x, y, z = (fixed @ turns[:, axis].T + moves[:, axis] for axis in range(3))  # each [R D, F] mm
-        fx, fy, cx, cy = views.intrinsics.astype(np.float32).T
+        fx, fy, cx, cy = views.cameras.intrinsics.astype(np.float32).T
         depth = z.clip(MIN_DEPTH)
         u, v = x / depth * fx + cx, y / depth * fy + cy
         inside = (z > MIN_DEPTH) & (u >= 0) & (u < views.width) & (v >= 0) & (v < views.height)
@@ -258,13 +248,13 @@ class MotionEvidence:
         """Median over the rays of the standard deviation, of the image's width, by which their points move over all
         frames, as one camera would see them."""
         views = self.views
-        back = np.linalg.inv(np.linalg.inv(views.world_from_camera) @ poses)[self.frames]
+        back = np.linalg.inv(np.linalg.inv(views.cameras.poses) @ poses)[self.frames]
         best = self.evidence(poses).mean(-1).argmax(1)
         points = np.einsum("rij,rj->ri", back[:, :3, :3], self.points[np.arange(len(best)), best]) + back[:, :3, 3]
         world = np.einsum("fij,rj->rfi", poses[:, :3, :3], points) + poses[:, :3, 3]
-        other_pose = views.world_from_camera[self.frames]
+        other_pose = views.cameras.poses[self.frames]
         local = np.einsum("rfi,rij->rfj", world - other_pose[:, None, :3, 3], other_pose[:, :3, :3])
-        fx, fy, cx, cy = views.intrinsics[self.frames].T[..., None]
+        fx, fy, cx, cy = views.cameras.intrinsics[self.frames].T[..., None]
         u, v = project(local, fx, fy, cx, cy, nearest=1.0)
         return float(np.median(np.hypot(u.std(1), v.std(1)))) / views.width
 

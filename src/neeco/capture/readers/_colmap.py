@@ -24,7 +24,7 @@ from neeco.errors import NeecoError
 from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import COLMAP
-from neeco.geometry.rotations import quat_to_matrix
+from neeco.geometry.rotations import quat_to_matrix, rigid
 from neeco.plausible import center_fault, focal_fault, size_fault
 
 _MODELS = {
@@ -67,7 +67,7 @@ def find_model(root: Path) -> Path | None:
 def parse_colmap(model: Path, root: Path, report: ProblemReport, *, as_source: bool = False) -> Parsed:
     """Read a COLMAP model; problems go to `report`. Lengths are in the model's own unit. as_source: see `Parsed`.
 
-    Images lie in `images/` beside it; sorted by name, every 8th is a test frame, and time is the order.
+    Images are in the capture's `images/`; sorted by name, every 8th is a test frame, and time is the order.
     """
     parsed = Parsed(root, timed=False, as_source=as_source)
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
@@ -151,10 +151,7 @@ def _world_from_camera(image: _Image) -> np.ndarray:
     if not (0.99 < norm < 1.01 and np.abs(translation).max() < 1e9):  # nor when NaN
         raise NeecoError("its pose is not a finite unit quaternion and translation; drop it")
     rotation = quat_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ translation
-    return COLMAP.camera_to_opencv(pose)
+    return COLMAP.camera_to_opencv(rigid(rotation.T, -rotation.T @ translation))
 
 
 def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:

@@ -41,7 +41,7 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
 
 
 def capture_of(parsed: Parsed) -> Capture:
-    """What was read without an error, as a capture, the poses of articulated instruments as those of their roots.
+    """Build the capture from what was read without errors. Poses of articulated instruments become their roots'.
     Raises NeecoError for an image whose name is not in UTF-8."""
     frames, instruments = tuple(parsed.frames), parsed.instruments
     for frame in frames:

@@ -103,8 +103,8 @@ def declared_instruments(document: Node) -> tuple[Instrument, ...]:
         if name in instruments:
             item.child("name").error(f"{printable(name)} is declared twice", "give every instrument its own name")
         tree = parse_kinematics(item.child("kinematics")) if item.has("kinematics") else None
-        seen = parse_from_video(item.child("from_video")) if item.has("from_video") else None
-        instruments[name] = Instrument(name, joints, tree, tuple(unrecorded), seen)
+        shaft = parse_from_video(item.child("from_video")) if item.has("from_video") else None
+        instruments[name] = Instrument(name, joints, tree, tuple(unrecorded), shaft)
     return tuple(instruments.values())
 
 
@@ -169,7 +169,7 @@ def _deviations(node: Node, what: str) -> tuple[float, float, float] | None:
 
 
 def _trust(item: Node) -> float | None:
-    """What a tracked state says of itself; None, reported where it is no share, of one that says nothing."""
+    """The confidence of a tracked state; None where none is stated, or, reported, where it is no share."""
     trust = item.child("trust").number() if item.has("trust") else None
     if trust is not None and not 0 <= trust <= 1:
         item.child("trust").error(f"is {trust:g}, not a share", "give 0 to 1, or leave it out")
@@ -178,7 +178,7 @@ def _trust(item: Node) -> float | None:
 
 
 def _is_unrecorded(joint: Node) -> bool:
-    """Whether a joint of the header says `"recorded": false`."""
+    """Return True if a joint of the header states `"recorded": false`."""
     if not joint.has("recorded"):
         return False
     recorded = joint.child("recorded")
@@ -188,7 +188,7 @@ def _is_unrecorded(joint: Node) -> bool:
 
 
 def _joint_nodes(item: Node) -> dict[str, Node] | None:
-    """What stands under each name in `joints` ({} where there is none), or None when that is no object."""
+    """The values in `joints` by name ({} where there is none), or None when that is no object."""
     if not item.has("joints"):
         return {}
     node = item.child("joints")
@@ -198,8 +198,8 @@ def _joint_nodes(item: Node) -> dict[str, Node] | None:
 def _parse_line(text: str, where: str, instruments: Sequence[Instrument], tissues: Sequence[str]) -> StateLine:
     try:
         value = json.loads(text)
-    except (ValueError, RecursionError) as error:  # beside what is no JSON: endless numbers and nesting
-        reason = error.msg if isinstance(error, json.JSONDecodeError) else "a number or the nesting is beyond measure"
+    except (ValueError, RecursionError) as error:  # RecursionError, ValueError: endless nesting and numbers
+        reason = error.msg if isinstance(error, json.JSONDecodeError) else "a number or the nesting is too large"
         raise NeecoError(f"{where}: not valid JSON: {reason}; give one JSON object per line") from None
     node = Node(value, where, "", RaisingReport())
     if not isinstance(node.child("instruments").value, list):

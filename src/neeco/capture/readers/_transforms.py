@@ -35,8 +35,6 @@ def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
         value = read_json(file)
     except NeecoError as error:
         report.error(name, "", str(error).removeprefix(f"{file}: "))
-    except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels
-        report.error(name, "", "not usable JSON: a number or the nesting is beyond all measure")
     node = Node(value, name, "", report)
     return node if node.is_object() else Node({}, name, "", report)
 
@@ -57,8 +55,7 @@ def parse_transforms(
 
 
 def is_blender(document: Node) -> bool:
-    """Whether a transforms file gives the field of view instead of intrinsics and no states, as Blender's exporters
-    do."""
+    """Return True if a transforms file has the field of view for intrinsics and no states, as Blender writes."""
     value = document.value
     return "camera_angle_x" in value and "fl_x" not in value and not _lists_states(document)
 
@@ -316,7 +313,7 @@ def _image(node: Node, folder: Path, parsed: Parsed, extensions: tuple[str, ...]
 
 
 class _HeaderReport(ProblemReport):
-    """What is wrong with the camera at the file's top level: reported once, with how many frames it concerns.
+    """Problems of the camera at the file's top level, each reported once with the number of frames it concerns.
 
     A number that neither a frame nor the top level gives counts as the top level's.
     """

@@ -15,12 +15,12 @@ from neeco.capture.documents import Node, as_float, printable
 from neeco.capture.images import image_size
 from neeco.capture.readers.parsed import Parsed
 from neeco.errors import NeecoError
-from neeco.geometry.camera import COEFFICIENTS, Camera
+from neeco.geometry.camera import COEFFICIENT_COUNTS, Camera
 from neeco.geometry.lens import BORDER, COEFFICIENT_NAMES, INTRINSICS, Border, Lens
-from neeco.plausible import LARGEST_SIZE, focal_fault, size_fault
+from neeco.plausible import MAX_SIZE_PX, focal_fault, size_fault
 
-MOST_PX = 65_536.0  # no image is as large
-MOST_BENT = 1e6  # nor any coefficient of a lens
+MAX_PX = 65_536.0  # beyond any image
+MAX_COEFFICIENT = 1e6  # beyond any lens
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIDISTANT", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 POLYNOMIAL = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 MODELS = (*POLYNOMIAL, *FISHEYE)
@@ -34,17 +34,17 @@ LISTED = {
     6: ("k1", "k2", "k3", "k4", "p1", "p2"),
     8: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-WIDEST_ANGLE = math.radians(80)  # off the axis, that a lens fitted by OpenCV's rational model may see
-MISFIT_PX = 0.1  # largest error of that fit
+MAX_ANGLE = math.radians(80)  # off the axis, of a lens fitted by OpenCV's rational model
+MAX_MISFIT_PX = 0.1  # largest error of that fit
 
 
 @dataclass(frozen=True)
 class StatedDistortion:
-    """What a file says of a lens's distortion: one of MODELS, and the coefficients that are not 0, by NAMES."""
+    """Distortion of a lens as a file states it: one of MODELS, and the coefficients that are not 0, by NAMES."""
 
     model: str
     coefficients: Mapping[str, float]
-    place: Node | None  # of what tells it: a fisheye model or the first coefficient; None: there is no distortion
+    place: Node | None  # where it is stated: a fisheye model or the first coefficient; None: there is no distortion
 
 
 def stated_distortion(node_of: Callable[[str], Node]) -> StatedDistortion | None:
@@ -129,19 +129,19 @@ def fit_rational(
     intrinsics: tuple[float, float, float, float],
     size: tuple[int, int] | None,
 ) -> tuple[float, ...]:
-    """OpenCV's eight coefficients of the rational model that shows rays where `bend` does, to MISFIT_PX or better.
+    """Fit OpenCV's rational model of eight coefficients to the radial distortion `bend`, to MAX_MISFIT_PX or better.
 
     bend: angles [N] off the axis, rad, to radii [N] in the image, in focal lengths. Least squares, reweighted by the
     denominator. Raises NeecoError ("what is wrong; what to do").
     """
     fl_x, fl_y, cx, cy = intrinsics
     width, height = size or (2 * cx, 2 * cy)
-    theta = np.linspace(1e-3, WIDEST_ANGLE, 2000)
+    theta = np.linspace(1e-3, MAX_ANGLE, 2000)
     bent = bend(theta)
     beyond = bent > math.hypot(max(cx, width - cx) / fl_x, max(cy, height - cy) / fl_y)
     used = slice(int(np.argmax(beyond)))
     if not beyond.any() or (np.diff(bent[used]) <= 0).any():
-        what = f"sees farther than {math.degrees(WIDEST_ANGLE):.0f} degrees off its axis, or folds the image over"
+        what = f"covers more than {math.degrees(MAX_ANGLE):.0f} degrees off its axis, or folds the image over"
         raise NeecoError(f"this lens {what}; crop the images, or calibrate again")
     radius, share = np.tan(theta[used]), bent[used] / np.tan(theta[used])
     powers = (radius[:, None] ** 2) ** np.arange(1, 4)  # [N, 3]
@@ -151,7 +151,7 @@ def fit_rational(
         found = np.linalg.lstsq(rows, (share - 1) * weight, rcond=None)[0]
         weight = radius / np.maximum(1 + powers @ found[3:], 1e-6)
     error = np.abs((1 + powers @ found[:3]) / (1 + powers @ found[3:]) - share) * radius * max(fl_x, fl_y)
-    if not error.max() < MISFIT_PX:
+    if not error.max() < MAX_MISFIT_PX:
         raise NeecoError(
             f"this lens bends too much for OpenCV's rational model ({error.max():.2f} px off); crop the images, or "
             "calibrate again"
@@ -169,8 +169,8 @@ def parse_lens(node: Node) -> Lens | None:
     if not node.is_object():
         return None
     size = [node.child(key).integer(least=1) for key in ("w", "h")]
-    focal = [node.child(key).number(above=0, below=MOST_PX) for key in INTRINSICS[:2]]
-    center = [node.child(key).number(above=-MOST_PX, below=MOST_PX) for key in INTRINSICS[2:]]
+    focal = [node.child(key).number(above=0, below=MAX_PX) for key in INTRINSICS[:2]]
+    center = [node.child(key).number(above=-MAX_PX, below=MAX_PX) for key in INTRINSICS[2:]]
     border = _border(node.child("border")) if node.has("border") else None
     distortion = _distortion(node)
     width, height = size
@@ -195,8 +195,11 @@ def _distortion(node: Node) -> tuple[float, ...] | None:
     """The coefficients up to the last that is given, as many as one of OpenCV's models has."""
     given = [node.has(name) for name in COEFFICIENT_NAMES]
     last = len(given) - given[::-1].index(True) if any(given) else 0
-    names = COEFFICIENT_NAMES[: min(count for count in COEFFICIENTS if count >= last)]
-    read = [node.child(name).number(above=-MOST_BENT, below=MOST_BENT) if node.has(name) else 0.0 for name in names]
+    names = COEFFICIENT_NAMES[: min(count for count in COEFFICIENT_COUNTS if count >= last)]
+    read = [
+        node.child(name).number(above=-MAX_COEFFICIENT, below=MAX_COEFFICIENT) if node.has(name) else 0.0
+        for name in names
+    ]
     known = tuple(value for value in read if value is not None)
     return known if len(known) == len(read) else None
 
@@ -204,8 +207,8 @@ def _distortion(node: Node) -> tuple[float, ...] | None:
 def _border(node: Node) -> Border | None:
     if not node.is_object():
         return None
-    x, y = (node.child(key).number(above=-MOST_PX, below=MOST_PX) for key in BORDER[:2])
-    radius = node.child(BORDER[2]).number(above=1, below=MOST_PX)
+    x, y = (node.child(key).number(above=-MAX_PX, below=MAX_PX) for key in BORDER[:2])
+    radius = node.child(BORDER[2]).number(above=1, below=MAX_PX)
     return None if x is None or y is None or radius is None else (x, y, radius)
 
 
@@ -219,7 +222,7 @@ def _size_or_largest(image_path: Path) -> tuple[int, int]:
     try:
         return image_size(image_path)
     except NeecoError:  # reported when the images are checked
-        return LARGEST_SIZE, LARGEST_SIZE
+        return MAX_SIZE_PX, MAX_SIZE_PX
 
 
 class CameraFields:
@@ -259,7 +262,7 @@ class CameraFields:
         stated = stated_distortion(self._node)
         if stated is None or stated.place is None or self.parsed.as_source:
             return stated
-        message = f"is {printable(stated.place.value)}: only PINHOLE is drawn, and the images are distorted"
+        message = f"is {printable(stated.place.value)}: the images are distorted, and cameras must be PINHOLE"
         stated.place.error(message, f"undistort them: neeco ingest {self.parsed.root} --output CAPTURE")
         return None
 

@@ -28,7 +28,7 @@ POSES_FILE = "poses_bounds.npy"
 MASKS = "masks"
 COLUMNS = 17
 FIRST_TEST = 1  # frames 1, 9, 17, ... test, as in EndoGaussian, SurgicalGaussian and Deform3DGS: numbers compare
-STILL = 1e-6  # of a pose's entries: less is one still camera
+MAX_STILL_CHANGE = 1e-6  # of the entries of a still camera's pose
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class _Row:
 
 
 def is_endonerf_folder(root: Path) -> bool:
-    """Whether a folder has EndoNeRF's poses."""
+    """Return True if a folder has EndoNeRF's poses."""
     return (root / POSES_FILE).is_file()
 
 
@@ -152,8 +152,8 @@ def _warn_of_limits(root: Path, rows: list[_Row], file: Node) -> None:
     file.child("instruments").warning("no instrument states", remedy)
     file.child("units").warning("names no unit of length", "lengths are taken as mm: distances may be off")
     poses = np.stack([row.world_from_camera for row in rows]) if rows else np.zeros((0, 4, 4))
-    if len(poses) > 1 and np.ptp(poses, axis=0).max() < STILL:
-        message = "the camera never moves, so the images do not tell depth"
+    if len(poses) > 1 and np.ptp(poses, axis=0).max() < MAX_STILL_CHANGE:
+        message = "the camera never moves, so the images do not determine depth"
         file.child("poses").warning(message, "views other than the recorded one will be wrong")
     elif len(poses) > 1:
         remedy = "folders prepared for some EndoNeRF successors hold right, down, forwards: reorder those"

@@ -15,9 +15,9 @@ from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.capture.kinematics import FIXED, JOINT_TYPES, Array, KinematicTree, Link
 from neeco.errors import NeecoError
 
-MOST_MM = 1e4  # no instrument is as long
-MOST_GAIN = 1e3
-UNIT = 1e-12  # how far from 1 the length of a unit vector of float64 may be
+MAX_MM = 1e4  # beyond any instrument
+MAX_GAIN = 1e3
+UNIT_TOLERANCE = 1e-12  # of the length of a unit vector of float64
 
 
 def parse_kinematics(node: Node) -> KinematicTree | None:
@@ -58,7 +58,7 @@ def _parse_link(node: Node) -> Link | None:
     origin = _origin(node.child("origin")) if node.has("origin") else np.eye(4)
     axis = _axis(node.child("axis")) if node.has("axis") else np.array([0.0, 0.0, 1.0])
     value = _gains(node.child("value")) if node.has("value") else {}
-    offset = node.child("offset").number(above=-MOST_MM, below=MOST_MM) if node.has("offset") else 0.0
+    offset = node.child("offset").number(above=-MAX_MM, below=MAX_MM) if node.has("offset") else 0.0
     limits = node.child("limits").range("rad or mm") if node.has("limits") else None
     body = node.child("body")
     if node.has("body") and not isinstance(body.value, bool):
@@ -80,7 +80,7 @@ def _origin(node: Node) -> Array | None:
     place = node.numbers(3, "x, y, z in mm")
     if place is None:
         return None
-    if max(map(abs, place)) > MOST_MM:
+    if max(map(abs, place)) > MAX_MM:
         node.error(f"lies {max(map(abs, place)):g} mm away", "give it in mm, in the parent's frame")
         return None
     origin = np.eye(4)
@@ -96,7 +96,9 @@ def _axis(node: Node) -> Array | None:
     if not 1e-6 < length < 1e6:
         node.error("is no direction", "give three numbers that are not all 0")
         return None
-    if abs(length - 1) < UNIT:  # as written by us: divided again, its last digits would change with every reading
+    if (
+        abs(length - 1) < UNIT_TOLERANCE
+    ):  # as written by us: divided again, its last digits would change with every reading
         return np.array(given)
     return np.array(given) / length
 
@@ -104,6 +106,6 @@ def _axis(node: Node) -> Array | None:
 def _gains(node: Node) -> dict[str, float] | None:
     if not node.is_object():
         return None
-    found = {name: node.child(name).number(above=-MOST_GAIN, below=MOST_GAIN) for name in node.value}
+    found = {name: node.child(name).number(above=-MAX_GAIN, below=MAX_GAIN) for name in node.value}
     known = {name: gain for name, gain in found.items() if gain is not None}
     return known if len(known) == len(found) else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import unicodedata
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -63,22 +64,23 @@ class Parsed:
 
     def with_cameras(self) -> Parsed:
         """The same without the frames whose camera is a placeholder."""
-        rows = [row for row in range(len(self.frames)) if row not in self.without_camera]
-        frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
-        return replace(self, frames=frames, places=places, without_camera=set())
+        return self._of_rows([row for row in range(len(self.frames)) if row not in self.without_camera])
 
     def by_tissue(self) -> list[Parsed]:
-        """What is of each tissue, whose world is its own, and has frames; all of it where there is one."""
+        """The parts of several tissues that have frames, each with a world of its own; the whole where there is one."""
         if not self.tissues:
             return [self]
         parts = []
         for tissue in self.tissues:
             rows = [row for row, frame in enumerate(self.frames) if frame.state.tissue == tissue.name]
-            without = {index for index, row in enumerate(rows) if row in self.without_camera}
-            frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
-            part = replace(self, frames=frames, places=places, without_camera=without, tissues=[], over=tissue.name)
+            part = replace(self._of_rows(rows), tissues=[], over=tissue.name)
             parts += [replace(part, points=tissue.points, points_place=tissue.place)] if rows else []
         return parts
+
+    def _of_rows(self, rows: Sequence[int]) -> Parsed:
+        without = {index for index, row in enumerate(rows) if row in self.without_camera}
+        frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
+        return replace(self, frames=frames, places=places, without_camera=without)
 
     def states_of(self, name: str) -> list[tuple[Node, InstrumentState]]:
         """(place of the state, state) of one instrument, over the frames that have it."""

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.kinematics import FIXED, PRISMATIC, REVOLUTE, KinematicTree, Link
 from neeco.errors import NeecoError
 from neeco.files import read_text
+from neeco.geometry.rotations import rigid
 
 MM = 1000.0  # per m
 TYPES = {"fixed": FIXED, "revolute": REVOLUTE, "continuous": REVOLUTE, "prismatic": PRISMATIC}
@@ -64,11 +65,11 @@ def read_urdf(
     for given in names:
         if given not in moving:
             raise NeecoError(f"{path}: readings: {given!r} is no joint that moves; it has {', '.join(sorted(moving))}")
-    seen = {name for name, _ in reached if known[name].visuals}
+    visible = {name for name, _ in reached if known[name].visuals}
     reached_joints = {joint.name: joint for _, joint in reached if joint is not None}
     links = []
     for name, joint in reached:
-        body = name in seen or not seen
+        body = name in visible or not visible
         links.append(Link(name, body=body) if joint is None else _link(joint, reached_joints, names, body, path))
     try:
         return KinematicTree(tuple(links), pose_of)
@@ -120,8 +121,8 @@ def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body:
         raise NeecoError(f"{path}: joint {joint.name!r} is {joint.type}; {', '.join(TYPES)} can be had")
     kind, origin = TYPES[joint.type], np.eye(4)
     if joint.origin is not None:
-        origin[:3, :3] = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0]).as_matrix()
-        origin[:3, 3] = MM * np.array(joint.origin.xyz or [0, 0, 0], np.float64)
+        turn = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0]).as_matrix()
+        origin = rigid(turn, MM * np.array(joint.origin.xyz or [0, 0, 0], np.float64))
     if kind == FIXED:
         return Link(joint.child, joint.parent, FIXED, origin, body=body)
     axis = np.array(joint.axis or [1.0, 0.0, 0.0], np.float64)  # URDF's own default

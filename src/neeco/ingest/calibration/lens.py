@@ -16,7 +16,7 @@ from neeco.capture.documents import Node, RaisingReport, as_float, printable
 from neeco.capture.readers.cameras import opencv_distortion, stated_distortion
 from neeco.errors import NeecoError
 from neeco.files import require_file
-from neeco.geometry.camera import COEFFICIENTS
+from neeco.geometry.camera import COEFFICIENT_COUNTS
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.camera_fields import EXPECTED, CameraNumbers, cameras_in, read_calibration
 from neeco.plausible import size_fault
@@ -110,7 +110,7 @@ def checked_lens(
     coefficients = tuple(float(value) for value in distortion)
     if fisheye:
         coefficients = _rational(source, [float(value) for value in values], coefficients, size)
-    if len(coefficients) not in COEFFICIENTS:
+    if len(coefficients) not in COEFFICIENT_COUNTS:
         raise NeecoError(f"{source}: distortion: has {len(coefficients)} coefficients; OpenCV has 4, 5, 8, 12 or 14")
     if not any(coefficients):
         coefficients = ()

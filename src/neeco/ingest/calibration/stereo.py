@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
 from neeco.files import read_text, require_file, visible_entries
-from neeco.geometry.camera import COEFFICIENTS
+from neeco.geometry.camera import COEFFICIENT_COUNTS
 from neeco.geometry.lens import Lens
-from neeco.geometry.rotations import rotation_error
+from neeco.geometry.rotations import rigid, rotation_error
 from neeco.ingest.calibration.camera_fields import (
     CameraNumbers,
     cameras_in,
@@ -233,7 +233,7 @@ def _numbers(path: Path, document: Mapping[str, Any], names: tuple[str, ...], co
 
 def _lens(path: Path, camera: CameraNumbers) -> Lens:
     """Return the lens of a camera, its distortion filled up with zeros to as many coefficients as OpenCV has."""
-    length = next((count for count in COEFFICIENTS if count >= len(camera.distortion)), len(camera.distortion))
+    length = next((count for count in COEFFICIENT_COUNTS if count >= len(camera.distortion)), len(camera.distortion))
     missing = (0.0,) * (length - len(camera.distortion))
     return lens_of(path, replace(camera, distortion=camera.distortion + missing))
 
@@ -263,6 +263,4 @@ def _pose(path: Path, turn: Sequence[float] | np.ndarray, shift: Sequence[float]
         raise NeecoError(
             f"{path}: T: puts the right camera to the left; exchange left and right, or give right_from_left (-R^T T)"
         )
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), vector * scales[0]
-    return pose
+    return rigid(rotation.as_matrix(), vector * scales[0])

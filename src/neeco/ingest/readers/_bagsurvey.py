@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid
 from neeco.ingest.readers import OTHER, Stream, Table
 from neeco.ingest.readers._bagfile import Bag, open_bag, plain
 from neeco.ingest.readers._rosimages import ImageLog
@@ -232,11 +233,10 @@ def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.n
     for edge in edges:
         log = survey.poses[f"tf:{edge}"]
         if log.static:
-            values, pose = log.table()[-1], np.eye(4)
+            values = log.table()[-1]
             if not (np.isfinite(values).all() and abs(np.linalg.norm(values[3:]) - 1) < NORM_TOLERANCE):
                 raise NeecoError(f"{survey.path}: tf:{edge}: is no rotation and translation; record it anew")
-            pose[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
-            pose[:3, 3] = 1000 * values[:3]
+            pose = rigid(Rotation.from_quat(values[3:]).as_matrix(), 1000 * values[:3])
             poses = np.tile(pose, (len(seconds), 1, 1))
         else:
             # as it stands, whatever its parent's axes: those of the last frame alone matter

@@ -8,7 +8,7 @@ import numpy as np
 
 from neeco.errors import NeecoError
 from neeco.ingest.foreground.residual_flow import ResidualFlow
-from neeco.ingest.frames.views import Views
+from neeco.ingest.frames.views import StageProgress, Views
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.registration.hand_eye import Registration, register_with_laparoscope
 from neeco.ingest.timing.clock_search import (
@@ -144,11 +144,14 @@ def _take(data: Episodes, episode: int, name: str, found: ClockOffset) -> Episod
     return data.with_clocks(episode, clocks)
 
 
-def find_instrument_clocks(data: Episodes, flow: ResidualFlow, views: Views) -> Episodes:
+def find_instrument_clocks(data: Episodes, flow: ResidualFlow, views: Views, progress: StageProgress) -> Episodes:
     """Find the clocks of instruments that the scope did not give, from their motion in the images.
 
     They are taken where nothing gave them, and compared where `sync` did. views: the rows of `flow`.
     """
+    if not any(_is_open(part, log) for part in data.parts for log in part.poses.values()):
+        return data
+    progress("finding the instrument's clock", 0, 0)
     moved = flow.fastest_motion()
     for episode, part in enumerate(data.parts):
         rows = np.flatnonzero(views.episodes == episode)
@@ -172,11 +175,6 @@ def _is_open(part: Episode, log: PoseLog) -> bool:
     if part.scope is not None and part.scope.clock == log.clock:
         return log.clock not in part.clocks
     return log.clock not in part.clocks or part.clocks[log.clock].source == GIVEN
-
-
-def has_open_clocks(data: Episodes) -> bool:
-    """Return whether the clock of some instrument's poses is to be found, or compared."""
-    return any(_is_open(part, log) for part in data.parts for log in part.poses.values())
 
 
 def note_frame_rates(data: Episodes) -> None:

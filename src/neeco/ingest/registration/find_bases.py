@@ -10,7 +10,7 @@ import numpy as np
 
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
-from neeco.ingest.frames.views import Views, reduced
+from neeco.ingest.frames.views import StageProgress, Views, reduced
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import ReadingLog
@@ -27,16 +27,6 @@ N_FRAMES = 140  # searched, evenly spaced
 MIN_BEND_MM = 2.0  # from the root to the logged link: nearer, nothing bends there
 MIN_TRAVEL_MM = 2.0  # root mean square, from which an arm counts as moving
 KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedBase:
-    """world_from_base [4, 4] mm of one instrument, the clock of its log (None: as before), and how they were found
-    (None: stated exactly)."""
-
-    world_from_base: np.ndarray
-    clock: ClockOffset | None = None
-    found: BaseRegistration | None = None
 
 
 def check_frames(data: Episodes, *, moving: bool) -> None:
@@ -74,60 +64,51 @@ def require_no_base(data: Episodes) -> None:
 
 
 def find_bases(
-    data: Episodes, views: Views, moving: Callable[[np.ndarray], np.ndarray]
+    data: Episodes, views: Views, moving: Callable[[np.ndarray], np.ndarray], progress: StageProgress
 ) -> tuple[Episodes, dict[str, BaseRegistration]]:
-    """Return the episodes with all bases and the clocks that come with them (see `place_bases`), and those found."""
-    found, bases = {}, dict(data.world_from_base)
-    for name, base in place_bases(data, views, moving).items():
-        bases[name] = base.world_from_base
-        if base.clock is not None:
-            data = data.with_moved_clock(data.parts[0].poses[name].clock, base.clock)
-        if base.found is not None:
-            found[name] = base.found
-    return replace(data, world_from_base=bases), found
+    """Find the bases of all instruments of which the recording states something; take those stated exactly.
 
-
-def place_bases(data: Episodes, views: Views, moving: Callable[[np.ndarray], np.ndarray]) -> dict[str, PlacedBase]:
-    """Find the bases of all instruments of which the recording states something.
-
-    moving(rows): masks bool [R, h, w] of what moves in rows of `views`, reduced to REFERENCE_PIXELS. Lengths of a robot
-    are taken as they are. Notes state what was found, its standard deviation and what stays undetermined. Raises
-    NeecoError where nothing moves with an instrument.
+    views: in mm; moving(rows): masks bool [R, h, w] of what moves in rows of them, reduced to REFERENCE_PIXELS. Lengths
+    of a robot are taken as they are. Return the episodes with these bases and the clocks that come with them, and what
+    was found by instrument. Notes state standard deviations and what stays undetermined. Raises NeecoError where
+    nothing moves with an instrument.
     """
-    placed: dict[str, PlacedBase] = {}
-    unknown = []
+    unknown, logs = [], data.parts[0].poses
     for item in data.recording.instruments:
-        logs = data.parts[0].poses
         if item.base is None or item.name not in logs or logs[item.name].frame == CAMERA:
             continue
         if item.base.exact:
-            placed[item.name] = PlacedBase(_in_world(item.base, views.world_from_camera))
+            data = data.with_base(item.name, _in_world(item.base, views.world_from_camera))
         else:
             unknown.append(item)
     if not unknown:
-        return placed
+        return data, {}
+    progress("finding the robot's base", 0, 0)
     observed = _Observed(views, np.array(evenly_spaced(len(views.times), N_FRAMES)), moving)
     shape, hidden = observed.images.shape[:3], observed.hidden
     usable = np.ones(shape, bool) if hidden is None else np.tile(~hidden, (shape[0], 1, 1))
     arms = [_arm(data, item, observed) for item in unknown]
+    found = {}
     # what moves most is found most easily, and then out of the way
     for arm in sorted(arms, key=lambda arm: -arm.travel):
+        name, clock = arm.item.name, arm.clock
         registration, covered = _find(arm, observed, usable, alone=len(arms) == 1)
-        usable, clock = usable & ~covered, arm.clock
+        usable = usable & ~covered
         if registration is None:
             assert arm.prior is not None
-            _, sd_mm, sd_deg = arm.prior
-            placed[arm.item.name] = PlacedBase(arm.prior[0])
+            given, sd_mm, sd_deg = arm.prior
+            data = data.with_base(name, given)
             data.notes.add(
-                f"instrument {arm.item.name!r}: it moves by {arm.travel:.1f} mm only, too little to find its base, "
+                f"instrument {name!r}: it moves by {arm.travel:.1f} mm only, too little to find its base, "
                 f"which stays as given, with standard deviations {sd_mm:.1f} mm and {sd_deg:.1f} deg"
             )
             continue
         if clock.source not in KNOWN:
             clock = replace(clock.later(registration.clock_s), sd=registration.clock_sd_s, source=FOUND)
-        placed[arm.item.name] = PlacedBase(registration.world_from_base, clock, registration)
-        data.notes.add(describe(arm.item.name, registration))
-    return placed
+        data = data.with_base(name, registration.world_from_base).with_moved_clock(logs[name].clock, clock)
+        data.notes.add(describe(name, registration))
+        found[name] = registration
+    return data, found
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,10 +17,11 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.model import IngestSettings
-from neeco.ingest.timing.clock_search import SCOPE_MOTION, SURE, ClockOffset, clock_from_turning
+from neeco.ingest.timing.clock_search import RATE_SIGNIFICANCE, SCOPE_MOTION, ClockOffset, clock_from_turning
 
 MIN_FRAMES = 12
 MIN_TURN = 0.05  # rad, spread of the scope's directions below which the hand-eye rotation is not determined
@@ -68,7 +69,7 @@ def register_with_laparoscope(
 
     From a closed form all unknowns are refined under a soft-L1 loss, the tracker's slow drift among them: left out, it
     (a few tenths of a mm over seconds) is taken for scope motion and bends the scale by percents. A known clock is
-    kept; else it is estimated, with a rate where that differs from 1 by more than SURE standard deviations. Raises
+    kept; else it is estimated, with a rate where that differs from 1 by RATE_SIGNIFICANCE. Raises
     NeecoError when the scope moved too little.
     """
     settings = settings or IngestSettings()
@@ -141,7 +142,7 @@ def register_with_laparoscope(
     else:
         solution, covariance, sd = solve(unknowns, ())
         rate = clock.rate * (1 + solution[STRETCH])
-        if abs(rate - 1) < SURE * clock.rate * sd[1]:
+        if abs(rate - 1) < RATE_SIGNIFICANCE * clock.rate * sd[1]:
             solution[STRETCH], rate = 1 / clock.rate - 1, 1.0
             solution, covariance, sd = solve(solution, (STRETCH,))
         seconds = clock.seconds + clock.rate * solution[LAG] + (clock.rate - rate) * now
@@ -150,8 +151,7 @@ def register_with_laparoscope(
     scale, rotation, origin, hand, lever, _, _ = unpack(solution)
     position, turn, keep = errors(solution)
     used = np.flatnonzero(keep)
-    camera_from_sensor = np.eye(4)
-    camera_from_sensor[:3, :3], camera_from_sensor[:3, 3] = hand.as_matrix(), lever
+    camera_from_sensor = rigid(hand.as_matrix(), lever)
     return Registration(
         scale,
         rotation.as_matrix(),

@@ -1,5 +1,4 @@
-"""The instrument of a recording that nothing tracked: found in the video, and from then on as if a tracker had logged
-it."""
+"""The instrument of a recording that nothing tracked: found in the video, then used as if a tracker had logged it."""
 
 from __future__ import annotations
 
@@ -16,10 +15,10 @@ from neeco.ingest.shaft.axis import ShaftVideo
 from neeco.ingest.shaft.from_video import MIN_SHARE, FoundShaft, find_shaft
 from neeco.ingest.timing.episodes import Episodes
 
-NOT_SEEN = "the shaft is not seen well enough"
+NOT_VISIBLE = "too little of the shaft is visible"
 ROLL_DEG = 5.0  # standard deviation of a logged roll
 READING_DEG = 1.0  # of a logged joint
-AROUND = 7  # px about what moves, in which features are not the tissue's
+MARGIN_PX = 7  # about what moves, in which features are not the tissue's
 
 
 def find_in_video(
@@ -68,16 +67,16 @@ def _in_words(name: str, found: FoundShaft) -> str:
     return (
         f"instrument {name!r} was found in the video: {found.share:.0%} of the frames show two diameters of its shaft "
         f"({MIN_SHARE:.0%} are needed); {left_out} of {len(found.known)} show too little of it and are left out; its "
-        f"direction is sure to {np.median(turns):.1f} degrees, its place to {np.median(shifts[:, :2]):.1f} mm across "
-        f"the view and {np.median(shifts[:, 2]):.1f} mm in depth (standard deviations); from the end of the shaft to "
-        f"the tip it is {found.working_length:.0f} mm{scale}"
+        f"direction has a standard deviation of {np.median(turns):.1f} degrees, its place of "
+        f"{np.median(shifts[:, :2]):.1f} mm across the view and {np.median(shifts[:, 2]):.1f} mm in depth; from the "
+        f"end of the shaft to the tip it is {found.working_length:.0f} mm{scale}"
     )
 
 
 def on_masks(masks: np.ndarray, sfm: SfmResult, size: tuple[int, int]) -> np.ndarray:
-    """bool [Q]: observations of `sfm` that lie on masks bool [M, h, w] of its rows, or beside them; size: of the images
-    that they count pixels of."""
-    around = np.stack([cv2.dilate(mask.astype(np.uint8), np.ones((AROUND, AROUND), np.uint8)) for mask in masks])
+    """Return bool [Q], the observations of `sfm` on or near masks bool [M, h, w] of its rows. size: of the images whose
+    pixels they count."""
+    around = np.stack([cv2.dilate(mask.astype(np.uint8), np.ones((MARGIN_PX, MARGIN_PX), np.uint8)) for mask in masks])
     _, height, width = masks.shape
     row, x, y = (sfm.observations[:, column] for column in (0, 2, 3))
     column = np.clip(x * width / size[0], 0, width - 1).astype(int)
@@ -85,17 +84,17 @@ def on_masks(masks: np.ndarray, sfm: SfmResult, size: tuple[int, int]) -> np.nda
 
 
 def uncertainties(item: InstrumentLogs, found: FoundShaft) -> tuple[Uncertainty, ...]:
-    """How sure every state is, with what was logged beside the video."""
+    """Return the uncertainty of every state, with that of logged rolls and joints."""
     assert item.from_video is not None
-    sure = found.uncertainties
+    known = found.uncertainties
     if item.roll is not None:
-        sure = tuple(replace(one, rotation_deg=(*one.rotation_deg[:2], ROLL_DEG)) for one in sure)
+        known = tuple(replace(one, rotation_deg=(*one.rotation_deg[:2], ROLL_DEG)) for one in known)
     joints = dict.fromkeys(item.joints, READING_DEG)
-    return tuple(replace(one, joints_deg=joints) for one in sure)
+    return tuple(replace(one, joints_deg=joints) for one in known)
 
 
 def instruments_of(recording: Recording, found: FoundShaft | None) -> tuple[Instrument, ...]:
-    """The instruments of a recording as the capture states them; found: the one that was found in the video."""
+    """Return the instruments of a recording for its capture. found: the one that was found in the video."""
     stated = []
     for item in recording.instruments:
         if item.placed:

@@ -16,28 +16,31 @@ from neeco.errors import NeecoError
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog
 
-STEP = 0.02  # s, of the coarse search for an offset
-STRIDE = 0.12  # s, over which a turn is measured: long enough to stand out of the tracker's noise
-MIN_CORRELATION = 0.6  # below which two motions are not the same
+STEP_S = 0.02  # s, of the coarse search for an offset
+STRIDE_S = 0.12  # s, over which a turn is measured: long enough to stand out of the tracker's noise
+MIN_CORRELATION = 0.6  # of two recordings of one motion
 SAME_MOTION = 0.95  # from which on no other rate is tried: ends are off by less than a lobe
 MIN_LEAD = 0.08  # by how much the best offset must beat every other, apart from its own lobe
-LOBE = 0.3  # s
-MIN_OVERLAP = 0.6  # of the video that must lie on the log
-LONGEST = 24 * 3600.0  # s that a recording may last: a longer log or video has stray stamps
+LOBE_S = 0.3  # s
+MIN_OVERLAP = 0.6  # of the video, that the log covers
+MAX_LENGTH_S = 24 * 3600.0  # s that a recording may last: a longer log or video has stray stamps
 MAX_RATE = 2.5  # s of a log in one second of the video: 60 frames a second taken for 25
-SEGMENT = 40.0  # s of the video on which all rates are tried; around the best one the rest of it is added
-RATE_MISMATCH = 0.1  # s by which the ends of a segment are off between two rates tried
-RATE_CORRELATION = 0.85  # below which two motions do not tell a rate: of hundreds tried one fits by chance
+SEGMENT_S = 40.0  # s of the video on which all rates are tried; around the best one the rest of it is added
+RATE_MISMATCH_S = 0.1  # s by which the ends of a segment are off between two rates tried
+RATE_CORRELATION = 0.85  # that another rate needs: of hundreds tried one fits by chance
 RATE_LEAD = 0.04  # by how much the correlation at another rate must beat that at rate 1
-SURE = 2.0  # standard deviations from 1 at which a rate counts as another
+RATE_SIGNIFICANCE = 2.0  # standard deviations from 1, at which a rate is taken to differ
 GIVEN, SCOPE_MOTION, INSTRUMENT_MOTION = "given", "scope motion", "instrument motion"  # sources of clocks
 ASSUMED = "assumed equal to the video's"
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """t_log = seconds + rate * t_video, and where it came from. sd: standard deviation, s, of t_log over the video (0:
-    taken as exact, NaN: unknown); rate_sd: of the rate (0: not estimated)."""
+    """A log's clock, t_log = seconds + rate * t_video, and its source.
+
+    sd: standard deviation, s, of t_log over the video (0: taken as exact, NaN: unknown); rate_sd: of the rate (0: not
+    estimated).
+    """
 
     seconds: float
     sd: float
@@ -46,15 +49,15 @@ class ClockOffset:
     rate_sd: float = 0.0
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        """The log's times at the video's times [N] s."""
+        """Return the log's times at the video's times [N] s."""
         return np.asarray(self.seconds + self.rate * times)
 
     def video_times(self, log_times: np.ndarray) -> np.ndarray:
-        """The video's times at the log's times [N] s."""
+        """Return the video's times at the log's times [N] s."""
         return np.asarray((log_times - self.seconds) / self.rate)
 
     def later(self, seconds: float) -> ClockOffset:
-        """The same with its offset moved."""
+        """Return the clock with its offset moved."""
         return replace(self, seconds=self.seconds + seconds)
 
     def __str__(self) -> str:
@@ -67,38 +70,38 @@ class ClockOffset:
 
 
 def clock_from_turning(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog) -> ClockOffset:
-    """Coarse clock (offset to about 10 ms): how fast the cameras [N, 4, 4] turned, against how fast the sensor turned.
+    """Estimate a coarse clock (offset to about 10 ms) from the angular speeds of cameras [N, 4, 4] and sensor.
 
-    Speed of turning needs no calibration: it is the same for every point of a rigid scope. Raises NeecoError when the
+    Angular speed needs no calibration: it is the same for every point of a rigid scope. Raises NeecoError when the
     two never fit, or fit at several offsets.
     """
     _check_span(log)
-    video_grid = np.arange(times[0] + STRIDE, times[-1] - STRIDE, STEP)
-    log_grid = np.arange(log.times[0] + STRIDE, log.times[-1] - STRIDE, STEP)
+    video_grid = np.arange(times[0] + STRIDE_S, times[-1] - STRIDE_S, STEP_S)
+    log_grid = np.arange(log.times[0] + STRIDE_S, log.times[-1] - STRIDE_S, STEP_S)
     if len(video_grid) < 50 or len(log_grid) < 50:
         raise NeecoError(f"{log.path}: video or log is shorter than a second; give its clock offset in `sync`")
     video = turning_speed(video_grid, times, Rotation.from_matrix(world_from_camera[:, :3, :3]))
     sensor = turning_speed(log_grid, log.times, Rotation.from_quat(log.quats, scalar_first=True))
     rate, lags, scores = _best_rate(video, sensor)
-    seconds = log_grid[0] + _peak(lags, scores, rate, log) * STEP - rate * video_grid[0]
+    seconds = log_grid[0] + _peak(lags, scores, rate, log) * STEP_S - rate * video_grid[0]
     return ClockOffset(float(seconds), float("nan"), SCOPE_MOTION, rate)
 
 
 def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -> ClockOffset:
-    """Clock from how fast the picture of the instrument moved, against how fast its tracker did.
+    """Estimate a clock from the speeds of the instrument in the image and of its tracker.
 
-    motion [M-1] px between frames at video `times` [M] s, beyond a still scene's. Raises NeecoError when the two never
-    fit, or fit at several offsets. The uncertainty is what halves of the video disagree by.
+    motion [M-1] px between frames at video `times` [M] s, beyond a still scene's. The standard deviation is that of the
+    estimates from halves of the video. Raises NeecoError when the two never fit, or fit at several offsets.
     """
     _check_span(log)
     steps = np.diff(times)
     middle, speed = (times[1:] + times[:-1]) / 2, motion / steps
-    grid = np.arange(middle[0], middle[-1], STEP)
-    log_grid = np.arange(log.times[0] + STRIDE, log.times[-1] - STRIDE, STEP)
+    grid = np.arange(middle[0], middle[-1], STEP_S)
+    log_grid = np.arange(log.times[0] + STRIDE_S, log.times[-1] - STRIDE_S, STEP_S)
     if len(grid) < 100 or len(log_grid) < 100:
         raise NeecoError(f"{log.path}: video or log is shorter than two seconds; give its clock offset in `sync`")
-    before, after = (poses_at(log, log_grid + side * STEP) for side in (-1, 1))
-    tracked = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (2 * STEP)
+    before, after = (poses_at(log, log_grid + side * STEP_S) for side in (-1, 1))
+    tracked = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (2 * STEP_S)
     tracked = np.sqrt(np.where(before[1] & after[1], tracked, np.nanmedian(tracked)))
     seen = np.sqrt(np.interp(grid, middle, speed))  # roots: a fast stroke must not outweigh all others
     rate, lags, scores = _best_rate(seen, tracked)
@@ -108,25 +111,25 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
     best, length = _peak(lags, scores, rate, log), grid[-1] - grid[0]
     sd = _spread_of_halves(_stretched(seen, rate), tracked, best)
     rate_sd = np.sqrt(12) * sd / length if rate != 1 else 0.0  # of a line through offsets spread over the video
-    seconds = log_grid[0] + _vertex(lags, scores) * STEP - rate * grid[0]
+    seconds = log_grid[0] + _vertex(lags, scores) * STEP_S - rate * grid[0]
     return ClockOffset(float(seconds), sd, INSTRUMENT_MOTION, rate, float(rate_sd))
 
 
 def _spread_of_halves(seen: np.ndarray, tracked: np.ndarray, best: int) -> float:
-    """Standard deviation, s, of the offsets of the video's halves about the lag `best` of all of it."""
+    """Return the standard deviation, s, of the offsets of the video's halves about the lag `best` of all of it."""
     quarter = len(seen) // 4
     halves = []
     for part in (slice(0, 2 * quarter), slice(quarter, 3 * quarter), slice(2 * quarter, 4 * quarter)):
         near, fit = correlate(seen[part], tracked)
-        around = np.abs((near - part.start - best) * STEP) < LOBE
+        around = np.abs((near - part.start - best) * STEP_S) < LOBE_S
         if around.any():
             halves.append(_vertex(near[around] - part.start, fit[around]))
-    return max(float(np.std(halves)) * STEP if len(halves) > 1 else LOBE, STEP / 4)
+    return max(float(np.std(halves)) * STEP_S if len(halves) > 1 else LOBE_S, STEP_S / 4)
 
 
 def _check_span(log: PoseLog) -> None:
     """Raise NeecoError when stray stamps make a log too long to search."""
-    if log.times[-1] - log.times[0] > LONGEST:
+    if log.times[-1] - log.times[0] > MAX_LENGTH_S:
         raise NeecoError(
             f"{log.path}: its times span {(log.times[-1] - log.times[0]) / 3600:.3g} h; remove rows with stray times, "
             "or give its clock offset in `sync`"
@@ -134,18 +137,20 @@ def _check_span(log: PoseLog) -> None:
 
 
 def _best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """The rate at which two motions [V] and [L], sampled every STEP s, fit best, with all lags and their correlation at
-    it. All rates are tried on the liveliest segment; it grows to the whole video while the rates narrow down."""
+    """Return the rate at which motions [V] and [L], sampled every STEP_S, fit best; all lags, and their correlation.
+
+    All rates are tried on the segment of most variance; it grows to the whole video while the rates narrow down.
+    """
     lags, scores = correlate(video, log)
     if scores.max(initial=-1.0) > SAME_MOTION:
         return 1.0, lags, scores
-    size = min(len(video), round(SEGMENT / STEP))
+    size = min(len(video), round(SEGMENT_S / STEP_S))
     variances = [float(np.var(video[start : start + size])) for start in range(0, len(video) - size + 1, size)]
     centre = int(np.argmax(variances)) * size + size // 2
     span = np.log(MAX_RATE)
     rate = 1.0
     while True:
-        step = RATE_MISMATCH / (size * STEP / 2)
+        step = RATE_MISMATCH_S / (size * STEP_S / 2)
         rates = rate * np.exp(step * np.arange(-round(span / step), round(span / step) + 1))
         start = int(np.clip(centre - size // 2, 0, len(video) - size))
         fits = [correlate(_stretched(video[start : start + size], one), log)[1].max(initial=-1.0) for one in rates]
@@ -160,28 +165,28 @@ def _best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, n
 
 
 def _finer_rate(video: np.ndarray, log: np.ndarray, rate: float) -> float:
-    """The rate about a coarse one at which the correlation has its vertex."""
-    step = RATE_MISMATCH / (len(video) * STEP / 2) / 4
+    """Return the rate near a coarse one at which the correlation has its vertex."""
+    step = RATE_MISMATCH_S / (len(video) * STEP_S / 2) / 4
     rates = rate * (1 + step * np.arange(-6, 7))
     fits = np.array([correlate(_stretched(video, one), log)[1].max(initial=-1.0) for one in rates])
     return rate * (1 + step * _vertex(np.arange(-6.0, 7.0), fits))
 
 
 def _stretched(video: np.ndarray, rate: float) -> np.ndarray:
-    """Samples [V] of the video, every STEP s of its clock, every STEP s of a log's at `rate`."""
+    """Resample a signal [V] of the video from every STEP_S of its clock to every STEP_S of a log's at `rate`."""
     if rate == 1:
         return video
     return np.interp(np.arange(int(rate * (len(video) - 1)) + 1) / rate, np.arange(len(video)), video)
 
 
 def _peak(lags: np.ndarray, scores: np.ndarray, rate: float, log: PoseLog) -> int:
-    """The best lag. Raises NeecoError when it is no fit, or one of several."""
+    """Return the best lag. Raises NeecoError when it is no fit, or one of several."""
     best = int(scores.argmax())
-    rivals = scores[np.abs(lags - lags[best]) * STEP > LOBE * max(rate, 1.0)]
+    rivals = scores[np.abs(lags - lags[best]) * STEP_S > LOBE_S * max(rate, 1.0)]
     rival = float(rivals.max()) if len(rivals) else -1.0
     if scores[best] < MIN_CORRELATION or scores[best] - rival < MIN_LEAD:
         raise NeecoError(
-            f"{log.path}: its clock cannot be told from the images: the best offset fits with correlation "
+            f"{log.path}: its clock cannot be determined from the images: the best offset fits with correlation "
             f"{scores[best]:.2f}, another with {rival:.2f}; give it in `sync`, or shake what is tracked at the start "
             "of the recording"
         )
@@ -189,7 +194,7 @@ def _peak(lags: np.ndarray, scores: np.ndarray, rate: float, log: PoseLog) -> in
 
 
 def _vertex(lags: np.ndarray, scores: np.ndarray) -> float:
-    """Lag of the parabola through the best score and its neighbours."""
+    """Return the lag at the vertex of the parabola through the best score and its neighbours."""
     best = int(scores.argmax())
     if best in (0, len(scores) - 1):
         return float(lags[best])
@@ -199,15 +204,17 @@ def _vertex(lags: np.ndarray, scores: np.ndarray) -> float:
 
 
 def turning_speed(grid: np.ndarray, times: np.ndarray, turns: Rotation) -> np.ndarray:
-    """[G] rad/s at the grid's times s, over STRIDE, by chords between nearest-in-time interpolated rotations [T]."""
+    """Return angular speeds [G] rad/s at the grid's times s, from interpolated rotations STRIDE_S apart."""
     along = Slerp(times, turns)
-    before, after = (along(np.clip(grid + side * STRIDE / 2, times[0], times[-1])) for side in (-1, 1))
-    return (before.inv() * after).magnitude() / STRIDE
+    before, after = (along(np.clip(grid + side * STRIDE_S / 2, times[0], times[-1])) for side in (-1, 1))
+    return (before.inv() * after).magnitude() / STRIDE_S
 
 
 def correlate(short: np.ndarray, long: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pearson correlation of two signals on one grid at every lag (`long` index of `short`'s first sample) where they
-    overlap by at least MIN_OVERLAP of the shorter. Returns lags and scores."""
+    """Return lags (`long` index of `short`'s first sample) and the Pearson correlation of two signals at each.
+
+    They overlap by at least MIN_OVERLAP of the shorter.
+    """
     least = int(MIN_OVERLAP * min(len(short), len(long)))
     lags = np.arange(-(len(short) - least), len(long) - least + 1)
     # without their means, which correlation does not see, less is lost to rounding

@@ -21,7 +21,7 @@ from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording.model import InstrumentLogs, Recording
-from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, LONGEST, ClockOffset
+from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, MAX_LENGTH_S, ClockOffset
 from neeco.ingest.timing.compatibility import check_recordings, episode_names, file_name, refusal
 from neeco.ingest.timing.notes import Notes
 
@@ -115,6 +115,10 @@ class Episodes:
             return f"{of}{frame:06d}"
         episode = int(self.episode_of(np.array([frame]))[0])
         return f"{of}{self.notes.names[episode]}_{frame - self.parts[episode].first:06d}"
+
+    def with_base(self, name: str, world_from_base: np.ndarray) -> Episodes:
+        """Return the episodes with the base [4, 4] mm of an instrument's log."""
+        return replace(self, world_from_base={**self.world_from_base, name: world_from_base})
 
     # clocks
 
@@ -448,7 +452,7 @@ def _check_bases(recording: Recording, scope: PoseLog | None, poses: Mapping[str
 def _check_video(recording: Recording, video: VideoSource) -> None:
     """Raise NeecoError for times that no recording has, and for frames too small."""
     rate, length = 1 / float(np.median(np.diff(video.times))), video.times[-1] - video.times[0]
-    if not (MIN_FPS < rate < MAX_FPS and length < LONGEST):
+    if not (MIN_FPS < rate < MAX_FPS and length < MAX_LENGTH_S):
         raise NeecoError(
             f"{video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
             "cannot be; correct fps or the times' unit"

@@ -226,7 +226,7 @@ def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | 
 
 
 def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What downstream.json holds of these results."""
+    """Return the contents of downstream.json for these results."""
     settings = plan.settings
     kinds = {name: model_class(name) for name in settings.models}
     predicts = {name: kind.predicts for name, kind in kinds.items()}
@@ -280,13 +280,13 @@ def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict
 
 
 def _made_by(data: ImageSet) -> dict[str, Any] | None:
-    """What dataset.json says of how a set was synthesized; None where there is none."""
+    """Return how a set was synthesized, from its dataset.json; None where there is none."""
     info, keys = data.info(), ("settings", "scene", "scene_sha256", "version", "complete")
     return None if info is None else {key: info.get(key) for key in keys}
 
 
 def _result_notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What failed, what was not trained long enough, and which models are biased."""
+    """Return notes on failures, on trainings that were too short, and on biased models."""
     notes = [f"failed: {line}" for line in failed_jobs({"jobs": results})]
     done = [job for job in results if "error" not in job]
     late = sorted({f"{job['model']}, {job['condition']}" for job in done if job["still_learning"]})

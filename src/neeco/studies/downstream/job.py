@@ -1,4 +1,4 @@
-"""One training of a downstream study: what it learns from, how it is tested, and what is stored of it."""
+"""One training of a downstream study: its data, its test and its stored result."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ EDGES: tuple[Edges, ...] = ("hard", "soft", "ignore")
 DEFAULT_EDGES: Edges = "hard"
 RESERVED = (REAL, AUGMENT, *EDGES)
 PARTS_STEPS = 2.5  # times as many steps to learn parts as one class: more of them do not help
-PAIR_DISTANCE = 4.0  # px about a pair (jaws) in which `iou_jaws` is taken: they are thin, and small beside the shaft
+PAIR_DISTANCE = 4.0  # px about a pair (jaws) in which `iou_jaws` is taken: thin, and small compared with the shaft
 HELD_OUT = ("validation_every", "min_validated")  # settings that job.json has only where they are not the default
 PYTHON_ONLY = ("finetune_share", "finetune_epochs", *HELD_OUT)
 MIN_STORED_SCORE = 0.05  # boxes of a lower confidence are not stored
@@ -53,7 +53,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Condition:
-    """What a model is trained on: a sum of words, `SET+real+augment`."""
+    """The training data of a model: a sum of words, `SET+real+augment`."""
 
     name: str
     sets: tuple[str, ...]  # names of data sets
@@ -87,7 +87,7 @@ def default_conditions(sets: Sequence[str]) -> list[str]:
 
 
 def labelled_count(word: str, frames: int) -> int:
-    """How many labelled frames a word of `--num-real` means, of so many. Raises NeecoError."""
+    """Return the number of labelled frames, of so many, that a word of `--num-real` means. Raises NeecoError."""
     if word == "all":
         return frames
     if not word.isdecimal():
@@ -98,9 +98,9 @@ def labelled_count(word: str, frames: int) -> int:
 
 
 def labelled_frames(frames: int, count: int, fold: int, selection: FrameSelection) -> list[int]:
-    """Which `count` of so many recorded frames are labelled in a fold, in their order.
+    """Choose the `count` of so many recorded frames that are labelled in a fold, in their order.
 
-    spread: the recording is cut into `count` stretches of one length and a frame is drawn from each. first: the
+    spread: the recording is cut into `count` stretches of one length and a frame is sampled from each. first: the
     recording's first, the same in every fold. The same for every condition and model of a fold.
     """
     if selection == "first" or count == frames:
@@ -116,7 +116,7 @@ def labelled_frames(frames: int, count: int, fold: int, selection: FrameSelectio
 
 @dataclass(frozen=True, kw_only=True)
 class DownstreamSettings:
-    """A study: which models learn from what, how long, and what they are tested on. None: the usual, or the model's."""
+    """A study: models, training data, budget and tests. None: the usual, or the model's."""
 
     capture: Path
     output: Path
@@ -130,14 +130,14 @@ class DownstreamSettings:
     frame_selection: FrameSelection = "spread"
     splits: tuple[str, ...] = ()  # tested; empty: all but train that have truth
     steps: int | None = None
-    size: int | None = None  # px, the longer side of images as a model sees them
+    size: int | None = None  # px, the longer side of a model's input images
     batch: int | None = None
     weights: Mapping[str, Path] = field(default_factory=dict)  # safetensors to start from, by model
     workers: int = 1
     transforms: str = "transforms.json"
     device: str = "auto"
-    finetune_share: float = 0.3  # of the steps at most: the last see recorded frames alone, as the test does
-    finetune_epochs: int = 20  # in which each of them is seen at most so often: few are soon overfitted
+    finetune_share: float = 0.3  # of the steps at most: the last are of recorded frames alone, as the test is
+    finetune_epochs: int = 20  # passes over them at most: a few frames are soon overfitted
     validation_every: int = 5  # one in so many images of each source is held out for validation
     min_validated: int = 40  # images: of fewer all are learned, the held-out ones would be too few to choose weights by
 
@@ -157,15 +157,15 @@ class DownstreamSettings:
         return shlex.join(words)
 
     def steps_of(self, kind: type[Model]) -> int:
-        """How many steps a model is trained."""
+        """Return the number of steps of a model."""
         return self.steps or round(kind.steps * (PARTS_STEPS if self.classes == "parts" else 1))
 
     def batch_of(self, kind: type[Model]) -> int:
-        """How many images it sees in each."""
+        """Return the number of images in a step."""
         return self.batch or kind.batch
 
     def input_of(self, kind: type[Model], frame: tuple[int, int]) -> tuple[int, int]:
-        """(width, height) it sees of frames of this size."""
+        """Return its input (width, height) for frames of this size."""
         return input_size(frame, self.size or kind.image_size, kind.multiple)
 
     def hold_out(self, samples: Sequence[T], fold: int) -> tuple[list[T], list[T]]:
@@ -178,12 +178,12 @@ class DownstreamSettings:
 
 
 def job_folder(output: Path, model: str, condition: str, real: int, fold: int) -> Path:
-    """Where one job stores what it made."""
+    """Return the folder of one job."""
     return output / "jobs" / f"{model}-{condition}-real{real}-fold{fold}"
 
 
 def predictions_folder(job: Path, split: str) -> Path:
-    """Where a job's folder has the predictions for a split."""
+    """Return the folder of a job's predictions for a split."""
     return job / "predictions" / split
 
 
@@ -217,16 +217,16 @@ class DownstreamJob:
 
     @property
     def sets(self) -> list[ImageSet]:
-        """The data sets it learns from."""
+        """The image sets of its training data."""
         return [data for data in self.settings.sets if data.name in self.condition.sets]
 
     @property
     def _finetunes(self) -> bool:
-        """Whether the last steps see recorded frames alone."""
+        """Whether the last steps are of recorded frames alone."""
         return self.condition.real and bool(self.condition.sets) and model_class(self.model).keeps_order
 
     def identity(self) -> dict[str, Any]:
-        """What a folder must agree with to be this job's. Its keys are those of job.json, for good."""
+        """Return what a folder must agree with to be this job's. Its keys are those of job.json."""
         settings, kind = self.settings, model_class(self.model)
         finish = f"{settings.finetune_share} of the steps, {settings.finetune_epochs} rounds at most"
         held_out = {key: getattr(settings, key) for key in HELD_OUT}
@@ -294,7 +294,7 @@ class DownstreamJob:
         return result
 
     def task(self, capture: Capture) -> TrainingTask:
-        """What the model is to learn. Its training and validation images depend on the fold, their order on nothing
+        """Return the training task. Its training and validation images depend on the fold, their order on nothing
         else."""
         settings, kind = self.settings, model_class(self.model)
         recorded = recorded_samples(capture, "train", settings.classes, settings.labels) if self.condition.real else ()
@@ -366,13 +366,13 @@ def _stored(found: Detections) -> dict[str, Any]:
 
 
 def _cpu_seconds() -> float:
-    """What this process and the programs that it has run have spent."""
+    """Return the CPU time, in s, of this process and the programs that it has run."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system
 
 
 def _still_rises(trained: TrainedModel, steps: int) -> bool:
-    """Whether the last checkpoints are the best by more than checkpoints differ by chance: more steps may help."""
+    """Return whether the last checkpoint is clearly the best: more steps may help."""
     curve = trained.validation
     if len(curve) < 2 or trained.best_step <= 0.8 * steps:
         return False

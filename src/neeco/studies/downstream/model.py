@@ -1,4 +1,4 @@
-"""What a model to train says of itself, is given and returns; and the one training loop of all PyTorch modules."""
+"""The interface of downstream models, and the training loop of all that are PyTorch modules."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ REPORT_EVERY = 10  # steps
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingTask:
-    """What a model is to learn, and within which limits."""
+    """The training data, size and budget of a model."""
 
     classes: tuple[str, ...]
     batches: BatchSampler
     validation: tuple[Sample, ...]  # may be empty
-    size: tuple[int, int]  # width, height of images as the model sees them
+    size: tuple[int, int]  # width, height of input images
     steps: int
     batch: int
     seed: int
@@ -65,21 +65,21 @@ class Model(ABC):
 
     model: ClassVar[str]
     predicts: ClassVar[Literal["masks", "boxes"]]
-    image_size: ClassVar[int]  # px, the longer side of the images it sees unless --size says otherwise
+    image_size: ClassVar[int]  # px, the longer side of its input images unless --size is given
     multiple: ClassVar[int]  # both sides are multiples of it
-    steps: ClassVar[int]  # until a few hundred images are learned
+    steps: ClassVar[int]  # that suffice for a few hundred images
     batch: ClassVar[int]
     accepts_weights: ClassVar[bool] = True
-    keeps_order: ClassVar[bool] = True  # it sees images in the order of the task's batches
+    keeps_order: ClassVar[bool] = True  # whether it takes images in the order of the task's batches
 
     @classmethod
     @abstractmethod
     def missing_requirement(cls) -> str | None:
-        """What it needs and this machine lacks, with the remedy; None when it can be trained."""
+        """Return what this machine lacks to train it, with the remedy; None when it can be trained."""
 
     @classmethod
     def is_too_small(cls, size: tuple[int, int]) -> bool:
-        """Whether images of this size (width, height), as it would see them, are too small for it."""
+        """Return whether images of this size (width, height), at its input, are too small for it."""
         return False
 
     @abstractmethod
@@ -111,8 +111,8 @@ def model_class(name: str) -> type[Model]:
 
 
 def input_size(frame: tuple[int, int], longer_side: int, multiple: int) -> tuple[int, int]:
-    """(width, height) a model sees of frames of this size: at most `longer_side`, both multiples of `multiple`, the
-    nearest to the frame's shape."""
+    """Return the input (width, height) of a model for frames of this size: at most `longer_side`, both multiples of
+    `multiple`, the nearest to the frame's shape."""
     scale = min(1.0, max(multiple, longer_side - longer_side % multiple) / max(frame))
     width, height = (max(multiple, multiple * round(edge * scale / multiple)) for edge in frame)
     return width, height
@@ -138,11 +138,11 @@ class TorchModel(Model):
 
     @abstractmethod
     def loss(self, module: Any, images: Tensor, examples: Sequence[Example]) -> Tensor:
-        """Of a batch: images [B, 3, h, w] in [0, 1] as the model sees them, and the examples they were made from."""
+        """Return the loss of a batch: input images [B, 3, h, w] in [0, 1], and the examples they were made from."""
 
     @abstractmethod
     def predictions(self, module: Any, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Prediction]:
-        """Of images [B, 3, h, w]; sizes: (height, width) of each prediction."""
+        """Return the predictions of images [B, 3, h, w]; sizes: (height, width) of each prediction."""
 
     def fit(self, task: TrainingTask) -> TrainedModel:
         """Train it (see `Model.fit`); writes the kept weights to the folder's weights.safetensors.

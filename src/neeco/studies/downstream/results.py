@@ -1,4 +1,4 @@
-"""From jobs to what they say: means over folds, paired differences with intervals, findings in words, tables.
+"""Results of jobs: means over folds, paired differences with intervals, findings in words, tables.
 
 A study's results are one document, that of downstream.json, of plain values: "jobs" as they wrote them, "summary",
 "paired" and "answers" from here. An arm is what is averaged over folds: a model, a condition and a number of labelled
@@ -131,7 +131,7 @@ def scores_by_fold(jobs: Sequence[Document], model: str, split: str, metric: str
 
 
 def paired(jobs: Sequence[Document], first: Arm, second: Arm, split: str, metric: str) -> dict[str, Any] | None:
-    """How much better `first` does than `second` (of one model) on the folds that both finished: the mean difference,
+    """Compare `first` with `second` (of one model) on the folds that both finished: the mean difference of scores,
     and the interval that holds the mean with 95 % confidence (Student's t; None for a single fold)."""
     scores = scores_by_fold(jobs, first.model, split, metric)
     ours, theirs = (scores.get(arm[1:], {}) for arm in (first, second))
@@ -153,7 +153,7 @@ def comparisons(
     """The differences that the study is about, over the jobs that finished.
 
     With synthetic images against without, at every number of labelled frames; synthetic images alone against the most
-    labelled frames; the first set against each other set, alone and beside labelled frames; every condition that does
+    labelled frames; the first set against each other set, alone and with labelled frames; every condition that does
     something to a set (`set+soft`) against the set as it is.
     """
     done = [job for job in jobs if "error" not in job]
@@ -205,7 +205,7 @@ def main_differences(experiment: Document, model: Document, split: str) -> list[
 
 
 def findings(experiment: Document) -> list[str]:
-    """What the numbers say: a sentence for every model, split and condition with synthetic images."""
+    """Return the findings: a sentence for every model, split and condition with synthetic images."""
     return [
         f"{model['name']}, {split}: {sentence}"
         for model, split in models_and_splits(experiment)
@@ -221,7 +221,7 @@ def findings_of(experiment: Document, model: Document, split: str) -> list[str]:
 
 
 def _finding(key: tuple[str, int], scores: Scores, experiment: Document, model: Document, split: str) -> str | None:
-    """One condition beside labelled frames alone; None where there is nothing to compare."""
+    """Compare one condition with labelled frames alone; None where there is nothing to compare."""
     (condition, real), metric = key, TITLES[MAIN[model["answers"]]]
     words = condition.split("+")
     sets = [entry for entry in experiment["sets"] if entry["name"] in words]
@@ -267,7 +267,7 @@ def real_curve(scores: Scores, key: tuple[str, int]) -> list[tuple[int, float]]:
 
 
 def verdict(row: Document) -> str:
-    """What a paired difference shows: one of VERDICTS; "" where there is no interval."""
+    """Return the verdict of a paired difference, one of VERDICTS; "" where there is no interval."""
     if row["low"] is None:
         return ""
     return HELPS if row["low"] > 0 else HURTS if row["high"] < 0 else NONE_SHOWN
@@ -340,7 +340,7 @@ def _metric_title(metric: str) -> str:
 
 
 def budget_text(experiment: Document) -> str:
-    """What every training was given, and how often."""
+    """Return the budget of every training and the number of folds, in words."""
     models = [
         f"{model['name']}: {model['steps']} steps of {model['batch']} images of {model['input'][0]}x{model['input'][1]}"
         for model in experiment["models"]

@@ -54,7 +54,7 @@ class Example:
 
 
 def class_names(capture: Capture, classes: ClassNames) -> tuple[str, ...]:
-    """What a model tells apart: the instrument, or the parts of the capture's truth. Raises NeecoError."""
+    """Return the classes of a model: the instrument, or the parts of the capture's truth. Raises NeecoError."""
     if classes == "instrument":
         return WHOLE
     return tuple(dict.fromkeys(_paired(truth_names(capture.root)).values()))
@@ -158,7 +158,7 @@ class ImageSet:
     count: int | None = None
 
     def __str__(self) -> str:
-        """As the command line has it."""
+        """Return the word of the command line."""
         return f"{self.name}={self.path.absolute()}" + ("" if self.count is None else f":{self.count}")
 
     def file(self, *names: str) -> Path:
@@ -166,7 +166,7 @@ class ImageSet:
         return require_inside(self.path.joinpath(*names), self.path)
 
     def info(self) -> Any:
-        """What its dataset.json says, fit for another JSON file; None where there is none. Raises NeecoError."""
+        """Return the contents of its dataset.json, fit for another JSON file; None without one. Raises NeecoError."""
         file = self.file(DATASET_FILE)
         if not file.is_file():
             return None
@@ -178,7 +178,7 @@ class ImageSet:
         return info
 
     def described(self) -> dict[str, Any]:
-        """What tells it from others; `sha256` of its dataset.json changes when it is synthesized anew."""
+        """Return its identity; `sha256` of its dataset.json changes when it is synthesized anew."""
         file = self.file(DATASET_FILE)
         digest = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
         return {"name": self.name, "path": str(self.path.absolute()), "count": self.count, "sha256": digest}
@@ -193,7 +193,7 @@ def recorded_samples(
 ) -> tuple[RecordedSample, ...]:
     """The labelled frames of a split: by the capture's truth, or by a folder of masks named as the frames.
 
-    Frames without a label are left out. Raises NeecoError where there is none at all, or where parts are asked for and
+    Frames without a label are left out. Raises NeecoError where there is none at all, or where parts are requested and
     the labels have none.
     """
     masks = None if labels is None else open_masks(labels, option=f"{labels / PARTS_FILE}:")
@@ -213,7 +213,7 @@ def recorded_samples(
 
 
 def has_labels(capture: Capture, split: str) -> bool:
-    """Whether any frame of the split has a true mask."""
+    """Return whether any frame of the split has a true mask."""
     try:
         return bool(open_truth(capture, splits=[split]).files)
     except NeecoError:
@@ -233,9 +233,9 @@ def synthetic_samples(
 ) -> tuple[SyntheticSample, ...]:
     """The images of a data set in their order, each with its labels; the first `count` of them.
 
-    The dataset.json of `neeco synthesize` says what ids mean; without it, masks/ tell instrument from tissue. Of a set
-    that `neeco annotate` wrote only the frames of split train are used: models are tested on the others. size: (width,
-    height) that all must have. Raises NeecoError.
+    The dataset.json of `neeco synthesize` says what ids mean; without it, masks/ separate instrument and tissue. Of a
+    set that `neeco annotate` wrote only the frames of split train are used: models are tested on the others. size:
+    (width, height) that all must have. Raises NeecoError.
     """
     folder = data.file(IMAGE_FOLDER)
     if not folder.is_dir():
@@ -317,12 +317,12 @@ Augmentation = Callable[[Example, np.random.Generator], Example]
 
 
 class BatchSampler:
-    """Draws examples from sources without end. A source is shuffled anew when all of it has been seen.
+    """Samples examples from sources without end. A source is shuffled anew after each pass.
 
     sources: recorded frames, each data set. A batch takes as many from each, whatever their sizes: a few labelled
-    frames are not outnumbered by a thousand synthetic ones. mixed: how many examples are drawn so; those after them are
-    of the first source. The seed decides the order, whatever the batches and the augmentation. cache_bytes: of decoded
-    images that are kept; others are read again.
+    frames are not outnumbered by a thousand synthetic ones. mixed: how many examples are sampled so; those after them
+    are of the first source. The seed decides the order, whatever the batches and the augmentation. cache_bytes: of
+    decoded images that are kept; others are read again.
     """
 
     def __init__(
@@ -342,7 +342,7 @@ class BatchSampler:
         self._cached = 0
 
     def batch(self, count: int) -> list[Example]:
-        """The next `count` examples, augmented where that was asked for."""
+        """Return the next `count` examples, augmented where there is an augmentation."""
         return [self._next() for _ in range(count)]
 
     def _next(self) -> Example:

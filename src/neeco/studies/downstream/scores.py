@@ -1,4 +1,4 @@
-"""How well a model's predictions agree with labels: masks per frame, boxes over a split (by pycocotools)."""
+"""Scores of predictions against labels: masks per frame, boxes over a split (by pycocotools)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_DETECTIONS = 100  # per image, as COCO
 
 @dataclass(frozen=True)
 class Detections:
-    """What a detector found in one image, best first."""
+    """The detections in one image, best first."""
 
     boxes: np.ndarray  # [n, 4] x0, y0, x1, y1 px
     classes: np.ndarray  # [n] int64, from 1
@@ -102,7 +102,7 @@ def _detection_scores(found: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequ
 
 
 def _matches(found: np.ndarray, true: np.ndarray) -> int:
-    """How many true boxes are found, each detection (best first) taking the one it fits best."""
+    """Count the true boxes that are found; each detection (best first) takes the one it fits best."""
     if not len(found) or not len(true):
         return 0
     ious, matches = box_ious(found, true), 0
@@ -152,7 +152,7 @@ def _coco_box(image: int, box: np.ndarray) -> dict[str, object]:
 
 
 def validation_score(predictions: Sequence[Prediction], truth: Sequence[Example], classes: int) -> float:
-    """One number in [0, 1] to choose weights by: mean IoU of masks, or AP of boxes."""
+    """Return a number in [0, 1] to choose weights by: mean IoU of masks, or AP of boxes."""
     names = [str(number) for number in range(classes)]
     boxes = [found for found in predictions if isinstance(found, Detections)]
     if boxes:

@@ -33,7 +33,9 @@ IGNORED = 255
 RECORDS = ".records"
 CHECKSUM = "sha256"  # of the rest of a record
 LABELS = ("masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
-MAX_INSTRUMENTS = 8  # in `silhouettes`, whose bit k is set where instrument k would be seen if nothing else were there
+MAX_INSTRUMENTS = (
+    8  # in `silhouettes`, whose bit k is set where instrument k would be visible if nothing else were there
+)
 FOLDERS = ("images", *LABELS, RECORDS)
 PUBLIC = {  # what every line of states.jsonl holds, among others
     "index": int,
@@ -117,14 +119,14 @@ def _digest(record: Record) -> str:
 
 
 def record_path(root: Path, index: int) -> Path:
-    """Where the record of image `index` lies."""
+    """Return the path of the record of image `index`."""
     return root / RECORDS / f"{stem(index)}.json"
 
 
 def load_record(root: Path, index: int) -> Record | None:
     """The record of image `index` when it is as it was written and all its files are there and whole, else None.
 
-    The record of a version that wrote less is not whole: its image is to be drawn again.
+    The record of a version that wrote less is not whole: its image is to be rendered again.
     """
     try:
         record = json.loads(read_text(record_path(root, index), "the record of an image"))
@@ -152,7 +154,7 @@ def link(source: Path, target: Path) -> None:
 
 
 def files_of(record: Record) -> list[str]:
-    """The files of an image beside its record, relative to the data set."""
+    """Return the files of an image, other than its record, relative to the data set."""
     return [record["image"], *(f"{folder}/{stem(record['index'])}.png" for folder in LABELS)]
 
 

@@ -1,4 +1,4 @@
-"""What the libraries of dataset hubs read: `imagefolder/` (Hugging Face) and WebDataset shards.
+"""Formats of dataset hubs: `imagefolder/` (Hugging Face) and WebDataset shards.
 
 imagefolder/{train,validation}/metadata.jsonl beside the images and their masks:
                                              datasets.load_dataset("imagefolder", data_dir="DATASET/imagefolder")

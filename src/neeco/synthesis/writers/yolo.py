@@ -53,7 +53,7 @@ def detect_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
 
 
 def segment_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
-    """One polygon; the pieces of an instrument seen in several are joined by bridges of no width."""
+    """Return one polygon; the visible pieces of an instrument are joined by bridges of no width."""
     return _shares(joined_polygon([np.array(polygon) for polygon in label["polygons"]]), size)
 
 
@@ -63,7 +63,7 @@ def oriented_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
 
 
 def joined_polygon(polygons: list[np.ndarray]) -> np.ndarray:
-    """One polygon [P, 2] out of several, joined by bridges of no width between their nearest corners."""
+    """Return one polygon [P, 2] out of several, joined by bridges of no width between their nearest corners."""
     joined, *rest = polygons
     remaining = list(rest)
     while remaining:

@@ -132,7 +132,7 @@ def _predict(work: Path, weights: Path, images: Sequence[np.ndarray], task: Trai
 
 
 def _boxes(file: Path, image: np.ndarray) -> Detections:
-    """What the program wrote of one image; it writes no file where it found nothing."""
+    """Read the program's detections in one image; it writes no file where there are none."""
     lines = file.read_text().splitlines() if file.is_file() else []
     try:
         table = [[float(word) for word in line.split()] for line in lines]
