@@ -22,7 +22,7 @@ from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, Pose
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording, recording_from_flags
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.timing.episodes import read_episodes
+from neeco.ingest.timing.reading import read_episodes
 
 SIZE = (64, 48)  # px
 FOCAL = (60.0, 60.0, 32.0, 24.0)
