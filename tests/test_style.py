@@ -21,17 +21,11 @@ TRITON = "neeco.raster.triton"  # kernels, whose arguments are addresses and str
 LONG_CALLS = {
     "ingest": 12,
     "labels": 1,
-    "methods": 7,
-    "raster": 2,
-    "scene": 3,
 }
 LONG_DATACLASSES = {
     "geometry": 1,
     "ingest": 8,
     "labels": 2,
-    "methods": 7,
-    "raster": 4,
-    "scene": 3,
 }
 PRIVATE_IMPORTS: dict[str, int] = {}
 PRIVATE_IN_TESTS = {  # to become at most ten
