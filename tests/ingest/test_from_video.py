@@ -189,7 +189,7 @@ def test_a_video_and_a_ruler_become_a_capture(recorded, tmp_path):
         assert state.uncertainty.rotation_deg[2] < 20
     assert any("two diameters of its shaft" in note for note in result.notes)
     assert result.in_video == ("grasper",)
-    assert not any("roll is not known" in doubt for doubt in assess_ingest(result, capture).doubts)
+    assert not any("roll is not known" in doubt for doubt in assess_ingest(result, capture).warnings)
     state = capture.frames[0].state.instruments["grasper"]
     unknown = replace(state, uncertainty=replace(state.uncertainty, rotation_deg=(1.0, 1.0, 180.0)))
     first = replace(capture.frames[0], state=State({"grasper": unknown}))
