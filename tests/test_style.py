@@ -22,9 +22,6 @@ LONG_CALLS = {
     "cli": 2,
     "ingest": 12,
     "labels": 1,
-    "methods": 7,
-    "raster": 2,
-    "scene": 3,
     "viewer": 2,
 }
 LONG_DATACLASSES = {
@@ -32,9 +29,6 @@ LONG_DATACLASSES = {
     "geometry": 1,
     "ingest": 8,
     "labels": 2,
-    "methods": 7,
-    "raster": 4,
-    "scene": 3,
     "viewer": 3,
 }
 PRIVATE_IMPORTS: dict[str, int] = {}

@@ -278,7 +278,7 @@ def test_images_of_two_sizes_and_lenses_of_a_part_are_refused(tmp_path: Path) ->
     known = format_of(bag.path)
     assert known is not None
     assert "changes from 8x8 to 16x8 pixels midway" in refusal(lambda: known.open_images(bag.path))
-    assert "camera_info: speaks of binning" in refusal(lambda: known.lens(bag.path, LEFT))
+    assert "camera_info: states binning" in refusal(lambda: known.lens(bag.path, LEFT))
 
 
 def test_a_type_that_is_defined_otherwise_is_not_read(tmp_path: Path, bags: dict[str, Path]) -> None:
