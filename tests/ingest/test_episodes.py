@@ -20,7 +20,8 @@ from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.splits import assign_splits
 from neeco.ingest.timing.compatibility import episode_names, separate
-from neeco.ingest.timing.episodes import PAUSE_S, read_episodes
+from neeco.ingest.timing.episodes import PAUSE_S
+from neeco.ingest.timing.reading import read_episodes
 
 BEGINS = (0.0, 2.0, 4.5)  # s of the bar's motion
 
@@ -113,7 +114,7 @@ def test_another_tissue_is_refused_by_name(tmp_path: Path) -> None:
                            "joints": {"jaw": {"file": "bar.csv", "columns": {"value": "qx"},
                                               "units": {"angle": "rad"}}}}]}, "bar: joints (jaw)"),
         ({"camera": "moving"}, "camera: is not as"),
-        ({"splits": {"test_every": 3}}, "splits: says another than"),
+        ({"splits": {"test_every": 3}}, "splits: differs from that"),
     ],
 )  # fmt: skip
 def test_what_one_capture_cannot_hold_is_refused_in_one_line(
