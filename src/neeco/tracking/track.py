@@ -202,7 +202,7 @@ def _write_run(output: Path, run: GaussianRun, scene: GaussianScene) -> None:
     folder, digest = output / RUN, ""
     if (output / "transforms.json").exists():
         capture = read_capture(output)
-        scene.recorded = Recorded.of(capture.frames, scene.instruments, capture.lens, still=capture.still)
+        scene.recorded = Recorded.of(capture.frames, scene.instruments, lens=capture.lens, still=capture.still)
         digest = fingerprint(capture)
     folder.mkdir(exist_ok=True)
     save_scene(scene, folder / SCENE_FILE)
