@@ -187,15 +187,15 @@ def test_a_recording_that_does_not_join_the_others_is_named(recorded, tmp_path: 
 
 def test_several_recordings_are_given_on_the_command_line(tmp_path: Path) -> None:
     paths = still_recordings(tmp_path, (1, 1))
-    assert [recording.path for recording in recordings_of(Ingest(tuple(paths)))] == paths
+    assert [recording.path for recording in recordings_of(Ingest(source=tuple(paths)))] == paths
     for sources, words in [
         ((paths[0], tmp_path), "is a folder; of several recordings give each recording.yaml"),
         ((paths[0], paths[1].parent), "holds a recording; give the file"),
     ]:
         with pytest.raises(NeecoError, match=words):
-            run(Ingest(sources, output=tmp_path / "capture"))
+            run(Ingest(source=sources, output=tmp_path / "capture"))
     with pytest.raises(NeecoError, match="--init: looks at one folder or file"):
-        run(Ingest(tuple(paths), init=True))
+        run(Ingest(source=tuple(paths), init=True))
 
 
 class TestEpisodesOfADataSet:

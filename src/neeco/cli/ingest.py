@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from neeco.ingest.recording.model import Recording
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Ingest:
     """Make a capture from a recording: video and tracker logs; CAPTURE/ingest.html reports how good it is."""
 
