@@ -166,7 +166,7 @@ RECORDINGS: dict[str, Callable[[Contents, Path], Path]] = {
 def measure(path: Path) -> None:
     """Read a recording and print the processor's seconds, those of the logs alone, frames and peak memory MiB."""
     from neeco.ingest.recording.file import read_recording
-    from neeco.ingest.timing.episodes import read_episodes
+    from neeco.ingest.timing.reading import read_episodes
 
     started = time.process_time()
     data = read_episodes([read_recording(path)])

@@ -50,8 +50,8 @@ def ball_scene(
         torch.full((count,), 4.0),
         (colors[:, None] - 0.5) / 0.28209479177387814,
         torch.zeros(count, 15, 3),
-        (len(tissue), inside),
-        {LINK_LOGITS: torch.zeros(count, 1)},
+        counts=(len(tissue), inside),
+        extras={LINK_LOGITS: torch.zeros(count, 1)},
     )
     states = tuple(ball_state(name, *place) for place in places)
     names = tuple(f"{k:06d}" for k in range(len(states)))

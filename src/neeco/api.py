@@ -40,7 +40,7 @@ Progress = Callable[[str, int, int], None]  # is given what is being done, how m
 
 
 class Scene:
-    """A learned scene: draws instruments in any state from any view, with labels.
+    """A learned scene: renders instruments in any state from any view, with labels.
 
         scene = neeco.Scene("runs/sample/scene.safetensors")        # or neeco.load("runs/sample").scene
         state, camera = scene.recorded[0]
@@ -80,7 +80,7 @@ class Scene:
 
     @property
     def num_gaussians(self) -> int | None:
-        """How many Gaussians it has; None for a radiance field."""
+        """Number of Gaussians; None for a radiance field."""
         return self.learned.num_gaussians
 
     @property
@@ -94,7 +94,7 @@ class Scene:
     @overload
     def draw(self, state: State, camera: Camera, labels: bool) -> RGBDImage: ...
     def draw(self, state: State, camera: Camera, labels: bool = True) -> RGBDImage:
-        """Draw `state` as `camera` sees it: image and depth; with `labels` also masks, parts, boxes and keypoints.
+        """Render `state` as seen by `camera`: image and depth; with `labels` also masks, parts, boxes and keypoints.
 
         state: poses world_from_instrument [4, 4] in mm and joints in rad, of every instrument of the scene. camera:
         intrinsics in px and world_from_camera [4, 4] in mm, OpenCV axes (x right, y down, z forward). Poses may be
@@ -172,7 +172,7 @@ class Run:
 
 
 def _view_fault(camera: Camera) -> Fault | None:
-    """What is wrong with a camera that is to see a scene, and what to do."""
+    """Return what is wrong with a camera, and what to do; None for a valid one."""
     for pose in (camera.world_from_camera, camera.world_from_lamps):
         fault = None if pose is None else rigid_fault(pose.detach().cpu().double().numpy())
         if fault is not None:

@@ -193,13 +193,16 @@ def test_what_is_posed_stands_where_forward_kinematics_says(tree: KinematicTree,
     local = rng.normal(size=(len(tree.bodies), 3)) * 5
     origins, axes = tree.axes_at_rest
     body = ArticulatedBody(
-        torch.eye(4, dtype=torch.float64),
-        torch.from_numpy(origins),
-        torch.from_numpy(axes),
-        torch.from_numpy(tree.values(readings)[:, 1:]),  # the first body is the root, which does not move
-        torch.zeros(3, dtype=torch.float64),
-        torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64),
-        *(torch.tensor(v, dtype=torch.float64) for v in (-math.inf, -1e9, 1.0, 1e9)),
+        world_from_body=torch.eye(4, dtype=torch.float64),
+        origins=torch.from_numpy(origins),
+        axes=torch.from_numpy(axes),
+        values=torch.from_numpy(tree.values(readings)[:, 1:]),  # the first body is the root, which does not move
+        shaft_origin=torch.zeros(3, dtype=torch.float64),
+        shaft_direction=torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64),
+        spin_end=torch.tensor(-math.inf, dtype=torch.float64),
+        gate_start=torch.tensor(-1e9, dtype=torch.float64),
+        gate_width=torch.tensor(1.0, dtype=torch.float64),
+        longest=torch.tensor(1e9, dtype=torch.float64),
         slides=tuple(link.type == PRISMATIC for link in tree.joints),
     )
     means = [

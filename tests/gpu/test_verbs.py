@@ -141,7 +141,7 @@ def test_the_viewer_draws_every_view(run: str, device: torch.device) -> None:
     assert loaded.scene.center.device.type == device.type
     camera, controls = loaded.recorded.cameras[2], Controls(2.0)
     for view in views_of(loaded.scene, bool(loaded.frames)):
-        drawn, expected = (render_run(runs, 0, controls, camera, 2, view) for runs in (there, here))
+        drawn, expected = (render_run(runs, 0, controls, camera, view) for runs in (there, here))
         difference = np.abs(drawn.picture.pixels.astype(float) - expected.picture.pixels)
         assert (difference > 2).mean() < 0.01, view
     score = scored(drawn).score
@@ -158,8 +158,8 @@ def test_the_viewer_says_that_a_gpu_failed_and_goes_on(run: str, monkeypatch: py
     with monkeypatch.context() as patch:
         patch.setattr(GaussianScene, "at", full)
         with pytest.raises(NeecoError, match=r"2\.50 GiB more were asked for"):
-            render_run(runs, 0, controls, camera, 2, IMAGE)
-    assert render_run(runs, 0, controls, camera, 2, IMAGE).picture.pixels.any()
+            render_run(runs, 0, controls, camera, IMAGE)
+    assert render_run(runs, 0, controls, camera, IMAGE).picture.pixels.any()
 
 
 @slowly

@@ -109,7 +109,7 @@ def test_init_writes_the_picture_beside_the_recording(tmp_path, capsys):
     places, turns = pivoting()
     states = [{STATE: np.column_stack([places, turns.as_quat()])}]
     path = write_data_set(tmp_path / "set", "v3.0", states)
-    assert run(Ingest((path,), init=True)) == 0
+    assert run(Ingest(source=(path,), init=True)) == 0
     assert (tmp_path / CHOICES).is_file()
     assert str(tmp_path / CHOICES) in capsys.readouterr().out
     assert (tmp_path / "recording.yaml").is_file()

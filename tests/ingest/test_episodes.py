@@ -20,7 +20,8 @@ from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.splits import assign_splits
 from neeco.ingest.timing.compatibility import episode_names, separate
-from neeco.ingest.timing.episodes import PAUSE_S, read_episodes
+from neeco.ingest.timing.episodes import PAUSE_S
+from neeco.ingest.timing.reading import read_episodes
 
 BEGINS = (0.0, 2.0, 4.5)  # s of the bar's motion
 
@@ -113,7 +114,7 @@ def test_another_tissue_is_refused_by_name(tmp_path: Path) -> None:
                            "joints": {"jaw": {"file": "bar.csv", "columns": {"value": "qx"},
                                               "units": {"angle": "rad"}}}}]}, "bar: joints (jaw)"),
         ({"camera": "moving"}, "camera: is not as"),
-        ({"splits": {"test_every": 3}}, "splits: says another than"),
+        ({"splits": {"test_every": 3}}, "splits: differs from that"),
     ],
 )  # fmt: skip
 def test_what_one_capture_cannot_hold_is_refused_in_one_line(
@@ -186,15 +187,15 @@ def test_a_recording_that_does_not_join_the_others_is_named(recorded, tmp_path: 
 
 def test_several_recordings_are_given_on_the_command_line(tmp_path: Path) -> None:
     paths = still_recordings(tmp_path, (1, 1))
-    assert [recording.path for recording in recordings_of(Ingest(tuple(paths)))] == paths
+    assert [recording.path for recording in recordings_of(Ingest(source=tuple(paths)))] == paths
     for sources, words in [
         ((paths[0], tmp_path), "is a folder; of several recordings give each recording.yaml"),
         ((paths[0], paths[1].parent), "holds a recording; give the file"),
     ]:
         with pytest.raises(NeecoError, match=words):
-            run(Ingest(sources, output=tmp_path / "capture"))
+            run(Ingest(source=sources, output=tmp_path / "capture"))
     with pytest.raises(NeecoError, match="--init: looks at one folder or file"):
-        run(Ingest(tuple(paths), init=True))
+        run(Ingest(source=tuple(paths), init=True))
 
 
 class TestEpisodesOfADataSet:

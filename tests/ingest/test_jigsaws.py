@@ -14,7 +14,7 @@ from neeco.ingest.readers.columns import PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.timing.episodes import read_episodes
+from neeco.ingest.timing.reading import read_episodes
 
 ROWS = 40
 ARMS = ("master left", "master right", "slave left", "slave right")

@@ -19,7 +19,7 @@ from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.file import read_recording
-from neeco.ingest.timing.episodes import read_episodes
+from neeco.ingest.timing.reading import read_episodes
 
 pytest.importorskip("pycolmap")
 

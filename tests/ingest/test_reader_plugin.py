@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from neeco.capture.reader import read_capture
 from plugin_site import install_plugin
 
+from neeco.capture.readers import read_capture
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.ingest.readers import read_table, recording_formats

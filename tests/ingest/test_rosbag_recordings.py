@@ -22,7 +22,7 @@ from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, Pose
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording, recording_from_flags
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.timing.episodes import read_episodes
+from neeco.ingest.timing.reading import read_episodes
 
 SIZE = (64, 48)  # px
 FOCAL = (60.0, 60.0, 32.0, 24.0)
@@ -278,7 +278,7 @@ def test_images_of_two_sizes_and_lenses_of_a_part_are_refused(tmp_path: Path) ->
     known = format_of(bag.path)
     assert known is not None
     assert "changes from 8x8 to 16x8 pixels midway" in refusal(lambda: known.open_images(bag.path))
-    assert "camera_info: speaks of binning" in refusal(lambda: known.lens(bag.path, LEFT))
+    assert "camera_info: states binning" in refusal(lambda: known.lens(bag.path, LEFT))
 
 
 def test_a_type_that_is_defined_otherwise_is_not_read(tmp_path: Path, bags: dict[str, Path]) -> None:

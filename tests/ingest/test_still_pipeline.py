@@ -15,7 +15,7 @@ from neeco.capture import read_capture, write_capture
 from neeco.capture.checks import inspect_capture
 from neeco.errors import NeecoError
 from neeco.ingest.readers.logs import read_pose_log
-from neeco.ingest.timing import episodes
+from neeco.ingest.timing import reading
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def test_a_still_scope_is_noticed_and_the_instruments_clock_found_from_its_motio
 def test_a_log_that_states_the_cameras_frame_itself_needs_no_word_in_the_recording(
     theatre: Theatre, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(episodes, "read_pose_log", lambda source: replace(read_pose_log(source), frame="camera"))
+    monkeypatch.setattr(reading, "read_pose_log", lambda source: replace(read_pose_log(source), frame="camera"))
     with pytest.raises(NeecoError, match="need a scope that stands still"):
         theatre.ingest(instruments=[{"name": "bar", "poses": "bar.csv"}], camera="moving")
     result = theatre.ingest(instruments=[{"name": "bar", "poses": "bar.csv"}])

@@ -53,7 +53,7 @@ def test_what_the_first_says_of_splits_holds_for_every_tissue(tmp_path: Path) ->
     assert (bowel[0].splits.test_episodes, bowel[0].splits.test_every) == ((), 0)  # no frame of it was asked for
     assert {(item.frames, item.splits.unseen_fraction) for item in liver + bowel} == {(20, 0.2)}
     change(paths[2], frames=30)
-    with pytest.raises(NeecoError, match=r"take 2/recording\.yaml: frames: says another than in .*take 0"):
+    with pytest.raises(NeecoError, match=r"take 2/recording\.yaml: frames: differs from that in .*take 0"):
         by_tissue([read_recording(path) for path in paths])
 
 

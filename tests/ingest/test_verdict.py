@@ -11,8 +11,8 @@ def test_a_stated_clock_that_motion_contradicts_is_doubtful_and_strict_ends_it_w
     path.write_text(text.replace("sync: sync.json", "sync: {em: 0.14}"))
     assert main(["ingest", str(path), "--output", str(recorded.folder / "out"), "--strict"]) == 1
     told = capsys.readouterr().out
-    verdict = told[told.index("how good it is: ") :]
-    assert verdict.startswith("how good it is: DOUBTFUL: sync: em: 140.0 ms contradicts")
+    verdict = told[told.index("verdict: ") :]
+    assert verdict.startswith("verdict: DOUBTFUL: sync: em: 140.0 ms contradicts")
     assert "which gives 4" in verdict
     page = (recorded.folder / "out" / "ingest.html").read_text()
     assert "DOUBTFUL" not in page

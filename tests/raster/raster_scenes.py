@@ -9,9 +9,9 @@ from torch import Tensor
 
 from neeco.raster import Camera, Gaussians, Headlight, Rendering, rasterize
 from neeco.raster.reference import (
-    FAINTEST,
-    FULL,
-    OPAQUE,
+    MAX_ALPHA,
+    MIN_ALPHA,
+    MIN_TRANSMITTANCE,
     alphas_at_pixels,
     camera_from_world,
     depth_keys,
@@ -68,7 +68,9 @@ def make_scene(
 def leaves(scene: Scene, dtype: torch.dtype) -> tuple[dict[str, Tensor], Gaussians, Camera]:
     t = {k: v.to(dtype).clone().requires_grad_(k != "sh_frames") for k, v in scene.tensors.items()}
     light = Headlight(t["falloff"], t["vignette"], left=t["left"]) if "falloff" in t else None
-    gaussians = Gaussians(t["means"], t["quats"], t["scales"], t["opacities"], t["sh"], t.get("sh_frames"), light)
+    gaussians = Gaussians(
+        t["means"], t["quats"], t["scales"], t["opacities"], t["sh"], sh_frames=t.get("sh_frames"), headlight=light
+    )
     camera = Camera(
         t["world_from_camera"], scene.focal, scene.focal * 1.03, scene.width / 2 + 1.3, scene.height / 2 - 0.7,
         scene.width, scene.height, scene.near,
@@ -109,9 +111,9 @@ def decided_pixels(scene: Scene, tolerance: float = 1e-4) -> Tensor:
         projection = project(chosen, camera, means @ rotation.T + translation, rotation, torch.zeros(len(index), 2))
         alphas = alphas_at_pixels(projection, chosen.opacities, camera)
         alphas = alphas[:, torch.argsort(depth_keys(means, camera), stable=True)]
-        close = ((alphas / FAINTEST - 1).abs() < tolerance) | ((alphas / OPAQUE - 1).abs() < tolerance)
-        left = torch.cumprod(1 - torch.where(alphas >= FAINTEST, alphas.clamp(max=OPAQUE), 0.0), dim=1)
-        close |= (left / FULL - 1).abs() < 100 * tolerance
+        close = ((alphas / MIN_ALPHA - 1).abs() < tolerance) | ((alphas / MAX_ALPHA - 1).abs() < tolerance)
+        left = torch.cumprod(1 - torch.where(alphas >= MIN_ALPHA, alphas.clamp(max=MAX_ALPHA), 0.0), dim=1)
+        close |= (left / MIN_TRANSMITTANCE - 1).abs() < 100 * tolerance
     return (~close.any(dim=1)).reshape(camera.height, camera.width).float()
 
 

@@ -17,7 +17,7 @@ from articulated_worlds import Tree, assert_same_as_definition, hinges, make_wor
 from neeco.errors import NeecoError
 from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import kernels
-from neeco.raster.articulated import MOST_JOINTS, ArticulatedBody, pose_bodies
+from neeco.raster.articulated import MAX_JOINTS, ArticulatedBody, pose_bodies
 from neeco.raster.native import set_threads
 
 
@@ -158,13 +158,16 @@ def test_cuda_poses_the_same() -> None:
 def test_a_chain_moves_what_lies_beyond_each_joint() -> None:
     """A shaft along z, a wrist that bends at 0 about x, a slide beyond it at 10: by hand."""
     body = ArticulatedBody(
-        torch.eye(4),
-        torch.tensor([[0.0, 0.0, 10.0], [0.0, 0.0, 0.0]]),  # the outermost joint first
-        torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
-        torch.tensor([[0.0, 3.0], [math.pi / 2, math.pi / 2]]),  # of the links wrist and slide
-        torch.zeros(3),
-        torch.tensor([0.0, 0.0, 1.0]),
-        *map(torch.tensor, (-math.inf, -1e9, 1.0, 1e9)),
+        world_from_body=torch.eye(4),
+        origins=torch.tensor([[0.0, 0.0, 10.0], [0.0, 0.0, 0.0]]),  # the outermost joint first
+        axes=torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+        values=torch.tensor([[0.0, 3.0], [math.pi / 2, math.pi / 2]]),  # of the links wrist and slide
+        shaft_origin=torch.zeros(3),
+        shaft_direction=torch.tensor([0.0, 0.0, 1.0]),
+        spin_end=torch.tensor(-math.inf),
+        gate_start=torch.tensor(-1e9),
+        gate_width=torch.tensor(1.0),
+        longest=torch.tensor(1e9),
         slides=(True, False),
     )
     logits = 1e3 * torch.eye(3)  # a Gaussian of each link
@@ -175,6 +178,6 @@ def test_a_chain_moves_what_lies_beyond_each_joint() -> None:
 
 
 def test_a_body_of_too_many_joints_is_refused() -> None:
-    world = make_world((2,), (hinges(MOST_JOINTS + 1),))
+    world = make_world((2,), (hinges(MAX_JOINTS + 1),))
     with pytest.raises(NeecoError, match="a body of 32 joints and 33 links; at most 31 and 32"):
         posed(world, torch.float32)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neeco.raster import Camera, Gaussians, Headlight, Rendering, kernels, rasterize
 from neeco.raster.native import Family, set_threads
-from neeco.raster.shadow import GAMMA, LEAST, Casting, _light_camera, blocked, blocked_reference, blur
+from neeco.raster.shadow import GAMMA, MIN_WINDOW_SD, Casting, blocked, blocked_reference, blur, light_camera
 from neeco.raster.types import Shadow
 
 CAMERA = Camera(torch.eye(4), fx=80.0, fy=80.0, cx=40.0, cy=32.0, width=80, height=64)
@@ -196,7 +196,7 @@ def test_the_kernel_finds_behind_what_the_reference_finds(
     local = torch.randn(count, 3, generator=g) * 30 + torch.tensor([0.0, 0.0, 60.0])
     means = local @ pose[:3, :3].T + pose[:3, 3]
     casters = torch.rand(count, generator=g) < 0.2
-    at_light = _light_camera(camera, torch.tensor(offset))
+    at_light = light_camera(camera, torch.tensor(offset))
     shape = (at_light.height, at_light.width)
     alpha = torch.rand(shape, generator=g) * (torch.rand(shape, generator=g) < 0.7)
     depth = 40 + 30 * torch.rand(shape, generator=g)
@@ -277,5 +277,5 @@ def test_a_blur_moves_light_and_loses_none(height: int, width: int, sigma: float
     out = blur(image, torch.tensor(sigma, dtype=torch.float64))
     assert float(out.sum()) == pytest.approx(1)
     spread = (out.sum(0) * (torch.arange(width) - width // 2) ** 2).sum().sqrt()
-    assert float(spread) <= max(sigma, LEAST) + 1e-9
+    assert float(spread) <= max(sigma, MIN_WINDOW_SD) + 1e-9
     assert torch.equal(out, out.clamp(0, 1))

@@ -85,7 +85,7 @@ def test_any_scene_matches_the_reference(**shape: int) -> None:
 
 
 def test_tiles_of_another_size_draw_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backend, "TILE", 8)
+    monkeypatch.setattr(backend, "TILE_PX", 8)
     same(scene_of(40, 4, 2, seed=2))
 
 
@@ -278,7 +278,7 @@ def test_tensors_on_two_devices_are_refused() -> None:
 
 
 def test_more_pairs_than_can_be_numbered_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(binning, "MOST_PAIRS", 3)
+    monkeypatch.setattr(binning, "MAX_PAIRS", 3)
     _, gaussians, camera = leaves(scene_of(30), torch.float32)
     with pytest.raises(NeecoError, match="pairs of a tile and a Gaussian are too many"):
         rasterize(gaussians, camera, backend="triton")

@@ -14,10 +14,11 @@ from scene_worlds import GRASPER, TISSUE, grasper_state, pose_of, random_canonic
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.methods.networks import encode
 from neeco.methods.nps import NPS, NPSSettings
 from neeco.raster.devices import fast_bfloat16, processor_has
 from neeco.scene import GaussianScene
-from neeco.scene.deformation import encode, mark_moving, otsu
+from neeco.scene.deformation import mark_moving, otsu
 from neeco.scene.method_registry import make_deformation, method_class, method_settings
 from neeco.training.config import method_defaults
 

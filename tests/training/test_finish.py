@@ -13,9 +13,9 @@ from capture_files import PIVOT_MM, WRIST_MM, grasper_body, write_grasper
 from neeco.capture import read_capture
 from neeco.methods.kinematic import wrist
 from neeco.methods.kinematic.articulation import LINK_LOGITS
-from neeco.methods.kinematic.finish import conclude, extend_shaft, settle_links, shaft_coverage
+from neeco.methods.kinematic.finish import conclude, extend_shaft, finalise_links, shaft_coverage
 from neeco.methods.kinematic.hinges import Hinges
-from neeco.methods.kinematic.wrist import color_boundary, measure_radius, place_wrists, replace_wrists
+from neeco.methods.kinematic.wrist import color_boundary, measure_radius, place_wrists, refine_wrists
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
@@ -146,7 +146,7 @@ def test_a_wrist_found_again_moves_unless_spinning_then_costs_more(
     monkeypatch.setattr(wrist, "SPIN_ANGLE", math.pi / 4)  # the rings have eight Gaussians each
     hinges = hinges_of(session)
     hinges.wrist_start.fill_(3.0)
-    replace_wrists(session, session.scene.deformation)
+    refine_wrists(session, session.scene.deformation)
     assert float(hinges.wrist_start) == pytest.approx(WRIST_MM + 0.75, abs=1.0)
     with torch.no_grad():  # a shaft that is flat from -10 mm on, but coloured as before: the border is no wrist
         flat = session.scene.canonical.means[session.scene.canonical.body(1)]
@@ -157,7 +157,7 @@ def test_a_wrist_found_again_moves_unless_spinning_then_costs_more(
     )
     session.views = replace(session.views, images=images)
     hinges.wrist_start.fill_(-12.0)
-    replace_wrists(session, session.scene.deformation)
+    refine_wrists(session, session.scene.deformation)
     assert float(hinges.wrist_start) < -8
 
 
@@ -279,7 +279,7 @@ def test_a_scene_is_stored_with_its_links_settled(session: GaussianSession) -> N
     logits = scene.canonical.extras[LINK_LOGITS].clone()
     logits[rows.stop - 15 : rows.stop] = torch.tensor([30.0, 0.0, 1.0])  # the second jaw, learned as the shaft
     scene.canonical = scene.canonical.with_extras(**{LINK_LOGITS: logits})
-    settled = settle_links(scene.canonical, scene.deformation)
+    settled = finalise_links(scene.canonical, scene.deformation)
     places, links = settled.means[rows], settled.extras[LINK_LOGITS][rows].argmax(1)
     beyond = hinges.along_shaft(places) > PIVOT_MM + 0.9 * 3.0
     assert bool(beyond.any())

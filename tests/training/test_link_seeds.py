@@ -17,7 +17,7 @@ from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.fitting.refinement import RefineConfig, Refinement
 from neeco.geometry.rotations import rotate_about
-from neeco.methods.kinematic.link_search import along_links, doubt_readings, readings_of, start_links
+from neeco.methods.kinematic.link_search import align_to_links, check_readings, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve
 from neeco.scene.drawable import Recorded
@@ -101,7 +101,7 @@ def started(carved: tuple[Evidence, CarvedShape]) -> StatedLinks:
 
 def test_every_link_is_seeded_where_it_is(carved: tuple[Evidence, CarvedShape]) -> None:
     links, generator = started(carved), torch.Generator().manual_seed(0)
-    seeds, logits = start_links(session(carved[0]), links, carved[0], "tool", carved[1], 4, generator)
+    seeds, logits = start_links(session(carved[0]), links, carved[0], "tool", carved[1], columns=4, generator=generator)
     assert logits.shape == (len(seeds), 4)
     owners = logits.argmax(1)
     for k, (near, far) in enumerate(((-45, PITCH_AT), (PITCH_AT, YAW_AT), (YAW_AT, TIP), (YAW_AT, TIP))):
@@ -118,9 +118,9 @@ def test_a_carved_line_is_kept_where_the_links_agree_and_else_theirs_is_taken(
 ) -> None:
     evidence, shape = carved
     links, kept, told = started(carved), session(evidence), session(evidence)
-    assert along_links(kept, links, evidence, "tool", shape, torch.Generator().manual_seed(0)).seeds is shape.seeds
+    assert align_to_links(kept, links, evidence, "tool", shape, torch.Generator().manual_seed(0)).seeds is shape.seeds
     astray = CarvedShape(**vars(shape) | {"instrument_from_shaft": torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))})
-    again = along_links(told, links, evidence, "tool", astray, torch.Generator().manual_seed(0))
+    again = align_to_links(told, links, evidence, "tool", astray, torch.Generator().manual_seed(0))
     assert told.said
     assert not kept.said
     assert float(again.instrument_from_shaft[2, 2]) > 0.99
@@ -133,7 +133,13 @@ def test_links_of_a_joint_that_nobody_recorded_are_seeded_on_their_sides(carved:
     evidence = carved[0]
     asked = session(evidence, ("jaw",))
     seeds, logits = start_links(
-        asked, started(carved), evidence, "tool", carved[1], 4, torch.Generator().manual_seed(0)
+        asked,
+        started(carved),
+        evidence,
+        "tool",
+        carved[1],
+        columns=4,
+        generator=torch.Generator().manual_seed(0),
     )
     owners = logits.argmax(1)
     for link, sense in ((2, 1.0), (3, -1.0)):  # jaw_left turns by half of the reading about x, which takes z to -y
@@ -160,7 +166,9 @@ def test_links_that_nobody_recorded_open_from_where_they_are_closed() -> None:
     shape = carve(evidence, "tool", torch.Generator().manual_seed(0), SEARCH)
     assert shape is not None
     asked, links = session(evidence, ("jaw",)), started((evidence, shape))
-    seeds, logits = start_links(asked, links, evidence, "tool", shape, 4, torch.Generator().manual_seed(0))
+    seeds, logits = start_links(
+        asked, links, evidence, "tool", shape, columns=4, generator=torch.Generator().manual_seed(0)
+    )
     found = readings_of(asked, evidence, "tool")[0]["jaw"]
     assert found < 0.3  # of 1.6; half way is 0.8
     ahead = torch.tensor([0, -np.sin(HEADING), np.cos(HEADING)]).float()
@@ -189,7 +197,7 @@ def test_readings_that_drive_other_joints_than_they_say_are_doubted(
 ) -> None:
     asked = session(carved[0])
     readings = [change(given) for given in readings_of(asked, carved[0], "tool")]
-    doubt_readings(asked, started(carved), carved[0], asked.scene.instruments[0], readings)
+    check_readings(asked, started(carved), carved[0], asked.scene.instruments[0], readings)
     assert set(asked.scene.diagnostics.get("doubted_readings", {})) == doubted
     assert all(words in line for line in asked.said)
     assert len(asked.said) == bool(doubted)

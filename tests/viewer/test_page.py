@@ -314,7 +314,7 @@ def test_a_damaged_file_says_so(chromium: Any, exported: Path, tmp_path: Path) -
     at = text.index('id="scene">') + 2000
     broken = tmp_path / "broken.html"
     broken.write_text(text[:at] + "AAAA" + text[at + 4 :])
-    assert "could not be drawn" in said(chromium, broken)
+    assert "could not be rendered" in said(chromium, broken)
 
 
 @pytest.mark.parametrize(
@@ -334,4 +334,4 @@ def test_a_hostile_file_neither_hangs_nor_shows_anything(
     header, planes = pack(scene, 1)
     path = tmp_path / "hostile.html"
     path.write_text(page_of(header | change, planes, "hostile", []))
-    assert "could not be drawn" in said(chromium, path)
+    assert "could not be rendered" in said(chromium, path)

@@ -147,6 +147,14 @@ def test_every_method_can_be_looked_at(method: str, tmp_path: Path) -> None:
     assert runs.unit > 0
 
 
+def test_two_runs_are_of_one_capture(run: Path, tmp_path: Path) -> None:
+    scene = grasper_scene()
+    elsewhere = write_run(scene, tmp_path / "elsewhere", write_recorded_images(scene, tmp_path / "other-capture"))
+    with pytest.raises(NeecoError, match=r"view: .*elsewhere: was trained on .*other-capture, .*compare runs of one"):
+        ViewedRuns([run, elsewhere])
+    assert len(ViewedRuns([run, run]).loaded) == 2
+
+
 def test_what_is_known_of_frames_is_found_out_anew_for_a_changed_run(run: Path) -> None:
     runs = ViewedRuns([run])
     before = score_frame(runs.loaded[0], 2)

@@ -23,10 +23,10 @@ from neeco.viewer.views import (
     UNOBSERVED_COLOR,
     VIEWS,
     Picture,
-    beside,
     difference,
     dimmed,
     picture,
+    side_by_side,
     split,
     views_of,
 )
@@ -145,7 +145,7 @@ def test_a_field_shows_image_and_depth() -> None:
 
 
 def test_side_by_side_each_keeps_its_width() -> None:
-    both = beside([plain((10, 0, 0), note="a"), plain((20, 0, 0), note="b")])
+    both = side_by_side([plain((10, 0, 0), note="a"), plain((20, 0, 0), note="b")])
     assert both.pixels[0, :, 0].tolist() == [10] * 7 + [255] * 2 + [20] * 7
     assert both.depth[0].tolist() == [10.0] * 8 + [20.0] * 8
     assert both.note == "a; b"

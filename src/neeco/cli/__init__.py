@@ -25,21 +25,21 @@ from neeco.files import require_utf8
 
 VERBS = {
     "demo": "The whole main job on the bundled sample capture, in five minutes.",
-    "check": "Tell everything that is wrong with a capture.",
+    "check": "Report everything that is wrong with a capture.",
     "ingest": "Make a capture from a recording: video and tracker logs.",
     "train": "Learn a scene from a capture.",
     "evaluate": "Score a run: images, masks, parts, speed; writes a report.",
-    "render": "Draw frames of a capture, or states from a file, with part ids and masks.",
+    "render": "Render frames of a capture, or states from a file, with part ids and masks.",
     "compare": "Train and score several methods under the same budget; tables and a report.",
-    "score-masks": "Score a folder of masks, whoever made them, against the truth.",
-    "view": "Look at a run and steer it, in a browser or as one file.",
+    "score-masks": "Score a folder of masks from any source against the truth.",
+    "view": "Show a run interactively, in a browser or as one file.",
     "export": "Write a scene in one state for other viewers of Gaussians (PLY, SPZ).",
-    "synthesize": "Draw a labelled data set of states that nobody recorded.",
-    "annotate": "Label the recorded frames by the scene, each with how far to trust it.",
+    "synthesize": "Render a labelled data set of states that nobody recorded.",
+    "annotate": "Label the recorded frames by the scene, each with its confidence.",
     "track": "Find instruments in footage that has no states, by their learned scene.",
     "refine": "Train a run again, with frames that were tracked by it.",
-    "downstream": "Train detectors and segmenters on drawn images; test them on recorded frames.",
-    "ablate": "Take parts of the methods away one by one; the paper's tables and ours.",
+    "downstream": "Train detectors and segmenters on synthetic images; test them on recorded frames.",
+    "ablate": "Remove parts of the methods one by one; the paper's tables and ours.",
 }
 
 DESCRIPTION = "Labelled images of surgical instruments in states nobody recorded."
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _status(words: list[str]) -> int:
-    """Exit status of a command line; a failure that the user can mend is one line on stderr."""
+    """Exit status of a command line; a failure that the user can correct is one line on stderr."""
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
@@ -120,7 +120,7 @@ def _prepare_streams() -> None:
 
 
 def _discard_unwritable() -> None:
-    """Let nothing be left for the interpreter to write on its way out that cannot be written."""
+    """Discard what cannot be written, so that the interpreter does not fail on exit."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -180,5 +180,5 @@ def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any
 
 
 def _named_only(name: str, line: str) -> Callable[..., Any]:
-    """Stands for a verb in the overview without importing it."""
+    """Return a stand-in for a verb in the overview, which is not imported."""
     return make_dataclass(name.replace("-", "_"), [], namespace={"__doc__": line})

@@ -1,4 +1,4 @@
-"""What several verbs print: tables that fit the terminal, where files lie, what failed."""
+"""Output shared by several verbs: tables that fit the terminal, paths of files, failures."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from neeco.files import new_folder
 if TYPE_CHECKING:
     from neeco.studies.tables import ResultTable
 
-BORDER = 3  # what a column takes beside its text
+BORDER = 3  # characters of a column in addition to its text
 
 
 def fitted(table: ResultTable, width: int) -> list[Table]:
-    """A table in as many pieces as a terminal of `width` characters needs; the keys' columns stand in each.
+    """Split a table into as many pieces as a terminal of `width` characters needs; each has the key columns.
 
-    Bold are the best of a column, and a row that others are measured against; a row that failed says so in every piece.
+    The best of a column and reference rows are bold; a failed row is marked in every piece.
     """
     headings, keys = [*table.keys, *(column.title for column in table.columns)], len(table.keys)
     rows = []
@@ -72,10 +72,24 @@ def _piece(
 
 
 def print_outcome(
-    console: Console, output: Path, stem: str, page: Path, notes: Sequence[str], failed: Sequence[str], runs: str
+    output: Path,
+    stem: str,
+    page: Path,
+    tables: Sequence[ResultTable],
+    *,
+    sentences: Sequence[str] = (),
+    notes: Sequence[str],
+    failed: Sequence[str],
+    runs: str,
 ) -> int:
-    """Print notes, the files named by `stem` and the report; returns 1 when any of `runs` (`3 runs`) failed, and prints
-    the first failure."""
+    """Print tables, sentences, notes, the files named by `stem` and the report; returns 1 when any of `runs` (`3 runs`)
+    failed, and prints the first failure."""
+    console = Console()
+    for table in tables:
+        for piece in fitted(table, console.width):
+            console.print(piece)
+    for sentence in sentences:
+        console.print(sentence, markup=False, highlight=False)
     for note in notes:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
     for what, name in (("tables", f"{stem}.md, .csv, .tex"), ("all numbers", f"{stem}.json, data/")):
@@ -98,7 +112,7 @@ def require_ending(option: str, path: Path, *endings: str) -> None:
 
 @contextmanager
 def ready_for_json(path: Path | None) -> Iterator[None]:
-    """For the work whose numbers go to `--json`: checks before it that the file can be written.
+    """Check before the work whose numbers go to `--json` that the file can be written.
 
     Raises NeecoError for a folder, a name of another format, or a file whose folder cannot be written to.
     """

@@ -1,4 +1,4 @@
-"""Progress bars on the error stream, and what a verb says where its work ended early."""
+"""Progress bars on the error stream, and messages for interrupted work."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
 
 
 class Bars:
-    """A bar for each thing counted and each running job; none before there is progress, so that bad input prints
+    """A bar for each count and each running job; none before there is progress, so that bad input prints
     its one line alone."""
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class Bars:
             self.bar.stop()
 
     def stage(self, what: str, done: int, total: int | None) -> None:
-        """How many of `what` are done."""
+        """Show that `done` of `total` are done."""
         self.bar.update(self._task(what), completed=done, total=total, text=f"{done}/{total}")
 
     def training(self, row: ProgressRow) -> None:
@@ -62,7 +62,7 @@ class Bars:
         self.bar.update(task, completed=row.progress, text=text)
 
     def end(self, title: str) -> None:
-        """What was counted under `title` is done, if it has a bar."""
+        """Complete the bar of `title`, if there is one."""
         if title in self.tasks:
             self.bar.update(self.tasks[title], completed=1.0)
 
@@ -99,7 +99,7 @@ def counting(title: str, total: int | None = None) -> Iterator[Callable[..., Non
 
 @contextmanager
 def resumable(how: str, begun: Path | None = None) -> Iterator[None]:
-    """Where Ctrl-C, a failing GPU or too little memory ends the block, say `how` to resume, once `begun` exists.
+    """Report `how` to resume where Ctrl-C, a failing GPU or too little memory ends the block, once `begun` exists.
 
     Ctrl-C's own message goes first where it has one. Raises KeyboardInterrupt and NeecoError.
     """

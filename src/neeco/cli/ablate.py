@@ -1,4 +1,4 @@
-"""`neeco ablate`: what each part of the methods is good for."""
+"""`neeco ablate`: the contribution of each part of the methods."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def run(plan: AblationPlan) -> int:
 
 
 def _print_tables(console: Console, ablation: AblationResult) -> None:
-    """Of the paper's tables how many of its directions hold, ours whole, then the notes."""
+    """Print how many of the paper's directions hold, our tables in full, then the notes."""
     from neeco.studies.ablation_study import agreement, grid
 
     for table in ablation.tables:

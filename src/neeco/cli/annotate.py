@@ -12,7 +12,7 @@ from neeco.settings import Device
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, formats_help
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Label the frames of a recording by the scene, poses fitted to each; writes those that can be trusted as a data
     set, and annotate.html: all of them, worst first."""
@@ -33,7 +33,7 @@ class Arguments:
 
 
 def run(arguments: Arguments) -> int:
-    """Annotate, write the page, and say where both lie."""
+    """Annotate, write the page, and print where both are."""
     from neeco.capture.checks import read_checked
     from neeco.cli._progress import counting, resumable
     from neeco.raster.devices import device_of

@@ -1,4 +1,4 @@
-"""neeco check: tell everything that is wrong with a capture."""
+"""`neeco check`: report everything that is wrong with a capture."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Tell everything that is wrong with a capture, at once. Exit status 1 when it cannot be trained on."""
+    """Report everything that is wrong with a capture, at once. Exit status 1 when it cannot be trained on."""
 
     capture: tyro.conf.Positional[Path]
     """The capture's folder, or a transforms file in it."""
@@ -67,7 +67,7 @@ def _summary_lines(summary: CaptureSummary) -> list[str]:
     lines = [f"frames: {frames}", f"sparse points: {summary.points}"]
     if summary.still:
         lines.append(
-            "scope: stands still; nothing shows the scene from elsewhere, so draw views near the recorded ones"
+            "scope: stands still; nothing shows the scene from elsewhere, so render views near the recorded ones"
         )
     if summary.tissues:
         lines.append("tissues: " + ", ".join(f"{count} frames of {name!r}" for name, count in summary.tissues.items()))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.console import Console
 
-from neeco.cli._output import fitted, print_outcome
+from neeco.cli._output import print_outcome
 from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from neeco.studies.training_job import Budget
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Compare:
     """Train and score methods on the same frames under the same budget; writes tables and a report.
 
@@ -42,7 +42,7 @@ class Compare:
     splits: tuple[str, ...] | None = None
     """Splits to score; default: all but train."""
     masks: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """NAME=FOLDER: masks that something else made of the same frames, scored in the same table; repeatable."""
+    """NAME=FOLDER: masks of the same frames from another program, scored in the same table; repeatable."""
     workers: int = 1
     """Runs at once; each gets its share of the cores. RAY_ADDRESS names a Ray cluster (install neeco[cluster])."""
     transforms: str = "transforms.json"
@@ -66,17 +66,20 @@ def run(args: Compare) -> int:
         bars.stage("report", 0, 1)
         page = write_comparison_report(args.output, comparison, plan.capture)
         bars.stage("report", 1, 1)
-    console = Console()
-    console.print(f"{args.capture}: {budget_words(comparison)}", markup=False, highlight=False)
-    for table in tables_of(comparison):
-        for part in fitted(table, console.width):
-            console.print(part)
-    notes, failed = absent_notes(comparison), comparison.failures
-    return print_outcome(console, args.output, "comparison", page, notes, failed, f"{len(comparison.jobs)} runs")
+    Console().print(f"{args.capture}: {budget_words(comparison)}", markup=False, highlight=False)
+    return print_outcome(
+        args.output,
+        "comparison",
+        page,
+        tables_of(comparison),
+        notes=absent_notes(comparison),
+        failed=comparison.failures,
+        runs=f"{len(comparison.jobs)} runs",
+    )
 
 
 def _spec(args: Compare) -> ComparisonSpec:
-    """What the words mean. Raises NeecoError for a budget or masks that cannot be understood."""
+    """Return the comparison that the arguments ask for. Raises NeecoError for an unreadable budget or masks."""
     from neeco.errors import NeecoError
     from neeco.studies.comparison import ComparisonSpec
 

@@ -1,4 +1,4 @@
-"""`neeco downstream`: does a model trained on synthetic images do better on recorded frames?"""
+"""`neeco downstream`: the benefit of synthetic images for models tested on recorded frames."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
-from rich.console import Console
 
-from neeco.cli._output import fitted, print_outcome
+from neeco.cli._output import print_outcome
 from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
@@ -17,14 +16,14 @@ if TYPE_CHECKING:
     from neeco.studies.downstream.samples import ImageSet
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Downstream:
     """Train detectors and segmenters on recorded and on synthetic images, and test them on recorded frames.
 
     Each model is trained from scratch in every condition, with as many steps, on the same labelled frames of a fold;
     tests are frames of the other splits. Conditions are sums of words: `real`, names of sets, `augment`, and for the
-    edges of synthetic labels `hard`, `soft` or `ignore`. Interrupted, the same command goes on where it stopped; with
-    more models, sets, conditions or folds it adds them. Needs neeco[downstream].
+    edges of synthetic labels `hard`, `soft` or `ignore`. The same command continues interrupted work; with more models,
+    sets, conditions or folds it adds them. Needs neeco[downstream].
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
@@ -78,15 +77,15 @@ def run(args: Downstream) -> int:
         bars.stage("report", 0, 1)
         page = write_downstream_report(args.output, experiment, plan.capture)
         bars.stage("report", 1, 1)
-    console = Console()
-    for table in tables_of(experiment):
-        for part in fitted(table, console.width):
-            console.print(part)
-    for sentence in experiment["answers"]:
-        console.print(sentence, markup=False, highlight=False)
-    notes, failed = experiment["notes"], failed_jobs(experiment)
     return print_outcome(
-        console, args.output, "downstream", page, notes, failed, f"{len(experiment['jobs'])} trainings"
+        args.output,
+        "downstream",
+        page,
+        tables_of(experiment),
+        sentences=experiment["answers"],
+        notes=experiment["notes"],
+        failed=failed_jobs(experiment),
+        runs=f"{len(experiment['jobs'])} trainings",
     )
 
 

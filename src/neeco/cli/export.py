@@ -34,7 +34,7 @@ class Arguments:
 
 
 def run(arguments: Arguments) -> int:
-    """Write the file and say what it holds."""
+    """Write the file and print what it holds."""
     from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
     from neeco.training.run import open_gaussian_run

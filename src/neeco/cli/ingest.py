@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from neeco.ingest.recording.model import Recording
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Ingest:
-    """Make a capture from a recording: video and tracker logs; says how good it is in CAPTURE/ingest.html."""
+    """Make a capture from a recording: video and tracker logs; CAPTURE/ingest.html reports how good it is."""
 
     source: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """recording.yaml, or several of one instrument for one capture; or a folder in another format to convert
@@ -106,7 +106,7 @@ def _refuse_others(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
 
     for option in fields(Ingest):
         if option.name not in ("source", "init", *keep) and getattr(args, option.name) != option.default:
-            raise NeecoError(f"{what}, and --{option.name} would be ignored beside it; leave one of them out")
+            raise NeecoError(f"{what}, and --{option.name} would be ignored with it; leave one of them out")
 
 
 def _list_formats() -> int:
@@ -135,7 +135,7 @@ def recordings_of(args: Ingest) -> list[Recording]:
     if args.video is None:
         raise NeecoError("--video: give the video (or images' folder), or a recording.yaml (`neeco ingest --init`)")
     if args.intrinsics is not None and args.calibration is not None:
-        raise NeecoError("--calibration: given beside --intrinsics; give one of them")
+        raise NeecoError("--calibration: given together with --intrinsics; give one of them")
     recording = recording_from_flags(
         args.video, args.instrument, args.laparoscope, args.joint, args.calibration or args.intrinsics,
         sync=args.sync, frames=args.frames, fps=args.fps, shaft_diameter=args.shaft_diameter,

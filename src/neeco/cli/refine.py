@@ -22,12 +22,12 @@ class Arguments:
     output: Path
     """Folder to write; must be empty or absent unless --resume."""
     resume: bool = False
-    """Go on where work was broken off."""
+    """Continue interrupted work."""
     device: Device = "auto"
 
 
 def run(arguments: Arguments) -> int:
-    """Fit, merge, train; say where the run lies."""
+    """Fit, merge and train; print where the run is."""
     from neeco.cli._progress import Bars, resumable
     from neeco.errors import NeecoError
     from neeco.raster.devices import device_of

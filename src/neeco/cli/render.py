@@ -11,26 +11,26 @@ from neeco.settings import Device
 from neeco.synthesis.settings import AS_RECORDED, ImageSettings
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Draw frames of a capture, or states from a file, with part ids and masks."""
+    """Render frames of a capture, or states from a file, with part ids and masks."""
 
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote."""
     output: Path
     """Folder to write to; pictures go into OUTPUT/SPLIT or OUTPUT/states."""
     capture: Path | None = None
-    """Capture whose frames to draw; the run's own when not given."""
+    """Capture whose frames are rendered; the run's own when not given."""
     split: str = "test"
     """Which frames."""
     states: Path | None = None
-    """Draw these states (JSON lines) instead of a split."""
+    """Render these states (JSON lines) instead of a split."""
     images: tyro.conf.OmitArgPrefixes[ImageSettings] = AS_RECORDED
     device: Device = "auto"
 
 
 def run(arguments: Arguments) -> int:
-    """Draw, and say where it lies."""
+    """Render, and print the folder."""
     from neeco.cli._progress import counting
     from neeco.raster.devices import device_of
     from neeco.synthesis.rendered_views import STATES_FOLDER, render, split_views, state_views

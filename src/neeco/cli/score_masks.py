@@ -1,4 +1,4 @@
-"""`neeco score-masks`: how good a folder of masks is, whoever made it."""
+"""`neeco score-masks`: the quality of a folder of masks from any source."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COLUMNS = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Score a folder of masks against the truth: IoU, Challenge IoU, Dice, boundary F and box AP, per part."""
 

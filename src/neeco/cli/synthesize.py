@@ -21,15 +21,15 @@ VIEWS_OF_STILL = {
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Draw a labelled data set of states that nobody recorded: of one run, or of one run's tissue under the instruments
-    of others (--tissue, --instruments)."""
+    """Render a labelled data set of states that nobody recorded: of one run, or of one run's tissue under the
+    instruments of others (--tissue, --instruments)."""
 
     run: Annotated[Path | None, tyro.conf.arg(metavar="RUN"), tyro.conf.Positional] = None
     """Run folder that `neeco train` wrote."""
     tissue: Path | None = None
-    """Instead of RUN: the run whose tissue and light are drawn."""
+    """Instead of RUN: the run whose tissue and light are rendered."""
     instruments: tuple[Path, ...] = ()
-    """With --tissue: the runs whose instruments stand before it."""
+    """With --tissue: the runs whose instruments are rendered over it."""
     output: Path
     """Data set folder to write; must be empty or absent unless --resume."""
     settings: tyro.conf.OmitArgPrefixes[Settings]
@@ -42,7 +42,7 @@ class Arguments:
 
 
 def run(arguments: Arguments) -> int:
-    """Make the data set and say where it lies."""
+    """Make the data set and print where it is."""
     from neeco.api import synthesize
     from neeco.cli._progress import Bars, resumable
 

@@ -11,7 +11,7 @@ import tyro
 from neeco.settings import Device
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Find the run's instruments in footage whose states nobody recorded, by the run's own scene; writes a capture of
     the frames that can be trusted, and track.html: what was found in all of them."""
@@ -19,12 +19,12 @@ class Arguments:
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote, by method kinematic."""
     footage: tyro.conf.Positional[Path]
-    """Capture with cameras, whose states are not looked at, or a video file; its cameras are found first, as by
+    """Capture with cameras, whose states are not read, or a video file; its cameras are found first, as by
     `neeco ingest`."""
     output: Path
     """Capture folder to write; must be empty or absent unless --resume."""
     start: Literal["first", "none"] = "none"
-    """first: the first frame's states are about known, the footage says them. none: nothing is known."""
+    """first: the footage states the first frame's states roughly. none: nothing is known."""
     tissue: Literal["run", "footage"] | None = None
     """run: the footage shows the run's tissue, its cameras in the run's world (default for a capture). footage: any
     tissue, cameras in any world; it is learned from the footage first, and OUTPUT/run becomes a run of the instruments
@@ -32,12 +32,12 @@ class Arguments:
     min_trust: float = 0.5
     """Frames trusted less are left out of the capture: 0 to 1."""
     resume: bool = False
-    """Go on with footage whose tracking was broken off."""
+    """Continue interrupted tracking."""
     device: Device = "auto"
 
 
 def run(arguments: Arguments) -> int:
-    """Track, and say where the capture and the page lie."""
+    """Track, and print where the capture and the page are."""
     from neeco.api import track
     from neeco.cli._progress import Bars, resumable
 

@@ -11,7 +11,7 @@ import tyro
 from neeco.settings import Device
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Learn a scene from a capture's training frames."""
 
@@ -23,7 +23,7 @@ class Arguments:
     """kinematic (the default), neeco (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's
     training adjustment."""
     iterations: int | None = None
-    """Frames drawn and learned from; by default as the method has it."""
+    """Frames rendered and learned from; by default as the method has it."""
     batch_size: int | None = None
     """Frames between two optimisation steps, whose mean loss is minimised; by default 1. More are for a GPU."""
     minutes: float | None = None
@@ -76,7 +76,7 @@ def run(args: Arguments) -> int:
 
 
 def explain() -> str:
-    """What `--help` adds: each method's own settings."""
+    """Return the paragraphs that `--help` adds: each method's own settings."""
     from neeco.scene.method_registry import methods
     from neeco.settings import described
 

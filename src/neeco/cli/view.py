@@ -1,4 +1,4 @@
-"""`neeco view`: look at a run and steer it, in a browser or as one file; pose frames of a capture by hand."""
+"""`neeco view`: show a run interactively, in a browser or as one file; pose frames of a capture by hand."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 POLL_S = 0.5  # between two looks for Ctrl-C
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Show a run in a web browser: any state, any view, what is made up and what is wrong. Two runs side by side; one
     that is still trained, too. With --export, write one file that does so without a server. With --annotate, set roll
@@ -53,7 +53,7 @@ def run(arguments: Arguments) -> int:
         return _annotate(arguments)
     if arguments.export is not None:
         if arguments.size != RECORDED_SIZE:
-            raise NeecoError("--size, --scale: an exported page draws as large as its window is; leave them out")
+            raise NeecoError("--size, --scale: an exported page renders at the size of its window; leave them out")
         return _export(arguments, arguments.export)
     arguments.size.check()
     from neeco.viewer.server import ViewerServer
@@ -68,7 +68,7 @@ def run(arguments: Arguments) -> int:
 
 
 def _serve(address: str, no_browser: bool) -> int:
-    """Say where a server is, until Ctrl-C."""
+    """Print the address of a server, and wait for Ctrl-C."""
     try:
         print(f"{address}  (Ctrl-C ends)", flush=True)
         if not no_browser:

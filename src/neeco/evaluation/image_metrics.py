@@ -216,6 +216,12 @@ def difference_map(
     return np.concatenate([colored, _legend(colored.shape[1], full_scale)]) if legend else colored
 
 
+def part_color(part: int) -> str:
+    """Colour of a part id from 1, as in CSS."""
+    red, green, blue = PART_COLORS[(part - 1) % len(PART_COLORS)].astype(int).tolist()
+    return f"#{red:02x}{green:02x}{blue:02x}"
+
+
 def overlay_parts(image: np.ndarray, parts: np.ndarray, opacity: float = 0.45) -> Pixels:
     """Tint each part of `parts` [H, W] (0 is left clear) over `image` [H, W, 3] in [0, 1]; outline the whole mask."""
     pixels = np.asarray(image, np.float64) * 255

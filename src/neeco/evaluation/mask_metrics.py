@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -104,17 +104,31 @@ class PartTally:
         def mean(ours: str, theirs: str) -> float:
             return mean_of([row[ours, theirs] for row in self.rows])
 
-        means = {part: mean(part, part) for part in part_scores(self.names)}
-        assignment = {}
-        for pair, (left, right) in pairs_of(self.names.values()).items():
-            swapped = {left: mean(right, left), right: mean(left, right)}
-            is_better = total(swapped.values()) > total((means[left], means[right]))
-            assignment[pair] = "swapped" if is_better else "as named"
-            means |= swapped if is_better else {}
-        return means, assignment
+        swap, assignment = assigned_pairs(pairs_of(self.names.values()), mean)
+        return {part: mean(swap.get(part, part), part) for part in part_scores(self.names)}, assignment
 
 
-def total(values: Iterable[float]) -> float:
+def assigned_pairs(
+    pairs: Mapping[str, tuple[str, str]], mean_iou: Callable[[str, str], float]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the parts to exchange, and how each pair is assigned: "swapped" where that fits better, else "as named".
+
+    mean_iou: of a part and a part of the truth, over all images.
+    """
+    swap: dict[str, str] = {}
+    assignment = {}
+    for pair, (left, right) in pairs.items():
+        swapped, named = (
+            (mean_iou(right, left), mean_iou(left, right)),
+            (mean_iou(left, left), mean_iou(right, right)),
+        )
+        is_better = _total(swapped) > _total(named)
+        assignment[pair] = "swapped" if is_better else "as named"
+        swap |= {left: right, right: left} if is_better else {}
+    return swap, assignment
+
+
+def _total(values: Iterable[float]) -> float:
     """Return the sum of the values that are numbers."""
     return sum(value for value in values if not math.isnan(value))
 

@@ -15,6 +15,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, read_truth
 from neeco.evaluation.mask_metrics import (
+    assigned_pairs,
     average_precision,
     boundary_f,
     boxes_of,
@@ -22,7 +23,6 @@ from neeco.evaluation.mask_metrics import (
     iou,
     mean_of,
     pairs_of,
-    total,
 )
 from neeco.files import finite
 
@@ -192,13 +192,11 @@ def _overlap(mask: np.ndarray, truth: np.ndarray, counted: np.ndarray | None) ->
 
 def _summary(images: Sequence[_Image], regions: Regions) -> dict[str, Any]:
     """Return numbers per region, pairs assigned as fits the whole folder better (see `mask_metrics.PartTally`)."""
-    assignment: dict[str, str] = {}
-    swap: dict[str, str] = {}
-    for pair, (left, right) in regions.pairs.items():
-        exchanged = {left: right, right: left}
-        is_better = _pair_sum(images, exchanged, exchanged) > _pair_sum(images, exchanged, {})
-        assignment[pair] = "swapped" if is_better else "as named"
-        swap |= exchanged if is_better else {}
+
+    def mean_iou(ours: str, theirs: str) -> float:
+        return mean_of([image.overlaps[ours, theirs]["iou"] for image in images])
+
+    swap, assignment = assigned_pairs(regions.pairs, mean_iou)
     numbers = {region: _region_numbers(images, region, swap) for region in regions.truth}
     notes = []
     for part in regions.missing:
@@ -210,7 +208,7 @@ def _summary(images: Sequence[_Image], regions: Regions) -> dict[str, Any]:
     overall = None
     if regions.classes:
         challenge, isinet = _challenge(images, regions.classes, swap)
-        class_iou = mean_of([mean_of([image.iou(part, swap) for image in images]) for part in regions.classes])
+        class_iou = mean_of([mean_iou(swap.get(part, part), part) for part in regions.classes])
         overall = {"challenge_iou": challenge, "isinet_iou": isinet, "mean_class_iou": class_iou}
     return {
         INSTRUMENT: instrument,
@@ -230,10 +228,6 @@ def _region_numbers(images: Sequence[_Image], region: str, swap: Mapping[str, st
     numbers["box_ap"] = average_precision(*boxes)
     numbers["box_ap50"] = average_precision(*boxes, thresholds=(0.5,))
     return numbers | {"images": sum(not math.isnan(row["iou"]) for row in rows)}
-
-
-def _pair_sum(images: Sequence[_Image], pair: Iterable[str], swap: Mapping[str, str]) -> float:
-    return total(mean_of([image.iou(part, swap) for image in images]) for part in pair)
 
 
 def _challenge(images: Sequence[_Image], classes: Sequence[str], swap: Mapping[str, str]) -> tuple[float, float]:

@@ -20,7 +20,7 @@ MIN_OVERLAP = 0.8  # of a base's outline with what moves: nine tenths are usual,
 MIN_PLAUSIBLE_OVERLAP = 0.6
 MAX_SHOWN = 5  # warnings listed by `lines`
 VERDICTS = {"good": "good", "careful": "usable", "bad": "doubtful"}
-USABLE = ("not among the", "beside an unseen frame")  # how reasons begin that do not speak against a frame
+USABLE = ("not among the", "beside an unseen frame")  # beginnings of reasons that are no fault of a frame
 
 
 @dataclass(frozen=True)
@@ -87,13 +87,13 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
     elif not capture.registered:
         severe.append(
             "Cameras and instrument do not meet: instrument poses are in a frame of their own, so that it cannot be "
-            "drawn where it was."
+            "rendered where it was."
         )
     if severe:
         return Assessment("bad", "Doubtful: " + _lower(severe[0]), (*severe, *mild))
     if mild:
         return Assessment("careful", "Usable, with care: " + _lower(mild[0]), tuple(mild))
-    fit = "nothing measured speaks against it" if result.registration is None else "cameras and instrument fit together"
+    fit = "no measurement contradicts it" if result.registration is None else "cameras and instrument fit together"
     return Assessment("good", f"Ready to train: {fit}.", ())
 
 

@@ -52,16 +52,16 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
             notes += found
         border = None if any(frame.mask_path for frame in frames) else _shared_border(frames)
         if border is not None:
-            seen = visible_mask(border, (frames[0].camera.width, frames[0].camera.height))
-            write_labels(work / "border.png", torch.from_numpy(seen.astype(np.uint8) * 255))
+            visible = visible_mask(border, (frames[0].camera.width, frames[0].camera.height))
+            write_labels(work / "border.png", torch.from_numpy(visible.astype(np.uint8) * 255))
             frames = [replace(frame, mask_path=work / "border.png") for frame in frames]
-            notes.append(f"The endoscope's dark border ({1 - seen.mean():.0%} of the image) is masked.")
+            notes.append(f"The endoscope's dark border ({1 - visible.mean():.0%} of the image) is masked.")
         undistorted = undistort_frames(frames, work / "undistorted", border)
         notes += undistorted.notes
         capture = replace(capture, frames=undistorted.frames, lens=undistorted.lens or capture.lens)
         notes += _inverted_masks(capture)
         write_capture(capture, work / "capture")
-    settled = ("instruments", "units")  # warnings that `_lacking` says; converting settles those of masks
+    settled = ("instruments", "units")  # warnings that `_lacking` repeats; converting settles those of masks
     warnings = [problem for problem in report.problems if problem.severity == "warning" and problem.file != f"{MASKS}/"]
     others = [str(problem) for problem in condensed(warnings) if problem.field not in settled]
     return (*_lacking(parsed, masked=bool(tool_masks)), *others, *notes)

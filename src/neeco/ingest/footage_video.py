@@ -16,14 +16,14 @@ from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.file import recording_from_flags
 from neeco.ingest.result import IngestResult
 from neeco.scene import GaussianScene
-from neeco.tracking.footage_tissue import Report
+from neeco.tracking.footage_tissue import Progress
 from neeco.tracking.track import FOOTAGE
 
 SOURCE = "source.json"  # states the video's hash
 DISTANCE_QUANTILE = 0.5  # of the tissue's distances: what ingest takes for the tissue's distance
 
 
-def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, report: Report) -> Capture:
+def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, report: Progress) -> Capture:
     """Read the footage at `path`: a capture, or a video file, which becomes the capture `FOOTAGE` in `output`.
 
     A video has no scale: lengths of a moving scope are such that the tissue lies as far from it as from the cameras

@@ -140,7 +140,7 @@ def _reliable(data: Episodes, sfm: SfmResult, points: np.ndarray) -> PointCloud:
     reliable = sfm.reliable_points()
     if not reliable.any():
         reliable = np.ones(len(points), dtype=bool)
-        data.notes.add("no tissue point is seen by several frames and fits well: all of them are kept")
+        data.notes.add("no tissue point is observed by several frames and fits well: all of them are kept")
     return PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32))
 
 

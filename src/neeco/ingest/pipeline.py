@@ -37,7 +37,8 @@ from neeco.ingest.shaft.video_instruments import NOT_VISIBLE, instruments_of, un
 from neeco.ingest.splits import LEFT_OUT, split_frames
 from neeco.ingest.still_scope import find_still_world, is_still
 from neeco.ingest.timing.compatibility import separate
-from neeco.ingest.timing.episodes import Episodes, States, read_episodes
+from neeco.ingest.timing.episodes import Episodes, States
+from neeco.ingest.timing.reading import read_episodes
 from neeco.ingest.world import World
 
 

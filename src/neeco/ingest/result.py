@@ -35,7 +35,7 @@ class IngestResult:
     shapes: dict[str, RoughShape] = field(default_factory=dict)  # rough shape of each instrument, its own frame
     tissue: str | None = None  # how a still scope's tissue got its depth, after "the tissue's depth is"
     split_rule: str = ""
-    notes: tuple[str, ...] = ()  # what was lost, dropped or doubtful, one sentence each
+    notes: tuple[str, ...] = ()  # losses and assumptions, one sentence each
     search: tuple[str, ...] = ()  # what was tried to find cameras and what was taken, one sentence each
     # camera_from_instrument [K, 4, 4] mm of each instrument before registration: the laparoscope's sensor taken for its
     # camera. NaN where a log has a gap; empty where there was no registration
@@ -52,7 +52,7 @@ class IngestResult:
 
     @property
     def still(self) -> bool:
-        """Whether the scope stood still, so that cameras were not looked for."""
+        """The scope stood still: no cameras were searched."""
         return self.tissue is not None
 
     def frame_words(self, frame: int) -> str:

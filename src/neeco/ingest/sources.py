@@ -1,4 +1,4 @@
-"""What a user names for `neeco ingest`: recordings, or a folder in another format."""
+"""The sources that `neeco ingest` is given: recordings, or a folder in another format."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def folder_to_convert(sources: Sequence[Path]) -> Path | None:
     for source in sources:
         if (known := format_of(source)) is not None and source.exists():
             raise NeecoError(
-                f"{source}: is in a recording's format ({known.format}) but says not what is what in it; write that "
-                f"down first: neeco ingest --init {source}"
+                f"{source}: is in a recording's format ({known.format}) but does not state the meaning of its streams; "
+                f"write that down first: neeco ingest --init {source}"
             )
         if source.is_dir():
             if (source / RECORDING).is_file():

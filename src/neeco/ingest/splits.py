@@ -1,4 +1,4 @@
-"""The split of frames: which train, which test seen states, and which test unseen ones."""
+"""The split of frames into training, test (seen states) and unseen states."""
 
 from __future__ import annotations
 

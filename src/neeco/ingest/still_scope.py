@@ -54,13 +54,11 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     """
     if images.lens is None:
         raise NeecoError(
-            f"{data.recording.path}: intrinsics: missing; images of a scope that stands still do not tell its "
+            f"{data.recording.path}: intrinsics: missing; images of a scope that stands still do not determine its "
             "lens; give fl_x, fl_y, cx, cy or a calibration"
         )
     if data.parts[0].scope is not None:
-        data.notes.add(
-            "the scope stands still: the laparoscope's log tells nothing that its images do not, and is ignored"
-        )
+        data.notes.add("the scope stands still: the laparoscope's log adds nothing to its images, and is ignored")
     check_frames(data, moving=False)
     _check_one_place(data, images, progress)
     right = _right_camera(data, images, folder, progress)
@@ -77,7 +75,7 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     data, bases = find_bases(data, views, moving, progress)
     if unplaced := [name for name in data.parts[0].poses if name not in data.world_from_base]:
         data.notes.add(
-            f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}, "
+            f"nothing states how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}, "
             "or camera_from_base): they stay in their own frame (unregistered)"
         )
     shaft = masks = None

@@ -17,7 +17,7 @@ from neeco.ingest.pipeline import find_world, finish
 from neeco.ingest.recording.model import EACH, Recording, Splits
 from neeco.ingest.result import IngestResult
 from neeco.ingest.timing.compatibility import check_shared_settings, episode_names, file_name, separate
-from neeco.ingest.timing.episodes import check_episodes, read_episodes
+from neeco.ingest.timing.reading import check_episodes, read_episodes
 from neeco.ingest.world import World
 
 

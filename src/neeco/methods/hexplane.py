@@ -30,25 +30,17 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
+from neeco.methods.networks import RecordedTimes, check_warm_up, robust_bounds
 from neeco.raster.devices import tf32_products
 from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformation import (
-    UNPERTURBED,
-    LabelledByMotion,
-    Perturbation,
-    Posed,
-    RecordedTimes,
-    check_warm_up,
-    log_linear,
-    robust_bounds,
-)
+from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Perturbation, Posed, log_linear
 from neeco.scene.method import PLAIN_TRAINING
 
 MARGIN = 1.2  # the cube's side, in those of the points' longest
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HexPlaneSettings:
     """`channels` per plane and resolution; `resolution` of space, doubled `levels` - 1 times; `time_resolution`;
     `width` of the network; `warm_up`: share of the training over which all of it is off; `rate_scale` multiplies the

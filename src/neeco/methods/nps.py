@@ -19,25 +19,13 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
+from neeco.methods.networks import HALF_BY_DEFAULT, check_warm_up, encode, half_resolved, octave_weights, robust_bounds
 from neeco.methods.space_carving import CarvingSettings
 from neeco.methods.swept_volume import SweptVolume, bound_volume
 from neeco.methods.tissue_fit import carve_seeds
 from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
-from neeco.scene.deformation import (
-    HALF_BY_DEFAULT,
-    UNPERTURBED,
-    LabelledByMotion,
-    Perturbation,
-    Posed,
-    check_warm_up,
-    encode,
-    floored_decay,
-    half_resolved,
-    octave_weights,
-    robust_bounds,
-    state_of,
-)
+from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Perturbation, Posed, floored_decay, state_of
 from neeco.scene.training_session import GaussianTraining
 from neeco.training.session import gaussian_session
 
@@ -49,7 +37,7 @@ MEMBER_LOGITS = "member_logits"  # the per-Gaussian extra [N, I] of learned memb
 SURE = 6.0  # its size at the start: 0.2 % of a motion smear what does not take part
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NPSSettings:
     """depth, width, L_mean, L_state as published; `identity` keeps the raw inputs beside their encodings.
 

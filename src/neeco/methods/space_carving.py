@@ -1,9 +1,10 @@
-"""Rough instrument shapes by space carving from the residuals of a tissue-only scene, without masks, CAD or labels.
+"""Space carving: rough instrument shapes (visual hulls) from the residuals of a tissue-only scene, without masks or
+CAD.
 
-A short static fit explains the tissue; each image's residual is the evidence. Points of a rigid instrument project onto
-evidence in all frames, whatever its pose; points of tissue do not. Background that no fit explains does so too, but
-under any frame's pose: points that score as well with exchanged poses are left out. The carved volume gives the shaft's
-axis (which need not be the sensor's z), the tip, and seeds for the Gaussians.
+A short static fit explains the tissue; each image's residual is the silhouette evidence. Points of a rigid instrument
+project onto evidence in all frames, whatever its pose; points of tissue do not. Background that no fit explains does so
+too, but under any frame's pose: points that score as well with exchanged poses are left out. The carved volume gives
+the shaft's axis (which need not be the sensor's z), the tip, and seeds for the Gaussians.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.session import GaussianSession
 
-SOLID = (0.85, 0.75, 0.65)  # mean evidence of a point surely inside: the strictest level that enough points reach
-MIN_SOLID = 8  # solid points without which nothing is carved
-FEW_SOLID = 24  # solid points: with fewer, the finer grid is tried
+SOLID_LEVELS = (0.85, 0.75, 0.65)  # mean evidence of a solid point: the strictest level that enough points reach
+MIN_SOLID_POINTS = 8  # with fewer, nothing is carved
+MIN_COARSE_POINTS = 24  # solid points on the coarse grid; with fewer, the finer one is tried
 SEED_SPREAD = 0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame
-POSSIBLE = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
+MIN_LEVEL = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CarvingSettings:
     """`tissue_steps`: of the tissue-only fit whose residual is the evidence; `long_tissue_steps`: of the one with
     density control, where the first leaves more than `max_evidence` on average; `evidence_frames`: the most training
@@ -62,7 +63,7 @@ class CarvingSettings:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Residuals of F frames as soft masks, and the cameras that project points into them, on one device.
+    """Silhouette evidence: residuals of F frames as soft masks, and the cameras that observed them, on one device.
 
     H and W are the largest of the frames' heights and widths; outside its own image a frame has no evidence.
     """
@@ -91,7 +92,7 @@ class Evidence:
 
     @cached_property
     def worlds(self) -> tuple[Tensor, ...]:
-        """Frames [F_t] of each tissue, in whose world their poses are; all where there is one."""
+        """Frame indices [F_t] of each tissue, in whose world their poses are given; one group where there is one."""
         tissues = [frame.state.tissue for frame in self.frames]
         return tuple(
             torch.tensor([row for row, other in enumerate(tissues) if other == tissue], device=self.device)
@@ -99,7 +100,7 @@ class Evidence:
         )
 
     def subset(self, index: Tensor) -> Evidence:
-        """The frames `index` [M] alone."""
+        """Return the evidence of the frames `index` [M]."""
         index = index.to(self.device)
         frames = tuple(self.frames[i] for i in index.tolist())
         return Evidence(
@@ -107,8 +108,8 @@ class Evidence:
         )
 
     def look_up_camera(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Evidence at camera-frame points [F, Q, 3], and whether each is in the image and before the tissue; both
-        [F, Q]."""
+        """Return the evidence at camera-frame points [F, Q, 3], and which of them are in the image and in front of the
+        tissue; both [F, Q]."""
         z = points[..., 2]
         fx, fy, cx, cy = (column[:, None] for column in self.intrinsics.unbind(1))
         u, v = project(points, fx, fy, cx, cy)
@@ -124,7 +125,7 @@ class Evidence:
 @torch.no_grad()
 def gather_evidence(scene: GaussianScene, views: TrainingViews, settings: CarvingSettings) -> Evidence:
     """Residuals of a tissue-only `scene` against every n-th training image, at most `settings.evidence_frames`, on its
-    device. Where a mask is False there is no evidence."""
+    device. Pixels outside a mask have no evidence."""
     frames = views.frames
     picked = list(range(0, len(frames), max(1, -(-len(frames) // settings.evidence_frames))))
     hits, depths = [], []
@@ -149,18 +150,18 @@ def gather_evidence(scene: GaussianScene, views: TrainingViews, settings: Carvin
 
 
 def _pad_and_stack(images: list[Tensor], padding: float) -> Tensor:
-    """Images [H_i, W_i] of any sizes as one [F, H, W], padded at the right and below."""
+    """Stack images [H_i, W_i] of any sizes as [F, H, W], padded at the right and below."""
     height, width = max(image.shape[0] for image in images), max(image.shape[1] for image in images)
     margins = [(0, width - image.shape[1], 0, height - image.shape[0]) for image in images]
     return torch.stack([pad(image, margin, value=padding) for image, margin in zip(images, margins, strict=True)])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CarvedShape:
     """Rough geometry of one instrument, instrument frame, mm."""
 
     instrument_from_shaft: Tensor  # [4, 4], z along the shaft towards the tip, origin at the evidence's centroid
-    near: float  # mm along the shaft: first position seen often enough
+    near: float  # mm along the shaft: first position observed often enough
     tip: float  # mm along the shaft: last position with evidence
     radius: float  # mm, of the solid part
     center_line: Tensor  # [Z, 3] mm: position along the shaft, and the solid's centre across it (x, y), shaft frame
@@ -169,13 +170,14 @@ class CarvedShape:
 
 
 def camera_from_instrument(evidence: Evidence, name: str) -> Tensor:
-    """[F, 4, 4] float32, the recorded poses of instrument `name` as each frame's camera sees them."""
+    """Recorded camera_from_instrument transforms [F, 4, 4], float32, of instrument `name`."""
     poses = torch.stack([frame.state.instruments[name].pose.double() for frame in evidence.frames]).to(evidence.device)
     return (evidence.camera_from_world.double() @ poses).float()
 
 
 def score_points(evidence: Evidence, transforms: Tensor, points: Tensor, chunk: int = 8192) -> tuple[Tensor, Tensor]:
-    """Mean evidence [Q] at points [Q, 3] over the frames that see them, and the fraction [Q] of frames that do.
+    """Return the mean evidence [Q] at points [Q, 3] over the frames that observe them, and the share [Q] of such
+    frames.
 
     `transforms` [F, 4, 4] take the points' frame to each camera's.
     """
@@ -198,14 +200,14 @@ class PosedViews:
     exchanged: Tensor  # [settings.pose_shifts, F, 4, 4]
     motion_ratio: float  # as `CarvingSettings` has it
 
-    def seen_from(self, base: Tensor) -> PosedViews:
-        """The same for another coordinate frame, `base` [4, 4] in the present one."""
+    def in_frame(self, base: Tensor) -> PosedViews:
+        """Return the views of another coordinate frame, given as `base` [4, 4] in the present one."""
         return PosedViews(self.evidence, self.own @ base, self.exchanged @ base, self.motion_ratio)
 
     def scores(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """`score_points`, but 0 for what is nearly as evident under exchanged poses."""
+        """Return `score_points` with 0 where the evidence is nearly as strong under exchanged poses."""
         score, seen = score_points(self.evidence, self.own, points)
-        likely = torch.nonzero(score > 0.5 * POSSIBLE)[:, 0]  # the others are far below all thresholds
+        likely = torch.nonzero(score > 0.5 * MIN_LEVEL)[:, 0]  # the others are far below all thresholds
         static = score[likely] <= self.motion_ratio * self.exchanged_scores(points[likely])
         score[likely[static]] = 0
         return score, seen
@@ -216,8 +218,9 @@ class PosedViews:
 
 
 def posed_views(evidence: Evidence, name: str, settings: CarvingSettings, moved: Tensor | None = None) -> PosedViews:
-    """The views of instrument `name`; of a link of it that each frame's readings move by `moved` [F, 4, 4]. An exchange
-    keeps the cameras and shifts poses and readings among the frames."""
+    """Return the views of instrument `name`, or of a link of it that each frame's readings move by `moved` [F, 4, 4].
+
+    An exchange keeps the cameras and shifts poses and readings among the frames."""
     own = camera_from_instrument(evidence, name)
     own = own if moved is None else own @ moved
     cameras = evidence.camera_from_world.double()
@@ -228,7 +231,7 @@ def posed_views(evidence: Evidence, name: str, settings: CarvingSettings, moved:
 
 
 def _rolled(poses: Tensor, number: int, count: int, worlds: Sequence[Tensor]) -> Tensor:
-    """Poses [F, 4, 4] shifted among the frames of each world, in one of `count` ways."""
+    """Return poses [F, 4, 4] shifted among the frames of each world, in one of `count` ways."""
     rolled = poses.clone()
     for rows in worlds:
         # uneven shifts, so that periodic motion does not come out the same
@@ -238,8 +241,8 @@ def _rolled(poses: Tensor, number: int, count: int, worlds: Sequence[Tensor]) ->
 
 
 def carved_shape(session: GaussianSession, evidence: Evidence, name: str, generator: torch.Generator) -> CarvedShape:
-    """The carved shape, or what of it is around the instrument's frame where the rest may be static parts of the scene.
-    Raises NeecoError when there is nothing."""
+    """Return the carved shape, or seeds around the tracked frame where the evidence does not move with the instrument.
+    Raises NeecoError without evidence."""
     search = session.config.deformation.carving
     shape = carve(evidence, name, generator, search)
     if shape is None:
@@ -253,10 +256,10 @@ def carved_shape(session: GaussianSession, evidence: Evidence, name: str, genera
 
 
 def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, shape: CarvedShape) -> bool:
-    """Whether the evidence moves with the instrument: with poses exchanged among frames it must be weaker.
+    """Whether the evidence moves with the instrument: with exchanged poses it must be weaker.
 
-    Where it is not (an instrument that hardly moves, say), carving cannot separate the instrument from static parts of
-    the scene.
+    Where it is not (an instrument that hardly moves), carving cannot separate the instrument from static parts of the
+    scene. Reports that, and notes it in the scene's diagnostics.
     """
     search = session.config.deformation.carving
     views = posed_views(evidence, name, search)
@@ -277,7 +280,7 @@ def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, sha
 
 
 def shape_around_frame(shape: CarvedShape, distance: float, count: int, generator: torch.Generator) -> CarvedShape:
-    """The initial shape where carving cannot be trusted: `count` seeds around the tracked frame, which is on the
+    """Return the initial shape where carving is not reliable: `count` seeds around the tracked frame, which is on the
     body."""
     spread = SEED_SPREAD * distance
     seeds = (torch.randn(count, 3, generator=generator, device=generator.device) * spread).to(shape.seeds)
@@ -286,52 +289,65 @@ def shape_around_frame(shape: CarvedShape, distance: float, count: int, generato
 
 
 def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: CarvingSettings) -> CarvedShape | None:
-    """The shape of instrument `name`, or None when nothing in its frame is evident (wrong poses, or never in view)."""
+    """Return the shape of instrument `name`; None without evidence in its frame (wrong poses, or never in view)."""
     reach = 0.6 * evidence.distance
     views = posed_views(evidence, name, settings)
     for side in (settings.grid, settings.fine_grid):
         solid, level = _solid_points(views, reach, side)
-        if len(solid) >= FEW_SOLID:
+        if len(solid) >= MIN_COARSE_POINTS:
             break
-    if len(solid) < MIN_SOLID:
+    if len(solid) < MIN_SOLID_POINTS:
         return None
     base, line, radius = _refine_axis(views, _shaft_frame(views, solid), 2 * reach / (side - 1), level)
     if line.shape[0] < 4:
         return None
     near, tip = float(line[0, 0]), float(line[-1, 0])
-    points = _sample_seeds(views.seen_from(base), near, tip, max(3 * radius, 0.08 * reach), settings.seeds, generator)
-    return CarvedShape(base, near, tip, radius, line, points @ base[:3, :3].T + base[:3, 3], level)
+    points = _sample_seeds(views.in_frame(base), near, tip, max(3 * radius, 0.08 * reach), settings.seeds, generator)
+    return _shape(base, line, radius, points, level)
 
 
 def carve_along(
     evidence: Evidence, name: str, base: Tensor, level: float, generator: torch.Generator, settings: CarvingSettings
 ) -> CarvedShape | None:
-    """As `carve`, about a line that is known: the z axis of `base` [4, 4], instrument_from_shaft. None where there is
-    no evidence along it."""
+    """Return the shape about a known line, the z axis of `base` [4, 4], instrument_from_shaft; None without evidence
+    along it."""
     reach = 0.6 * evidence.distance
-    views = posed_views(evidence, name, settings).seen_from(base)
+    views = posed_views(evidence, name, settings).in_frame(base)
     line, radius = _solid_line(views, 2 * reach / (settings.fine_grid - 1), 0.09 * evidence.distance, level)
     if len(line) < 4:
         return None
     near, tip = float(line[0, 0]), float(line[-1, 0])
     points = _sample_seeds(views, near, tip, max(3 * radius, 0.08 * reach), settings.seeds, generator)
-    return CarvedShape(base, near, tip, radius, line[:, :3], points @ base[:3, :3].T + base[:3, 3], level)
+    return _shape(base, line[:, :3], radius, points, level)
+
+
+def _shape(base: Tensor, line: Tensor, radius: float, points: Tensor, level: float) -> CarvedShape:
+    """Return the shape of a centre line [Z, 3] and points [M, 3], both in the frame of the shaft, `base`."""
+    return CarvedShape(
+        instrument_from_shaft=base,
+        near=float(line[0, 0]),
+        tip=float(line[-1, 0]),
+        radius=radius,
+        center_line=line,
+        seeds=points @ base[:3, :3].T + base[:3, 3],
+        level=level,
+    )
 
 
 def _solid_points(views: PosedViews, reach: float, side: int) -> tuple[Tensor, float]:
-    """Points [S, 3] surely inside, of a grid of `side`^3 that ends `reach` mm from the frame's origin, and their level:
-    the strictest of SOLID that MIN_SOLID of them have."""
+    """Return the solid points [S, 3] of a grid of `side`^3 within `reach` mm of the frame's origin, and their level:
+    the strictest of SOLID_LEVELS that MIN_SOLID_POINTS of them reach."""
     ticks = torch.linspace(-reach, reach, side, device=views.evidence.device)
     grid = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     score, seen = views.scores(grid)
     score[seen <= 0.25] = 0
-    level = next((level for level in SOLID if int((score > level).sum()) >= MIN_SOLID), SOLID[-1])
+    level = next((level for level in SOLID_LEVELS if int((score > level).sum()) >= MIN_SOLID_POINTS), SOLID_LEVELS[-1])
     return grid[score > level], level
 
 
 def _shaft_frame(views: PosedViews, solid: Tensor) -> Tensor:
-    """instrument_from_shaft [4, 4] by the principal axis of solid points [S, 3], towards the end that more frames
-    see."""
+    """Return instrument_from_shaft [4, 4] by the principal axis of solid points [S, 3], towards the end that more
+    frames observe."""
     center = solid.mean(0)
     arm = (solid - center).double()
     covariance = (arm[:, :, None] * arm[:, None, :]).sum(0)  # [3, 3]
@@ -345,7 +361,7 @@ def _shaft_frame(views: PosedViews, solid: Tensor) -> Tensor:
 
 
 def frame_along(origin: Tensor, direction: Tensor) -> Tensor:
-    """[4, 4] with z along `direction` and x as near as can be to the instrument frame's x (or y)."""
+    """Return the frame [4, 4] with z along `direction` and x closest to the instrument frame's x (or y)."""
     x = origin.new_tensor([1.0, 0.0, 0.0])
     if abs(float(direction @ x)) > 0.9:
         x = origin.new_tensor([0.0, 1.0, 0.0])
@@ -361,12 +377,12 @@ def _refine_axis(views: PosedViews, base: Tensor, spacing: float, level: float) 
     half = 0.09 * views.evidence.distance
     line, radius = base.new_zeros(0, 3), spacing
     for _ in range(3):
-        rows, radius = _solid_line(views.seen_from(base), spacing, half, level)
+        rows, radius = _solid_line(views.in_frame(base), spacing, half, level)
         if len(rows) < 4:
             return base, base.new_zeros(0, 3), radius
         line, area, seen = rows[:, :3], rows[:, 3], rows[:, 4]
         near, tip = float(line[0, 0]), float(line[-1, 0])
-        # the ends are seen rarely (rear) or bend and open (front)
+        # the ends are rarely observed (rear) or bend and open (front)
         middle = (line[:, 0] > near + 0.15 * (tip - near)) & (line[:, 0] < near + 0.65 * (tip - near)) & (seen > 0.3)
         if middle.sum() < 3:
             middle = line[:, 0] < near + 0.65 * (tip - near)
@@ -379,21 +395,21 @@ def _refine_axis(views: PosedViews, base: Tensor, spacing: float, level: float) 
 
 
 def _solid_line(views: PosedViews, spacing: float, half: float, level: float) -> tuple[Tensor, float]:
-    """The rows [Z, 5] of `_slice_centers`, and the solid's radius mm by their median area."""
+    """Return the rows [Z, 5] of `_slice_centers`, and the solid's radius in mm by their median area."""
     rows = _slice_centers(views, spacing, half, level)
     area = float(rows[:, 3].median()) if len(rows) else 0.0
     return rows, max(math.sqrt(area / math.pi), spacing / 4)
 
 
 def center_line(evidence: Evidence, name: str, shape: CarvedShape, settings: CarvingSettings) -> Tensor:
-    """[Z, 3] like `CarvedShape.center_line`, from other frames."""
-    views = posed_views(evidence, name, settings).seen_from(shape.instrument_from_shaft)
+    """Return the centre line [Z, 3] (see `CarvedShape`) by other frames."""
+    views = posed_views(evidence, name, settings).in_frame(shape.instrument_from_shaft)
     return _slice_centers(views, (shape.tip - shape.near) / 30, 4 * shape.radius, shape.level)[:, :3]
 
 
 def _slice_centers(views: PosedViews, spacing: float, half: float, level: float) -> Tensor:
-    """[Z, 5]: position along the shaft, centre of the solid across it (x, y), its area mm^2, fraction of frames that
-    see it."""
+    """Return rows [Z, 5]: position along the shaft, centre of the solid across it (x, y), its area mm^2, and the share
+    of frames that observe it."""
     device = views.evidence.device
     ticks = torch.linspace(-half, half, 21, device=device)
     cell = float(ticks[1] - ticks[0]) ** 2
@@ -404,7 +420,7 @@ def _slice_centers(views: PosedViews, spacing: float, half: float, level: float)
         plane = torch.stack([x.flatten(), y.flatten(), z.expand(x.numel())], -1)
         score, seen = views.scores(plane)
         score = torch.where(seen > 0.15, score, 0.0)
-        if score.max() < POSSIBLE:
+        if score.max() < MIN_LEVEL:
             continue
         weight = (score - level).clamp_min(0)
         weight = weight if weight.sum() > 0 else (score - 0.95 * score.max()).clamp_min(0)
@@ -415,7 +431,7 @@ def _slice_centers(views: PosedViews, spacing: float, half: float, level: float)
 
 
 def _robust_line(positions: Tensor, values: Tensor, weights: Tensor) -> Tensor:
-    """[2, 2] slope and intercept of values [Z, 2] over positions [Z]; iteratively reweighted against outlying slices.
+    """Fit slope and intercept [2, 2] of values [Z, 2] over positions [Z] by iteratively reweighted least squares.
 
     In closed form: LAPACK's least squares may differ in the last bit from run to run with the memory's alignment.
     """
@@ -436,14 +452,14 @@ def _robust_line(positions: Tensor, values: Tensor, weights: Tensor) -> Tensor:
 def _sample_seeds(
     views: PosedViews, near: float, tip: float, width: float, count: int, generator: torch.Generator
 ) -> Tensor:
-    """[count, 3] shaft-frame points around the shaft where the evidence allows an instrument."""
+    """Sample points [count, 3], shaft frame, where the evidence allows an instrument."""
     length = tip - near
     device, target = generator.device, views.evidence.device
     random = torch.rand(20 * count, 3, generator=generator, device=device).to(target)
     along = near - 0.1 * length + random[:, 2] * 1.2 * length
     points = torch.stack([(2 * random[:, 0] - 1) * width, (2 * random[:, 1] - 1) * width, along], -1)
     score, seen = views.scores(points)
-    chosen = points[(score > POSSIBLE) & (seen > 0.05)]
+    chosen = points[(score > MIN_LEVEL) & (seen > 0.05)]
     if len(chosen) < count:  # thin instruments: fill up with jittered copies
         source = chosen if len(chosen) else points
         extra = torch.randint(len(source), (count - len(chosen),), generator=generator, device=device)

@@ -26,21 +26,10 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
+from neeco.methods.networks import HALF_BY_DEFAULT, RecordedTimes, check_warm_up, encode, half_resolved, robust_bounds
 from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformation import (
-    HALF_BY_DEFAULT,
-    UNPERTURBED,
-    LabelledByMotion,
-    Perturbation,
-    Posed,
-    RecordedTimes,
-    check_warm_up,
-    encode,
-    half_resolved,
-    log_linear,
-    robust_bounds,
-)
+from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Perturbation, Posed, log_linear
 from neeco.scene.method import PLAIN_TRAINING
 
 DEPTH, SKIP = 8, 4  # layers; the one after which the input is given again
@@ -51,7 +40,7 @@ def octaves(values: Tensor, count: int) -> Tensor:
     return torch.cat([values, encode(values, count, unit=1.0)], -1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TimeMLPSettings:
     """`width` of the network and the octaves `L_mean`, `L_time` as published (None: 10, or 6 where synthetic);
     `synthetic`: the variant for D-NeRF's data; `warm_up`: share of the training over which the network is off;

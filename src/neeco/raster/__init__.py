@@ -1,4 +1,4 @@
-"""Drawing Gaussians: `rasterize(gaussians, camera)`, differentiable, on the CPU, on CUDA or, slowly, anywhere."""
+"""Rendering Gaussians: `rasterize(gaussians, camera)`, differentiable, on the CPU, on CUDA or, slowly, any device."""
 
 from neeco.geometry.camera import Camera
 from neeco.raster.native import kernels

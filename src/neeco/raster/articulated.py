@@ -1,6 +1,7 @@
-"""Posing Gaussians that belong to bodies of links that joints move: its definition for any device, and kernels.
+"""Posing of articulated bodies: Gaussians on links that joints move, by the definition in torch and by kernels.
 
-What a body is does not matter here: rows that follow each other, moved together and bent by the same joints.
+A body is a range of rows that move together and by the same joints; instruments are unknown here. A Gaussian's link
+weights blend the joints' values (angles, distances), not transforms as in linear blend skinning.
 """
 
 from __future__ import annotations
@@ -19,50 +20,49 @@ from neeco.raster.devices import constant
 from neeco.raster.native import all_run_native, native
 from neeco.raster.triton.ready import runs_triton
 
-LEAST_MOVING = 1e-6
-MOST_JOINTS, MOST_LINKS = 31, 32  # of a body, as kernels are made
+MIN_MOVING_SHARE = 1e-6
+MAX_JOINTS, MAX_LINKS = 31, 32  # of a body, limits of the kernels
 Rows = tuple[Tensor, Tensor, Tensor, Tensor]  # means [N, 3], quats [N, 4], scales [N, 3], sh_frames [N, 4]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ArticulatedBody:
-    """How one body's links move, and where it is; lengths in mm, angles in rad, all but the pose in the body's frame.
+    """Pose and joint values of one articulated body; lengths in mm, angles in rad, all but the pose in its own frame.
 
-    Link 0 keeps its place in the body. Joint j turns about its axis, or slides along it where `slides[j]`: a Gaussian
-    by the sum of its shares of the links, each times `values[j]` of that link, which is 0 for links that the joint does
-    not move. Joints act one after the other in their order, so that those farther out on a chain come first: all axes
-    are those of the body at rest. A Gaussian's share of a link is the softmax of its logits times how far it lies
-    beyond `gate_start` along the shaft: sigmoid((s - start) / width). The shaft, the gate and `longest` take no
-    gradient but the shaft that of `roll`.
+    Link 0 is fixed to the body. Joint j is revolute, or prismatic where `slides[j]`: it moves a Gaussian by the sum of
+    its link weights times `values[j]` of the links, which is 0 for links that the joint does not move. Joints act in
+    their order, the outermost on a chain first, since all axes are those of the body at rest. A Gaussian's weight of a
+    link is the softmax of its logits times the gate sigmoid((s - gate_start) / gate_width) at its position s along the
+    shaft. Gradients reach the shaft by `roll` alone, and neither the gate nor `longest`.
     """
 
     world_from_body: Tensor  # [4, 4] rigid
     origins: Tensor  # [J, 3] points on the axes
     axes: Tensor  # [J, 3] unit
-    values: Tensor  # [J, L - 1] rad, or mm where the joint slides, of links 1 to L - 1
+    values: Tensor  # [J, L - 1] rad, or mm of prismatic joints, of links 1 to L - 1
     shaft_origin: Tensor  # [3]
     shaft_direction: Tensor  # [3] unit
-    spin_end: Tensor  # [] along the shaft: only what lies before is spun about it
+    spin_end: Tensor  # [] along the shaft: only Gaussians before it are spun about it
     gate_start: Tensor  # []
     gate_width: Tensor  # []
-    longest: Tensor  # [] standard deviation; over the share of a Gaussian that moves, the most it may have
+    longest: Tensor  # [] maximum standard deviation of a Gaussian times its moving share
     roll: float = 0.0  # about the shaft
-    slides: tuple[bool, ...] = ()  # of every joint; shorter: the others turn
+    slides: tuple[bool, ...] = ()  # whether each joint is prismatic; those beyond the end are revolute
 
     @property
     def link_count(self) -> int:
-        """L, link 0 among them."""
+        """Number of links L, with link 0."""
         return 1 + self.values.shape[1] if len(self.origins) else 1
 
     @property
     def slide_mask(self) -> int:
-        """Bit j: joint j slides."""
+        """Bit mask: joint j is prismatic."""
         return sum(1 << joint for joint, slides in enumerate(self.slides) if slides)
 
     def numbers(self) -> Tensor:
-        """[22 + J (5 + L)]: all of it but roll and kinds of joints in the order that kernels read, differentiable: the
-        pose's upper rows 12, shaft 3 + 3, spin_end, gate_start, gate_width, longest, then of each joint origin 3, axis
-        3 and values L - 1."""
+        """Return all but roll and joint types as kernels read them, [22 + J (5 + L)], differentiable: the pose's upper
+        rows 12, shaft 3 + 3, spin_end, gate_start, gate_width, longest, then per joint origin 3, axis 3 and values L -
+        1."""
         ends = torch.stack([self.spin_end, self.gate_start, self.gate_width, self.longest])
         joints = torch.cat([self.origins, self.axes, self.values], 1)
         return torch.cat(
@@ -73,8 +73,8 @@ class ArticulatedBody:
 def link_weights(
     points: Tensor, logits: Tensor, shaft: tuple[Tensor, Tensor], gate_start: Tensor, gate_width: Tensor
 ) -> Tensor:
-    """[M, L] share of each link, summing to 1, in Gaussians at `points` [M, 3] with logits [M, L] of the links; the
-    shaft (origin [3], unit direction [3]) and the gate are `ArticulatedBody`'s, and take no gradient."""
+    """Return the weight [M, L] of each link, summing to 1, of Gaussians at `points` [M, 3] with link logits [M, L]; the
+    shaft (origin [3], unit direction [3]) and the gate are `ArticulatedBody`'s, without gradient."""
     with torch.no_grad():
         along = (points - shaft[0]) @ shaft[1]
         gate = torch.sigmoid((along - gate_start) / gate_width)
@@ -90,14 +90,13 @@ def pose_bodies(
     counts: Sequence[int],
     bodies: Sequence[ArticulatedBody | None],
 ) -> Rows:
-    """World means, quats, scales (standard deviations, mm) and sh_frames (world_from_sh, without gradient) of Gaussians
-    given by means [N, 3] mm, quats [N, 4] of any length, log_scales [N, 3] and link logits [N, L or more].
+    """Return world means, quats, scales (standard deviations, mm) and sh_frames (world_from_sh, without gradient) of
+    Gaussians given by means [N, 3] mm, quats [N, 4] of any length, log_scales [N, 3] and link logits [N, L or more].
 
-    The first `counts[0]` rows are of the first body, and so on; a body that is None stands still in the world, quats
-    and all. Gradients reach all tensors, of the Gaussians and of the bodies, as `ArticulatedBody` says. float32 on the
-    CPU takes the native kernel, which gives the same bits whatever the number of threads, float32 on a CUDA device with
-    Triton that one (not run on a GPU), everything else the definition.
-    Raises NeecoError where counts, bodies and tensors do not fit.
+    The first `counts[0]` rows belong to the first body, and so on; a body that is None is fixed in the world. Gradients
+    reach the tensors of the Gaussians and of the bodies, see `ArticulatedBody`. float32 on the CPU takes the native
+    kernel, with the same bits for any number of threads; float32 on a CUDA device takes the Triton kernel (not tested
+    on a GPU); everything else takes the definition. Raises NeecoError where counts, bodies and tensors do not fit.
     """
     _check(means, quats, log_scales, logits, counts, bodies)
     kernel = _kernel([t for t in (means, quats, log_scales, logits) if t is not None])
@@ -148,7 +147,7 @@ def _pose_body(given: Rows, logits: Tensor | None, body: ArticulatedBody) -> Row
         shaft = body.shaft_origin, body.shaft_direction
         weights = link_weights(resting, logits[:, : body.link_count], shaft, body.gate_start, body.gate_width)
         moving = 1 - weights[:, :1].detach()
-        scales = torch.minimum(scales, body.longest / moving.clamp_min(LEAST_MOVING))
+        scales = torch.minimum(scales, body.longest / moving.clamp_min(MIN_MOVING_SHARE))
         for joint in range(len(body.origins)):
             amount = weights[:, 1:] @ body.values[joint]
             if body.slide_mask >> joint & 1:
@@ -161,7 +160,7 @@ def _pose_body(given: Rows, logits: Tensor | None, body: ArticulatedBody) -> Row
 
 
 def _kernel(given: Sequence[Tensor]) -> Any:
-    """What poses such tensors, a class; None: the definition."""
+    """Return the kernel class that poses such tensors; None: the definition."""
     if all_run_native(*given):
         return native().Posing
     if all(runs_triton(t) for t in given):
@@ -190,7 +189,7 @@ class _Pose(torch.autograd.Function):
         posed = [means.new_empty(len(means), columns) for columns in (3, 4, 3, 4)]
         posing.forward(*posed)
         ctx.mark_non_differentiable(posed[3])
-        # Saved so that autograd notices when someone changes an input before the backward pass.
+        # saved so that autograd detects a modified input before the backward pass
         ctx.save_for_backward(*given)
         ctx.posing = posing
         return tuple(posed)
@@ -221,9 +220,9 @@ def _check(
     if len(counts) != len(bodies) or sum(counts) != n or min(counts, default=0) < 0:
         raise NeecoError(f"pose_bodies: counts: {tuple(counts)} of {len(bodies)} bodies do not share out {n} Gaussians")
     for body in bodies:
-        if body is not None and (len(body.origins) > MOST_JOINTS or body.link_count > MOST_LINKS):
+        if body is not None and (len(body.origins) > MAX_JOINTS or body.link_count > MAX_LINKS):
             found = f"{len(body.origins)} joints and {body.link_count} links"
-            raise NeecoError(f"pose_bodies: a body of {found}; at most {MOST_JOINTS} and {MOST_LINKS} can be posed")
+            raise NeecoError(f"pose_bodies: a body of {found}; at most {MAX_JOINTS} and {MAX_LINKS} can be posed")
     columns = max((body.link_count for body in bodies if body is not None and len(body.origins)), default=0)
     has = 0 if logits is None else logits.shape[1] if logits.dim() == 2 and logits.shape[0] == n else -1
     if has < columns:

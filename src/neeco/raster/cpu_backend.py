@@ -28,7 +28,8 @@ def rasterize_cpu(
 
 
 def last_statistics() -> dict[str, float]:
-    """Stage times in ms, and visible Gaussians and (tile, Gaussian) pairs, of the latest drawing and its gradient."""
+    """Return stage times in ms, visible Gaussians and (tile, Gaussian) pairs of the latest rendering and its
+    gradient."""
     return native().last_statistics()
 
 
@@ -64,7 +65,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         if keep:
-            # Saved so that autograd notices when someone changes an input before the backward pass.
+            # saved so that autograd detects a modified input before the backward pass
             ctx.save_for_backward(alpha, depth, *tensors)
             ctx.drawing = drawing
         return color, alpha, depth, composited, radii

@@ -1,4 +1,4 @@
-"""Which device a word of the command line means, what one says when it fails, and what is copied to it."""
+"""Devices: choice by `--device`, messages of failures, cached constants, and reduced precision."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from neeco.raster.triton.ready import missing, require_triton
 
 
 def cuda_backend() -> str:
-    """The backend for CUDA devices where nobody chooses: "cuda" (gsplat) if it is installed, else "triton"."""
+    """Return the default backend for CUDA devices: "cuda" (gsplat) if it is installed, else "triton"."""
     return "cuda" if importlib.util.find_spec("gsplat") is not None else "triton"
 
 
 def device_of(word: str, drawing: bool = True) -> torch.device:
-    """The device behind `--device`: cpu, cuda, cuda:N, or auto: a CUDA device where there is one, else the CPU.
+    """Return the device of `--device`: cpu, cuda, cuda:N, or auto: a CUDA device where there is one, else the CPU.
 
-    drawing: it is to draw, which on CUDA needs triton or gsplat; without, PyTorch is enough. `auto` passes over a card
-    that PyTorch or Triton cannot use at all, with a warning.
+    drawing: it renders, which on CUDA needs triton or gsplat; else PyTorch is sufficient. `auto` skips a card that
+    PyTorch or Triton cannot use, with a warning.
 
     Raises NeecoError for another word, or a device that is not there or cannot be used.
     """
@@ -53,8 +53,8 @@ def device_of(word: str, drawing: bool = True) -> torch.device:
 
 
 def device_failure(error: BaseException) -> str | None:
-    """What a CUDA device, or too little memory, ended the work with, and what to do, in one line; None: the error is of
-    another kind."""
+    """Return a one-line message of a failed CUDA device or of exhausted memory, with the remedy; None: another
+    error."""
     message = _first_line(error)
     if isinstance(error, torch.cuda.OutOfMemoryError) or re.match("CUDA error: (out of memory|CUBLAS.*ALLOC)", message):
         asked = re.search(r"Tried to allocate ([\d.]+ \w+)", message)
@@ -76,8 +76,7 @@ def device_failure(error: BaseException) -> str | None:
 
 @contextmanager
 def readable_failures() -> Iterator[None]:
-    """Raises NeecoError, one line, where a CUDA device fails, or memory is too little, in the block
-    (`device_failure`)."""
+    """Raise NeecoError, one line, where a CUDA device fails or memory is exhausted in the block (`device_failure`)."""
     try:
         yield
     except Exception as error:
@@ -87,7 +86,7 @@ def readable_failures() -> Iterator[None]:
 
 
 def _no_cuda() -> str:
-    """Why PyTorch has no CUDA device, and the remedy."""
+    """Return the reason why PyTorch has no CUDA device, and the remedy."""
     if torch.version.cuda is None and torch.version.hip is None:
         return (
             f"{torch.__version__} is a build without CUDA; on Linux pip install --force-reinstall torch takes PyPI's, "
@@ -95,7 +94,7 @@ def _no_cuda() -> str:
         )
     try:
         torch.cuda.init()
-        message = "it says no more"
+        message = "no further message"
     except (RuntimeError, AssertionError) as error:  # a driver that is missing, too old or without a card
         message = _first_line(error).rstrip(".")
     return f"{message}; check `nvidia-smi` and CUDA_VISIBLE_DEVICES, install or update NVIDIA's driver"
@@ -106,8 +105,8 @@ def _first_line(error: BaseException) -> str:
 
 
 def _not_built_for(device: torch.device) -> str | None:
-    """Why this PyTorch has no kernels for the card; None: it has. Binaries (sm_XY) run on cards of the same major and
-    no lower minor number, intermediate code (compute_XY) on all that are no older."""
+    """Return the reason why this PyTorch has no kernels for the card; None: it has. Binaries (sm_XY) run on cards of
+    the same major and no lower minor number, intermediate code (compute_XY) on all that are no older."""
     card = torch.cuda.get_device_capability(device)
     names = torch.cuda.get_arch_list()
     parsed = [found for name in names if (found := re.fullmatch(r"(sm|compute)_(\d+)(\d)[a-z]?", name))]
@@ -123,15 +122,15 @@ def _not_built_for(device: torch.device) -> str | None:
 
 @lru_cache(maxsize=256)
 def constant(values: tuple[float, ...], device: torch.device) -> Tensor:
-    """`values` [n] float32 on `device`, copied there once and cached: a copy to a CUDA device waits for all that it has
-    yet to do. Not to be changed."""
+    """Return `values` [n] float32 on `device`, cached, since a copy to a CUDA device waits for its queue. Do not
+    modify."""
     return torch.tensor(values, dtype=torch.float32, device=device)
 
 
 class CachedPredicate:
-    """A yes or no about a tensor that its device is asked for once, as long as nothing changes the tensor in place.
+    """A boolean predicate of a tensor, read from its device once per in-place version of the tensor.
 
-    Of a tensor on the device "meta", which holds no numbers, the answer is no.
+    It is false of a tensor on the device "meta", which has no values.
     """
 
     def __init__(self, question: Callable[[Tensor], Tensor]) -> None:
@@ -149,9 +148,8 @@ class CachedPredicate:
 
 @contextmanager
 def tf32_products(device: torch.device) -> Iterator[None]:
-    """Until the end of the block, let a CUDA device multiply float32 matrices in TF32: ten bits of every factor, sums
-    in float32. For networks alone: a pose, or a place in mm, needs more. Elsewhere nothing changes. Not run on a GPU.
-    """
+    """Let a CUDA device multiply float32 matrices in TF32 within the block: ten bits of every factor, sums in float32.
+    For networks alone: poses and positions in mm need more. Not tested on a GPU."""
     before = torch.get_float32_matmul_precision()
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
@@ -164,15 +162,14 @@ def tf32_products(device: torch.device) -> Iterator[None]:
 
 @cache
 def processor_has(*features: str) -> bool:
-    """Whether the processor has one of these instruction sets, as PyTorch calls them; no where this PyTorch is too old
-    to tell."""
+    """Whether the processor has one of these instruction sets, by PyTorch's names; false where PyTorch is too old."""
     capabilities: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
     return any(bool(capabilities.get(feature)) for feature in features)
 
 
 def fast_bfloat16() -> bool:
-    """Whether the processor multiplies in bfloat16 several times as fast as in float32, as measured: with tiles (AMX)
-    3 times on an Intel Xeon, with AVX-512 BF16 alone 4 times on an AMD EPYC; that took a third longer on the Xeon."""
+    """Whether the processor multiplies in bfloat16 several times faster than in float32. Measured: 3 times with AMX on
+    an Intel Xeon, 4 times with AVX-512 BF16 alone on an AMD EPYC, which was a third slower on the Xeon."""
     capabilities: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
     by_amd = str(capabilities.get("cpu_name", "")).startswith("AMD")
     return processor_has("amx_bf16") or (by_amd and processor_has("avx512_bf16"))
@@ -180,11 +177,9 @@ def fast_bfloat16() -> bool:
 
 @contextmanager
 def bfloat16_products(device: torch.device, wanted: bool) -> Iterator[None]:
-    """Until the end of the block, let a CPU multiply in bfloat16 where `wanted`: eight bits of every factor and result,
-    sums in float32. For networks alone. What the block returns may be bfloat16; parameters and their gradients stay
-    float32. A processor without such instructions would take 4 to 20 times as long as in float32: it stays with that,
-    with a warning.
-    """
+    """Let a CPU multiply in bfloat16 within the block where `wanted`: eight bits of every factor and result, sums in
+    float32. For networks alone. Results may be bfloat16; parameters and their gradients stay float32. A processor
+    without such instructions would be 4 to 20 times slower: it stays with float32, with a warning."""
     wanted = wanted and device.type == "cpu"
     if wanted and not processor_has("amx_bf16", "avx512_bf16", "bf16"):
         warnings.warn("deformation.half: this processor has no bfloat16; it multiplies in float32", stacklevel=3)

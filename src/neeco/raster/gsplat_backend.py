@@ -1,4 +1,4 @@
-"""The CUDA backend: gsplat (an extra, `pip install neeco[cuda]`) draws, plain torch evaluates the colours."""
+"""The cuda backend: gsplat (an extra, `pip install neeco[cuda]`) renders, plain torch evaluates the colours."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def rasterize_cuda(
 ) -> Rendering:
     """`rasterize` through gsplat >= 1.4, float32, on the device of the means.
 
-    gsplat orders equal depths as it likes; everything else follows the reference to float32 accuracy.
+    gsplat does not define the order of equal depths; everything else follows the reference to float32 accuracy.
     """
     from gsplat import rasterization
 
@@ -27,7 +27,7 @@ def rasterize_cuda(
     pose = camera.world_from_camera.float()
     rotation, translation = camera_from_world(pose)
     if len(index) == 0:
-        return _nothing(camera, channels, background, empty)
+        return _empty_rendering(camera, channels, background, empty)
     means = gaussians.means[index].float()
     frames = None if gaussians.sh_frames is None else gaussians.sh_frames[index].float()
     values = sh_colors(gaussians.sh[index].float(), means, pose[:3, 3], frames).clamp(min=0)
@@ -43,15 +43,15 @@ def rasterize_cuda(
     view = torch.cat([torch.cat([rotation, translation[:, None]], dim=1), last_row])  # camera_from_world
     intrinsics = constant((camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0), device).view(3, 3)
     images, alphas, info = rasterization(
-        means,
-        gaussians.quats[index].float(),
-        gaussians.scales[index].float(),
-        gaussians.opacities[index].float(),
-        values,
-        view[None],
-        intrinsics[None],
-        camera.width,
-        camera.height,
+        means=means,
+        quats=gaussians.quats[index].float(),
+        scales=gaussians.scales[index].float(),
+        opacities=gaussians.opacities[index].float(),
+        colors=values,
+        viewmats=view[None],
+        Ks=intrinsics[None],
+        width=camera.width,
+        height=camera.height,
         near_plane=camera.near,
         render_mode="RGB+ED",
         packed=False,
@@ -68,12 +68,12 @@ def rasterize_cuda(
 
 
 def _largest(radii: Tensor) -> Tensor:
-    """gsplat gives one radius per Gaussian up to 1.4 and two, per axis, from 1.5 on."""
+    """Return one radius per Gaussian: gsplat gives one up to version 1.4 and one per axis from 1.5 on."""
     return radii.amax(dim=-1) if radii.dim() == 2 else radii
 
 
 def _center_gradients(centers: Tensor, index: Tensor, offsets: Tensor) -> Tensor:
-    """Makes `offsets.grad` receive the gradient of gsplat's projected centres [1, M, 2] when it is computed."""
+    """Let `offsets.grad` receive the gradient of gsplat's projected centres [1, M, 2] when it is computed."""
     if centers.requires_grad:
 
         def receive(gradient: Tensor) -> None:
@@ -85,7 +85,7 @@ def _center_gradients(centers: Tensor, index: Tensor, offsets: Tensor) -> Tensor
     return offsets
 
 
-def _nothing(camera: Camera, channels: Tensor | None, background: Tensor | None, offsets: Tensor) -> Rendering:
+def _empty_rendering(camera: Camera, channels: Tensor | None, background: Tensor | None, offsets: Tensor) -> Rendering:
     blank = torch.zeros(camera.height, camera.width, device=offsets.device)
     color = blank[..., None].expand(-1, -1, 3)
     if background is not None:

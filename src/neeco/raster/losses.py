@@ -16,20 +16,19 @@ from neeco.raster.triton.ready import runs_triton
 
 # image, target, mask, weight of SSIM, whether the gradient is wanted: the loss [] and the gradient
 Kernel = Callable[[Tensor, Tensor, Tensor | None, float, bool], tuple[Tensor, Tensor | None]]
-WINDOW = 11  # px, side of the Gaussian window
-SIGMA = 1.5  # px
+WINDOW_PX = 11  # side of the Gaussian window
+WINDOW_SD = 1.5  # px
 C1, C2 = 1e-4, 9e-4  # (0.01)^2 and (0.03)^2 for images in [0, 1]
 
 
 def photometric_loss(image: Tensor, target: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.1) -> Tensor:
     """(1 - w) * mean |image - target| + w * (1 - mean SSIM), w = `ssim_weight`; a scalar, differentiable in `image`.
 
-    image, target [H, W, 3] in [0, 1]; mask [H, W] bool, False where the loss must not look. A mask multiplies both
-    images before anything is compared, and both means run over its True pixels; with none of those the loss is 0.
-    SSIM (Wang et al. 2004) with an 11 x 11 Gaussian window of sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4, each
-    colour apart, as in 3DGS. float32 on the CPU takes the native kernel, float32 on a CUDA device with Triton kernels
-    that give the same bits every time (not run on a GPU), everything else the definition; all tensors are on one
-    device. Raises NeecoError where shapes do not fit.
+    image, target [H, W, 3] in [0, 1]; mask [H, W] bool, False where pixels are ignored. A mask multiplies both images
+    before anything is compared, and both means run over its True pixels; with none of those the loss is 0. SSIM (Wang
+    et al. 2004) with an 11 x 11 Gaussian window of sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4, per colour, as in
+    3DGS. float32 on the CPU takes the native kernel, float32 on a CUDA device deterministic Triton kernels (not tested
+    on a GPU), everything else the definition; all tensors are on one device. Raises NeecoError where shapes do not fit.
     """
     native_kernel = all_run_native(image)
     if not native_kernel and not runs_triton(image):
@@ -42,7 +41,7 @@ def photometric_loss(image: Tensor, target: Tensor, mask: Tensor | None = None, 
 def photometric_loss_reference(
     image: Tensor, target: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.1
 ) -> Tensor:
-    """`photometric_loss` in plain torch, any float type and device; nothing waits for a device's numbers."""
+    """`photometric_loss` in plain torch, any float type and device, without synchronisation."""
     _check(image, target, mask)
     weight = torch.ones_like(image[..., :1]) if mask is None else mask[..., None].to(image.dtype)  # [H, W, 1]
     x, y = image * weight, target.to(image.dtype) * weight
@@ -52,7 +51,7 @@ def photometric_loss_reference(
 
 
 def ssim_map(x: Tensor, y: Tensor) -> Tensor:
-    """SSIM at every pixel and colour, [H, W, 3], of images [H, W, 3] in [0, 1]; zero padding outside."""
+    """Return SSIM at every pixel and colour, [H, W, 3], of images [H, W, 3] in [0, 1]; zero padding outside."""
     x, y = x.permute(2, 0, 1), y.permute(2, 0, 1)
     mx, my, mxx, myy, mxy = _blur(torch.cat([x, y, x * x, y * y, x * y])).split(3)
     vx, vy, vxy = mxx - mx * mx, myy - my * my, mxy - mx * my
@@ -61,12 +60,12 @@ def ssim_map(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _blur(planes: Tensor) -> Tensor:
-    """Planes [C, H, W] under the Gaussian window, which is separable: two passes of 11 taps."""
-    offsets = torch.arange(WINDOW, dtype=torch.float64, device=planes.device) - WINDOW // 2
-    weights = torch.exp(-(offsets**2) / (2 * SIGMA**2))
+    """Return planes [C, H, W] blurred by the separable Gaussian window: two passes of 11 taps."""
+    offsets = torch.arange(WINDOW_PX, dtype=torch.float64, device=planes.device) - WINDOW_PX // 2
+    weights = torch.exp(-(offsets**2) / (2 * WINDOW_SD**2))
     window = (weights / weights.sum()).to(planes.dtype)
-    down = conv2d(planes[:, None], window.view(1, 1, -1, 1), padding=(WINDOW // 2, 0))
-    return conv2d(down, window.view(1, 1, 1, -1), padding=(0, WINDOW // 2))[:, 0]
+    down = conv2d(planes[:, None], window.view(1, 1, -1, 1), padding=(WINDOW_PX // 2, 0))
+    return conv2d(down, window.view(1, 1, 1, -1), padding=(0, WINDOW_PX // 2))[:, 0]
 
 
 class _Photometric(torch.autograd.Function):

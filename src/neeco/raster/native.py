@@ -18,7 +18,7 @@ _family: ContextVar[Family] = ContextVar("family of kernels", default="native")
 
 
 def native() -> Any:
-    """The module `neeco._native`. Raises NeecoError when it was never built."""
+    """Return the module `neeco._native`. Raises NeecoError when it was not built."""
     try:
         return importlib.import_module("neeco._native")
     except ImportError as error:
@@ -27,9 +27,9 @@ def native() -> Any:
 
 @contextmanager
 def kernels(family: Family) -> Iterator[None]:
-    """Until the end of the block, let this thread draw, compare and step CPU tensors by `family` of kernels.
+    """Select the `family` of kernels that this thread uses for CPU tensors within the block.
 
-    "native": neeco's own, the default; "torch": the plain torch that works on every device, and is slow. Concerns
+    "native": neeco's own, the default; "torch": plain torch, which works on every device and is slow. Applies to
     `rasterize(backend="auto")`, `photometric_loss` and `adam_step`. Raises NeecoError for another family.
     """
     if family not in get_args(Family):
@@ -42,12 +42,12 @@ def kernels(family: Family) -> Iterator[None]:
 
 
 def runs_native(tensor: Tensor) -> bool:
-    """Whether the native kernels work on `tensor`: it is on the CPU, and `kernels("torch")` is not in force."""
+    """Whether the native kernels process `tensor`: it is on the CPU, outside `kernels("torch")`."""
     return tensor.device.type == "cpu" and _family.get() == "native"
 
 
 def all_run_native(*tensors: Tensor) -> bool:
-    """Whether native kernels, which know float32 alone, work on `tensors` as they are."""
+    """Whether the native kernels, which take float32 alone, process `tensors`."""
     return all(runs_native(tensor) and tensor.dtype == torch.float32 for tensor in tensors)
 
 
@@ -59,16 +59,16 @@ def set_threads(count: int) -> None:
 
 
 def threads() -> int:
-    """Threads that the CPU kernels use."""
+    """Return the number of threads of the CPU kernels."""
     return native().thread_count()
 
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Let torch's own operations use `count` threads until the end of the block; the kernels keep theirs.
+    """Let torch's own operations use `count` threads within the block; the kernels keep theirs.
 
-    Threads that share a small operation wait for each other, at full load, longer than they work: one is best for the
-    operations between two drawings.
+    Threads that share a small operation wait for each other longer than they work: one is best for the operations
+    between two renderings.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(count)
@@ -79,13 +79,14 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 def synchronise(device: torch.device) -> None:
-    """Wait until `device` has done all that it was asked: before a clock is read."""
+    """Wait until `device` has finished its queue, before a clock is read."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def simd() -> str:
-    """Instruction set in use: "sse2", "avx2", "avx512" or "neon". The environment variable NEECO_SIMD forces one."""
+    """Return the instruction set in use: "sse2", "avx2", "avx512" or "neon". The environment variable NEECO_SIMD forces
+    one."""
     try:
         return native().simd()
     except RuntimeError as error:
@@ -93,9 +94,9 @@ def simd() -> str:
 
 
 def keep_freed_memory() -> bool:
-    """Let this process keep what it frees, up to 1 GiB; whether the system can (glibc).
+    """Let this process keep up to 1 GiB of freed memory; return whether the system supports it (glibc).
 
-    A training step frees megabytes of tensors that the next one wants again; by default the system takes them back
-    and clears every page anew. A setting of the whole process: for programs to call, not for libraries.
+    A training step frees megabytes of tensors that the next one allocates again; by default the system takes them back
+    and clears every page. A setting of the whole process, for programs, not libraries.
     """
     return native().keep_freed_memory()

@@ -1,6 +1,6 @@
 """Adam: one native pass per tensor on the CPU, one Triton launch for all tensors on CUDA, plain torch elsewhere.
 
-The moments are plain tensors that belong to the caller: density control edits their rows, checkpoints save them.
+The moments are plain tensors owned by the caller: density control edits their rows, checkpoints save them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ EPS = 1e-15  # as in 3DGS
 
 @dataclass(frozen=True)
 class Update:
-    """One tensor's share of a step. All have the parameter's shape [N, ...], type and device."""
+    """One tensor of a step. All tensors have the parameter's shape [N, ...], type and device."""
 
     parameter: Tensor
     gradient: Tensor
@@ -52,10 +52,9 @@ def adam_step(
 def adam_steps(updates: Sequence[Update], betas: tuple[float, float] = BETAS, eps: float = EPS) -> None:
     """A step of Adam for each of several tensors, in place, without autograd.
 
-    float32 on the CPU takes the native kernel, float32 on a CUDA device with Triton one launch of a kernel for all
-    tensors there (not run on a GPU), everything else plain torch. Both kernels need contiguous tensors, and give the
-    same bits from the same inputs, the native one whatever the number of threads. Raises NeecoError where tensors do
-    not fit.
+    float32 on the CPU takes the native kernel, float32 on a CUDA device one Triton launch for all tensors (not tested
+    on a GPU), everything else plain torch. Both kernels need contiguous tensors and are deterministic, the native one
+    for any number of threads. Raises NeecoError where tensors do not fit.
     """
     together: list[Update] = []
     for update in updates:
@@ -78,7 +77,7 @@ def adam_steps(updates: Sequence[Update], betas: tuple[float, float] = BETAS, ep
 
         tensors = [(u.parameter, u.gradient.contiguous(), u.exp_avg, u.exp_avg_sq) for u in together]
         step_together(tensors, [(u.lr, u.step) for u in together], betas, eps)
-    # Autograd notices in-place changes by this counter, which no kernel touches.
+    # the counter by which autograd detects in-place changes; kernels do not increment it
     for update in updates:
         torch.autograd.graph.increment_version(update.parameter)
 
@@ -100,7 +99,7 @@ def _step_native(update: Update, betas: tuple[float, float], eps: float) -> None
 def adam_update(
     grad: Tensor, mean: Tensor, square: Tensor, step: float, betas: tuple[float, float], eps: float
 ) -> Tensor:
-    """The definition: both moments take `grad` in, in place; returns the step for a learning rate of 1."""
+    """Update both moments by `grad` in place (the definition); return the step for a learning rate of 1."""
     mean.copy_(betas[0] * mean + (1 - betas[0]) * grad)
     square.copy_(betas[1] * square + (1 - betas[1]) * grad.square())
     return mean / (1 - betas[0] ** step) / ((square / (1 - betas[1] ** step)).sqrt() + eps)
@@ -120,11 +119,11 @@ def _kind(tensor: Tensor) -> str:
 
 
 class Adam:
-    """Every tensor has its learning rate, step by step, and keeps its own step count (eps 1e-15 as in 3DGS).
+    """Adam with a learning rate per tensor and step, and a step count per tensor (eps 1e-15 as in 3DGS).
 
-    `views`: over how many images the gradients of a step are means. Rates, which are stated for one, are multiplied by
-    its root, and the betas taken to that power (Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting Training"; to
-    first order also gsplat's rule): so many images then move a tensor, and are remembered, about as one by one.
+    `views`: the number of images that the gradients of a step average. Rates, stated for one image, are multiplied by
+    its root, and the betas raised to its power (Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting Training"; to
+    first order also gsplat's rule), so that a batch has about the effect of its images one by one.
     """
 
     def __init__(self, views: int = 1) -> None:
@@ -137,9 +136,7 @@ class Adam:
     @torch.no_grad()
     def step(self, learned: Iterable[tuple[str, Tensor, float]]) -> None:
         """Update parameters, given with their names and learning rates, in place by their gradients, and clear those.
-
-        Without a gradient nothing happens.
-        """
+        Parameters without a gradient are skipped."""
         updates = []
         for name, parameter, rate in learned:
             if parameter.grad is None:
@@ -168,11 +165,11 @@ class Adam:
                 moments[name].zero_()
 
     def tensors(self) -> dict[str, Tensor]:
-        """Moments by name, for a checkpoint."""
+        """Return the moments by name, for a checkpoint."""
         return {f"first.{n}": t for n, t in self.first.items()} | {f"second.{n}": t for n, t in self.second.items()}
 
     def restore(self, tensors: dict[str, Tensor], steps: dict[str, int]) -> None:
-        """The inverse of `tensors` and `steps`."""
+        """Restore `tensors` and `steps`."""
         self.first = {n.removeprefix("first."): t for n, t in tensors.items() if n.startswith("first.")}
         self.second = {n.removeprefix("second."): t for n, t in tensors.items() if n.startswith("second.")}
         self.steps = dict(steps)

@@ -1,4 +1,4 @@
-"""`rasterize`: one entry point, four backends."""
+"""`rasterize`: the entry point of rendering, with four backends."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def rasterize(
     background: Tensor | None = None,
     backend: str = "auto",
 ) -> Rendering:
-    """Draw Gaussians (3D Gaussian splatting, Kerbl et al. 2023, with gsplat's conventions).
+    """Render Gaussians (3D Gaussian splatting, Kerbl et al. 2023, with gsplat's conventions).
 
-    channels [N, C], C <= 32: composited like colour over background 0. background [3]: what lies behind; by default
-    the Gaussians' background, or black.
+    channels [N, C], C <= 32: composited like colour over background 0. background [3]: colour behind all, by
+    default the Gaussians' background, or black.
     backend: "cpu" (native, float32), "reference" (plain torch, any float type and device, slow), "cuda" (gsplat),
     "triton" (neeco's own, float32, on a CUDA device), or "auto": for tensors on a CUDA device cuda where gsplat is
-    installed, else triton; cpu for those on the CPU, reference on other devices and where `kernels("torch")` asks for
-    it. The camera's pose may stay on the CPU.
+    installed, else triton; cpu for those on the CPU, reference on other devices and within
+    `kernels("torch")`. The camera's pose may stay on the CPU.
 
     Defined by the reference:
     - the projected covariance gets 0.3 px^2 on its diagonal; the projection is linearised at the mean, moved to within
@@ -45,19 +45,19 @@ def rasterize(
     - alpha = min(0.999, opacity * exp(-distance^2 / 2)), nothing where it is below 1/255; a pixel is full, and takes
       nothing more, once its transmittance would fall to 1e-4 or less;
     - order is by depth, computed in float64 and rounded once to float32, equal depths by index;
-    - a camera with a lens, or with another size than the learned one, sees what `draw_through` makes of pinholes;
+    - a camera with a lens, or with another size than the learned one, is resampled from pinholes (`draw_through`);
     - Gaussians nearer than `camera.near`, or with a NaN or an infinity in any parameter, or with a quaternion of length
-      zero, draw nothing and get zero gradients.
+      zero, are not rendered and get zero gradients.
 
     Gradients reach means, quats, scales, opacities, sh, headlight, channels, background and
     `camera.world_from_camera`, whose inverse is taken as [R^T | -R^T t].
 
-    Raises NeecoError where shapes do not fit, or the backend cannot be had.
+    Raises NeecoError where shapes do not fit, or the backend is not available.
     """
     if background is None:
         background = gaussians.background
     _check(gaussians, camera, channels, background)
-    if channels is not None and channels.shape[1] == 0:  # no kernel need know of none
+    if channels is not None and channels.shape[1] == 0:  # kernels take no empty channels
         rendering = rasterize(gaussians, camera, background=background, backend=backend)
         return replace(rendering, channels=rendering.color.new_zeros((camera.height, camera.width, 0)))
     if camera.is_resampled:

@@ -1,4 +1,4 @@
-"""The definition of drawing: plain torch, dense, differentiable by autograd, in whatever float type the inputs have.
+"""The definition of rendering: plain torch, dense, differentiable by autograd, in the float type of the inputs.
 
 Every Gaussian is evaluated at every pixel: use it to understand and to test, not to train.
 """
@@ -15,9 +15,9 @@ from neeco.geometry.projection import field_slopes
 from neeco.raster.types import Gaussians, Headlight, Rendering
 
 LOW_PASS = 0.3  # px^2 added to projected covariances
-FAINTEST = 1 / 255  # smallest alpha that is drawn
-OPAQUE = 0.999  # largest alpha
-FULL = 1e-4  # transmittance at which a pixel takes no more
+MIN_ALPHA = 1 / 255  # smaller ones are not rendered
+MAX_ALPHA = 0.999
+MIN_TRANSMITTANCE = 1e-4  # at which a pixel is full
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Projection:
 def rasterize_reference(
     gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
 ) -> Rendering:
-    """`rasterize`, as a formula, on the device of the means. Memory grows with Gaussians x pixels."""
+    """`rasterize` as a formula, on the device of the means. Memory grows with Gaussians x pixels."""
     means = gaussians.means
     offsets = torch.zeros(len(gaussians), 2, dtype=means.dtype, device=means.device)
     offsets.requires_grad_(torch.is_grad_enabled())
@@ -60,13 +60,13 @@ def rasterize_reference(
 
 
 def camera_from_world(world_from_camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotation [3, 3] and translation [3] that take world points to the camera frame: R^T and -R^T t."""
+    """Return rotation [3, 3] and translation [3] from world to camera: R^T and -R^T t."""
     rotation = world_from_camera[:3, :3].T
     return rotation, -(rotation @ world_from_camera[:3, 3])
 
 
 def depth_keys(means: Tensor, camera: Camera) -> Tensor:
-    """Depths [N] to sort by: in float64, summed in a fixed order, rounded once to float32: what is sorted."""
+    """Return the depths [N] to sort by: computed in float64, summed in a fixed order, rounded once to float32."""
     with torch.no_grad():
         pose = camera.world_from_camera.double()
         axis, centre = pose[:3, 2], pose[:3, 3]
@@ -97,7 +97,7 @@ def project(
 
 
 def alphas_at_pixels(projection: Projection, opacities: Tensor, camera: Camera) -> Tensor:
-    """Alpha [P, N] of every Gaussian at every pixel centre, before any of the cut-offs."""
+    """Return alpha [P, N] of every Gaussian at every pixel centre, before any cut-off."""
     rows = torch.arange(camera.height, dtype=opacities.dtype, device=opacities.device) + 0.5
     columns = torch.arange(camera.width, dtype=opacities.dtype, device=opacities.device) + 0.5
     y, x = torch.meshgrid(rows, columns, indexing="ij")
@@ -109,11 +109,11 @@ def alphas_at_pixels(projection: Projection, opacities: Tensor, camera: Camera) 
 
 
 def blend_weights(projection: Projection, opacities: Tensor, order: Tensor, camera: Camera) -> Tensor:
-    """Weights [P, N], columns in `order`, near to far: what share of a pixel each Gaussian makes up."""
+    """Return the share [P, N] of each pixel that each Gaussian contributes, columns in `order`, near to far."""
     alphas = alphas_at_pixels(projection, opacities, camera)[:, order]
-    alphas = torch.where(alphas >= FAINTEST, alphas.clamp(max=OPAQUE), 0.0)
+    alphas = torch.where(alphas >= MIN_ALPHA, alphas.clamp(max=MAX_ALPHA), 0.0)
     with torch.no_grad():
-        taken = torch.cumprod(1 - alphas, dim=1) > FULL
+        taken = torch.cumprod(1 - alphas, dim=1) > MIN_TRANSMITTANCE
     alphas = torch.where(taken, alphas, 0.0)
     behind = torch.cumprod(1 - alphas, dim=1)
     before = torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], dim=1)
@@ -129,7 +129,7 @@ def _colors(gaussians: Gaussians, camera: Camera, camera_means: Tensor) -> Tenso
 
 
 def usable_gaussians(gaussians: Gaussians, camera: Camera, channels: Tensor | None) -> Tensor:
-    """[N] bool: Gaussians in front of the camera with finite parameters and quaternions that are not zero."""
+    """Return the Gaussians in front of the camera with finite parameters and non-zero quaternions, [N] bool."""
     n = len(gaussians)
     light = gaussians.headlight
     tensors: list[Tensor | None] = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
@@ -145,10 +145,8 @@ def usable_gaussians(gaussians: Gaussians, camera: Camera, channels: Tensor | No
 def _hide(
     gaussians: Gaussians, channels: Tensor | None, hidden: Tensor, camera: Camera
 ) -> tuple[Gaussians, Tensor | None]:
-    """Gaussians and channels with the `hidden` [N] made transparent, finite, 1 mm before the camera, without gradients.
-
-    Taking the others out instead would make shapes depend on numbers, which a device without numbers cannot do.
-    """
+    """Return Gaussians and channels with the `hidden` [N] made transparent, finite, 1 mm before the camera, without
+    gradients. Selecting the others instead would make shapes depend on values, which "meta" tensors do not have."""
     pose = camera.world_from_camera.detach().to(gaussians.means.dtype)
 
     def but(tensor: Tensor, value: Tensor | float) -> Tensor:
@@ -172,18 +170,18 @@ def _hide(
 
 @torch.no_grad()
 def _radii(projection: Projection, opacities: Tensor, camera: Camera) -> Tensor:
-    """3 standard deviations along the longer axis, px; 0 for Gaussians fainter than 1/255 at every pixel."""
+    """Return 3 standard deviations along the longer axis, px; 0 for Gaussians below 1/255 at every pixel."""
     largest = torch.linalg.eigvalsh(projection.covariances)[:, -1]
-    touching = (alphas_at_pixels(projection, opacities, camera) >= FAINTEST).any(dim=0)
+    touching = (alphas_at_pixels(projection, opacities, camera) >= MIN_ALPHA).any(dim=0)
     return torch.where(touching, 3 * largest.sqrt(), 0.0)
 
 
 SH_C0 = 0.28209479177387814  # the constant harmonic
-HALF = 0.5 / SH_C0  # by how much of it colours are more than harmonics say
+COLOR_OFFSET = 0.5 / SH_C0  # colour 0.5, which is added to the harmonics, as a constant harmonic
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] wxyz, taken as unit."""
+    """Return rotation matrices [N, 3, 3] of quaternions [N, 4] wxyz, taken as unit."""
     w, x, y, z = quats.unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -194,7 +192,8 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def sh_basis(directions: Tensor, count: int) -> Tensor:
-    """Real spherical harmonics [N, count] at unit directions [N, 3], constants and signs of 3D Gaussian Splatting."""
+    """Return real spherical harmonics [N, count] at unit directions [N, 3], constants and signs of 3D Gaussian
+    Splatting."""
     x, y, z = directions.unbind(-1)
     basis = [torch.full_like(x, SH_C0)]
     if count > 1:
@@ -222,14 +221,15 @@ def sh_basis(directions: Tensor, count: int) -> Tensor:
 
 
 def brightened(sh: Tensor, factor: Tensor) -> Tensor:
-    """Harmonics [N, K, 3] with the colours, half a unit more than they say, multiplied by `factor` [N, 1, 1] or [3]."""
+    """Return harmonics [N, K, 3] whose colours, sh . basis + 0.5, are multiplied by `factor` [N, 1, 1] or [3]."""
     lit = sh * factor
-    lit[:, :1] += HALF * (factor - 1)
+    lit[:, :1] += COLOR_OFFSET * (factor - 1)
     return lit
 
 
 def sh_colors(sh: Tensor, means: Tensor, camera_centre: Tensor, sh_frames: Tensor | None) -> Tensor:
-    """Colours [N, 3] = sh . basis(direction) + 0.5, not clamped; sh [N, K, 3]; means [N, 3], centre [3]: world."""
+    """Return colours [N, 3] = sh . basis(direction) + 0.5, not clamped; sh [N, K, 3]; means [N, 3], centre [3]:
+    world."""
     directions = torch.nn.functional.normalize(means - camera_centre, dim=-1)
     if sh_frames is not None:
         world_from_sh = rotation_matrices(sh_frames.detach())
@@ -238,7 +238,7 @@ def sh_colors(sh: Tensor, means: Tensor, camera_centre: Tensor, sh_frames: Tenso
 
 
 def headlight_factor(headlight: Headlight, camera: Camera, camera_means: Tensor) -> Tensor:
-    """Brightness [N] of the headlight at means [N, 3] in the camera frame, mm, with what shadows leave of it."""
+    """Return the brightness [N] of the headlight, with its shadows, at means [N, 3] mm in the camera frame."""
     x, y, z = camera_means.unbind(-1)
     log_distance = 0.5 * torch.log((x * x + y * y + z * z) / 100.0**2)
     t = field_slopes(camera, camera_means).square().sum(-1)

@@ -1,7 +1,7 @@
-"""Images of another size than Gaussians were learned at, or seen through a lens.
+"""Resampling of images of another size than the learned one, or through a lens with distortion.
 
-The backends know pinholes of the learned size. Everything else is drawn by such a pinhole and resampled: colour, alpha,
-depth and channels alike, so that labels are decided by what the pixels then hold.
+The backends render pinholes of the learned size. Everything else is rendered by such a pinhole and resampled: colour,
+alpha, depth and channels alike, so that labels follow the resampled pixels.
 """
 
 from __future__ import annotations
@@ -21,21 +21,20 @@ from neeco.geometry.distortion import field_pinhole, lens_field
 from neeco.raster.reference import LOW_PASS
 from neeco.raster.types import Gaussians, Rendering
 
-# Of the learned size: from here up the backends' own low-pass is near enough. Measured at .9: .1 dB less than averaged.
-COARSE = 0.9
-ORIGIN = torch.eye(4)  # one tensor, so that cameras there are equal when their numbers are
-NOWHERE = 2.0  # in the coordinates of `grid_sample`, beyond the image
+# Scale from which the backends' own low-pass replaces supersampling. Measured at 0.9: 0.1 dB less than averaged.
+MIN_DIRECT_SCALE = 0.9
+ORIGIN = torch.eye(4)  # one tensor, so that cameras there are equal when their intrinsics are
+OUTSIDE = 2.0  # in the coordinates of `grid_sample`, beyond the image
 
 Draw = Callable[[Camera], Rendering]
 
 
 def draw_through(camera: Camera, draw: Draw) -> Rendering:
-    """What `camera`, which has a lens or a size other than the learned one, sees; `draw` draws for pinholes of its
+    """Render for `camera`, which has a lens or a size other than the learned one; `draw` renders pinholes of the
     learned size or larger.
 
-    Smaller than learned, a whole number of times as many pixels are drawn along each side, and averaged. Through a
-    lens, a pinhole is drawn whose field holds the lens's, and sampled bilinearly; beyond border and field there is
-    nothing.
+    Sizes smaller than learned are supersampled by a whole number along each side, and averaged. A lens is rendered by
+    a pinhole whose field contains the lens's, and sampled bilinearly; beyond border and field the image is empty.
     """
     fine = supersampled(camera)
     seen = field_pinhole(fine)
@@ -57,21 +56,21 @@ def draw_through(camera: Camera, draw: Draw) -> Rendering:
 
 
 def learned_scale(camera: Camera) -> float:
-    """How many of the camera's pixels there are to a learned one, along each side."""
+    """Return the camera's pixels per learned pixel, along each side."""
     return 1.0 if camera.learned_fx is None else camera.fx / camera.learned_fx
 
 
 def supersampled(camera: Camera) -> Camera:
-    """The camera with the pixels that are drawn, a whole number along each side of each of the image's."""
+    """Return the camera of the rendered pixels, a whole number per pixel of the image along each side."""
     scale = learned_scale(camera)
-    times = math.ceil(1 / scale - 1e-6) if scale < COARSE else 1
+    times = math.ceil(1 / scale - 1e-6) if scale < MIN_DIRECT_SCALE else 1
     return camera if times == 1 else camera.resized(times * camera.width, times * camera.height)
 
 
 def widened(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """The Gaussians as a pinhole larger than learned is to draw them: the picture that was learned, seen larger.
+    """Return the Gaussians for a pinhole larger than learned, which magnifies the learned image.
 
-    The backends' low-pass is a number of pixels, smaller ones now; what it lacks, Gaussians are given as a size,
+    The backends' low-pass is constant in pixels, which are smaller now; the rest is added to the Gaussians' size,
     isotropically, as by Mip-Splatting's 3D filter (Yu et al. 2024, eq. 7).
     """
     scale = learned_scale(camera)
@@ -84,14 +83,14 @@ def widened(gaussians: Gaussians, camera: Camera) -> Gaussians:
 
 
 def of_learned_size(camera: Camera) -> Camera:
-    """The pinhole with pixels as many as were learned from, or nearly."""
+    """Return the pinhole with approximately the learned number of pixels."""
     scale = learned_scale(camera)
     return camera.resized(*(max(1, round(size / scale)) for size in (camera.width, camera.height)))
 
 
 def resampled(image: Tensor, seen: Camera, fine: Camera, camera: Camera) -> Tensor:
-    """An image [H, W, C] that the pinhole `seen` sees, as `camera` sees it by way of the pixels of `fine`, of which it
-    has a whole number along each side of each of its own; 0 where it sees nothing of it."""
+    """Resample an image [H, W, C] of the pinhole `seen` for `camera`, by the supersampled pixels of `fine`; 0 outside
+    the image."""
     planes = image.permute(2, 0, 1)[None]
     if not fine.is_pinhole:
         pinhole = (seen.fx, seen.fy), (seen.cx, seen.cy), (seen.width, seen.height)
@@ -104,8 +103,8 @@ def resampled(image: Tensor, seen: Camera, fine: Camera, camera: Camera) -> Tens
 
 @lru_cache(maxsize=4)
 def _sampling_grid(lens: Camera, pinhole: tuple[tuple[float, float], ...]) -> Tensor:
-    """[1, H, W, 2] where the pixels of `lens`, a camera at ORIGIN, lie in the image of a pinhole of these focal
-    lengths, principal point and size, as `grid_sample` takes it."""
+    """Return the positions [1, H, W, 2], for `grid_sample`, of the pixels of `lens`, a camera at ORIGIN, in the image
+    of a pinhole of these focal lengths, principal point and size."""
     focal, center, size = (np.array(pair, np.float32) for pair in pinhole)
     place = lens_field(lens).slopes * focal + center
-    return torch.from_numpy(np.nan_to_num(2 * place / size - 1, nan=NOWHERE))[None]
+    return torch.from_numpy(np.nan_to_num(2 * place / size - 1, nan=OUTSIDE))[None]

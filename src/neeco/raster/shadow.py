@@ -1,8 +1,8 @@
-"""The shadows that what moves casts on what stands still, under lamps that sit beside the lens.
+"""Shadow maps: shadows that instruments cast on the tissue under lamps next to the lens.
 
-The casters are drawn once more, from every lamp: how opaque they are there, blurred by the lamp's width, is how much of
-its light a Gaussian behind them misses. Shares of light add up, stored colours do not: they go with its root (`GAMMA`).
-Only brightness changes; nothing is added to the image, and labels know nothing of it.
+The casters are also rendered from every lamp: their opacity there, blurred by the lamp's width, is the share of its
+light that a Gaussian behind them does not receive. Shares of light add up linearly; stored colours follow their root
+(`GAMMA`). Only brightness changes: no image is added, and labels are unaffected.
 """
 
 from __future__ import annotations
@@ -22,63 +22,63 @@ from neeco.raster.devices import constant
 from neeco.raster.native import all_run_native, native
 from neeco.raster.types import Gaussians, Rendering, Shadow
 
-RESOLUTION = 0.5  # of the image's
-MARGIN = 0.15  # of the image's size, to each side: what casts may stand beside the image
-GAMMA = 2.2  # of stored images, about
-DARKEST = 0.01  # of the light reaches any place
-FAINT = 1e-4  # of a lamp's light: less is not missed
-NEAR = 1e-6
-NEAREST = 1e-3  # mm
+MAP_SCALE = 0.5  # resolution of the map relative to the image
+MAP_MARGIN = 0.15  # of the image's size, to each side: casters may be outside the image
+GAMMA = 2.2  # of stored images, approximately
+MIN_LIGHT = 0.01  # share of the light that reaches any Gaussian
+MIN_OPACITY = 1e-4  # of the blurred map: less casts no shadow
+MIN_DEPTH = 1e-6  # mm, and smallest opacity that depths are divided by
+MIN_DISTANCE = 1e-3  # mm
 
 Draw = Callable[[Gaussians, Camera], Rendering]
 
 
 def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
-    """The same Gaussians, their headlight with what its shadows leave of it instead of them, as it shines from the
-    camera's lamps; `draw` rasterizes.
+    """Return the Gaussians with the headlight's shadows evaluated as its share `left` at every Gaussian; `draw`
+    rasterizes.
 
-    Gradients reach the falloff, and the lamps' offsets, strengths and width; the casters' shapes are taken as they are.
+    Gradients reach the falloff, and the lamps' offsets, strengths and width, but not the casters' shapes.
     """
     light = gaussians.headlight
     if light is None or light.left is not None:
         return gaussians
     left = None if light.shadow is None else _left_by(light.shadow, gaussians, camera, draw)
     if camera.world_from_lamps is not None:
-        beside = _from_beside(light.falloff, gaussians.means, camera, camera.world_from_lamps)
-        left = beside if left is None else left * beside
+        relative = _relative_to_camera(light.falloff, gaussians.means, camera, camera.world_from_lamps)
+        left = relative if left is None else left * relative
     return gaussians if left is None else replace(gaussians, headlight=replace(light, shadow=None, left=left))
 
 
 def _left_by(shadow: Shadow, gaussians: Gaussians, camera: Camera, draw: Draw) -> Tensor | None:
-    """[N] what a shadow leaves of the Gaussians' stored colours; None: nothing casts, or there is nothing behind."""
+    """Return the factor [N] of the Gaussians' stored colours in the shadow; None: no casters, receivers or lamps."""
     casters, lit = shadow.casters, shadow.strengths.detach() > 0
-    every, some, *shines = torch.stack([casters.all(), casters.any(), *lit]).tolist()  # the device is asked once
-    if every or not some or not any(shines):  # nothing to fall on, or nothing that falls
+    every, some, *shines = torch.stack([casters.all(), casters.any(), *lit]).tolist()  # read from the device once
+    if every or not some or not any(shines):
         return None
     shares = blocked(Casting.of(gaussians, casters, camera), shadow.width, shadow.offsets, draw, shines)
-    return (1 - shadow.strengths @ shares).clamp_min(DARKEST) ** (1 / GAMMA)
+    return (1 - shadow.strengths @ shares).clamp_min(MIN_LIGHT) ** (1 / GAMMA)
 
 
-def _from_beside(falloff: Tensor, means: Tensor, camera: Camera, world_from_lamps: Tensor) -> Tensor:
-    """[N] by how much brighter than from the camera itself the headlight shines from lamps elsewhere."""
+def _relative_to_camera(falloff: Tensor, means: Tensor, camera: Camera, world_from_lamps: Tensor) -> Tensor:
+    """Return the brightness [N] of the headlight at lamps elsewhere, relative to one at the camera."""
     places = (pose[:3, 3].detach().to(means) for pose in (camera.world_from_camera, world_from_lamps))
-    own, lamps = ((means.detach() - place).norm(dim=1).clamp_min(NEAREST).log() for place in places)
+    own, lamps = ((means.detach() - place).norm(dim=1).clamp_min(MIN_DISTANCE).log() for place in places)
     return torch.exp(falloff * (own - lamps))
 
 
 @dataclass(frozen=True)
 class Casting:
-    """Those that cast and those that may stand behind them, before the lamps' camera: the same for every lamp."""
+    """Casters and receivers in front of the lamps' camera, the same for every lamp."""
 
     casters: Tensor  # [N] bool
-    bare: Gaussians  # the casters, as opaque as they are and of no particular colour
+    bare: Gaussians  # the casters with their opacities, without light and harmonics
     means: Tensor  # [N, 3] mm, of all, world
     camera: Camera
 
     @staticmethod
     @torch.no_grad()
     def of(gaussians: Gaussians, casters: Tensor, camera: Camera) -> Casting:
-        """Of all the Gaussians and which of them cast, bool [N], before the camera that the lamps are beside."""
+        """Return all Gaussians, of which `casters` [N] bool cast, in front of the camera that the lamps are next to."""
         if camera.world_from_lamps is not None:
             camera = replace(camera, world_from_camera=camera.world_from_lamps, world_from_lamps=None)
         bare = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None, background=None).select(casters)
@@ -86,9 +86,9 @@ class Casting:
 
 
 def blocked(among: Casting, width: Tensor, offsets: Tensor, draw: Draw, shines: Sequence[bool] | None = None) -> Tensor:
-    """Shares [L, N] of the light of lamps at `offsets` [L, 3] mm, of this `width` (slope), that the casters keep from
-    each Gaussian; 0 for themselves, and for lamps that do not shine (`shines`; None: all do). float32 on the CPU takes
-    the native kernels."""
+    """Return the shares [L, N] of the light of lamps at `offsets` [L, 3] mm, of this `width` (slope), that the casters
+    block for each Gaussian; 0 for themselves, and for lamps that are off (`shines`; None: all are on). float32 on the
+    CPU takes the native kernels."""
     lamps = [index for index in range(len(offsets)) if shines is None or shines[index]]
     if all_run_native(among.means, offsets):
         return _Blocked.apply(width, offsets, among, draw, lamps)
@@ -99,7 +99,7 @@ def blocked(among: Casting, width: Tensor, offsets: Tensor, draw: Draw, shines: 
 
 def _blocked_by(among: Casting, width: Tensor, offset: Tensor, draw: Draw) -> Tensor:
     """`blocked` of one lamp, [N]. Any float type and device."""
-    at_light = _light_camera(among.camera, offset.detach())
+    at_light = light_camera(among.camera, offset.detach())
     with torch.no_grad():
         seen = draw(among.bare, at_light)
     return blocked_reference(seen.alpha, seen.depth, width, offset, among, at_light)
@@ -108,7 +108,7 @@ def _blocked_by(among: Casting, width: Tensor, offset: Tensor, draw: Draw) -> Te
 def blocked_reference(
     alpha: Tensor, depth: Tensor, width: Tensor, offset: Tensor, among: Casting, at_light: Camera
 ) -> Tensor:
-    """What `blocked` makes of a lamp's map, the opacity `alpha` [h, w] and `depth` [h, w] mm of what casts: shares [N].
+    """Return the shares [N] blocked by a lamp's map, opacity `alpha` [h, w] and `depth` [h, w] mm of the casters.
     Gradients reach the lamp's width and offset [3] mm. Any float type and device."""
     sigma = width * at_light.fx
     opacity = blur(alpha, sigma)  # [h, w]
@@ -117,13 +117,15 @@ def blocked_reference(
         summed = torch.stack([opacity, blur(alpha * depth, sigma)], -1)  # [h, w, 2]
         pose = among.camera.world_from_camera.to(among.means)
         points = (among.means - pose[:3, 3]) @ pose[:3, :3]  # [N, 3] mm, in the camera's frame
-        pixels = torch.stack(project(points - offset, *focus, nearest=NEAREST), 1)  # [N, 2]; those behind fall outside
+        pixels = torch.stack(
+            project(points - offset, *focus, nearest=MIN_DISTANCE), 1
+        )  # [N, 2]; those behind project outside
         weight, sums = _look_up(summed, pixels, at_light).unbind(1)
-        before = (sums / weight.clamp_min(NEAR)).clamp_min(NEAR)  # [N] mm, depth of what casts there
-        hit = (weight > FAINT) & (points[:, 2] - offset[2] > before) & ~among.casters
-    few = hit.nonzero()[:, 0]  # of these alone the gradient is wanted
+        before = (sums / weight.clamp_min(MIN_DEPTH)).clamp_min(MIN_DEPTH)  # [N] mm, depth of the casters there
+        hit = (weight > MIN_OPACITY) & (points[:, 2] - offset[2] > before) & ~among.casters
+    few = hit.nonzero()[:, 0]  # gradients are needed for these alone
     points, before = points[few], before[few]
-    pixels = torch.stack(project(points - offset, *focus, nearest=NEAREST), 1)
+    pixels = torch.stack(project(points - offset, *focus, nearest=MIN_DISTANCE), 1)
     pixels = pixels + _parallax(offset, pixels.detach(), before, at_light)
     return torch.zeros_like(among.means[:, 0]).masked_scatter(hit, _look_up(opacity[..., None], pixels, at_light)[:, 0])
 
@@ -140,10 +142,10 @@ class _Blocked(torch.autograd.Function):
         ctx.lamps = []
         ctx.save_for_backward(width, offsets, means, among.casters, shares)
         for lamp in lamps:
-            at_light = _light_camera(among.camera, offsets[lamp])
+            at_light = light_camera(among.camera, offsets[lamp])
             seen = draw(among.bare, at_light)
             maps = torch.empty(3, at_light.height, at_light.width)
-            focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy, float(width) * at_light.fx, NEAREST)
+            focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy, float(width) * at_light.fx, MIN_DISTANCE)
             given = torch.tensor([*view, *offsets[lamp].tolist(), *focus], dtype=torch.float32)
             wanted = ctx.needs_input_grad[0]
             alpha, depth = (image.detach().contiguous() for image in (seen.alpha, seen.depth))
@@ -165,28 +167,28 @@ class _Blocked(torch.autograd.Function):
         return to_width, to_offsets, None, None, None
 
 
-def _light_camera(camera: Camera, offset: Tensor) -> Camera:
-    """A small camera at the light, turned as `camera` is, that sees a little more."""
+def light_camera(camera: Camera, offset: Tensor) -> Camera:
+    """Return a small camera at the light with the orientation of `camera` and a slightly larger field."""
     pose = camera.world_from_camera.detach().clone()
     pose[:3, 3] += pose[:3, :3] @ offset.to(pose)
-    width, height = (max(1, round(RESOLUTION * (1 + 2 * MARGIN) * size)) for size in (camera.width, camera.height))
-    wide, high = MARGIN * camera.width, MARGIN * camera.height
+    width, height = (max(1, round(MAP_SCALE * (1 + 2 * MAP_MARGIN) * size)) for size in (camera.width, camera.height))
+    wide, high = MAP_MARGIN * camera.width, MAP_MARGIN * camera.height
     return Camera(
         pose,
-        camera.fx * RESOLUTION,
-        camera.fy * RESOLUTION,
-        (camera.cx + wide) * RESOLUTION,
-        (camera.cy + high) * RESOLUTION,
-        width,
-        height,
-        camera.near,
+        fx=camera.fx * MAP_SCALE,
+        fy=camera.fy * MAP_SCALE,
+        cx=(camera.cx + wide) * MAP_SCALE,
+        cy=(camera.cy + high) * MAP_SCALE,
+        width=width,
+        height=height,
+        near=camera.near,
     )
 
 
 def _parallax(offset: Tensor, pixels: Tensor, depth: Tensor, camera: Camera) -> Tensor:
-    """[R, 2] px, all zero, by whose gradient the map moves as its casters at `depth` [R] mm do when the light moves.
+    """Return zeros [R, 2] px whose gradient is the parallax of casters at `depth` [R] mm when the light moves.
 
-    The map was drawn without a gradient; to first order it moves as a whole.
+    The map was rendered without a gradient; to first order it moves as a whole.
     """
     moved = offset - offset.detach()  # [3]
     focal = constant((camera.fx, camera.fy), pixels.device)
@@ -195,26 +197,26 @@ def _parallax(offset: Tensor, pixels: Tensor, depth: Tensor, camera: Camera) -> 
 
 
 def _look_up(image: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
-    """Values [R, C] of an image [h, w, C] at pixels [R, 2], linear between their centres, 0 outside."""
+    """Sample an image [h, w, C] bilinearly at pixels [R, 2], [R, C]; 0 outside."""
     size = constant((camera.width, camera.height), pixels.device)
     place = (2 * pixels / size - 1)[None, None]  # [1, 1, R, 2]
     return grid_sample(image.permute(2, 0, 1)[None], place, align_corners=False)[0, :, 0].T
 
 
-TAPS = 6  # pixels to each side of the window's middle, which is cut off there
-LEAST = 0.3  # px: a narrower window is drawn as wide as this
+MAX_TAPS = 6  # pixels to each side of the window's middle, where it is cut off
+MIN_WINDOW_SD = 0.3  # px
 
 
 def blur(image: Tensor, sigma: Tensor) -> Tensor:
-    """`image` [H, W] under a Gaussian window of standard deviation `sigma` [] px, cut off after TAPS pixels; nothing
-    comes from beyond the image. Any float type and device; gradients reach both."""
+    """Blur `image` [H, W] by a Gaussian window of standard deviation `sigma` [] px, cut off after MAX_TAPS pixels, with
+    zero padding. Any float type and device; gradients reach both."""
     down, across = (_window_matrix(size, sigma) for size in image.shape)
     return down @ image @ across
 
 
 def _window_matrix(size: int, sigma: Tensor) -> Tensor:
-    """[size, size] that blurs a line of pixels; its middle row sums to 1."""
+    """Return the matrix [size, size] that blurs a line of pixels; its middle row sums to 1."""
     places = torch.arange(size, dtype=sigma.dtype, device=sigma.device)
     steps = (places[:, None] - places).abs()
-    weights = torch.exp(-0.5 * (steps / sigma.clamp_min(LEAST)).square()) * (steps <= TAPS)
+    weights = torch.exp(-0.5 * (steps / sigma.clamp_min(MIN_WINDOW_SD)).square()) * (steps <= MAX_TAPS)
     return weights / weights[size // 2].sum()

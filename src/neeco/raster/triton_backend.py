@@ -1,7 +1,8 @@
-"""The triton backend: float32, drawn and differentiated by neeco's own Triton kernels."""
+"""The triton backend: float32, rendered and differentiated by neeco's own Triton kernels (`triton/`)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,17 +14,17 @@ from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.raster.triton.binning import Lists, Tiles, list_per_tile
 from neeco.raster.triton.composite import Images, composite, composite_backward
-from neeco.raster.triton.project import Inputs, Projected, project
+from neeco.raster.triton.project import INPUTS, Inputs, Projected, project
 from neeco.raster.triton.project_backward import project_backward
 from neeco.raster.triton.ready import working_on
 from neeco.raster.types import Gaussians, Rendering, differentiable
 
-TILE = 16  # px
+TILE_PX = 16
 
 
 @dataclass(frozen=True)
-class Drawing:
-    """What the gradient needs of a drawing. No tensor of it is an input or an output of autograd."""
+class ForwardState:
+    """Intermediate results that the backward pass needs; none is an input or output of autograd."""
 
     projected: Projected
     lists: Lists
@@ -55,44 +56,40 @@ def rasterize_triton(
     return Rendering(color, alpha, depth, composited, radii, offsets)
 
 
+def _inputs(tensors: Iterable[Tensor | None]) -> Inputs:
+    given: dict[str, Any] = dict(zip(INPUTS, tensors, strict=True))
+    return Inputs(**given)
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, offsets: Tensor, camera: Camera, keep: bool, *tensors: Tensor | None) -> Any:
-        inputs = Inputs(*(None if t is None else t.detach() for t in tensors))  # type: ignore[arg-type]
-        size = TILE
-        tiles = Tiles(size, -(-camera.width // size), -(-camera.height // size))
+        inputs = _inputs(None if t is None else t.detach() for t in tensors)
+        tiles = Tiles(TILE_PX, camera.width, camera.height)
         projected = project(inputs, camera, tiles)
-        lists = list_per_tile(
-            projected.ellipses, projected.counts, projected.depths, tiles, camera.width, camera.height
-        )
-        images = composite(
-            projected.records, inputs.channels, lists, inputs.background, tiles, camera.width, camera.height
-        )
+        lists = list_per_tile(projected.ellipses, projected.counts, projected.depths, tiles)
+        images = composite(inputs, projected.records, lists, tiles)
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(projected.radii)
         if keep:
-            # Saved so that autograd notices when someone changes an input before the backward pass.
+            # saved so that autograd detects a modified input before the backward pass
             ctx.save_for_backward(images.alpha, images.depth, *tensors)
             ctx.camera = camera
-            ctx.drawing = Drawing(projected, lists, tiles, images.left, images.full_at)
+            ctx.state = ForwardState(projected, lists, tiles, images.left, images.full_at)
         return images.color, images.alpha, images.depth, images.channels, projected.radii
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> Any:
         alpha, depth, *tensors = ctx.saved_tensors
-        inputs, drawing, camera = Inputs(*tensors), ctx.drawing, ctx.camera
-        to_color, to_alpha, to_depth, to_channels = (
-            None if gradient is None else gradient.to(torch.float32).contiguous() for gradient in gradients[:4]
-        )
+        inputs, state, camera = _inputs(tensors), ctx.state, ctx.camera
+        to_images = tuple(None if g is None else g.to(torch.float32).contiguous() for g in gradients[:4])
+        to_color = to_images[0]
         wanted = ctx.needs_input_grad[3:]
-        images = Images(depth, alpha, depth, None, drawing.left, drawing.full_at)
+        images = Images(depth, alpha, depth, None, state.left, state.full_at)
         with working_on(alpha.device):
-            sums = composite_backward(
-                drawing.projected.records, inputs.channels, drawing.lists, inputs.background, drawing.tiles, images,
-                (to_color, to_alpha, to_depth, to_channels),
-            )  # fmt: skip
-            to = project_backward(inputs, drawing.projected, camera, sums, wanted[4], wanted[8] or wanted[9])
+            sums = composite_backward(inputs, state.projected.records, state.lists, state.tiles, images, to_images)
+            to = project_backward(inputs, state.projected, camera, sums, wanted[4], wanted[8] or wanted[9])
         to_background = None
         if wanted[10] and to_color is not None and inputs.background is not None:
             to_background = ((1 - alpha)[..., None] * to_color).sum(dim=(0, 1))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import KW_ONLY, dataclass, fields, replace
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -12,27 +13,27 @@ from neeco.geometry.camera import Camera
 
 @dataclass(frozen=True)
 class Shadow:
-    """What lamps miss behind some of the Gaussians, since they sit beside the lens (see `shadow.shadowed`)."""
+    """Shadows that some Gaussians cast on the others under lamps next to the lens (see `shadow.shadowed`)."""
 
-    casters: Tensor  # [N] bool: these cast it, all others receive it
+    casters: Tensor  # [N] bool: these cast the shadow, all others receive it
     offsets: Tensor  # [L, 3] mm, the lamps in the camera's frame (OpenCV axes)
     strengths: Tensor  # [L] in [0, 1]: share of all (linear) light that each gives, missing in its deepest shadow
-    width: Tensor  # [] slope: standard deviation of a shadow's edge, as seen from the lamp
+    width: Tensor  # [] slope: standard deviation of a shadow's edge, viewed from the lamp
 
     def to(self, device: torch.device | str) -> Shadow:
-        """The same shadow on `device`."""
-        return Shadow(*(getattr(self, field.name).to(device) for field in fields(self)))
+        """Return the shadow on `device`."""
+        return _moved(self, device)
 
 
 @dataclass(frozen=True)
 class Headlight:
-    """A light that sits at the camera, as an endoscope's does: it dims with distance and off the optical axis.
+    """Light at the camera, as an endoscope's: it decreases with distance and off the optical axis.
 
     A Gaussian's colour is multiplied by
     `(distance / 100 mm) ** -falloff * exp(vignette[0] * t + vignette[1] * t**2)`,
     distance and t taken at its mean, in the camera frame: distance = |p|, t = (p_x / p_z)^2 + (p_y / p_z)^2, the two
-    slopes brought into the field of view and its margin (`field_slopes`): beyond it the vignette means nothing, and its
-    powers would blind the image. What shadows leave of it, `left`, multiplies, too.
+    slopes clamped to the field of view and its margin (`field_slopes`), since the vignette diverges beyond it. It is
+    also multiplied by `left`, the share that shadows leave.
     """
 
     falloff: Tensor  # [N] exponent
@@ -41,20 +42,23 @@ class Headlight:
     left: Tensor | None = None  # [N] of stored colours, > 0; None: all
 
     def to(self, device: torch.device | str) -> Headlight:
-        """The same light on `device`."""
-        shadow = None if self.shadow is None else self.shadow.to(device)
-        left = None if self.left is None else self.left.to(device)
-        return Headlight(self.falloff.to(device), self.vignette.to(device), shadow, left)
+        """Return the light on `device`."""
+        return _moved(self, device)
+
+    def select(self, rows: Tensor | slice) -> Headlight:
+        """Return the light of the Gaussians `rows`."""
+        shadow = None if self.shadow is None else replace(self.shadow, casters=self.shadow.casters[rows])
+        left = None if self.left is None else self.left[rows]
+        return Headlight(self.falloff[rows], self.vignette, shadow, left)
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Posed Gaussians, ready to draw (world frame, lengths in mm).
+    """Posed Gaussians (world frame, lengths in mm).
 
     Colour is `max(0, sh . basis(direction) + 0.5)`, direction = from the camera centre to the mean, unit, turned into
     the Gaussian's SH frame when `sh_frames` is given; then the headlight. No gradient flows into `sh_frames`.
-    `background` lies behind all of them where nothing else is asked for, e.g. the white of images cut out of their
-    surroundings.
+    `background` is the default colour behind all of them, such as the white of segmented images.
     """
 
     means: Tensor  # [N, 3] mm
@@ -62,6 +66,7 @@ class Gaussians:
     scales: Tensor  # [N, 3] mm, standard deviations, > 0
     opacities: Tensor  # [N] in (0, 1)
     sh: Tensor  # [N, K, 3], K = 1, 4, 9 or 16
+    _: KW_ONLY
     sh_frames: Tensor | None = None  # [N, 4] wxyz unit, world_from_sh
     headlight: Headlight | None = None
     background: Tensor | None = None  # [3] colour; None: black
@@ -70,35 +75,31 @@ class Gaussians:
         return self.means.shape[0]
 
     def select(self, chosen: Tensor | slice) -> Gaussians:
-        """The chosen ones (bool [N], or rows that follow each other, which are not copied)."""
-        if isinstance(chosen, Tensor):
-            chosen = chosen.nonzero()[:, 0]  # asked for once: how many there are, a device has to say
-        light = self.headlight
-        if light is not None:
-            shadow = None if light.shadow is None else replace(light.shadow, casters=light.shadow.casters[chosen])
-            left = None if light.left is None else light.left[chosen]
-            light = Headlight(light.falloff[chosen], light.vignette, shadow, left)
-        return Gaussians(
-            means=self.means[chosen],
-            quats=self.quats[chosen],
-            scales=self.scales[chosen],
-            opacities=self.opacities[chosen],
-            sh=self.sh[chosen],
-            sh_frames=None if self.sh_frames is None else self.sh_frames[chosen],
-            headlight=light,
-            background=self.background,
-        )
+        """Return the chosen Gaussians (bool [N], or a slice, which is not copied)."""
+        rows = chosen.nonzero()[:, 0] if isinstance(chosen, Tensor) else chosen  # waits for the device once
+        columns: dict[str, Any] = {
+            name: getattr(self, name)[rows] for name in ("means", "quats", "scales", "opacities", "sh")
+        }
+        frames = None if self.sh_frames is None else self.sh_frames[rows]
+        return replace(self, **columns, sh_frames=frames, headlight=self.headlight and self.headlight.select(rows))
 
     def to(self, device: torch.device | str) -> Gaussians:
-        """The same Gaussians on `device`."""
-        held = {field.name: getattr(self, field.name) for field in fields(self)}
-        return replace(self, **{name: value.to(device) for name, value in held.items() if value is not None})
+        """Return the Gaussians on `device`."""
+        return _moved(self, device)
+
+
+Held = TypeVar("Held", Shadow, Headlight, Gaussians)
+
+
+def _moved(held: Held, device: torch.device | str) -> Held:
+    values = {field.name: getattr(held, field.name) for field in fields(held)}
+    return replace(held, **{name: value.to(device) for name, value in values.items() if value is not None})
 
 
 def differentiable(
     gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
 ) -> list[Tensor | None]:
-    """What gradients of a drawing reach, in the order in which neeco's own backends take it; None: not there."""
+    """Return the tensors that gradients of a rendering reach, in the order of neeco's own backends; None: absent."""
     light = gaussians.headlight
     return [
         gaussians.means,
@@ -117,16 +118,16 @@ def differentiable(
 
 @dataclass(frozen=True)
 class Rendering:
-    """One drawn image, and what density control wants to know of it."""
+    """A rendered image, and statistics for density control."""
 
     color: Tensor  # [H, W, 3]
     alpha: Tensor  # [H, W]
-    depth: Tensor  # [H, W] mm, expected depth (accumulated z / alpha; 0 where nothing was drawn)
+    depth: Tensor  # [H, W] mm, expected depth (accumulated z / alpha; 0 where alpha is 0)
     channels: Tensor | None  # [H, W, C] composited like colour, background 0
-    radii: Tensor  # [N] px, 3-sigma-like extent of the drawn ellipse, 0 where not drawn; no gradient
+    radii: Tensor  # [N] px, 3-sigma-like extent of the ellipse, 0 where not rendered; no gradient
     center_offsets: Tensor  # [N, 2] px, zeros added to the projected centres; `.grad` after backward: d loss / d centre
 
     @property
     def visible(self) -> Tensor:
-        """[N] bool: which Gaussians touched the image."""
+        """Gaussians that touch the image, [N] bool."""
         return self.radii > 0

@@ -1,6 +1,6 @@
 """Charts as inline SVG in the colours of the page's style sheet: lines of series, dots over time, and their keys.
 
-Matplotlib draws them. A chart is drawn in placeholder colours (PALETTE), which become the style sheet's variables, so
+Matplotlib draws them in placeholder colours (PALETTE), which become the style sheet's variables, so
 that it is readable in a light, a dark and a printed page; its background is transparent and its text stays text. An
 artist's gid becomes the class of its group.
 """

@@ -22,9 +22,9 @@ from neeco.report.charts import page_style
 
 N_FRAMES = 3  # shown
 MARGIN = 0.15  # of an image's sides, shown around it
-AXIS_SHARE = 0.2  # of a body's distance, that its axes are drawn long
+AXIS_SHARE = 0.2  # of a body's distance: length of its axes
 COLORS = ("#d62728", "#2ca02c", "#1f77b4")  # x, y, z
-N_LINES = 24  # of a shaft, drawn
+N_LINES = 24  # along a shaft
 MAX_ROWS = 10  # of choices
 CHOICES = "recording_choices.png"
 

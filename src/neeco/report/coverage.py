@@ -1,4 +1,4 @@
-"""Which states a capture holds: every degree of freedom of every instrument, by split, and where training ends."""
+"""Coverage of a capture's states: every degree of freedom of every instrument, by split, and the training range."""
 
 from __future__ import annotations
 

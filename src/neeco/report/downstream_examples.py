@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from neeco.capture.images import read_labels
 from neeco.capture.model import Capture
-from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline, overlay_parts
+from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline, overlay_parts, part_color
 from neeco.evaluation.mask_metrics import box_ious
 from neeco.files import read_json
 from neeco.report.page import MAX_WIDTH, jpeg
@@ -49,8 +49,7 @@ def example_sections(experiment: Experiment, capture: Capture, output: Path) -> 
             sections += shown
             rows += scores
     swatch = Markup('<i style="background: {}"></i>{} ').format
-    colors = [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in PART_COLORS.astype(int).tolist()]
-    names = [*zip(colors, experiment["classes"], strict=False), ("#ff0", "truth")]
+    names = [*((part_color(part), name) for part, name in enumerate(experiment["classes"], 1)), ("#ff0", "truth")]
     text = Markup('{} <span class="key">{}</span>').format(
         "Frames where synthetic images gain most over labelled frames alone, and where they gain least or lose, of one "
         "fold; under each prediction its score.",

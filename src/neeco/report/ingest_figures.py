@@ -23,16 +23,16 @@ N_SAMPLES = 12  # frames shown
 AXIS_COLORS = ("#ff5252", "#4cd964", "#4aa8ff")  # x, y, z
 MAIN_AXIS_COLOR = "#ff6bff"
 OUTLINE_COLOR = "#ffe14a"
-MIN_DEPTH_MM = 1.0  # mm: nearer points are not drawn
-AXIS_SHARE = 0.16  # of the image's width: how long the drawn frame axes are
+MIN_DEPTH_MM = 1.0  # of points that are shown
+AXIS_SHARE = 0.16  # of the image's width: length of the frame axes
 ORIGIN = np.zeros((1, 3))
-SHAFT_DIAMETERS = 30.0  # of a shaft found in video that are drawn
+SHAFT_DIAMETERS = 30.0  # length shown of a shaft found in video
 
 WIDTH, HEIGHT, MARGIN = 420, 320, 16  # of a view of the tracks, view box units
 MAX_SVG_POINTS, MAX_CANVAS_POINTS = 1500, 4000
 STRAY = 0.01  # share of the points at either end that may lie outside the view
 GAP = 4.0  # median time steps: a longer one breaks the line
-N_RAYS = 10  # cameras drawn with the direction they look in
+N_RAYS = 10  # cameras shown with their viewing direction
 LINE_COLORS = ("phase", "good", "bad")  # of the instruments; the camera's is accent
 
 
@@ -56,8 +56,8 @@ def main_axes(capture: Capture, shapes: Mapping[str, RoughShape]) -> dict[str, M
     """
     axes = {}
     for name, shape in shapes.items():
-        seen = [frame for frame in capture.frames if name in frame.state.instruments]
-        if not seen or len(shape.points) < 3:
+        showing = [frame for frame in capture.frames if name in frame.state.instruments]
+        if not showing or len(shape.points) < 3:
             continue
         middle = shape.points.mean(axis=0)
         direction = np.linalg.eigh(np.cov((shape.points - middle).T))[1][:, -1]
@@ -65,7 +65,7 @@ def main_axes(capture: Capture, shapes: Mapping[str, RoughShape]) -> dict[str, M
         ends = [middle + direction * np.quantile(along, share) for share in (0.02, 0.98)]
         if np.linalg.norm(ends[1] - ends[0]) < 1e-6:
             continue
-        if _visibility(ends[0], name, seen) > _visibility(ends[1], name, seen):
+        if _visibility(ends[0], name, showing) > _visibility(ends[1], name, showing):
             ends.reverse()
         axes[name] = MainAxis(ends[0], ends[1])
     return axes
@@ -123,7 +123,7 @@ def posed_picture(
     length: of their axes, mm; shafts: diameters in mm, of those whose z goes along a shaft that ends at their origin.
     Raises NeecoError when the image cannot be read.
     """
-    # drawn at twice the size shown, then shrunk: smooth lines
+    # at twice the size shown, then shrunk: smooth lines
     scale = 2 * MAX_WIDTH / frame.camera.width
     fx, fy, cx, cy = (scale * value for value in (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy))
     size = (2 * MAX_WIDTH, round(frame.camera.height * scale))

@@ -72,7 +72,7 @@ class Ingested:
         shown += [f"to scrub through: rerun {self.rrd}"] if self.rrd is not None else []
         for tissue, verdict in self.verdicts.items():
             first, *others = verdict.lines()
-            shown += [f"how good it is: {f'{tissue}: ' if tissue else ''}{first}", *others]
+            shown += [f"verdict: {f'{tissue}: ' if tissue else ''}{first}", *others]
         return shown
 
 

@@ -33,7 +33,7 @@ SPLITS = {  # what the usual names of splits mean
 def write_page(path: Path, template: str, **data: Any) -> Path:
     """Write one page: style, pictures, charts and data are inside it, nothing is fetched. Returns `path`.
 
-    Every page takes `title` and for its header `name`, `subtitle` and `stamps`: facts to stand beside time and version.
+    Every page takes `title` and for its header `name`, `subtitle` and `stamps`: facts shown with time and version.
     """
     page = _templates().get_template(template)
     made_at = f"{now():%Y-%m-%d %H:%M %Z}"

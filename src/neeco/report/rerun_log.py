@@ -33,7 +33,7 @@ def write_rrd(result: IngestResult, capture: Capture, path: Path) -> None:
     """Write a capture that an ingest made, and what the ingest found, into one file: `rerun FILE` shows it.
 
     In the viewer `world` has the tissue's points, the cameras with their images and what moves in them, and the
-    instruments with their rough shapes; `joints` has curves; `clocks` says how far each log is ahead. There is a
+    instruments with their rough shapes; `joints` has curves; `clocks` lists how far each log is ahead. There is a
     timeline for the video and one for each clock, of several recordings for each clock of each. Poses that were not
     registered are under `unregistered`, a world of their own. Raises NeecoError when rerun is missing, an image cannot
     be read or the file cannot be written.

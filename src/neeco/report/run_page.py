@@ -16,7 +16,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from neeco.capture.model import Capture, Frame, State
-from neeco.evaluation.image_metrics import FULL_SCALE, PART_COLORS, overlay_outline, overlay_parts
+from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, overlay_parts, part_color
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import pairs_of
 from neeco.geometry.camera import Camera
@@ -38,7 +38,7 @@ class Score(NamedTuple):
 
 
 SCORES = (
-    Score("psnr", "PSNR dB", "{:.2f}", "How close the drawn pixels are to the recorded; 30 is close, 20 is rough."),
+    Score("psnr", "PSNR dB", "{:.2f}", "Similarity of the rendered pixels to the recorded; 30 is close, 20 is rough."),
     Score("ssim", "SSIM", "{:.3f}", "Structural similarity, 1 is equal (11x11 Gaussian window, as 3DGS scores it)."),
     Score("lpips", "LPIPS", "{:.3f}", "Perceptual distance by AlexNet features (Zhang et al. 2018); 0 is equal."),
     Score("lpips_vgg", "LPIPS VGG", "{:.3f}", "The same by VGG16 features."),
@@ -47,11 +47,11 @@ SCORES = (
     Score("psnr_covered", "PSNR covered", "{:.2f}", "PSNR without the tissue that no training frame saw."),
     Score("covered_fraction", "covered", "{:.1%}", "How much of the visible tissue at least one training frame saw."),
     Score("fps", "FPS", "{:.1f}", "Posed images rendered per second on the machine that evaluated."),
-    Score("num_gaussians", "Gaussians", "{:,}", "How many Gaussians one drawing uses."),
+    Score("num_gaussians", "Gaussians", "{:,}", "Gaussians used by one rendering."),
     Score("frames", "frames", "{}", "How many frames were scored."),
 )  # fmt: skip
 KINDS = {
-    "given": "As given: drawn at the poses the capture states, tracker errors included",
+    "given": "As given: rendered at the poses the capture states, tracker errors included",
     "aligned": "Aligned: instrument and camera pose fitted to each recorded image first, the scene unchanged",
 }
 KIND_NAMES = {"given": "as given", "aligned": "aligned"}
@@ -69,7 +69,7 @@ def write_report(
     """Write `report.html` into the run folder and return its path. One file: style, pictures and curves are inside it.
 
     evaluation: what `evaluate_run` returned. synthesis_preview: an image of synthesised data to show. playable: a page
-    of its own that draws the scene, shown in a frame of this one. How many threads torch takes is the caller's to set
+    of its own that renders the scene, shown in a frame of this one. How many threads torch takes is the caller's to set
     (`open_run`). Raises NeecoError when a picture cannot be read or the page cannot be written.
     """
     rows = read_metrics(run_path / "metrics.jsonl")
@@ -111,7 +111,7 @@ def write_report(
 def frame_figures(
     evaluation: dict[str, Any], capture: Capture, scene: DrawableScene, kind: str
 ) -> list[dict[str, Any]]:
-    """For every evaluated split the best, the median and the worst frame by PSNR, drawn at the poses of `kind`.
+    """For every evaluated split the best, the median and the worst frame by PSNR, rendered at the poses of `kind`.
 
     Each has `split`, `name`, `why` (best, median, worst), `scores` (words) and `pictures`: (what it is, data URI).
     """
@@ -142,7 +142,7 @@ def _figure(
     recorded, image = frame.load_image().numpy(), drawing.image.numpy()
     pictures = [
         ("recorded image", jpeg(to_bytes(recorded))),
-        ("drawn", jpeg(to_bytes(image))),
+        ("rendered", jpeg(to_bytes(image))),
         ("difference", difference(image, recorded, frame.load_mask())),
     ]
     if drawing.parts is not None:
@@ -223,18 +223,14 @@ def _parts(evaluation: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tints(scene: DrawableScene) -> list[tuple[str, str]]:
-    """Which tint is which part."""
+    """Colour and name of every part."""
     several = len({instrument for instrument, _ in scene.label_names}) > 1
-    tints = []
-    for index, (instrument, part) in enumerate(scene.label_names):
-        name = f"{instrument} {part}" if several else part
-        red, green, blue = (int(value) for value in PART_COLORS[index % len(PART_COLORS)])
-        tints.append((f"rgb({red}, {green}, {blue})", name.replace("_", " ")))
-    return tints
+    names = [f"{instrument} {part}" if several else part for instrument, part in scene.label_names]
+    return [(part_color(part), name.replace("_", " ")) for part, name in enumerate(names, 1)]
 
 
 def _diagnostics(diagnostics: Mapping[str, Any]) -> dict[str, Any]:
-    """What the scene says about its own joints, from training data alone."""
+    """The scene's diagnostics of its own joints, from training data alone."""
     items = [(name, value, name.split(" · ")[-1] == "verdict") for name, value in _flat(diagnostics)]
     return {
         "diagnostics": [(name, _plain(value)) for name, value, is_verdict in items if not is_verdict],

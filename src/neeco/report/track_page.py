@@ -1,4 +1,4 @@
-"""The page of `neeco track`: what was found over time, how far it is trusted, and what it looks like in the frames."""
+"""The page of `neeco track`: states over time with their confidence, and labels over the frames."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ STRIP, DOUBTED = 24, 12  # frames shown: spread over the footage, and the least 
 BAND = 2.0  # standard deviations
 HOWS = {
     "begun": "begun from the given state",
-    "followed": "followed from the frame beside it",
-    "beside": "found beside where it was expected",
+    "followed": "followed from the neighbouring frame",
+    "beside": "found near where it was expected",
     "found": "found anew, anywhere",
     "lost": "not found",
 }
@@ -50,7 +50,7 @@ def write_track_page(tracked: Tracked) -> Path:
             (f"{tracked.written} of {len(records)}", f"frames trusted by {tracked.min_trust:g}"),
             (f"{median(values):.3f}", "trust, median"),
             (str(missing), "frames where nothing was found"),
-            (str(sum(record["how"] in ("beside", "found") for record in records)), "times looked for anew"),
+            (str(sum(record["how"] in ("beside", "found") for record in records)), "times searched for again"),
         ],
         hows=[[words, str(sum(record["how"] == how for record in records))] for how, words in HOWS.items()],
         charts=[chart for chart in _charts(tracked) if chart],
@@ -70,11 +70,11 @@ def _charts(tracked: Tracked) -> list[str]:
         line_chart("misfit of pixels", "s", [misfit], size=SMALL),
     ]
     for item in tracked.scene.instruments:
-        seen = [k for k, record in enumerate(records) if record["how"] != "lost"]
-        if len(seen) < 2:
+        found_rows = [k for k, record in enumerate(records) if record["how"] != "lost"]
+        if len(found_rows) < 2:
             continue
-        found = [records[k]["instruments"][item.name] for k in seen]
-        at = [times[k] for k in seen]
+        found = [records[k]["instruments"][item.name] for k in found_rows]
+        at = [times[k] for k in found_rows]
         poses = np.array([one["pose"] for one in found])
         turns = _turns(poses)
         for k, axis in enumerate("xyz"):
@@ -104,7 +104,7 @@ def _banded(title: str, times: Sequence[float], values: np.ndarray, deviations: 
 
 
 def _figure(tracked: Tracked, frame: Frame, record: dict[str, Any]) -> dict[str, Any]:
-    """One frame: its image, tinted by the label that the scene draws there."""
+    """One frame: its image, tinted by the label that the scene renders there."""
     image, trust = frame.load_image().numpy(), record["trust"]
     picture = np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)
     if record["how"] != "lost":

@@ -1,10 +1,10 @@
-"""What every deformation does: map (canonical Gaussians, state) to posed ones; hooks for training; shared pieces."""
+"""Interface of deformations, which map (canonical Gaussians, state) to posed Gaussians, with their training hooks."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,24 +14,22 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
-from neeco.raster.devices import fast_bfloat16
 from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import ArticulatedMotion, Skeleton
 from neeco.scene.method import Method
 from neeco.scene.training_session import GaussianTraining
 
-FINAL_RATE = 0.03  # of the first rate, at the end (3DGS: 0.01; runs here are shorter)
-MODULE_FLOOR = 0.3  # of the first rate: joints keep learning to the end
+FINAL_RATE = 0.03  # of the initial learning rate, at the end (3DGS: 0.01; runs here are shorter)
+MIN_MODULE_RATE = 0.3  # of the initial learning rate: joints keep learning to the end
 MEMBERSHIP = "membership"  # the per-Gaussian extra [N] in {0, 1} that `mark_moving` stores
-STILL_MM = 1e-6  # what moves less does not move
-HALF_BY_DEFAULT: Mapping[str, Any] = {"deformation.half": None}  # decided by `half_resolved` where training starts
-MARKING_STRIDE = 4  # recorded states between those that moving Gaussians are found from
+MIN_MOTION_MM = 1e-6  # a Gaussian that moves less is static
+MARKING_STRIDE = 4  # every fourth recorded state is used to find moving Gaussians
 
 
 @dataclass(frozen=True)
 class Posed:
-    """Geometry in the world frame; colour and opacity stay canonical (the paper never deforms opacity)."""
+    """Posed geometry in the world frame; colour and opacity stay canonical (the paper never deforms opacity)."""
 
     means: Tensor  # [N, 3] mm
     quats: Tensor  # [N, 4] wxyz
@@ -41,24 +39,16 @@ class Posed:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """What training may perturb on purpose; drawing never does. A method that perturbs more has a subclass.
+    """Deliberate perturbation of a training step; rendering never perturbs. A method that perturbs more has a subclass.
 
-    `state_noise`: standard deviation added to the encoded state, or to the encoded time of a method that knows the
-    state by its time (the paper's compensation). Normal numbers come from torch's own generator.
+    `state_noise`: standard deviation added to the encoded state, or to the encoded time of a method that encodes the
+    time (the paper's compensation). Normal numbers come from torch's own generator.
     """
 
     state_noise: float = 0.0
 
 
 UNPERTURBED = Perturbation()
-
-
-def half_resolved(settings: Any, begun: Any | None) -> Any:
-    """A network's `settings` with `half`, where left open, as the run has it that was `begun` with such settings, or as
-    this processor is fast."""
-    if settings.half is not None:
-        return settings
-    return replace(settings, half=fast_bfloat16() if begun is None else begun.half)
 
 
 @dataclass(frozen=True)
@@ -78,9 +68,9 @@ class Deformation(nn.Module, Method):
     "instrument", per instrument. `extra_rates` are Adam's learning rates of the per-Gaussian parameters that the method
     adds (`initial_extras`) by name; an extra without one is not learned.
 
-    `warm_up` is the share of the training in [0, 1) over which the deformation is off: training then keeps its
-    parameters and sets `warming_up`, which lets `pose` leave out what would change nothing. Before iteration
-    `start_iteration` training only keeps the parameters.
+    `warm_up` is the share of the training in [0, 1) over which the deformation is off: training then freezes its
+    parameters and sets `warming_up`, so that `pose` can skip the network. Before iteration `start_iteration` training
+    only freezes the parameters.
 
     Training calls the hooks of any method: `fit_ranges` and `initial_extras`, then `begin`, in every step `perturb`,
     `training_channels` and `regularisation`, after it `between_steps`, where density is controlled `prune_mask`, and at
@@ -107,94 +97,95 @@ class Deformation(nn.Module, Method):
         cls.motion = vars(cls).get("motion", Deformation.motion)  # type: ignore[method-assign]
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
-        """Posed geometry of `canonical` in `state`."""
+        """Return the posed geometry of `canonical` in `state`."""
         raise NotImplementedError
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
-        """Soft membership [N, len(label_names)] in [0, 1]; what is left to 1 is tissue."""
+        """Return the soft membership [N, len(label_names)] in [0, 1]; the remainder to 1 is tissue."""
         return canonical.means.new_zeros(len(canonical), len(self.label_names))
 
     def deltas(self, canonical: CanonicalGaussians, state: State) -> Deltas:
-        """Change from canonical to posed."""
+        """Return the change from canonical to posed."""
         posed = self.pose(canonical, state)
         quats = nn.functional.normalize(posed.quats, dim=-1) - nn.functional.normalize(canonical.quats, dim=-1)
         return Deltas(posed.means - canonical.means, quats, posed.scales - canonical.log_scales.exp())
 
     def keypoints(self, state: State) -> dict[str, dict[str, Tensor]]:
-        """Named points [3] mm, world frame, per instrument; empty where the deformation knows none."""
+        """Return named points [3] mm, world frame, per instrument; empty where the deformation has none."""
         return {}
 
     def skeleton(self) -> Skeleton:
-        """Pairs of keypoints' names that a line joins."""
+        """Return the pairs of keypoint names that a line joins."""
         return ()
 
     def motion(self, canonical: CanonicalGaussians) -> ArticulatedMotion | None:
-        """How Gaussians move, where joints say all of it; None otherwise. Subclasses do not inherit it: they may pose
-        otherwise."""
+        """Return the articulation where it determines all motion; None otherwise. Subclasses do not inherit it: they
+        may pose differently."""
         return None
 
     @classmethod
     def combined(cls, deformations: Sequence[Deformation]) -> Deformation:
-        """One deformation of the instruments of several of this method, in their order."""
+        """Return one deformation of the instruments of several deformations of this method, in their order."""
         raise NotImplementedError
 
     def fit_extras(self, extras: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The per-Gaussian parameters of the method, of a deformation that was combined into this one, in this one's
-        shapes."""
+        """Return the method's per-Gaussian parameters, of a deformation that was combined into this one, in the shapes
+        of this one."""
         return {}
 
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
-        """Take scales from the recorded states and the points [P, 3] mm, once before training; nothing by default."""
+        """Set ranges by the recorded states and the points [P, 3] mm, once before training; nothing by default."""
 
     def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
-        """The per-Gaussian parameters [N, ...] of its own that the first Gaussians, the tissue's, begin with, by name;
-        density control carries them along."""
+        """Return the method's per-Gaussian parameters [N, ...] of the initial Gaussians, the tissue's, by name; density
+        control carries them along."""
         return {}
 
     def begin(self, training: GaussianTraining) -> None:
-        """Once, before the first step of a new scene (not when a run goes on); may replace the canonical Gaussians."""
+        """Called once before the first step of a new scene (not on resume); may replace the canonical Gaussians."""
 
     def perturb(
         self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator
     ) -> Perturbation:
-        """What this training step perturbs, beside what the schedule does: `perturbation`, or a subclass."""
+        """Return the perturbation of this training step: the schedule's `perturbation`, or a subclass with more."""
         return perturbation
 
     def training_channels(self, canonical: CanonicalGaussians, iteration: int) -> Tensor | None:
-        """Extra channels [N, C] that this step draws for `regularisation`; None: none."""
+        """Return extra channels [N, C] that this step renders for `regularisation`; None: none."""
         return None
 
     def prune_mask(self, canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> Tensor | None:
-        """[N] bool: Gaussians that density control removes whatever their opacity; None: none. `cameras` are the
-        training frames'."""
+        """Return the Gaussians, [N] bool, that density control removes whatever their opacity; None: none. `cameras`
+        are those of the training frames."""
         return None
 
     def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor | None:
-        """A term added to the loss of every step, a scalar, or None; not asked during the warm-up."""
+        """Return a scalar that is added to the loss of every step, or None; not called during the warm-up."""
         return None
 
     def learning_rates(self, progress: float) -> dict[str, float]:
-        """Adam learning rate of each of this module's parameters, by name; 0 freezes one. `progress` in [0, 1]."""
+        """Return Adam's learning rate of each of this module's parameters, by name; 0 freezes one. `progress` in [0,
+        1]."""
         return {}
 
     def between_steps(self, training: GaussianTraining, before: float) -> None:
-        """After every step; `before` is the progress before it: for what is due at a share of the run. A step may be
-        several iterations (`batch_size`)."""
+        """Called after every step; `before` is the progress before it, for work that is due at a share of the run. A
+        step may be several iterations (`batch_size`)."""
 
     def finish(self, training: GaussianTraining) -> None:
-        """After the last step; may replace the canonical Gaussians."""
+        """Called after the last step; may replace the canonical Gaussians."""
 
 
 class LabelledByMotion(Deformation):
-    """One label column, "instrument", for all instruments together (none without any): the Gaussians that move
-    once all is learned."""
+    """Deformation with one label column, "instrument", for all instruments together (none without any): the Gaussians
+    that move in the trained scene."""
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: Any = None) -> None:
         super().__init__(instruments, settings)
         self.label_names = (("+".join(i.name for i in instruments), "instrument"),) if instruments else ()
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
-        """The moving Gaussians [N, len(label_names)] as found by `finish`; nothing before that."""
+        """Return the moving Gaussians [N, len(label_names)] found by `finish`; zeros before that."""
         if MEMBERSHIP not in canonical.extras or not self.label_names:
             return super().label_channels(canonical)
         return canonical.extras[MEMBERSHIP][:, None]
@@ -207,19 +198,19 @@ class LabelledByMotion(Deformation):
 
 @torch.no_grad()
 def mark_moving(deformation: Deformation, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
-    """Store which Gaussians move over the recorded states [N] in {0, 1}: spread of d_mu above Otsu's threshold of its
-    logarithm."""
+    """Store which Gaussians move over the recorded states, [N] in {0, 1}: those whose spread of d_mu exceeds Otsu's
+    threshold of its logarithm."""
     moved = torch.stack([deformation.deltas(canonical, state).means for state in states])  # [F, N, 3]
     spread = (moved - moved.mean(0)).square().sum(-1).mean(0).sqrt()
-    size = spread.clamp_min(STILL_MM).log()
-    evaluated = spread > STILL_MM  # those behind the gate would be a second cluster of their own
+    size = spread.clamp_min(MIN_MOTION_MM).log()
+    evaluated = spread > MIN_MOTION_MM  # those behind the gate would be a second cluster of their own
     threshold = otsu(size[evaluated]) if evaluated.any() else math.inf
     return canonical.with_extras(**{MEMBERSHIP: (size > threshold).float()})
 
 
 def otsu(values: Tensor, bins: int = 256) -> float:
-    """Threshold that splits `values` [N] into two classes of greatest between-class variance (Otsu 1979); the middle
-    of the gap between classes that lie apart."""
+    """Return the threshold that splits `values` [N] into two classes of maximum between-class variance (Otsu 1979); the
+    middle of the gap between separate classes."""
     low, high = float(values.min()), float(values.max())
     if not high > low:
         return high
@@ -233,73 +224,18 @@ def otsu(values: Tensor, bins: int = 256) -> float:
     return float(edges[1 + round(float(best.mean()))])
 
 
-class RecordedTimes(nn.Module):
-    """First time and duration (s) of the training frames, and their mean interval as a share of the duration."""
-
-    start: Tensor
-    duration: Tensor
-    interval: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("start", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("duration", torch.ones((), dtype=torch.float64))
-        self.register_buffer("interval", torch.ones(()))
-
-    def fit(self, states: list[State]) -> None:
-        """Take all three from the training frames' states."""
-        times = [state.time for state in states]
-        self.start.fill_(min(times))
-        self.duration.fill_(max(max(times) - min(times), 1e-9))
-        self.interval.fill_(1 / len(times))
-
-    def share(self, state: State) -> Tensor:
-        """The time of `state`, a scalar: 0 and 1 at the first and last training frame."""
-        return ((state.time - self.start) / self.duration).float()
-
-
-def octave_angles(values: Tensor, count: int, unit: float = math.pi) -> Tensor:
-    """Angles [..., D, L] rad, unit * 2^k * x for k < L = `count`, of values [..., D]."""
-    return values[..., None] * (unit * 2.0 ** torch.arange(count, dtype=values.dtype, device=values.device))
-
-
-def octave_weights(opened: Tensor, count: int) -> Tensor:
-    """Weight [L] of each octave k < L = `count`: (1 - cos(pi clamp(opened - k, 0, 1))) / 2 (Nerfies eq. 5)."""
-    octaves = torch.arange(count, device=opened.device)
-    return (1 - torch.cos(math.pi * (opened - octaves).clamp(0, 1))) / 2
-
-
-def encode(values: Tensor, count: int, unit: float = math.pi) -> Tensor:
-    """gamma: [..., D] to [..., 2 D L]: the sines of every coordinate's L = `count` octaves, then the cosines."""
-    angles = octave_angles(values, count, unit).flatten(-2)
-    return torch.cat([angles.sin(), angles.cos()], -1)
-
-
 def log_linear(first: float, last: float, progress: float) -> float:
-    """From `first` to `last` along a straight line of their logarithms (3DGS's learning rates); `progress` in
-    [0, 1]."""
+    """Interpolate from `first` to `last` linearly in their logarithms (3DGS's learning rates); `progress` in [0, 1]."""
     return first * math.exp(math.log(last / first) * min(1.0, progress))
 
 
 def floored_decay(progress: float) -> float:
-    """What is left of a learning rate that falls as the positions' does, but not below MODULE_FLOOR."""
-    return max(log_linear(1.0, FINAL_RATE, progress), MODULE_FLOOR)
-
-
-def check_warm_up(share: float) -> None:
-    """Raises NeecoError when `share` is not one of the training in [0, 1)."""
-    if not 0 <= share < 1:
-        raise NeecoError(f"deformation.warm_up: {share} is not a share of the training in [0, 1)")
-
-
-def robust_bounds(means: Tensor) -> tuple[Tensor, Tensor]:
-    """Centre [3] and greatest half extent [] mm of points [P, 3], without the outermost hundredth at either end."""
-    low, high = means.quantile(0.01, 0), means.quantile(0.99, 0)
-    return (low + high) / 2, (high - low).max() / 2
+    """Return the factor of a learning rate that decays as the positions' does, but not below MIN_MODULE_RATE."""
+    return max(log_linear(1.0, FINAL_RATE, progress), MIN_MODULE_RATE)
 
 
 def state_of(instrument: Instrument, state: State) -> InstrumentState:
-    """What `state` says of `instrument`. Raises NeecoError when the instrument or one of its joints is missing."""
+    """Return the state of `instrument`. Raises NeecoError when the instrument or one of its joints is missing."""
     if instrument.name not in state.instruments:
         raise NeecoError(f"state: instrument {instrument.name!r} is missing; give its pose and joints")
     given = state.instruments[instrument.name]

@@ -1,11 +1,12 @@
-"""A learned scene as the rest of the program sees it, whether it is made of Gaussians or a field."""
+"""Interface of learned scenes, whether of Gaussians or a radiance field, and the recording that they were learned
+from."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -18,18 +19,18 @@ from neeco.geometry.lens import Lens
 from neeco.raster.types import Rendering
 
 Skeleton = tuple[tuple[str, str], ...]  # pairs of keypoints' names that a line joins
-FAR_OUT = 2.0  # times the recorded range beyond it, no joint without stated limits goes
-BESIDE = 4  # training frames beside one of which a joint is not known
+LIMIT_RANGES = 2.0  # recorded ranges beyond the recorded values that limit a joint without stated limits
+N_NEIGHBOURS = 4  # training frames from which an unrecorded joint is interpolated
 
 
 @dataclass(frozen=True)
 class JointMotion:
-    """An axis about which a reading turns, or along which it slides, what it moves; instrument frame."""
+    """Axis about which a reading turns its links, or along which it slides them; instrument frame."""
 
     pivot: Tensor  # [3] mm
     axis: Tensor  # [3] unit
     reading: str
-    slides: bool = False
+    slides: bool = False  # prismatic
 
 
 @dataclass(frozen=True)
@@ -40,22 +41,24 @@ class Recorded:
     splits: tuple[str, ...] = ()
     states: tuple[State, ...] = ()
     cameras: tuple[Camera, ...] = ()
-    lens: Lens | None = None  # whose distortion is gone from the images; None: not known
+    _: KW_ONLY
+    lens: Lens | None = None  # whose distortion was removed from the images; None: not known
     scale: float = 1.0  # of the cameras' images, at which the scene was learned
-    still: bool = False  # the cameras stood still
-    tissues: tuple[str, ...] = ()  # of several that were recorded, each in a world of its own, as states name them
+    still: bool = False  # whether the camera did not move
+    tissues: tuple[str, ...] = ()  # names, where several were recorded, each in its own world
 
     @classmethod
     def of(
         cls,
         frames: Sequence[Frame],
         instruments: tuple[Instrument, ...],
+        *,
         lens: Lens | None = None,
         scale: float = 1.0,
         still: bool = False,
         tissues: Sequence[Tissue] = (),
     ) -> Recorded:
-        """What `frames` record of `instruments`: only these, and of each only the joints named."""
+        """Return the recording of `instruments` in `frames`: only these, and of each only its named joints."""
         states = []
         for frame in frames:
             chosen = {}
@@ -66,22 +69,22 @@ class Recorded:
             states.append(State(chosen, frame.state.time, frame.state.tissue))
         names, splits = tuple(frame.name for frame in frames), tuple(frame.split for frame in frames)
         cameras, named = tuple(frame.camera for frame in frames), tuple(tissue.name for tissue in tissues)
-        return cls(names, splits, tuple(states), cameras, lens, scale, still, named)
+        return cls(names, splits, tuple(states), cameras, lens=lens, scale=scale, still=still, tissues=named)
 
     def over(self, tissue: str) -> Recorded:
-        """The training frames of one of several tissues."""
+        """Return the training frames of one of several tissues."""
         rows = [row for row, state in enumerate(self.states) if state.tissue == tissue]
-        names, splits = tuple(self.names[row] for row in rows), tuple(self.splits[row] for row in rows)
-        states, cameras = tuple(self.states[row] for row in rows), tuple(self.cameras[row] for row in rows)
-        return replace(self, names=names, splits=splits, states=states, cameras=cameras)
+        columns = ("names", "splits", "states", "cameras")
+        chosen: dict[str, Any] = {name: tuple(getattr(self, name)[row] for row in rows) for name in columns}
+        return replace(self, **chosen)
 
     def by_tissue(self) -> tuple[Recorded, ...]:
-        """The training frames of each tissue; all of them where there is one."""
+        """Return the training frames of each tissue; all of them where there is one."""
         return tuple(self.over(tissue) for tissue in self.tissues) or (self,)
 
     def completed(self, capture: Capture, instruments: Sequence[Instrument]) -> Capture:
-        """`capture`, of the scene's `instruments`, with the values of joints that neither recording states as they were
-        found at the training frames nearest to each frame."""
+        """Return `capture`, of the scene's `instruments`, with the joints that neither recording states, interpolated
+        from the training frames nearest to each frame."""
         unstated = {item.name: set(item.unrecorded) for item in capture.instruments}
         found = [
             replace(item, unrecorded=tuple(joint for joint in item.unrecorded if joint in unstated[item.name]))
@@ -98,8 +101,8 @@ class Recorded:
         return replace(capture, frames=tuple(frames))
 
     def with_unrecorded(self, state: State, instruments: Sequence[Instrument]) -> State:
-        """A state with the unrecorded joints of `instruments` as they were found at the training frames nearest to it
-        by pose and time, all of one tissue."""
+        """Return `state` with the unrecorded joints of `instruments`, interpolated from the training frames nearest to
+        it by pose and time, all of one tissue."""
         if not any(item.unrecorded for item in instruments) or not self.states:
             return state
         filled = dict(state.instruments)
@@ -108,7 +111,7 @@ class Recorded:
                 continue
             far = self._poses[item.name].distances(state)
             far = far + np.abs([state.time - other.time for other in self.states])
-            nearest = np.argsort(far, kind="stable")[:BESIDE]
+            nearest = np.argsort(far, kind="stable")[:N_NEIGHBOURS]
             shares = 1 / (far[nearest] + 1e-6)
             found = {}
             for joint in item.unrecorded:
@@ -123,20 +126,20 @@ class Recorded:
         return {name: RecordedStates(self.states, [name], joints=False) for name in self.states[0].instruments}
 
     def with_limits(self, instruments: Sequence[Instrument]) -> tuple[Instrument, ...]:
-        """The instruments, joints without stated limits limited to FAR_OUT times the recorded range beyond it."""
+        """Return the instruments with limits for joints that state none: LIMIT_RANGES recorded ranges beyond the
+        recorded values."""
         limited = []
         for item in instruments:
             joints = dict(item.joints)
             for joint in (name for name, limits in joints.items() if limits is None and self.states):
                 values = [float(state.instruments[item.name].joints[joint]) for state in self.states]
-                room = FAR_OUT * (max(values) - min(values))
-                joints[joint] = (min(values) - room, max(values) + room) if room else None
+                margin = LIMIT_RANGES * (max(values) - min(values))
+                joints[joint] = (min(values) - margin, max(values) + margin) if margin else None
             limited.append(replace(item, joints=joints))
         return tuple(limited)
 
     def as_learned(self, camera: Camera) -> Camera:
-        """The camera, told what size of images was learned from, unless it says so itself: the focal length of theirs
-        that is nearest its own."""
+        """Return the camera with the focal length of the training images that is nearest its own, unless it has one."""
         if camera.learned_fx is not None:
             return camera
         least, most = self._learned_focal
@@ -145,17 +148,16 @@ class Recorded:
 
     @cached_property
     def _learned_focal(self) -> tuple[float, float]:
-        """Least and largest focal length, px, of the images that were learned from; without any, all lie between."""
+        """Smallest and largest focal length, px, of the training images; 0 and infinity without any."""
         focal = [self.scale * camera.fx for camera in self.cameras]
         return min(focal, default=0.0), max(focal, default=math.inf)
 
 
 @dataclass(frozen=True)
 class ArticulatedMotion:
-    """All that posing takes where bodies move rigidly with their instruments and joints move their links, for renderers
-    other than this program's."""
+    """Articulation of a scene whose Gaussians move rigidly with instruments and links, for other renderers."""
 
-    log_scales: Tensor  # [N, 3], as drawn
+    log_scales: Tensor  # [N, 3], as rendered
     amounts: Tensor  # [N, A, 2] rad or mm by which axis a moves a Gaussian: at a reading of 0, and per unit of it
     axes: tuple[tuple[JointMotion, ...], ...]  # of every moving instrument, in the order in which they move
 
@@ -169,15 +171,15 @@ class DrawableScene(Protocol):
     instruments: tuple[Instrument, ...]
     recorded: Recorded
     diagnostics: dict[str, Any]
-    has_gaussians: bool  # False: nothing to rasterise, pose or label; a drawing takes seconds
+    has_gaussians: bool  # False: nothing to rasterise, pose or label; an image takes seconds
 
     @property
     def casts_shadow(self) -> bool:
-        """Is the instruments' shadow drawn as one, so that none is learned as a faint part of them?"""
+        """Whether the instruments' shadow is rendered as a shadow, so that none is learned as a faint part of them."""
 
     @property
     def label_threshold(self) -> float | None:
-        """Share of a pixel from which its label is an instrument's; None: by its shadows."""
+        """Share of a pixel from which its label is an instrument's; None: chosen by whether it casts a shadow."""
 
     @property
     def label_names(self) -> Sequence[tuple[str, str]]:
@@ -185,23 +187,24 @@ class DrawableScene(Protocol):
 
     @property
     def num_gaussians(self) -> int | None:
-        """How many Gaussians one drawing uses; None: the scene has none."""
+        """Number of Gaussians; None: the scene has none."""
 
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
-        """`state` as the recorded `camera` sees it; `labels`: with label channels, where the scene has any."""
+        """Render `state` as the recorded `camera` observes it; `labels`: with label channels, where the scene has
+        any."""
 
     def motion(self) -> ArticulatedMotion | None:
-        """How the Gaussians move, where joints say all of it; None otherwise."""
+        """Return the articulation where it determines all motion; None otherwise."""
 
     def torch_threads(self) -> AbstractContextManager[None]:
-        """Use as many of torch's threads as pay where the scene is drawn."""
+        """Use the number of torch's threads that renders the scene fastest."""
 
     @property
     def settings(self) -> Any:
-        """The method's own."""
+        """The method's own settings."""
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """(tensors, JSON-able fields) that a file needs beside the state of its modules."""
+        """Return (tensors, JSON-able fields) that a file needs in addition to the state of its modules."""
 
     def named_parameters(self) -> Any: ...
     def named_buffers(self) -> Any: ...

@@ -1,4 +1,7 @@
-"""The learned model: canonical Gaussians, the deformation that poses them, and the light they are seen in."""
+"""The learned model: canonical Gaussians, the deformation that poses them, and their light.
+
+`GaussianScene.at` is where a state, poses and joints, becomes posed Gaussians.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,8 @@ from neeco.scene.drawable import ArticulatedMotion, DrawableScene, Recorded, Ske
 from neeco.scene.method import Stored
 from neeco.scene.visibility import VISIBILITY, measure_visibility, unobserved_share
 
-LAMPS = 3  # at most, as many as a laparoscope has light guides
-SHADOW_WIDTH = 0.01  # slope, at the start
+MAX_LAMPS = 3  # as many as a laparoscope has light guides
+INITIAL_SHADOW_WIDTH = 0.01  # slope
 CANONICAL_SHAPES = {  # of one Gaussian
     "means": (3,),
     "quats": (4,),
@@ -37,15 +40,15 @@ CANONICAL_SHAPES = {  # of one Gaussian
 
 
 class GaussianScene(nn.Module):
-    """A learned scene of Gaussians: `at` poses them in a state, for every method; `render` draws them.
+    """A learned scene of Gaussians: `at` poses them in a state, whatever the method; `render` renders them.
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
-    in mm, log scale about `center`), applied to every instrument pose; zero unless refined. Of several tissues each has
-    one, [T, 7], which is always refined: the instrument's shape takes on the constant error of one world, but not of
-    several. `falloff` (tissue, instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`,
+    in mm, log scale about `center`), applied to every instrument pose; zero unless refined. Several tissues have one
+    each, [T, 7], always refined: an instrument's shape absorbs the constant error of one world, but not of several.
+    `falloff` (tissue, instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`,
     `shadow_strengths` (0: no such lamp) and `shadow_width` the instruments' shadows on the tissue (see `Shadow`).
     `background` in [0, 1] is the grey behind everything. `label_threshold` in (0, 1) is the share of a pixel from which
-    it is labelled an instrument; None: by what shadows the scene draws (see `neeco.labels.labellers`).
+    it is labelled an instrument; None: chosen by whether the scene renders shadows (see `neeco.labels.labellers`).
     """
 
     has_gaussians = True
@@ -76,25 +79,25 @@ class GaussianScene(nn.Module):
         self.registration = nn.Parameter(torch.zeros(*center.shape[:-1], 7))
         self.falloff = nn.Parameter(torch.zeros(2))
         self.vignette = nn.Parameter(torch.zeros(2))
-        self.shadow_offsets = nn.Parameter(torch.zeros(LAMPS, 3))
-        self.shadow_strengths = nn.Parameter(torch.zeros(LAMPS))
-        self.shadow_width = nn.Parameter(torch.full((), SHADOW_WIDTH))
+        self.shadow_offsets = nn.Parameter(torch.zeros(MAX_LAMPS, 3))
+        self.shadow_strengths = nn.Parameter(torch.zeros(MAX_LAMPS))
+        self.shadow_width = nn.Parameter(torch.full((), INITIAL_SHADOW_WIDTH))
         self._shines = CachedPredicate(lambda strengths: (strengths > 0).any())
         self._corrects = CachedPredicate(lambda registration: registration.any())
 
     @property
     def settings(self) -> Any:
-        """The method's own."""
+        """The method's own settings."""
         return self.deformation.settings
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianScene:
-        """What `to` calls: the canonical Gaussians go with the modules."""
+        """Move the canonical Gaussians with the modules (called by `to`)."""
         super()._apply(fn, recurse)
         self.canonical = self.canonical.map(fn)
         return self
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """(tensors, JSON-able fields) that `load` makes the scene of, beside the state of its modules."""
+        """Return (tensors, JSON-able fields) from which, with the state of its modules, `load` makes the scene."""
         canonical = self.canonical
         return {f"canonical.{name}": tensor for name, tensor in canonical.tensors().items()}, {
             "counts": list(canonical.counts),
@@ -105,7 +108,7 @@ class GaussianScene(nn.Module):
 
     @classmethod
     def load(cls, deformation: Deformation, stored: Stored) -> GaussianScene:
-        """The inverse of `pack`. Raises ValueError or LookupError where what is stored does not fit."""
+        """Return the scene that `pack` stored. Raises ValueError or LookupError where it does not fit."""
         header = stored.header
         prefix = "canonical."
         canonical = _canonical(
@@ -131,10 +134,10 @@ class GaussianScene(nn.Module):
         return scene
 
     def at(self, state: State, perturbation: Perturbation = UNPERTURBED) -> Gaussians:
-        """Gaussians posed in `state`, float32. Gradients reach instrument poses that require them.
+        """Return the Gaussians posed in `state`, float32. Gradients reach instrument poses that require them.
 
-        Those of other tissues than the state's have opacity 0. Raises NeecoError when the state lacks an instrument or
-        joint that the scene has, or names no tissue of it where there are several.
+        Gaussians of other tissues than the state's have opacity 0. Raises NeecoError when the state lacks an instrument
+        or joint that the scene has, or names no tissue of it where there are several.
         """
         canonical, shown = self.canonical, self._shown(state)
         posed = self.deformation.pose(canonical, self.registered(state), perturbation)
@@ -153,14 +156,14 @@ class GaussianScene(nn.Module):
         )
 
     def _shown(self, state: State) -> Tensor | None:
-        """[N] float, 0 for the Gaussians of other tissues than the state's; None: there is one. Raises NeecoError."""
+        """Return 0 for Gaussians of other tissues than the state's, else 1, [N] float; None: there is one tissue."""
         index, canonical = self._tissue_index(state), self.canonical
         if index is None:
             return None
         return (canonical.of_tissue(index) | canonical.of_instruments).to(canonical.means.dtype)
 
     def _tissue_index(self, state: State) -> int | None:
-        """Which of several tissues the state names; None: there is one. Raises NeecoError for one that there is not."""
+        """Return the index of the state's tissue; None: there is one. Raises NeecoError for an unknown name."""
         names = self.recorded.tissues
         if state.tissue not in (names or (None,)) and (len(names) > 1 or state.tissue is not None):
             known = f"name one of {', '.join(names)}" if names else "it has one, without a name"
@@ -168,7 +171,7 @@ class GaussianScene(nn.Module):
         return names.index(str(state.tissue)) if len(names) > 1 else None
 
     def over(self, tissue: str) -> GaussianScene:
-        """The scene of one of several tissues alone, with what was recorded over it."""
+        """Return the scene of one of several tissues, with the frames recorded over it."""
         index = self.recorded.tissues.index(tissue)
         chosen = self.canonical.of_tissue(index) | self.canonical.of_instruments
         counts = (int(self.canonical.of_tissue(index).sum()), *self.canonical.counts[1:])
@@ -184,21 +187,21 @@ class GaussianScene(nn.Module):
         return alone
 
     def visibility(self) -> Tensor:
-        """[N, 12] how well the training frames observed each Gaussian (see `neeco.scene.visibility`). Measured at the
-        end of training; otherwise here, once."""
+        """Return the visibility [N, 12] of each Gaussian in the training frames (see `neeco.scene.visibility`),
+        measured at the end of training, or else here once."""
         if VISIBILITY not in self.canonical.extras:
             measured = measure_visibility(self.canonical, self.recorded, self.at)
             self.canonical = self.canonical.with_extras(**{VISIBILITY: measured})
         return self.canonical.extras[VISIBILITY]
 
     def unobserved(self, posed: Gaussians, camera: Camera) -> Tensor:
-        """[N] in [0, 1] how far each posed Gaussian, as `camera` sees it, is unobserved: seen by no training frame, or
-        not from about there."""
+        """Return the share [N] in [0, 1] by which each posed Gaussian, viewed by `camera`, is unobserved: by any
+        training frame, or from a similar direction."""
         return unobserved_share(self.visibility(), posed, camera)
 
     @property
     def casts_shadow(self) -> bool:
-        """Was a lamp beside the lens found, and is there anything that casts its shadow?"""
+        """Whether a lamp next to the lens was found, and there are instruments to cast its shadow."""
         return self._shines(self.shadow_strengths) and len(self.canonical) > self.canonical.counts[0]
 
     def _shadow(self) -> Shadow | None:
@@ -208,13 +211,13 @@ class GaussianScene(nn.Module):
         return Shadow(self.canonical.of_instruments, self.shadow_offsets, strengths, self.shadow_width)
 
     def registered(self, state: State) -> State:
-        """`state` with the learned tracker-to-world correction applied to its poses.
+        """Return `state` with the learned tracker-to-world correction applied to its poses.
 
         Raises NeecoError for poses that are not rigid and joints far beyond their limits (see `State.check`).
         """
         state.check(self.instruments, fitted=True)
         registration = self.registration
-        # a tensor on the device "meta" holds no numbers to ask
+        # a tensor on the device "meta" has no values to test
         corrects = registration.requires_grad or registration.is_meta or self._corrects(registration)
         if not state.instruments or not corrects:
             return state
@@ -233,21 +236,22 @@ class GaussianScene(nn.Module):
         return dataclasses.replace(state, instruments=moved)
 
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
-        """`state` as the recorded `camera` sees it, differentiable; `labels`: with label channels, where it has any."""
+        """Render `state` as the recorded `camera` observes it, differentiable; `labels`: with label channels, if
+        any."""
         channels = self.label_channels() if labels and self.label_names else None
         return rasterize(self.at(state), camera, channels=channels)
 
     def motion(self) -> ArticulatedMotion | None:
-        """How the Gaussians move, where joints say all of it; None otherwise."""
+        """Return the articulation where it determines all motion; None otherwise."""
         return self.deformation.motion(self.canonical)
 
     def torch_threads(self) -> AbstractContextManager[None]:
-        """As many of torch's threads as pay where the scene is drawn."""
+        """Use the number of torch's threads that renders the scene fastest."""
         return self.deformation.torch_threads()
 
     @property
     def num_gaussians(self) -> int:
-        """How many Gaussians one drawing uses."""
+        """Number of Gaussians."""
         return len(self.canonical)
 
     @property
@@ -256,19 +260,19 @@ class GaussianScene(nn.Module):
         return self.deformation.label_names
 
     def label_channels(self) -> Tensor:
-        """Soft membership [N, L] in [0, 1] of each Gaussian; what is left to 1 is tissue."""
+        """Return the soft membership [N, L] in [0, 1] of each Gaussian; the remainder to 1 is tissue."""
         return self.deformation.label_channels(self.canonical)
 
     def deltas(self, state: State) -> Deltas:
-        """How each Gaussian changes from canonical to `state`."""
+        """Return the change of each Gaussian from canonical to `state`."""
         return self.deformation.deltas(self.canonical, self.registered(state))
 
     def keypoints(self, state: State) -> dict[str, dict[str, Tensor]]:
-        """Named 3D points [3] mm, world frame, per instrument."""
+        """Return named 3D points [3] mm, world frame, per instrument."""
         return self.deformation.keypoints(self.registered(state))
 
     def skeleton(self) -> Skeleton:
-        """Pairs of keypoints' names that a line joins."""
+        """Return the pairs of keypoint names that a line joins."""
         return self.deformation.skeleton()
 
 
@@ -289,8 +293,7 @@ def require_gaussians(scene: DrawableScene, asked_by: str) -> GaussianScene:
 
 
 def over_one(scene: DrawableScene, tissue: str | None) -> DrawableScene:
-    """The scene over one tissue: that of this name, else the first; as it is where it has one. Raises NeecoError for a
-    name that is none of its."""
+    """Return the scene over the tissue of this name, or the first of several. Raises NeecoError for an unknown name."""
     names = scene.recorded.tissues
     if tissue is not None and tissue not in names:
         known = f"its tissues are {', '.join(names)}" if names else "it has one tissue, without a name"
@@ -308,7 +311,7 @@ def one_tissue(scene: DrawableScene, asked_by: str) -> None:
 
 
 def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:
-    """Of the Gaussians of the tissue and of each instrument; a scene that knows no instrument may have any bodies."""
+    """Return the number of Gaussians per body. Raises ValueError where they do not fit; without instruments all do."""
     fits = instruments == 0 or len(counts) in (1, 1 + instruments)
     if not fits or not all(isinstance(count, int) and count >= 0 for count in counts):
         raise ValueError(f"counts of {len(counts)} bodies do not fit {instruments} instruments")
@@ -316,7 +319,7 @@ def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:
 
 
 def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
-    """The Gaussians. Raises ValueError for shapes, types and numbers that do not fit."""
+    """Return the Gaussians. Raises ValueError for shapes, types and numbers that do not fit."""
     if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
         raise ValueError(f"{missing[0]} is missing")
     for name, tensor in tensors.items():

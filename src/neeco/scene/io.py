@@ -1,4 +1,4 @@
-"""Scenes on disk: one safetensors file, complete in itself."""
+"""Scenes on disk: one self-contained safetensors file."""
 
 from __future__ import annotations
 
@@ -29,15 +29,16 @@ from neeco.scene.method_registry import method_class, method_settings
 from neeco.settings import plain
 
 SCHEMA = "neeco-scene/2"
-OLD_SCHEMA = "neeco-scene/1"  # read as scenes without shadows, with readings counted from zero
-# tensors of modules that it lacks
+OLD_SCHEMA = "neeco-scene/1"  # read as scenes without shadows, with readings relative to zero
+INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height", "near")  # of a recorded camera, in the order of the file
+# tensors of modules that OLD_SCHEMA lacks
 ADDED = {"shadow_offsets", "shadow_strengths", "shadow_width", "middle", "closed", "radius", "tips"}
 MAX_REASON = 200  # characters of an error's message
 MAX_PIXELS = 2**26  # of a recorded image
-MAX_NUMBER = 1e9  # mm, rad, s or px: what is more was not recorded
-# what reading a damaged file raises; endless nesting is a RuntimeError
+MAX_NUMBER = 1e9  # mm, rad, s or px: larger numbers are damage
+# errors that reading a damaged file raises; endless nesting is a RuntimeError
 DAMAGED = (SafetensorError, OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, OverflowError)
-HEADER = {  # what every scene's header holds, whatever its method
+HEADER = {  # fields of every scene's header, whatever its method
     "method": str,
     "diagnostics": {},
     "deformation": {},
@@ -47,7 +48,7 @@ HEADER = {  # what every scene's header holds, whatever its method
 
 
 def save_scene(scene: DrawableScene, path: Path) -> None:
-    """Write `scene` atomically. The same scene gives the same bytes."""
+    """Write `scene` atomically; the same scene gives the same bytes."""
     tensors, header = pack_scene(scene)
     save_tensors(tensors, {"neeco": json.dumps(header, sort_keys=True, allow_nan=False)}, path)
 
@@ -98,7 +99,7 @@ def load_gaussians(path: Path, asked_by: str, device: torch.device | None = None
 
 
 def pack_scene(scene: DrawableScene) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """(tensors, JSON-able header) from which `unpack_scene` makes the scene again."""
+    """Return (tensors, JSON-able header) of a scene; `unpack_scene` is the inverse."""
     recorded = scene.recorded
     tensors = {f"module.{name}": tensor for name, tensor in scene.state_dict().items()}
     if recorded.states:
@@ -119,7 +120,7 @@ def pack_scene(scene: DrawableScene) -> tuple[dict[str, Tensor], dict[str, Any]]
                 "split": split,
                 "time": state.time,
                 "joints": {key: dict(value.joints) for key, value in state.instruments.items()},
-                "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near],
+                "intrinsics": [getattr(camera, field) for field in INTRINSICS],
             }
             for name, split, state, camera in zip(
                 recorded.names, recorded.splits, recorded.states, recorded.cameras, strict=True
@@ -143,7 +144,7 @@ def pack_scene(scene: DrawableScene) -> tuple[dict[str, Tensor], dict[str, Any]]
 
 
 def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> DrawableScene:
-    """The inverse of `pack_scene`; which kind of scene, the header's method says."""
+    """Return the scene of `pack_scene`'s tensors and header, of the kind of the header's method."""
     require_like(header, HEADER, "header", "it is damaged")
     if HALVES.search(json.dumps(header, ensure_ascii=False)):
         raise ValueError("its header holds an unpaired surrogate character")
@@ -160,7 +161,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Drawable
     if header.get("schema") == OLD_SCHEMA:
         module = {n: t for n, t in scene.state_dict().items() if n.rsplit(".", 1)[-1] in ADDED} | module
     scene.load_state_dict(module)
-    for name, parameter in scene.named_parameters():  # buffers may well be infinite: not every shaft has a known end
+    for name, parameter in scene.named_parameters():  # buffers may be infinite: not every shaft has a known end
         if not torch.isfinite(parameter).all():
             raise ValueError(f"{name} contains NaN or infinity")
     scene.requires_grad_(False)
@@ -168,7 +169,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Drawable
 
 
 def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tuple[Instrument, ...], Recorded]:
-    """The instruments and the training frames. Raises ValueError for what cannot have been recorded."""
+    """Return the instruments and the training frames. Raises ValueError for impossible values."""
     instruments = tuple(_instrument(entry) for entry in header["instruments"])
     states, cameras = [], []
     tissues = tuple(header.get("tissues", ()))
@@ -184,7 +185,7 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
         }
         states.append(State(moved, _number(entry["time"]), _one_of(entry["tissue"], tissues) if tissues else None))
         pose = _pose(tensors["recorded.cameras"][index], f"camera in frame {index}")
-        cameras.append(_camera(pose, *map(_number, entry["intrinsics"])))
+        cameras.append(_camera(pose, dict(zip(INTRINSICS, map(_number, entry["intrinsics"]), strict=True))))
     names, splits = (tuple(entry[key] for entry in header["recorded"]) for key in ("name", "split"))
     lens = None if "lens" not in header else parse_lens(Node(header["lens"], "header", "lens", RaisingReport()))
     scale = _number(header.get("scale", 1.0))
@@ -192,7 +193,9 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
         raise ValueError(f"its scale is {scale}, not a share of the images' size")
     still = header.get("still") is True
     lit = share_lamps(cameras, states) if still else tuple(cameras)
-    return instruments, Recorded(names, splits, tuple(states), lit, lens, scale, still, tissues)
+    return instruments, Recorded(
+        names, splits, tuple(states), lit, lens=lens, scale=scale, still=still, tissues=tissues
+    )
 
 
 def _one_of(name: Any, tissues: Sequence[str]) -> str:
@@ -202,7 +205,7 @@ def _one_of(name: Any, tissues: Sequence[str]) -> str:
 
 
 def _described(instrument: Instrument) -> dict[str, Any]:
-    """For the header; `_instrument` reads it."""
+    """Return the header's entry of an instrument; `_instrument` reads it."""
     described: dict[str, Any] = {"name": instrument.name, "joints": finite(dict(instrument.joints))}
     tree = instrument.kinematics
     described |= {} if tree is None else {"kinematics": tree.to_json()}
@@ -228,7 +231,7 @@ def _number(value: Any) -> float:
 
 
 def _limits(pair: Any) -> tuple[float, float] | None:
-    """Of a joint; an end may be null: infinite."""
+    """Return a joint's limits; a bound may be null: infinite."""
     if pair is None:
         return None
     lower, upper = pair
@@ -236,15 +239,15 @@ def _limits(pair: Any) -> tuple[float, float] | None:
 
 
 def _pose(pose: Tensor, what: str) -> Tensor:
-    """`pose` [4, 4], mm. Raises ValueError when it is not a rigid transform."""
+    """Return `pose` [4, 4], mm. Raises ValueError when it is not a rigid transform."""
     if tuple(pose.shape) != (4, 4) or rigid_fault(pose.double().numpy()):
         raise ValueError(f"the recorded pose of {what} is not a rigid transform")
     return pose
 
 
-def _camera(
-    pose: Tensor, fx: float, fy: float, cx: float, cy: float, width: float, height: float, near: float
-) -> Camera:
-    if min(fx, fy, near) <= 0 or min(width, height) < 1 or width * height > MAX_PIXELS:
+def _camera(pose: Tensor, given: dict[str, float]) -> Camera:
+    """Return the camera of intrinsics by name (INTRINSICS). Raises ValueError for impossible ones."""
+    fx, fy, width, height = given["fx"], given["fy"], given["width"], given["height"]
+    if min(fx, fy, given["near"]) <= 0 or min(width, height) < 1 or width * height > MAX_PIXELS:
         raise ValueError(f"a recorded camera of {width} x {height} px and focal lengths {fx}, {fy} px is not possible")
-    return Camera(pose, fx, fy, cx, cy, int(width), int(height), near)
+    return Camera(pose, fx, fy, given["cx"], given["cy"], width=int(width), height=int(height), near=given["near"])

@@ -1,4 +1,4 @@
-"""What the rest of the program asks of a method, whatever it is made of."""
+"""Interface of methods, of Gaussians or not."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ PLAIN_TRAINING: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class NoSettings:
-    """Of a method that has none of its own."""
+    """Settings of a method without its own."""
 
 
 @dataclass(frozen=True)
 class Stored:
-    """A scene as its file holds it."""
+    """Content of a scene's file."""
 
     settings: Any  # the method's own, an instance of its `Settings`
     instruments: tuple[Instrument, ...]
@@ -44,7 +44,7 @@ class Stored:
 
 class Method:
     """A method is one class in one file or folder under `methods/`, or an entry point of another package in the group
-    `neeco.methods`, found by its name, `method`; nothing else names it.
+    `neeco.methods`, found by its name, `method`; no other module names it.
 
     `Settings` is a frozen dataclass of its own settings (`--set deformation.NAME=VALUE`), each with a type and a
     default; its docstring describes them. `training_defaults` are fields of the training config that differ from the
@@ -56,42 +56,42 @@ class Method:
     Settings: ClassVar[type[Any]] = NoSettings
     training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    needs_instruments: ClassVar[bool] = False  # without recorded states there is nothing to learn
-    needs_times: ClassVar[bool] = False  # without recorded times there is nothing to learn
-    learns_tissues: ClassVar[bool] = False  # several in one scene: it moves no tissue, so each Gaussian is of one
-    has_gaussians: ClassVar[bool] = True  # False: nothing to rasterise, pose or densify; a drawing takes seconds
-    large_operations: ClassVar[bool] = False  # torch's own operations are large enough to gain from several threads
+    needs_instruments: ClassVar[bool] = False  # whether it learns from recorded instrument states alone
+    needs_times: ClassVar[bool] = False  # whether it learns from recorded times alone
+    learns_tissues: ClassVar[bool] = False  # whether one scene may have several tissues, which it does not move
+    has_gaussians: ClassVar[bool] = True  # False: nothing to rasterise, pose or densify; an image takes seconds
+    large_operations: ClassVar[bool] = False  # whether torch's operations are large enough to gain from several threads
 
     @classmethod
     def moves_stated_links(cls, settings: Any) -> bool:
-        """Whether links move as an instrument's stated kinematics say, where it has any."""
+        """Whether links move by an instrument's stated kinematics, where it has any."""
         return False
 
     @classmethod
     def learned_joints(
         cls, instrument: Instrument, joints: tuple[str, ...], frames: Sequence[Frame], settings: Any, report: Report
     ) -> tuple[str, ...]:
-        """Those of `joints`, which may move parts of an instrument without stated links, that are learned; `report`
-        what is left out or doubtful."""
+        """Return the `joints` that are learned of an instrument without stated links; `report` those that are left out
+        or uncertain."""
         return joints
 
     @classmethod
     def torch_threads(cls) -> AbstractContextManager[None]:
-        """Use one of torch's threads where scenes are posed and drawn, or all where the operations are large."""
+        """Use one of torch's threads where scenes are posed and rendered, or all where the operations are large."""
         return nullcontext() if cls.large_operations else torch_threads(1)
 
     @classmethod
     def resolved(cls, settings: Any, begun: Any | None = None) -> Any:
-        """The method's `settings` with what is left open to the machine decided: as this one has it, or as the settings
-        of a run that was `begun` elsewhere have it."""
+        """Return `settings` with machine-dependent choices decided: by this machine, or as in the settings of a run
+        that was `begun` elsewhere."""
         return settings
 
     @classmethod
     def session(
         cls, capture: Capture, views: TrainingViews, settings: Any, length: RunLength, seed: int, scene: Any | None
     ) -> Session:
-        """A session at iteration 0 of a method without Gaussians, on the views' device: around a new scene, or around
-        `scene`, which a checkpoint held. `settings` are the method's own. Methods with Gaussians share one session
+        """Return a session at iteration 0 of a method without Gaussians, on the views' device, with a new scene or the
+        `scene` of a checkpoint. `settings` are the method's own. Methods with Gaussians share one session
         (`neeco.training.session`).
 
         Raises NeecoError where the capture lacks what the method needs.
@@ -100,8 +100,8 @@ class Method:
 
     @classmethod
     def load(cls, stored: Stored) -> DrawableScene:
-        """The scene of a method without Gaussians that a file holds, but for the state of its modules, which the reader
-        of files loads into it.
+        """Return the scene of a method without Gaussians from a file's content, without the state of its modules, which
+        the caller loads.
 
         Raises ValueError, LookupError or RuntimeError where the file does not fit.
         """

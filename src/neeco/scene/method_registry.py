@@ -1,4 +1,4 @@
-"""Method names and the class behind each: those of `neeco.methods`, and those that installed packages offer."""
+"""Registry of methods: those of `neeco.methods`, and those of installed packages."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from neeco.scene.method import Method
 from neeco.settings import structure
 
 DEFAULT = "kinematic"
-PACKAGE = "neeco.methods"  # the room of ours, and the group of entry points of others
+PACKAGE = "neeco.methods"  # our package, and the entry point group of others
 
 
 @cache
 def methods() -> dict[str, type[Method]]:
-    """Every class with its own `method` name, by name: DEFAULT first, the others sorted. Raises NeecoError when two
-    share a name, or an installed package's method cannot be loaded."""
+    """Return every class with its own `method` name, by name: DEFAULT first, the others sorted. Raises NeecoError when
+    two share a name, or an installed package's method cannot be loaded."""
     found = plugins(Method, "method", PACKAGE)
     return dict(sorted(found.items(), key=lambda item: item[0] != DEFAULT))
 
 
 def add_method(kind: type[Method]) -> type[Method]:
-    """Make a method known to this process alone; usable as a decorator. One that other processes and the command line
-    are to find is an entry point in the group `neeco.methods`.
+    """Register a method in this process alone; usable as a decorator. Other processes and the command line find a
+    method by an entry point in the group `neeco.methods`.
 
     Raises NeecoError when another class has its name.
     """
@@ -38,7 +38,7 @@ def add_method(kind: type[Method]) -> type[Method]:
 
 
 def method_class(method: str) -> type[Method]:
-    """What the method says of itself. Raises NeecoError for an unknown name."""
+    """Return the class of the method. Raises NeecoError for an unknown name."""
     if method not in methods():
         raise NeecoError(
             f"method: {method!r} is unknown; choose one of {', '.join(methods())}, or install the package that has it"
@@ -47,13 +47,14 @@ def method_class(method: str) -> type[Method]:
 
 
 def method_settings(method: str, values: Mapping[str, Any]) -> Any:
-    """The method's own settings with `values`. Raises NeecoError for an unknown field or one that does not fit."""
+    """Return the method's own settings with `values`. Raises NeecoError for an unknown field or one that does not
+    fit."""
     return structure(method_class(method).Settings, values, "deformation", f"method {method}")
 
 
 def make_deformation(method: str, instruments: tuple[Instrument, ...], settings: Any = None) -> Deformation:
-    """The deformation of `method`, which has Gaussians, with its own settings (None: the defaults). Raises NeecoError
-    for an unknown name, or settings of which nothing can be made."""
+    """Return the deformation of `method`, which has Gaussians, with its own settings (None: the defaults). Raises
+    NeecoError for an unknown name, or settings that do not work."""
     kind: Any = method_class(method)
     try:
         return kind(instruments, settings)
@@ -62,7 +63,7 @@ def make_deformation(method: str, instruments: tuple[Instrument, ...], settings:
 
 
 def unmet_need(method: str, capture: Capture) -> str | None:
-    """What `method` needs and `capture` has not recorded, in words; None when it can be trained on it."""
+    """Return the recorded data that `method` needs and `capture` lacks, in words; None when it can be trained on it."""
     kind = method_class(method)
     if kind.needs_instruments and not capture.instruments:
         return "instrument states"

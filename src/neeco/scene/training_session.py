@@ -1,14 +1,14 @@
-"""What a method and its training share. Training itself is above this room: `neeco.training`.
+"""Interface between methods and training, which is a room above: `neeco.training`.
 
-`Session` is one run in memory, of any method. `GaussianTraining` is a session of a method that deforms Gaussians, as
-the hooks of its deformation see it.
+`Session` is one run in memory, of any method. `GaussianTraining` is the session of a method that deforms Gaussians, as
+far as the hooks of its deformation use it.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Protocol
 
 import torch
@@ -25,13 +25,13 @@ Report = Callable[[str], None]  # shows the user one line
 
 @dataclass(frozen=True)
 class RunLength:
-    """When a run ends: after `iterations`, or after `minutes` if that is sooner."""
+    """Length of a run: `iterations`, or `minutes` if they end sooner."""
 
     iterations: int
     minutes: float | None = None
 
     def progress(self, iteration: int, seconds: float) -> float:
-        """Share of the run in [0, 1] that is done, by iterations or minutes, whichever is further."""
+        """Return the completed share of the run in [0, 1], by iterations or minutes, whichever is larger."""
         done = iteration / self.iterations
         if self.minutes is not None:
             done = max(done, seconds / (60 * self.minutes))
@@ -47,18 +47,18 @@ class StepResult:
 
     @classmethod
     def of(cls, loss: float, squared_error: float) -> StepResult:
-        """From the image's loss and its mean squared error."""
+        """Return the result of an image's loss and mean squared error."""
         return cls(loss, -10 * math.log10(max(squared_error, 1e-10)))
 
     @classmethod
     def mean(cls, results: Sequence[StepResult]) -> StepResult:
-        """Of several images, at least one."""
+        """Return the mean over one or more images."""
         count = len(results)
         return cls(sum(result.loss for result in results) / count, sum(result.psnr for result in results) / count)
 
 
 def numbers(*scalars: Tensor) -> list[float]:
-    """Values of scalars on one device, with a single synchronisation."""
+    """Return the values of scalars on one device with a single synchronisation."""
     values: list[float] = torch.stack([scalar.detach() for scalar in scalars]).tolist()
     return values
 
@@ -73,7 +73,7 @@ def check_finite(total: float, iteration: int, where: str = "") -> None:
 
 
 def members(tensors: Mapping[str, Tensor], group: str) -> dict[str, Tensor]:
-    """The tensors called GROUP/NAME, by NAME."""
+    """Return the tensors called GROUP/NAME by NAME."""
     return {key.removeprefix(f"{group}/"): t for key, t in tensors.items() if key.startswith(f"{group}/")}
 
 
@@ -84,6 +84,7 @@ class Session:
     scene: DrawableScene
     length: RunLength
     generator: torch.Generator
+    _: KW_ONLY
     adam: Adam = field(init=False)
     iteration: int = field(default=0, init=False)
     seconds: float = field(default=0.0, init=False)
@@ -91,7 +92,7 @@ class Session:
 
     @property
     def progress(self) -> float:
-        """Share of the run in [0, 1] that is done."""
+        """Completed share of the run in [0, 1]."""
         return self.length.progress(self.iteration, self.seconds)
 
     @property
@@ -101,7 +102,7 @@ class Session:
 
     @property
     def forced(self) -> bool:
-        """Whether phase 2 began because the run was late."""
+        """Whether phase 2 started because of the run's progress alone."""
         return False
 
     def step(self) -> StepResult:
@@ -109,17 +110,19 @@ class Session:
         raise NotImplementedError
 
     def between_steps(self, before: float) -> None:
-        """Do what is due once `progress` has passed a mark; it was `before` at the last step."""
+        """Do the work that is due at shares of the run between `before`, the progress at the last step, and
+        `progress`."""
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """(tensors as GROUP/NAME, JSON-able fields) of a checkpoint beside scene, optimiser and random numbers."""
+        """Return (tensors as GROUP/NAME, JSON-able fields) of a checkpoint in addition to scene, optimiser and
+        generators."""
         return {}, {}
 
     def restore(self, tensors: Mapping[str, Tensor], fields: Mapping[str, Any]) -> None:
-        """The inverse of `pack`."""
+        """Restore the state that `pack` returned."""
 
     def finish(self) -> None:
-        """Compute what is derived from the learned scene after the last step."""
+        """Derive labels, verdicts and other results from the learned scene after the last step."""
 
 
 class CanonicalScene(DrawableScene, Protocol):
@@ -130,7 +133,7 @@ class CanonicalScene(DrawableScene, Protocol):
 
 @dataclass
 class GaussianTraining(Session):
-    """A training session as a deformation's hooks see it."""
+    """A training session as far as a deformation's hooks use it."""
 
     scene: CanonicalScene
     views: TrainingViews
@@ -139,5 +142,5 @@ class GaussianTraining(Session):
     timed: bool = field(default=True, init=False)  # `State.time` is in seconds
 
     def reached(self, iteration: int) -> bool:
-        """Whether the last step came to `iteration` or past it."""
+        """Whether the last step reached `iteration`."""
         return self.iteration - self.batch_size < iteration <= self.iteration

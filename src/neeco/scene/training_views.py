@@ -1,4 +1,4 @@
-"""The frames that a scene is learned from, with their pixels."""
+"""Training frames with their pixels."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ MAX_MEMORY_SHARE = 0.5  # of a CUDA device's free memory that all pixels may tak
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """Frames, each with its image and mask. Cameras and states stay on the frames' device.
+    """Training frames, each with image and mask. Cameras and states stay on the frames' device.
 
-    `images` and `masks` are on `device`, or, where that is too small, in the host's memory; `prefetcher` copies them
-    from there.
+    `images` and `masks` are on `device`, or, where its memory is too small, on the host, from where `prefetcher` copies
+    them.
     """
 
     frames: tuple[Frame, ...]
@@ -44,12 +44,12 @@ class TrainingViews:
 
     @property
     def device(self) -> torch.device:
-        """Device of targets and masks, where everything is computed."""
+        """Device of targets and masks."""
         return self.images[0].device if self.prefetcher is None else self.prefetcher.device
 
     def to(self, device: torch.device) -> TrainingViews:
-        """The same views on `device`; their pixels stay in the host's memory if they would take more than
-        MAX_MEMORY_SHARE of a CUDA device's free memory."""
+        """Return the views on `device`; pixels stay on the host if they would take more than MAX_MEMORY_SHARE of a CUDA
+        device's free memory."""
         if device.type == "cuda":
             size = sum(pixels.nbytes for pixels in (*self.images, *self.masks) if pixels is not None)
             if size > MAX_MEMORY_SHARE * torch.cuda.mem_get_info(device)[0]:
@@ -57,7 +57,7 @@ class TrainingViews:
         return self._with_pixels(lambda pixels: pixels.to(device))
 
     def prefetched_to(self, device: torch.device) -> TrainingViews:
-        """The same views for `device`, their pixels in page-locked memory of the host."""
+        """Return the views for `device`, their pixels in page-locked memory of the host."""
         views = self._with_pixels(lambda pixels: pixels.cpu().pin_memory())
         return replace(views, prefetcher=PixelPrefetcher(device))
 
@@ -66,8 +66,8 @@ class TrainingViews:
         return replace(self, images=tuple(change(image) for image in self.images), masks=masks)
 
     def scaled(self, scale: float) -> TrainingViews:
-        """The same views with images of `scale` times their size, area-averaged; a mask counts where all of a pixel
-        does."""
+        """Return the views with images of `scale` times their size, area-averaged; a mask pixel is set where all of its
+        area is."""
         if scale == 1:
             return self
         frames, images, masks = [], [], []
@@ -80,15 +80,15 @@ class TrainingViews:
         return TrainingViews(tuple(frames), tuple(images), tuple(masks), prefetcher)
 
     def target(self, index: int) -> Tensor:
-        """The target image [H, W, 3] of one frame, float32 in [0, 1]."""
+        """Return the target image [H, W, 3] of one frame, float32 in [0, 1]."""
         return self._pixels(index)[0].float() / 255
 
     def mask(self, index: int) -> Tensor | None:
-        """The mask [H, W] bool of one frame, or None."""
+        """Return the mask [H, W] bool of one frame, or None."""
         return self._pixels(index)[1]
 
     def prefetch(self, index: int) -> None:
-        """Start to copy the pixels of frame `index`, which is used next, where they have to be copied."""
+        """Start to copy the pixels of frame `index`, which is used next, where pixels are on the host."""
         if self.prefetcher is not None:
             self.prefetcher.start(index, self.images[index], self.masks[index])
 
@@ -98,20 +98,19 @@ class TrainingViews:
 
 
 def mean_pixels(frames: Sequence[Frame]) -> float:
-    """Of an image, over the frames."""
+    """Return the mean number of pixels of an image."""
     return sum(frame.camera.width * frame.camera.height for frame in frames) / len(frames)
 
 
 def _resized(pixels: Tensor, camera: Camera) -> Tensor:
-    """Bytes [H, W, ...] area-averaged to the camera's size, on the device or in the memory where they were."""
+    """Return bytes [H, W, ...] area-averaged to the camera's size, on the same device or in the same kind of memory."""
     resized = cv2.resize(pixels.cpu().numpy(), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     found = torch.from_numpy(resized)
     return found.pin_memory() if pixels.is_pinned() else found.to(pixels.device)
 
 
 class PixelPrefetcher:
-    """Copies one frame's pixels after another to a device; to a CUDA device on a stream of its own, while it
-    computes."""
+    """Copies pixels frame by frame to a device; to a CUDA device on a separate stream while it computes."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -120,7 +119,7 @@ class PixelPrefetcher:
         self._pixels: tuple[Tensor, ...] = ()
 
     def start(self, index: int, image: Tensor, mask: Tensor | None) -> None:
-        """Start to copy frame `index`, unless that was the last."""
+        """Start to copy frame `index`, unless it is the last one copied."""
         if index == self._index:
             return
         pixels = (image,) if mask is None else (image, mask)
@@ -129,7 +128,7 @@ class PixelPrefetcher:
         self._index = index
 
     def get(self, index: int, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """The copies of frame `index`; the device waits for them, not the caller."""
+        """Return the copies of frame `index`; the device waits for them, not the caller."""
         self.start(index, image, mask)
         if self.stream is not None:
             computing = torch.cuda.current_stream(self.device)

@@ -1,9 +1,9 @@
-"""Which Gaussians the training frames observed, from where, and tissue extrapolated beyond what they observed.
+"""Visibility of Gaussians in the training frames, by direction, and extrapolation of tissue beyond the observed border.
 
-A frame observes a Gaussian by as many pixels as its alpha and the transmittance before it leave of it. That is summed
-over the frames, separately for twelve directions in the frame that the Gaussian's colours turn with. A view that was
-never recorded also looks past the border of the recorded tissue: there, tissue is extrapolated smoothly from what lies
-beside it, and marked.
+A frame observes a Gaussian by the pixels that its alpha and the transmittance in front of it leave of it. They are
+summed over the frames, separately for twelve directions in the frame of the Gaussian's harmonics. An unrecorded view
+also shows the area beyond the recorded tissue: there, tissue is extrapolated smoothly from its neighbourhood, and
+marked.
 """
 
 from __future__ import annotations
@@ -28,35 +28,36 @@ from neeco.scene.canonical import TISSUE, CanonicalGaussians, seed_gaussians
 from neeco.scene.drawable import Recorded
 
 # per-Gaussian extras, under the names they have in files
-VISIBILITY = "seen"  # [N, 12], what `measure_visibility` finds
-EXTRAPOLATED = "made_up"  # [N], 1 where the Gaussian stands for tissue that no frame observed
+VISIBILITY = "seen"  # [N, 12], by `measure_visibility`
+EXTRAPOLATED = "made_up"  # [N], 1 where the Gaussian is extrapolated tissue
 
-GOLDEN = (1 + 5**0.5) / 2
+GOLDEN_RATIO = (1 + 5**0.5) / 2
 DIRECTIONS = tuple(  # the corners of an icosahedron, unit
-    tuple(value / (1 + GOLDEN**2) ** 0.5 for value in corner)
+    tuple(value / (1 + GOLDEN_RATIO**2) ** 0.5 for value in corner)
     for a in (-1.0, 1.0)
-    for b in (-GOLDEN, GOLDEN)
+    for b in (-GOLDEN_RATIO, GOLDEN_RATIO)
     for corner in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))
 )
 SHARPNESS = 4  # power of the cosine by which a view counts for a direction: half at 33 degrees
-HALF_OBSERVED = 0.002  # share of the average Gaussian's visibility at which one is half unobserved
-MIN_PIXELS = 1e-6  # visibility of the average Gaussian where frames show nothing
-MAX_FRAMES = 128  # frames looked at, evenly spaced and reduced to REFERENCE_PIXELS; neighbours observe the same
+HALF_VISIBILITY = 0.002  # share of the average Gaussian's visibility at which one is half unobserved
+MIN_PIXELS = 1e-6  # visibility of the average Gaussian, at least
+MAX_FRAMES = 128  # evenly spaced and reduced to REFERENCE_PIXELS; neighbouring frames observe the same
 
-CELL = 1 / 40  # of the image's width: spacing of extrapolated Gaussians
-REACH = 0.4  # of the image's width: how far tissue is extrapolated beyond the recorded border
-EXTENT = 1.5  # of the image's size, to each side of the middle camera's image: where tissue is extrapolated
-BEHIND = 1.1  # times the depth: what was observed stays in front
-SPREAD = 0.7  # of a cell: standard deviation of an extrapolated Gaussian
+# extrapolation
+CELL = 1 / 40  # spacing of extrapolated Gaussians, in image widths
+MAX_DISTANCE = 0.4  # of extrapolated tissue from the recorded border, in image widths
+GRID_MARGIN = 1.5  # of the grid to each side of the middle camera's image, in its size
+DEPTH_FACTOR = 1.1  # of extrapolated depths, so that observed tissue stays in front
+CELL_SD = 0.7  # standard deviation of an extrapolated Gaussian, in cells
 OPACITY = 0.98  # of an extrapolated Gaussian
-WELL_OBSERVED = 0.05  # share of the frames that must observe what tissue is extrapolated from
-SMOOTHING = (1.5, 3.0, 6.0, 12.0, 24.0)  # cells: tried in order until MIN_KNOWN cells are in reach
-MIN_KNOWN = 0.05  # share of known cells around one
+MIN_FRAME_SHARE = 0.05  # of the frames, that must observe the source tissue
+SMOOTHING_CELLS = (1.5, 3.0, 6.0, 12.0, 24.0)  # standard deviations, tried until MIN_KNOWN_SHARE is reached
+MIN_KNOWN_SHARE = 0.05  # of the cells around one, that must be known
 
 
 def measure_visibility(canonical: CanonicalGaussians, recorded: Recorded, at: Callable[[State], Gaussians]) -> Tensor:
-    """[N, 12] how many pixels the recorded frames observed of each Gaussian, as `at` poses it, from about each of
-    `DIRECTIONS`; as a share of what they observed of the average one. Zero for extrapolated tissue."""
+    """Measure the pixels [N, 12] by which the recorded frames observed each Gaussian, posed by `at`, from each of
+    `DIRECTIONS`, relative to the average Gaussian; zero for extrapolated tissue."""
     pixels = canonical.means.new_zeros((), dtype=torch.float64)
     visibility = canonical.means.new_zeros(len(canonical), len(DIRECTIONS))
     for index in evenly_spaced(len(recorded.cameras), MAX_FRAMES):
@@ -74,15 +75,16 @@ def measure_visibility(canonical: CanonicalGaussians, recorded: Recorded, at: Ca
 
 
 def unobserved_share(visibility: Tensor, posed: Gaussians, camera: Camera) -> Tensor:
-    """[N] in [0, 1]: how far each posed Gaussian, as `camera` sees it, is unobserved, from what `measure_visibility`
-    found: 1 where no frame saw it from about there."""
+    """Return the share [N] in [0, 1] by which each posed Gaussian, viewed by `camera`, is unobserved: 1 where no frame
+    observed it from a similar direction. `visibility`: by `measure_visibility`."""
     toward = _toward(posed, camera)
     share = (visibility * toward).sum(1) / toward.sum(1)
-    return HALF_OBSERVED / (share + HALF_OBSERVED)
+    return HALF_VISIBILITY / (share + HALF_VISIBILITY)
 
 
 def _toward(posed: Gaussians, camera: Camera) -> Tensor:
-    """[N, 12] in [0, 1] how near the direction from each Gaussian to the camera is to each of `DIRECTIONS`."""
+    """Return weights [N, 12] in [0, 1] of `DIRECTIONS` by their angle to the direction from each Gaussian to the
+    camera."""
     means = posed.means
     outward = normalize(camera.world_from_camera[:3, 3].to(means) - means, dim=1)  # [N, 3]
     if posed.sh_frames is not None:
@@ -92,20 +94,20 @@ def _toward(posed: Gaussians, camera: Camera) -> Tensor:
 
 
 def visible_pixels(posed: Gaussians, camera: Camera, weight: Tensor | None = None) -> Tensor:
-    """[N] how many of the camera's pixels, of `weight` [H, W] each, every posed Gaussian takes up: the gradient of a
-    drawn channel of 1."""
+    """Return the number [N] of the camera's pixels, weighted by `weight` [H, W], that every posed Gaussian covers: the
+    gradient of a rendered channel of 1."""
     channel = torch.ones_like(posed.opacities)[:, None].requires_grad_()
     with torch.enable_grad():
         unlit = replace(posed, sh=posed.sh[:, :1], headlight=None)
         composited = rasterize(unlit, camera, channels=channel).channels
         assert composited is not None
-        seen = composited.sum() if weight is None else (composited[..., 0] * weight).sum()
-        (pixels,) = torch.autograd.grad(seen, channel)
+        total = composited.sum() if weight is None else (composited[..., 0] * weight).sum()
+        (pixels,) = torch.autograd.grad(total, channel)
     return pixels[:, 0]
 
 
 def count_views(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
-    """How many [P] of the cameras' images points [P, 3] mm of the world fall into, whatever stands before them."""
+    """Count the images [P] that points [P, 3] mm of the world project into, ignoring occlusion."""
     count = torch.zeros(len(points), dtype=torch.int32, device=points.device)
     for camera in cameras:
         count += in_image(points, camera)
@@ -113,7 +115,7 @@ def count_views(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 
 def outside_all_views(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
-    """[P] bool: which points [P, 3] mm of the world fall into none of the cameras' images."""
+    """Return which points [P, 3] mm of the world project into none of the images, [P] bool."""
     left = torch.arange(len(points), device=points.device)
     for camera in cameras:
         left = left[~in_image(points[left], camera)]
@@ -124,16 +126,16 @@ def outside_all_views(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 @torch.no_grad()
 def extrapolate_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera], tissue: int = 0) -> CanonicalGaussians:
-    """Canonical Gaussians with tissue (body 0; of several the one so numbered, which `cameras` saw) extrapolated by
-    REACH beyond what `cameras` observed, in the mean depth and colour of its neighbourhood; unchanged where no observed
-    tissue is in reach."""
+    """Return canonical Gaussians with tissue (body 0; of several the one of this index, observed by `cameras`)
+    extrapolated by MAX_DISTANCE beyond the observed border, in the mean depth and colour of its neighbourhood;
+    unchanged without observed tissue."""
     grid = _Grid(_middle_camera(cameras))
     rows = canonical.body(0)
     means, colors = canonical.means[rows], canonical.sh_dc[rows][:, 0]  # [T, 3] both
     cells, depths = grid.cells(means)
     weights = torch.sigmoid(canonical.opacity_logits[rows]).double() * grid.holds(cells)
     weights *= canonical.of_tissue(tissue)[rows]
-    weights *= (depths > grid.camera.near) & (count_views(means, cameras) >= WELL_OBSERVED * len(cameras))
+    weights *= (depths > grid.camera.near) & (count_views(means, cameras) >= MIN_FRAME_SHARE * len(cameras))
     known = grid.sums(cells, weights, torch.cat([1 / depths[:, None], colors], 1).double())  # [rows, columns, 1 + 4]
     if not known[..., 0].any():
         return canonical
@@ -141,7 +143,7 @@ def extrapolate_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera],
     positions = grid.positions(1 / filled[..., 0])  # [rows, columns, 3]
     outside = outside_all_views(positions.reshape(-1, 3), cameras).reshape(positions.shape[:2]).cpu()
     distance = distance_transform_edt(outside.numpy()) * grid.cell
-    chosen = outside & torch.from_numpy(distance < REACH * grid.camera.width)
+    chosen = outside & torch.from_numpy(distance < MAX_DISTANCE * grid.camera.width)
     points, colors = positions[chosen], filled[chosen][:, 1:]
     added = seed_gaussians(points, colors, grid.spacing(points), opacity=OPACITY)
     return _append_tissue(canonical, replace(added, sh_dc=colors[:, None].clone()), tissue)
@@ -149,7 +151,7 @@ def extrapolate_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera],
 
 @dataclass(frozen=True)
 class _Grid:
-    """Cells of the middle camera's image, extended by EXTENT to each side."""
+    """Cells of the middle camera's image, extended by GRID_MARGIN to each side."""
 
     camera: Camera
 
@@ -160,24 +162,24 @@ class _Grid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        extended = (1 + 2 * EXTENT) / self.cell
+        """Number of rows and columns."""
+        extended = (1 + 2 * GRID_MARGIN) / self.cell
         return round(extended * self.camera.height), round(extended * self.camera.width)
 
     def _corner(self, like: Tensor) -> Tensor:
-        return like.new_tensor([self.camera.width, self.camera.height]) * -EXTENT
+        return like.new_tensor([self.camera.width, self.camera.height]) * -GRID_MARGIN
 
     def cells(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(row, column) [P, 2] and depth [P] mm of points [P, 3] mm of the world; also cells outside the grid."""
+        """Return (row, column) [P, 2] and depth [P] mm of points [P, 3] mm of the world, also outside the grid."""
         pixels, depths = project_world(points, self.camera)
         return ((pixels - self._corner(pixels)) / self.cell).floor().flip(1), depths
 
     def holds(self, cells: Tensor) -> Tensor:
-        """[P] bool: which of the cells [P, 2] lie in the grid."""
+        """Return which of the cells [P, 2] lie in the grid, [P] bool."""
         return ((cells >= 0) & (cells < cells.new_tensor(self.shape))).all(1)
 
     def sums(self, cells: Tensor, weights: Tensor, values: Tensor) -> np.ndarray:
-        """[rows, columns, 1 + V] float64: per cell the sum of weights [P] and of weighted values [P, V]."""
+        """Return the sums of weights [P] and of weighted values [P, V] per cell, [rows, columns, 1 + V] float64."""
         rows, columns = self.shape
         chosen = weights > 0
         index = (cells[chosen] @ cells.new_tensor([columns, 1.0])).long()
@@ -186,17 +188,17 @@ class _Grid:
         return total.reshape(rows, columns, -1).cpu().numpy()
 
     def positions(self, depths: Tensor) -> Tensor:
-        """Points [rows, columns, 3] mm of the world behind the cells' centres, at depths [rows, columns] mm."""
+        """Return points [rows, columns, 3] mm of the world behind the cells' centres, at depths [rows, columns] mm."""
         pixels = pixel_centers(*self.shape).to(depths) * self.cell + self._corner(depths)
-        return unproject_world(pixels, BEHIND * depths, self.camera)
+        return unproject_world(pixels, DEPTH_FACTOR * depths, self.camera)
 
     def spacing(self, points: Tensor) -> Tensor:
-        """Standard deviation [P] mm of Gaussians at points [P, 3] mm of the world that fill their cells."""
-        return SPREAD * self.cell * project_world(points, self.camera)[1] / self.camera.fx
+        """Return the standard deviation [P] mm of Gaussians at points [P, 3] mm of the world that fill their cells."""
+        return CELL_SD * self.cell * project_world(points, self.camera)[1] / self.camera.fx
 
 
 def _middle_camera(cameras: Sequence[Camera]) -> Camera:
-    """The camera whose place and direction are nearest to the mean of all."""
+    """Return the camera whose position and direction are closest to the mean of all."""
     poses = torch.stack([camera.world_from_camera.double().cpu() for camera in cameras])  # [C, 4, 4]
     places, directions = poses[:, :3, 3], poses[:, :3, 2]
     spread = places.std(0, correction=0).norm().clamp_min(1e-6)
@@ -206,14 +208,14 @@ def _middle_camera(cameras: Sequence[Camera]) -> Camera:
 
 
 def _filled(known: np.ndarray) -> np.ndarray:
-    """[rows, columns, V] means of the known cells around every cell, from sums [rows, columns, 1 + V]: over the
-    smallest neighbourhood that holds enough of them, then smoothed."""
+    """Return means [rows, columns, V] of the known cells around every cell, from sums [rows, columns, 1 + V]: over the
+    smallest neighbourhood with enough of them, then smoothed."""
     found = np.zeros((*known.shape[:2], known.shape[2] - 1))
     left = np.ones(known.shape[:2], dtype=bool)
     is_known = (known[..., 0] > 0).astype(float)
-    for sigma in SMOOTHING:
+    for sigma in SMOOTHING_CELLS:
         blurred = gaussian_filter(known, (sigma, sigma, 0), mode="constant")
-        here = left & (gaussian_filter(is_known, sigma, mode="constant") > MIN_KNOWN)
+        here = left & (gaussian_filter(is_known, sigma, mode="constant") > MIN_KNOWN_SHARE)
         found[here] = blurred[here][:, 1:] / blurred[here][:, :1]
         left &= ~here
     mean = known.sum((0, 1))
@@ -222,7 +224,7 @@ def _filled(known: np.ndarray) -> np.ndarray:
 
 
 def _append_tissue(canonical: CanonicalGaussians, added: CanonicalGaussians, tissue: int) -> CanonicalGaussians:
-    """`canonical` with `added` at the end of body 0, marked as extrapolated, and as of that tissue of several."""
+    """Return `canonical` with `added` at the end of body 0, marked as extrapolated and as belonging to the tissue."""
     unmarked = canonical.means.new_zeros(len(canonical))
     marked = canonical.with_extras(**{EXTRAPOLATED: canonical.extras.get(EXTRAPOLATED, unmarked)})
     blank = {name: tensor.new_zeros(len(added), *tensor.shape[1:]) for name, tensor in marked.extras.items()}

@@ -7,7 +7,6 @@ are written from the records of its images.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import neeco
 from neeco.errors import NeecoError
-from neeco.files import own_folder, read_begun, read_bytes, require_same, write_json
+from neeco.files import own_folder, read_begun, require_same, write_json
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.drawing import EDGE_WIDTH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels
@@ -50,6 +49,7 @@ from neeco.synthesis.writers.folder import (
     record_path,
     write_states,
 )
+from neeco.training.run import SCENE_FILE, scene_digest
 from neeco.workers import address, check_workers
 
 if TYPE_CHECKING:
@@ -58,7 +58,6 @@ if TYPE_CHECKING:
 
 SCHEMA = "neeco-dataset/1"
 INFO = "dataset.json"
-SCENE_FILE = "scene.safetensors"
 
 REMEDIES = {  # where every given state was refused
     LEAVES_IMAGE: "correct its poses (world frame, mm) or cameras, or lower --min-share",
@@ -177,21 +176,16 @@ def description(
     info = {
         "schema": SCHEMA,
         "version": neeco.__version__,
-        "scene_sha256": _digest(run),
+        "scene_sha256": scene_digest(run.path),
         "settings": settings,
         "soft": {"share_per_count": SHARE_PER_COUNT},
         "ignore": {"ignored": IGNORED, "clear_shares": list(CLEAR_SHARES), "reach": EDGE_WIDTH},
         "scene": str(run.path),
     }
     if instrument_runs:
-        info["settings"] = settings | {"instruments_sha256": [_digest(given) for given in instrument_runs]}
+        info["settings"] = settings | {"instruments_sha256": [scene_digest(given.path) for given in instrument_runs]}
         info["instruments"] = [str(given.path) for given in instrument_runs]
     return info
-
-
-def _digest(run: GaussianRun) -> str:
-    content = read_bytes(Path(run.path) / SCENE_FILE, "a learned scene", "no such file; train the run first")
-    return hashlib.sha256(content).hexdigest()
 
 
 def check_output(output: Path, description: dict[str, Any], resume: bool) -> bool:

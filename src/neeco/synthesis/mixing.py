@@ -142,7 +142,9 @@ class Mixture:
             chosen.append(camera)
             states.append(State(placed, 0.0))
         names, still = tuple(f"{k:06d}" for k in range(count)), self.tissue.recorded.still
-        return Recorded(names, ("train",) * count, tuple(states), tuple(chosen), self.tissue.recorded.lens, still=still)
+        return Recorded(
+            names, ("train",) * count, tuple(states), tuple(chosen), lens=self.tissue.recorded.lens, still=still
+        )
 
 
 @dataclass(frozen=True)

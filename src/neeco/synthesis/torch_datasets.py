@@ -54,13 +54,13 @@ from neeco.raster.native import torch_threads
 from neeco.scene.drawable import DrawableScene
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import load_gaussians, save_scene
-from neeco.synthesis.dataset import INFO, SCENE_FILE
+from neeco.synthesis.dataset import INFO
 from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, StatesRefused, limit_threads
 from neeco.synthesis.parallel import PackedSpec
 from neeco.synthesis.samplers import make_sampler
 from neeco.synthesis.settings import PATH_PREFIX, LabelWay, Settings, Views
 from neeco.synthesis.writers.folder import read_public_records, stem
-from neeco.training.run import TrainedRun, load_run
+from neeco.training.run import SCENE_FILE, TrainedRun, load_run
 
 Sample = dict[str, Any]
 Transform = Callable[[Sample], Sample]

@@ -169,14 +169,8 @@ class Follower:
             best, searched_at = self.search.anywhere(self._view(frame, None) if view is None else view), time
             if best is not None and (step := self._begun(frame, "found", best)).how != "lost":
                 return step
-        return Step(
-            frame=frame,
-            how="lost",
-            motion=before.motion,
-            recent=before.recent,
-            found_at=before.found_at,
-            searched_at=searched_at,
-        )
+        step = Step(frame=frame, how="lost", motion=before.motion, found_at=before.found_at, searched_at=searched_at)
+        return replace(step, recent=before.recent)
 
     def _begun(self, frame: int, how: How, fit: StateFit) -> Step:
         """Return the step of a state just found."""

@@ -26,7 +26,7 @@ from neeco.raster.reference import SH_C0
 from neeco.scene import CanonicalGaussians, GaussianScene
 from neeco.scene.canonical import join_bodies
 from neeco.scene.training_views import TrainingViews
-from neeco.tracking.footage_tissue import Report, foreground
+from neeco.tracking.footage_tissue import Progress, foreground
 from neeco.tracking.parameters import TrackingFitter, fitter_of
 from neeco.tracking.search import Search
 from neeco.training.config import method_defaults
@@ -172,7 +172,7 @@ class Adapted:
         }
 
 
-def adapted(scene: GaussianScene, frames: Sequence[Frame], report: Report) -> Adapted:
+def adapted(scene: GaussianScene, frames: Sequence[Frame], report: Progress) -> Adapted:
     """Return `scene`, of instruments over the tissue of `frames` (`over_tissue`), in their light."""
     plain = fitter_of(scene)
     chosen = [frames[k] for k in evenly_spaced(len(frames), N_FRAMES)]
@@ -215,7 +215,7 @@ def with_lamps(scene: GaussianScene, found: Sequence[tuple[Frame, StateFit]]) ->
     return made.requires_grad_(False)
 
 
-def _found(scene: GaussianScene, frames: Sequence[Frame], report: Report) -> list[tuple[Frame, StateFit]]:
+def _found(scene: GaussianScene, frames: Sequence[Frame], report: Progress) -> list[tuple[Frame, StateFit]]:
     """Return the frames in which the instruments of `scene` are found, with their states."""
     fitter, found = fitter_of(scene), []
     search = Search.of(fitter)

@@ -54,10 +54,10 @@ CHANGED_SETTINGS = {
     "density_start": 10**9,
 }
 
-Report = Callable[[str, int, int], None]  # what is under way, how much of how much is done
+Progress = Callable[[str, int, int], None]  # what is under way, how much of how much is done
 
 
-def learn_tissue(footage: Capture, folder: Path, device: torch.device, report: Report) -> GaussianScene:
+def learn_tissue(footage: Capture, folder: Path, device: torch.device, report: Progress) -> GaussianScene:
     """Learn the tissue behind all that moves in `footage`, without its states.
 
     `folder` keeps runs and masks, from which interrupted work continues to the same bits. Raises NeecoError for
@@ -82,7 +82,7 @@ def learn_tissue(footage: Capture, folder: Path, device: torch.device, report: R
     return scene
 
 
-def _learned(capture: Capture, run: Path, iterations: int, device: torch.device, report: Report) -> GaussianScene:
+def _learned(capture: Capture, run: Path, iterations: int, device: torch.device, report: Progress) -> GaussianScene:
     stage = f"learning the tissue, {run.name}"
 
     def progress(row: ProgressRow) -> None:
@@ -135,7 +135,9 @@ def usable(steps: Sequence[Step]) -> list[Step]:
     return [chosen[k] for k in evenly_spaced(len(chosen), MAX_FRAMES_AGAIN)] if chosen else []
 
 
-def learn_again(scene: GaussianScene, frames: Sequence[Frame], steps: Sequence[Step], report: Report) -> GaussianScene:
+def learn_again(
+    scene: GaussianScene, frames: Sequence[Frame], steps: Sequence[Step], report: Progress
+) -> GaussianScene:
     """Learn tissue and light of `scene`, which is changed in place, from frames tracked in `steps`."""
     chosen = usable(steps)
     if len(chosen) < MIN_FRAMES_AGAIN:

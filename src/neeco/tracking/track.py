@@ -7,7 +7,6 @@ written into the output as it is made, so that interrupted work continues to the
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 import shutil
@@ -25,16 +24,16 @@ from neeco.capture.model import Capture, Frame, InstrumentState, State
 from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
-from neeco.files import LOCK, own_folder, read_begun, read_bytes, read_json, require_same, write_json
+from neeco.files import LOCK, own_folder, read_begun, read_json, require_same, write_json
 from neeco.scene import Recorded
 from neeco.scene.gaussian_scene import one_tissue
 from neeco.scene.io import load_gaussians, save_scene
 from neeco.tracking.follow import SEARCH_ROLLS_EVERY, Follower, Step
 from neeco.tracking.footage_scene import adapted, over_tissue
-from neeco.tracking.footage_tissue import Report, learn_again, learn_tissue
+from neeco.tracking.footage_tissue import Progress, learn_again, learn_tissue
 from neeco.tracking.parameters import TrackedParameters, fitter_of
 from neeco.tracking.trust import Reference
-from neeco.training.run import stored_config, write_config
+from neeco.training.run import SCENE_FILE, scene_digest, stored_config, write_config
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
@@ -107,7 +106,7 @@ def track_footage(
     min_trust: float = MIN_TRUST,
     resume: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-    on_stage: Report = lambda what, done, total: None,
+    on_stage: Progress = lambda what, done, total: None,
 ) -> Tracked:
     """Find the states of the run's instruments in every frame of `footage`, and write those that are trusted as a
     capture.
@@ -130,13 +129,12 @@ def track_footage(
     frames = sorted(footage.frames, key=lambda frame: frame.state.time)
     given = _first_state(footage, frames[0], scene) if start == "first" else None
     trained_on = run.capture()
-    digest = scene_digest(run)
     info: dict[str, Any] = {
         "schema": SCHEMA,
         "version": neeco.__version__,
         "run": os.path.abspath(run.path),
         "footage": os.path.abspath(footage.root),
-        "scene_sha256": digest,
+        "scene_sha256": scene_digest(run.path),
         "captures_sha256": [fingerprint(capture) for capture in (footage, trained_on)],
         "start": start,
         "tissue": tissue,
@@ -163,7 +161,7 @@ def track_footage(
         else:
             info = stored
             if tissue == "footage":
-                scene = load_gaussians(output / RUN / "scene.safetensors", "track", scene.center.device)
+                scene = load_gaussians(output / RUN / SCENE_FILE, "track", scene.center.device)
         registered = trained_on.registered or tissue == "footage"
         trusted = replace(footage, frames=_with_trust(frames, info["frames"], min_trust), registered=registered)
         if trusted.frames:
@@ -176,14 +174,8 @@ def track_footage(
     return Tracked(output, footage, info["frames"], len(trusted.frames), min_trust, scene)
 
 
-def scene_digest(run: GaussianRun) -> str:
-    """Return the SHA-256 of a run's scene. Raises NeecoError for an unfinished run."""
-    file = Path(run.path) / "scene.safetensors"
-    return hashlib.sha256(read_bytes(file, "a learned scene", "no such file; train the run first")).hexdigest()
-
-
 def _learned_again(
-    scene: GaussianScene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Report
+    scene: GaussianScene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Progress
 ) -> GaussianScene:
     """Return the scene with tissue and light learned again from the tracked frames; kept in `folder`."""
     file = folder / "scene-2.safetensors"
@@ -193,10 +185,10 @@ def _learned_again(
 
 
 def _over_footage(
-    instruments: GaussianScene, footage: Capture, folder: Path, report: Report
+    instruments: GaussianScene, footage: Capture, folder: Path, report: Progress
 ) -> tuple[GaussianScene, dict[str, Any]]:
     """Return the instruments over the footage's tissue in its light, and that light; kept in `folder`."""
-    file, light = folder / "scene.safetensors", folder / "light.json"
+    file, light = folder / SCENE_FILE, folder / "light.json"
     if not light.exists():
         ground = learn_tissue(footage, folder / "tissue", instruments.center.device, report)
         found = adapted(over_tissue(instruments, ground), footage.frames, report)
@@ -210,10 +202,10 @@ def _write_run(output: Path, run: GaussianRun, scene: GaussianScene) -> None:
     folder, digest = output / RUN, ""
     if (output / "transforms.json").exists():
         capture = read_capture(output)
-        scene.recorded = Recorded.of(capture.frames, scene.instruments, capture.lens, still=capture.still)
+        scene.recorded = Recorded.of(capture.frames, scene.instruments, lens=capture.lens, still=capture.still)
         digest = fingerprint(capture)
     folder.mkdir(exist_ok=True)
-    save_scene(scene, folder / "scene.safetensors")
+    save_scene(scene, folder / SCENE_FILE)
     config = stored_config(Path(run.path), run.config)
     write_config(folder, output, replace(config, transforms="transforms.json"), digest)
 

@@ -55,7 +55,12 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
     instruments = tuple(_learned_instrument(item, frames, config, report) for item in capture.instruments)
     # at their recorded size, whatever size is learned from
     recorded = Recorded.of(
-        capture.split("train"), instruments, capture.lens, config.scale, capture.still, capture.tissues
+        capture.split("train"),
+        instruments,
+        lens=capture.lens,
+        scale=config.scale,
+        still=capture.still,
+        tissues=capture.tissues,
     )
     worlds = [tissue.points for tissue in capture.tissues] or [capture.points]
     clouds = [_thinned_points(points, frames, config) for points in worlds]

@@ -1,8 +1,9 @@
-"""Run folders: config.yaml, scene.safetensors, checkpoint/ (all that a session needs to go on bit for bit),
-metrics.jsonl."""
+"""Run folders: config.yaml, scene.safetensors, metrics.jsonl, and checkpoint/, from which a session continues bit for
+bit."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -22,6 +23,7 @@ from neeco.errors import NeecoError
 from neeco.files import (
     YamlDumper,
     parse_yaml,
+    read_bytes,
     read_text,
     require_file,
     require_inside,
@@ -36,7 +38,7 @@ from neeco.scene.training_session import Session, StepResult, members
 from neeco.training.config import TrainConfig, check_ranges, config_from_dict, config_to_dict
 
 SCHEMA = "neeco-run/1"
-CONFIG_FILE = "config.yaml"
+CONFIG_FILE, SCENE_FILE = "config.yaml", "scene.safetensors"
 CAPTURE_DIGEST = "capture_sha256"
 CHECKPOINT_SCHEMA = "neeco-checkpoint/1"
 CHECKPOINT_HEADER = {"schema": str, "scene": {}, "iteration": int, "seconds": float}
@@ -72,14 +74,20 @@ class GaussianRun(TrainedRun):
     scene: GaussianScene
 
 
+def scene_digest(path: Path) -> str:
+    """Return the SHA-256 of the scene in run folder `path`. Raises NeecoError for an unfinished run."""
+    content = read_bytes(Path(path) / SCENE_FILE, "a learned scene", "no such file; train the run first")
+    return hashlib.sha256(content).hexdigest()
+
+
 def load_run(path: Path, device: torch.device | None = None) -> TrainedRun:
     """Open a run folder, its scene on `device` (None: the CPU). Raises NeecoError when it is not one, is unfinished or
     comes from another version's format."""
     path = Path(path)
     config = read_config(path)
-    if not (path / "scene.safetensors").is_file():
+    if not (path / SCENE_FILE).is_file():
         raise NeecoError(f"{path}: training has not finished here; continue it with `neeco train … --resume`")
-    scene = load_scene(path / "scene.safetensors")
+    scene = load_scene(path / SCENE_FILE)
     return TrainedRun(path, scene if device is None else scene.to(device), config)
 
 

@@ -29,6 +29,7 @@ from neeco.training.config import TrainConfig, require_begun_with
 from neeco.training.initial import begin_session
 from neeco.training.run import (
     CONFIG_FILE,
+    SCENE_FILE,
     checkpoint_path,
     read_checkpoint,
     read_config,
@@ -102,7 +103,7 @@ def train(
     digest = fingerprint(capture)
     if stored is not None:
         require_same_capture(output, capture.root, digest)
-        if (output / "scene.safetensors").exists():
+        if (output / SCENE_FILE).exists():
             with own_folder(output):  # removes temporary files of a process killed after its last step
                 return output
     frames = _training_frames(capture, capture_path, config)
@@ -126,7 +127,7 @@ def train(
             log.note("finishing: labels, shaft, diagnostics")
             _check_finite(session)
             session.finish()
-            save_scene(session.scene, output / "scene.safetensors")
+            save_scene(session.scene, output / SCENE_FILE)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"while finishing; {go_on}") from None
     return output

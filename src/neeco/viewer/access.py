@@ -1,4 +1,4 @@
-"""Who may look: nothing from outside this machine without the token, nothing that another site's page asks for."""
+"""Access control: other machines need the token, and pages of other sites are refused."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class AccessControl:
         return None
 
     def in_address(self, path: str) -> bool:
-        """Does the address itself carry the token?"""
+        """Whether the address itself carries the token."""
         return any(self._is_token(value) for value in parse_qs(path.partition("?")[2]).get("token", ()))
 
     def _in_cookie(self, headers: Mapping[str, Sequence[str]]) -> bool:
@@ -86,7 +86,7 @@ def content_security_policy(page: bytes, host: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Does `--host` name this machine to itself alone?"""
+    """Whether `--host` is reachable from this machine alone."""
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -114,7 +114,7 @@ def free_port(host: str, port: int) -> int:
 
 
 def url_of(host: str, port: int, token: str | None) -> str:
-    """What to open in a browser."""
+    """Address to open in a browser."""
     if host in ("0.0.0.0", "::", ""):
         host = socket.gethostname()
     shown = f"[{host}]" if ":" in host and not host.startswith("[") else host

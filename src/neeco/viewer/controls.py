@@ -1,4 +1,4 @@
-"""What the sliders say, as a state: a place in the recording, and how far each instrument departs from it."""
+"""The sliders' values as a state: a place in the recording, and each instrument's departure from it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Shaft:
 
 @dataclass(frozen=True)
 class InstrumentControls:
-    """How one instrument departs from the recording. The default does not."""
+    """Departure of one instrument from the recording; none by default."""
 
     joints: Mapping[str, float] = field(default_factory=dict)  # rad; those not named are as recorded
     slide: float = 0.0  # mm along the shaft, towards the jaws
@@ -47,7 +47,7 @@ class InstrumentControls:
 
     @property
     def departs(self) -> bool:
-        """Does it do anything that was not recorded?"""
+        """Whether anything differs from the recording."""
         return self.pose is not None or bool(self.joints) or any((self.slide, self.roll, self.yaw, self.pitch))
 
 
@@ -114,7 +114,7 @@ def shafts_of(scene: DrawableScene) -> dict[str, Shaft]:
 
 
 def slider_ranges(instruments: Sequence[Instrument], states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
-    """How far the slider of each (instrument, joint) goes, in rad: to the capture's limits, or a little beyond what was
+    """Range of the slider of each (instrument, joint), in rad: the capture's limits, or a little beyond what was
     recorded where it states none."""
     found = {}
     for (name, joint), recorded in joint_ranges(states).items():
@@ -141,7 +141,7 @@ def _moved(recorded: InstrumentState, shaft: Shaft, controls: InstrumentControls
     )
     pose = to_numpy(recorded.pose) if controls.pose is None else controls.pose
     joints = {joint: controls.joints.get(joint, value) for joint, value in recorded.joints.items()}
-    with np.errstate(invalid="ignore"):  # a browser may send infinity: nothing can be drawn there
+    with np.errstate(invalid="ignore"):  # a browser may send infinity: nothing can be rendered there
         offset = rigid(np.eye(3), controls.slide * shaft.along) @ turn_about(shaft.end, turns.as_rotvec())
         return InstrumentState(torch.from_numpy(pose @ offset), joints)
 

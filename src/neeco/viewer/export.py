@@ -1,4 +1,4 @@
-"""`neeco view RUN --export FILE.html`: one file that carries the scene and draws it, without server, network or GPU.
+"""`neeco view RUN --export FILE.html`: one file that carries the scene and renders it, without server, network or GPU.
 
 The scene is packed as `neeco-page/1` (docs/viewer.md): every number of a Gaussian becomes a plane of its own, low bytes
 before high ones, so that deflate finds the likeness of neighbours. What joints move can be packed; what
@@ -140,7 +140,7 @@ def _source(*names: str) -> str:
 
 
 def _hash(text: str) -> str:
-    """As a Content-Security-Policy names an inline script or style."""
+    """Source expression of an inline script or style in a Content-Security-Policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
@@ -218,7 +218,7 @@ def _planes(numbers: np.ndarray, kind: str) -> bytes:
 
 
 def _columns(rows: Tensor, blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """Blocks [N, K] beside one another, also where there are none: whole numbers of as many rows as `rows` has."""
+    """Concatenate blocks [N, K] by columns; without any, return whole numbers of as many rows as `rows` has."""
     return np.concatenate([np.zeros((len(rows), 0), np.int64), *blocks], 1)
 
 

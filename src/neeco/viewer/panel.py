@@ -33,9 +33,9 @@ PLOT_COLORS = ("#228be6", "#f76707")
 LINE = 80  # characters of a name or message that are shown
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Actions:
-    """What the panel calls when the user does something."""
+    """Callbacks of the panel."""
 
     changed: Callable[[], None]
     go_to: Callable[[int], None]  # the camera of a frame
@@ -63,20 +63,20 @@ class Panel:
         self._add_saving()
 
     def controls(self, overlays: Overlays) -> Controls:
-        """What the sliders say."""
+        """Values of the sliders."""
         instruments = {item.name: item.controls(overlays.gizmo_pose(item.name)) for item in self.instruments}
         return Controls(self.place, instruments)
 
     @property
     def place(self) -> float:
-        """Where in the recording, in frames."""
+        """Place in the recording, in frames."""
         frame, last = float(self.frame.value), len(self._runs[0].recorded.states) - 1
         # a browser may say anything
         return min(max(frame, 0.0), float(last)) if math.isfinite(frame) else 0.0
 
     @property
     def side_by_side(self) -> bool:
-        """Does each run get its own part of the window?"""
+        """Whether each run has its own part of the window."""
         return len(self._runs) > 1 and self.layout.value == BESIDE
 
     def show_timelines(self, timelines: Sequence[Timeline]) -> None:
@@ -111,7 +111,7 @@ class Panel:
                 (SPLIT, BESIDE),
                 initial_value=BESIDE,
                 visible=len(self._runs) > 1,
-                hint="Side by side, cameras, points and arrows are not drawn: they would stand between the two.",
+                hint="Side by side, cameras, points and arrows are hidden.",
             )
             self.divide = gui.add_slider("divide at (%)", 0, 100, 1, 50, visible=False)
         self.view.on_update(self._moved)
@@ -267,7 +267,7 @@ class InstrumentPanel:
         self.back.on_click(lambda _: self.reset())
 
     def controls(self, pose: np.ndarray | None) -> InstrumentControls:
-        """What the sliders say; pose [4, 4]: where the gizmo stands, mm, or None where there is none."""
+        """Values of the sliders; pose [4, 4]: of the gizmo, mm, or None without one."""
         joints = {}
         if not self.as_recorded.value:
             for joint, slider in self._joints.items():
@@ -323,7 +323,7 @@ class InstrumentPanel:
 
 
 def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: float) -> viser.GuiSliderHandle[float]:
-    """In mm where `per_unit` is 1, else in degrees. Ends are rounded outwards; what lies outside the range there is
+    """Add a slider in mm where `per_unit` is 1, else in degrees. Ends are rounded outwards; what lies outside is
     drawn at its end."""
     lower, upper = per_unit * span.lower, per_unit * span.upper
     digits = max(0, 1 - math.floor(math.log10((upper - lower) / 5)))
@@ -366,7 +366,7 @@ def message_html(text: str) -> str:
 
 
 def _text(text: str, most: int = LINE) -> str:
-    """As it reads, on one line, not longer than `most`, escaped."""
+    """Text on one line, at most `most` characters, escaped."""
     line = " ".join(str(text).split())
     return html.escape(line if len(line) <= most else line[: most - 1] + "…")
 

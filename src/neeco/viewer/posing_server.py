@@ -137,17 +137,17 @@ class _Handler(BaseHTTPRequestHandler):
         return reason is None
 
     def _answer(self, ask: Callable[[], dict[str, Any]]) -> None:
-        """Send what `ask` gives as JSON, or what is wrong."""
+        """Send what `ask` returns as JSON, or what is wrong."""
         try:
             value, status = ask(), HTTPStatus.OK
         except NeecoError as error:
             value, status = {"error": str(error)}, HTTPStatus.BAD_REQUEST
         self._send(json.dumps(value, allow_nan=False).encode(), "application/json", status)
 
-    def _show(self, draw: Callable[[], bytes], kind: str) -> None:
-        """Send the picture that `draw` gives, or what is wrong."""
+    def _show(self, render: Callable[[], bytes], kind: str) -> None:
+        """Send the picture that `render` returns, or what is wrong."""
         try:
-            pixels = draw()
+            pixels = render()
         except NeecoError as error:
             self._send(f"{error}\n".encode(), "text/plain; charset=utf-8", HTTPStatus.NOT_FOUND)
         else:
@@ -169,7 +169,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _json(text: str | bytes) -> Any:
-    """What a JSON text says; None where it is none."""
+    """Value of a JSON text; None for any other text."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -177,5 +177,5 @@ def _json(text: str | bytes) -> Any:
 
 
 def _whole(text: str | None) -> int:
-    """A number of a frame; -1, which none has, where it is no number."""
+    """Number of a frame; -1, which no frame has, for any other text."""
     return int(text) if text is not None and text.isdecimal() and len(text) < 10 else -1

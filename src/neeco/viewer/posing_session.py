@@ -1,4 +1,4 @@
-"""What the page of `neeco view CAPTURE --annotate` shows and saves: asked frames, pictures along the shaft, answers."""
+"""Content of the page of `neeco view CAPTURE --annotate`: requested frames, pictures along the shaft, answers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from neeco.ingest.posing.posed_capture import N_SUGGESTED, PosedCapture, SolvedP
 from neeco.labels.drawing import draw
 from neeco.training.run import load_run
 
-# of the working length, that a picture shows: before and beyond the origin, beside it
+# of the working length, that a picture shows: before and beyond the origin, to its sides
 ALONG, ACROSS = (-0.6, 1.4), 0.65
 PICTURE_PX, THUMB_PX, GHOST_PX = 1000, 160, 500  # wide
 RUN_FILE = "config.yaml"  # tells a run from a capture
@@ -49,12 +49,12 @@ class PosingSession:
         return list(self._posings)
 
     def overview(self, instrument: str) -> dict[str, Any]:
-        """What is asked, answered and known of an instrument, as the page takes it. Raises NeecoError."""
+        """Requests, answers and estimates of an instrument, as JSON for the page. Raises NeecoError."""
         with self._lock:
             return self._overview(instrument)
 
     def frame(self, instrument: str, index: int) -> dict[str, Any]:
-        """What is known in one frame, and what its lines are drawing with. Raises NeecoError."""
+        """Estimates in one frame, and what the page's lines are drawn with. Raises NeecoError."""
         with self._lock:
             posing = self._posing(instrument, index)
             origin = posing.shafts.origins[index]
@@ -67,7 +67,7 @@ class PosingSession:
                     name: _known(solved.values[index], float(solved.deviations_deg[index]))
                     for name, solved in posing.joints.items()
                 },
-                # a point a mm along the shaft, b across, c towards the camera is seen at (a, b) of another depth
+                # a point a mm along the shaft, b across, c towards the camera is observed at (a, b) of another depth
                 "origin_towards": float(towards[index] @ origin),
                 "origin_along": float(posing.shafts.directions[index] @ origin),
             }
@@ -201,7 +201,7 @@ def _possible(posing: SolvedPosing, roll_deg: float, joints_deg: dict[str, float
 
 
 def _encoded(pixels: np.ndarray, kind: str) -> bytes:
-    """Of RGB or RGBA [H, W, C], as a file of that kind."""
+    """Encode RGB or RGBA [H, W, C] as a file of that kind."""
     order = cv2.COLOR_RGB2BGR if pixels.shape[-1] == 3 else cv2.COLOR_RGBA2BGRA
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if kind == ".jpg" else []
     done, encoded = cv2.imencode(kind, cv2.cvtColor(pixels, order), options)

@@ -1,4 +1,4 @@
-"""The run folders that are looked at: their scenes, also while they are trained, and how well each frame is drawn."""
+"""The viewed run folders: their scenes, also during training, and the score of each frame."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ if TYPE_CHECKING:
 SCENE_FILE = "scene.safetensors"
 ASSUMED_MM = 100.0  # from a camera to what it looks at, where no camera looks at the scene's centre
 DISTANCE_UNITS = 10.0  # viser's units of length, from a recorded camera to what it looks at
-WATCH_S = 2.0  # between two looks at the run folders
+WATCH_S = 2.0  # between two checks of the run folders
 TIMELINE_WIDTH = 320  # px at most of the images that a timeline compares
 FIELD_WIDTH = 48  # px, of a radiance field's, which take a hundred times as long
 WORST = 8  # frames that a timeline lists
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LoadedRun:
-    """What a run folder held when it was read; another reading is another object.
+    """Content of a run folder when it was read; another reading is another object.
 
     Frames are in the order they were recorded in, all splits together.
     """
 
     name: str
-    world: str  # the capture's folder: runs of one capture share their world frame
+    world: str  # the capture's folder, whose world frame the scene has
     scene: DrawableScene
     recorded: Recorded
     frames: tuple[Frame, ...]  # those of `recorded`, with their images; empty: the capture is not at hand
@@ -79,7 +79,7 @@ class LoadedRun:
 
     @property
     def signature(self) -> tuple[Any, ...]:
-        """What sliders are made from: where it changes, they must be made anew."""
+        """Everything that sliders depend on: where it changes, they are created again."""
         joints = tuple((item.name, tuple(item.joints.items())) for item in self.scene.instruments)
         return joints, self.recorded.names, tuple(self.scene.label_names), bool(self.frames)
 
@@ -180,7 +180,7 @@ def _read_capture_of(config: dict[str, Any]) -> tuple[Capture | None, str]:
 
 @dataclass(frozen=True)
 class FrameScore:
-    """How well one recorded frame is drawn."""
+    """Score of one rendered frame against the recorded one."""
 
     psnr: float  # dB
     iou: float | None  # of all instruments together; None: nobody drew a true mask, or the scene has no labels
@@ -189,7 +189,7 @@ class FrameScore:
 @lru_cache(maxsize=4096)
 @torch.no_grad()
 def score_frame(loaded: LoadedRun, index: int) -> FrameScore:
-    """What `neeco evaluate` would say of one frame of `loaded.frames`. Raises NeecoError for unreadable files."""
+    """Score one frame of `loaded.frames` as `neeco evaluate` does. Raises NeecoError for unreadable files."""
     frame = loaded.frames[index]
     counted = frame.load_mask()
     drawing = draw(loaded.scene, frame.state, frame.camera)
@@ -213,7 +213,7 @@ class Timeline:
 
     @property
     def done(self) -> bool:
-        """Is every frame known?"""
+        """Whether every frame is scored."""
         return not self._pending
 
     def advance(self) -> None:
@@ -226,7 +226,7 @@ class Timeline:
 
     @property
     def count(self) -> int:
-        """How many frames are known."""
+        """Number of scored frames."""
         return len(self._psnr)
 
     def known(self) -> tuple[np.ndarray, np.ndarray]:
@@ -236,7 +236,7 @@ class Timeline:
             return np.array(frames, np.int64), np.array([self._psnr[k] for k in frames], np.float64)
 
     def worst(self) -> list[tuple[int, float]]:
-        """(frame, PSNR) of the worst known frames, worst first; of neighbours, which look alike, only the worst."""
+        """(frame, PSNR) of the worst known frames, worst first; of similar neighbours only the worst."""
         frames, values = self.known()
         apart = max(1, len(self.loaded.frames) // (4 * WORST))
         chosen: list[tuple[int, float]] = []
@@ -250,7 +250,7 @@ class Timeline:
 
 @torch.no_grad()
 def coarse_psnr(loaded: LoadedRun, index: int) -> float:
-    """PSNR in dB of one frame, drawn and recorded at no more than TIMELINE_WIDTH px. Raises NeecoError."""
+    """PSNR in dB of one frame, rendered and recorded at no more than TIMELINE_WIDTH px. Raises NeecoError."""
     frame = loaded.frames[index]
     camera = narrowed(frame.camera, TIMELINE_WIDTH if loaded.scene.has_gaussians else FIELD_WIDTH)
     size = camera.width, camera.height
@@ -263,7 +263,7 @@ def coarse_psnr(loaded: LoadedRun, index: int) -> float:
 
 
 def narrowed(camera: Camera, width: int) -> Camera:
-    """The same view in an image of at most `width` px."""
+    """Return the same view in an image at most `width` px wide."""
     return camera if camera.width <= width else camera.scaled(width / camera.width)
 
 
@@ -278,8 +278,13 @@ class ViewedRuns:
     """The runs that all browsers of a server share, and what is known of their frames. Any thread may use it."""
 
     def __init__(self, paths: Sequence[Path], device: torch.device | None = None, tissue: str | None = None) -> None:
-        """Raises NeecoError where a run folder holds nothing to look at."""
+        """Raises NeecoError for a run folder without a scene, and for runs of different captures."""
         self.watched = [WatchedRun(path, device, tissue) for path in paths]
+        worlds = [loaded.world for loaded in self.loaded]
+        if len(set(worlds)) > 1:
+            raise NeecoError(
+                f"view: {paths[1]}: was trained on {worlds[1]}, {paths[0]} on {worlds[0]}; compare runs of one capture"
+            )
         self.distance = self.loaded[0].distance  # mm
         self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
         self.timelines = [Timeline(loaded) for loaded in self.loaded]
@@ -287,7 +292,7 @@ class ViewedRuns:
 
     @property
     def loaded(self) -> list[LoadedRun]:
-        """What the runs held when they were read last."""
+        """Content of the runs when they were last read."""
         return [run.loaded for run in self.watched]
 
     def refresh(self) -> bool:

@@ -1,4 +1,4 @@
-"""What a user saves while looking: states for `synthesize --states`, and single labelled images."""
+"""Files that a user saves in the viewer: states for `synthesize --states`, and single labelled images."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class SavedStates:
 
     @property
     def states_path(self) -> Path:
-        """What `synthesize --states` takes."""
+        """File for `synthesize --states`."""
         return self.folder / STATES
 
     def add(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> int:
@@ -56,7 +56,7 @@ class SavedStates:
             return self._write(self._lines(loaded)[:-1])
 
     def read(self, loaded: LoadedRun) -> list[StateLine]:
-        """What is saved, checked against the scene. Raises NeecoError."""
+        """Read the saved states, checked against the scene. Raises NeecoError."""
         if not self.states_path.exists():
             return []
         return read_states(self.states_path, loaded.scene.instruments, loaded.scene.recorded.tissues)

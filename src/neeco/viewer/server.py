@@ -86,7 +86,7 @@ class ViewerServer:
         _stop_server(self._server)
 
     def _prepare_scene(self) -> None:
-        """What all browsers share: which way is up, where a new one and the home button stand."""
+        """Set what all browsers share: the up direction and the initial camera."""
         first, unit = self.runs.loaded[0], self.runs.unit
         camera = first.recorded.cameras[0]
         pose = to_numpy(camera.world_from_camera)

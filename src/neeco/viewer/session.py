@@ -20,7 +20,7 @@ from neeco.viewer.controls import Controls, controlled_state, interpolated_state
 from neeco.viewer.panel import Actions, Panel, message_html, status_html
 from neeco.viewer.runs import LoadedRun, ViewedRuns
 from neeco.viewer.saving import SavedStates
-from neeco.viewer.views import Picture, RunPicture, beside, render_run, scored, split
+from neeco.viewer.views import Picture, RunPicture, render_run, scored, side_by_side, split
 from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fitting_view, jump, pose_of, stands_at
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class AdaptiveResolution:
         self._per_pixel: deque[float] = deque(maxlen=REMEMBERED)  # s
 
     def height(self, sharp: bool, window: int, aspect: float) -> int:
-        """How many px high to render: as the constants say and the window shows, fewer where that would take too long.
+        """Height in px to render: at most the constants' and the window's, less where that would take too long.
         aspect: width of all that is rendered by its height."""
         if sharp and self._sharp_px is not None:
             return max(MIN_PX, min(self._sharp_px, window))
@@ -61,7 +61,7 @@ class AdaptiveResolution:
         return max(MIN_PX, min(most, int(in_time)))
 
     def record(self, seconds: float, pixels: int) -> None:
-        """A rendering of that many pixels took so long."""
+        """Record how long a rendering of that many pixels took."""
         self._per_pixel.append(seconds / pixels)
 
 
@@ -84,7 +84,7 @@ class RenderThread:
 
     @property
     def sessions(self) -> tuple[ClientSession, ...]:
-        """Those that are connected."""
+        """The connected sessions."""
         with self._lock:
             return tuple(self._sessions.values())
 
@@ -99,19 +99,19 @@ class RenderThread:
         self._thread.join(timeout=10)
 
     def add(self, session: ClientSession) -> None:
-        """A browser has connected."""
+        """Add a browser that has connected."""
         with self._lock:
             self._sessions[session.key] = session
         self.request(session.key)
 
     def remove(self, key: int) -> None:
-        """A browser has gone."""
+        """Remove a browser that has gone."""
         with self._lock:
             for table in (self._sessions, self._requested, self._unsharp):
                 table.pop(key, None)
 
     def request(self, key: int | None = None) -> None:
-        """A session, or every one, needs another picture."""
+        """Request another picture for a session, or for every one."""
         now = time.perf_counter()
         with self._lock:
             for which in list(self._sessions) if key is None else [key]:
@@ -121,7 +121,7 @@ class RenderThread:
         self._wake.set()
 
     def run_job(self, job: Callable[[], None]) -> None:
-        """Have something else done between two pictures, by the thread that renders."""
+        """Run a job between two pictures, in the thread that renders."""
         with self._lock:
             self._jobs.append(job)
         self._wake.set()
@@ -143,7 +143,7 @@ class RenderThread:
             self._wake.wait(max(0.0, min([IDLE_S, *(moment - now for moment in moments)])))
 
     def _tick(self) -> list[float]:
-        """Let time go on for every session; when they want to be called again."""
+        """Advance every session; return when each is to be called again."""
         now = time.perf_counter()
         moments = []
         for session in self.sessions:
@@ -156,7 +156,7 @@ class RenderThread:
         return [moment for moment in moments if moment is not None]
 
     def _do_most_urgent(self) -> bool:
-        """Do a job, or render a picture; whether there was one."""
+        """Do a job or render a picture; return whether there was one."""
         with self._lock:
             job = self._jobs.pop(0) if self._jobs else None
             key, sharp = next(iter(self._requested), None), False
@@ -179,7 +179,7 @@ class RenderThread:
 
 
 class ClientSession:
-    """One browser: its panel, what is drawn over its picture, its picture.
+    """One browser: its panel, its picture and the overlays.
 
     Made when the browser connects. sharp_px: height of sharp pictures, where a user asked for one. `render` and `tick`
     belong to the render thread, the rest to any. connected: is it still there?
@@ -225,13 +225,13 @@ class ClientSession:
         camera = browser_camera(window, self._runs.unit, height, share)
         view = self._panel.view.value
         try:
-            parts = [render_run(self._runs, k, controls, camera, self._camera_frame, view) for k in range(len(current))]
+            parts = [render_run(self._runs, k, controls, camera, view) for k in range(len(current))]
         except NeecoError as error:
             self._panel.status.content = message_html(str(error))
             return
         pictures = [part.picture for part in parts]
         if len(pictures) == 1 or self._panel.side_by_side:
-            whole = beside(pictures)
+            whole = side_by_side(pictures)
         else:
             whole = split(pictures[0], pictures[1], self._panel.divide.value / 100)
         seconds = time.perf_counter() - began
@@ -260,7 +260,7 @@ class ClientSession:
         return self._played_at + 1 / per_s
 
     def _build(self, runs: list[LoadedRun]) -> tuple[list[LoadedRun], Overlays, Panel]:
-        """What the runs hold, and the overlays and panel for it."""
+        """Return the runs, and create overlays and panel for them."""
         actions = Actions(
             changed=self._request,
             go_to=self._go_to,
@@ -287,11 +287,11 @@ class ClientSession:
 
     @property
     def _share(self) -> float:
-        """Of the window's width, that one run's picture takes up."""
+        """Share of the window's width of one run's picture."""
         return 1 / len(self._loaded) if self._panel.side_by_side else 1.0
 
     def _fit_window(self) -> None:
-        """Where the window has changed its shape, have it show all that the recorded camera saw, if it stands there."""
+        """Show all of the recorded image where the window has changed its shape and stands at its camera."""
         window, recorded = self._client.camera, self._loaded[0].recorded.cameras[self._camera_frame]
         shape = aspect_of(window) * self._share
         if shape == self._shape:
@@ -301,7 +301,7 @@ class ClientSession:
             window.fov = fitting_view(recorded, shape)
 
     def _follow_recording(self) -> Controls:
-        """What the sliders say; they and the camera are brought along to where the recording is."""
+        """Return the sliders' values, after sliders and camera have followed the recording."""
         panel = self._panel
         controls = panel.controls(self.overlays)
         recorded = interpolated_state(self._loaded[0].recorded.states, controls.frame)
@@ -316,7 +316,7 @@ class ClientSession:
         return controls
 
     def _state(self) -> State:
-        """What the first run shows now."""
+        """Return what the first run shows now."""
         first = self._loaded[0]
         return controlled_state(first.recorded.states, first.shafts, self._panel.controls(self.overlays))
 
@@ -342,11 +342,11 @@ class ClientSession:
         self._report(lambda: f"kept: {saved.remove_last(loaded)} in {saved.states_path}")
 
     def _save_image(self) -> None:
-        if self._saving:  # or a page that asks a thousand times would be drawn for long after it has gone
+        if self._saving:  # or a page that asks a thousand times would be served long after it has gone
             return
         self._saving = True
         state, pose = self._state(), self._pose()
-        self._panel.saved.content = message_html("drawing …")
+        self._panel.saved.content = message_html("rendering …")
 
         def save() -> None:
             try:
@@ -392,7 +392,7 @@ class ClientSession:
 
 
 def frames_per_s(loaded: LoadedRun) -> float:
-    """How fast to play: as it was recorded, within reason."""
+    """Playback rate in frames per second: as recorded, between SLOWEST and FASTEST."""
     times = [state.time for state in loaded.recorded.states]
     if loaded.capture is None or not loaded.capture.timed or times[-1] <= times[0]:
         return PLAYED_PER_S

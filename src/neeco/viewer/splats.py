@@ -109,7 +109,9 @@ def spz_bytes(splats: Splats) -> bytes:
     degree = int(splats.sh.shape[1] ** 0.5) - 1
     header = struct.pack("<IIIBBBB", SPZ_MAGIC, SPZ_VERSION, len(splats.means), degree, SPZ_FRACTION, 0, 0)
     positions = (fixed & 0xFFFFFF).astype("<u4")[..., None].view(np.uint8)[..., :3]
-    quats = np.where(splats.quats[:, :1] < 0, -splats.quats, splats.quats)[:, 1:]  # w is made of the rest, and positive
+    quats = np.where(splats.quats[:, :1] < 0, -splats.quats, splats.quats)[
+        :, 1:
+    ]  # w follows from the rest, and is positive
     columns = (
         positions,
         _byte(255 / (1 + np.exp(-splats.logits.astype(np.float64)))),
@@ -140,7 +142,7 @@ def _in_world(posed: Gaussians) -> Tensor:
         return posed.sh
     directions = spread_directions(DIRECTIONS).to(posed.sh)  # [D, 3]
     back = torch.linalg.pinv(sh_basis(directions, count))  # [K, D]
-    frames, which = torch.unique(posed.sh_frames, dim=0, return_inverse=True)  # most stand still, all alike
+    frames, which = torch.unique(posed.sh_frames, dim=0, return_inverse=True)  # most are constant and equal
     local = torch.einsum("fij,di->fdj", quat_to_matrix(frames), directions)  # [F, D, 3]
     turned = back @ sh_basis(local.reshape(-1, 3), count).reshape(*local.shape[:2], count)  # [F, K, K]
     return torch.einsum("nkl,nlc->nkc", turned[which], posed.sh)

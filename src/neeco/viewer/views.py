@@ -20,7 +20,7 @@ from neeco.raster.types import Rendering
 from neeco.scene.gaussian_scene import is_gaussian
 from neeco.viewer.controls import Controls, controlled_state, corresponding_frame
 from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRuns, score_frame
-from neeco.viewer.viser_scene import carried_over, stands_at
+from neeco.viewer.viser_scene import stands_at
 
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene
@@ -38,14 +38,14 @@ DIMMED = 0.35  # of its light is left of what cannot be compared
 
 @dataclass(frozen=True)
 class Picture:
-    """What is shown, and how far away it is."""
+    """Shown pixels and their depth."""
 
     pixels: Pixels  # uint8 [H, W, 3]
     depth: np.ndarray  # [H, W] mm, 0 = nothing there
     note: str = ""  # what the colours mean, where that differs from picture to picture
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunPicture:
     """A run's part of the window, and what the status says of it."""
 
@@ -60,7 +60,7 @@ class RunPicture:
 
 
 def views_of(scene: DrawableScene, has_images: bool) -> tuple[str, ...]:
-    """Which of VIEWS there are of a scene; has_images: the capture is at hand."""
+    """The VIEWS that a scene has; has_images: the capture is at hand."""
     absent = set()
     if not scene.label_names:
         absent |= set(LABELLED)
@@ -94,8 +94,8 @@ def picture(scene: DrawableScene, state: State, camera: Camera, view: str, label
 
 @torch.no_grad()
 def difference(scene: DrawableScene, state: State, recorded_by: Camera, image: np.ndarray, window: Camera) -> Picture:
-    """How far what the camera that recorded `image` [H, W, 3] in [0, 1] would see is from it, as `window` shows it: a
-    camera at the same place with the same vertical field of view. What it shows beside the image is black."""
+    """Difference between `image` [H, W, 3] in [0, 1] and a rendering by the camera that recorded it, as `window` shows
+    it: a camera at the same place with the same vertical field of view. Outside the image it is black."""
     rendering = scene.render(state, recorded_by)
     compared = difference_map(rendering.color.clamp(0, 1).cpu().numpy(), image, legend=False)
     # the recorded pixel [H, W] that looks where each of the window's pixels does
@@ -110,12 +110,12 @@ def difference(scene: DrawableScene, state: State, recorded_by: Camera, image: n
 
 
 def dimmed(shown: Picture) -> Picture:
-    """The same picture, darker: it is not what was asked for."""
+    """Darken a picture that is not the requested one."""
     return replace(shown, pixels=_uint8(shown.pixels * DIMMED))
 
 
-def beside(pictures: list[Picture]) -> Picture:
-    """Pictures of one height side by side, a white line between them."""
+def side_by_side(pictures: list[Picture]) -> Picture:
+    """Join pictures of one height, with white lines between them."""
     if len(pictures) == 1:
         return pictures[0]
     pixels = np.concatenate([shown.pixels for shown in pictures], 1)
@@ -133,16 +133,12 @@ def split(left: Picture, right: Picture, share: float) -> Picture:
     return Picture(pixels, depth, _joined_notes([left, right]))
 
 
-def render_run(
-    runs: ViewedRuns, number: int, controls: Controls, camera: Camera, camera_frame: int, view: str
-) -> RunPicture:
-    """Render run `number` as the controls, made for the first run, say and `camera` sees it. Raises NeecoError.
-
-    A run of another capture has a world of its own: there the camera has gone, from the frame that belongs to
-    `camera_frame`, the way that `camera` went from that frame.
-    """
-    loaded = runs.loaded[number]
-    controls, camera = _in_world_of(loaded, runs.loaded[0], controls, camera, camera_frame)
+def render_run(runs: ViewedRuns, number: int, controls: Controls, camera: Camera, view: str) -> RunPicture:
+    """Render run `number` as seen by `camera`, at the controls, which were made for the first run. Raises
+    NeecoError."""
+    first, loaded = runs.loaded[0], runs.loaded[number]
+    frames = len(first.recorded.states), len(loaded.recorded.states)
+    controls = replace(controls, frame=corresponding_frame(controls.frame, *frames))
     scene, state = loaded.scene, controlled_state(loaded.recorded.states, loaded.shafts, controls)
     frame = controls.recorded_frame
     as_recorded = frame is not None and stands_at(camera, loaded.recorded.cameras[frame], loaded.distance)
@@ -157,28 +153,19 @@ def render_run(
             shown = dimmed(picture(scene, state, camera, IMAGE))
             note = ONLY_RECORDED if view == DIFFERENCE else f"{view}: a scene of method {scene.method} has none"
     trouble = runs.watched[number].trouble or loaded.trouble
-    return RunPicture(loaded, shown, controls.frame, frame is not None, as_recorded, note or shown.note, trouble)
-
-
-def _in_world_of(
-    loaded: LoadedRun, first: LoadedRun, controls: Controls, camera: Camera, camera_frame: int
-) -> tuple[Controls, Camera]:
-    """Controls and camera, made for the first run, for another."""
-    frames = len(first.recorded.states), len(loaded.recorded.states)
-    controls = replace(controls, frame=corresponding_frame(controls.frame, *frames))
-    if loaded.world == first.world:
-        return controls, camera
-    # a place in the first run's world means nothing in this one
-    unplaced = {name: replace(item, pose=None) for name, item in controls.instruments.items()}
-    start = loaded.recorded.cameras[int(corresponding_frame(camera_frame, *frames))]
-    scale = loaded.distance / first.distance
-    return replace(controls, instruments=unplaced), carried_over(
-        camera, first.recorded.cameras[camera_frame], start, scale
+    return RunPicture(
+        loaded=loaded,
+        picture=shown,
+        frame=controls.frame,
+        exact=frame is not None,
+        seen_as_recorded=as_recorded,
+        note=note or shown.note,
+        trouble=trouble,
     )
 
 
 def scored(shown: RunPicture) -> RunPicture:
-    """The same with its score, where the frame is seen as recorded and its capture at hand. Raises NeecoError."""
+    """Add the score where the frame is rendered as recorded and its capture is at hand. Raises NeecoError."""
     if not shown.seen_as_recorded or not shown.loaded.frames:
         return shown
     with shown.loaded.scene.torch_threads():

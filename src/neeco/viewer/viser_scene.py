@@ -18,7 +18,6 @@ from neeco.capture.model import evenly_spaced
 from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
-from neeco.synthesis.samplers import moved_camera
 from neeco.viewer.runs import DISTANCE_UNITS, LoadedRun
 
 if TYPE_CHECKING:
@@ -65,24 +64,16 @@ def browser_camera(window: viser.CameraHandle, unit: float, height: int, share: 
     width = max(1, round(height * aspect_of(window) * share))
     focal = height / 2 / math.tan(min(max(window.fov, NARROWEST), WIDEST) / 2)
     pose = torch.from_numpy(pose_of(window.wxyz, window.position, unit))
-    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+    return Camera(pose, focal, focal, width / 2, height / 2, width=width, height=height)
 
 
 def stands_at(window: Camera, recorded: Camera, distance: float) -> bool:
-    """Does the window look from where the recorded camera did, whatever part of that it shows? distance:
+    """Whether the window's camera has the recorded camera's pose, whatever part it shows. distance:
     `LoadedRun.distance`, mm."""
     one, two = to_numpy(window.world_from_camera), to_numpy(recorded.world_from_camera)
     apart = float(np.linalg.norm(one[:3, 3] - two[:3, 3]))
     turned = Rotation.from_matrix(one[:3, :3].T @ two[:3, :3]).magnitude()
     return apart <= SAME_PLACE * distance and turned <= SAME_TURN
-
-
-def carried_over(camera: Camera, here: Camera, there: Camera, scale: float) -> Camera:
-    """What stands to `there` as `camera` stands to `here`, in a world that is `scale` times as large."""
-    pose, start, end = (to_numpy(item.world_from_camera) for item in (camera, here, there))
-    moved = np.linalg.inv(start) @ pose
-    moved[:3, 3] *= scale
-    return moved_camera(camera, end @ moved)
 
 
 def fitting_view(camera: Camera, aspect: float) -> float:
@@ -104,7 +95,7 @@ def jump(client: viser.ClientHandle, camera: Camera, unit: float, distance: floa
 
 
 class Overlays:
-    """What viser draws over the picture. Nodes are named by number: names of a run go into no path."""
+    """Overlays that viser draws over the picture. Nodes are named by number: names of a run go into no path."""
 
     def __init__(
         self,
@@ -137,14 +128,14 @@ class Overlays:
 
     @property
     def shown(self) -> bool:
-        """Is there anything that the picture's depth must hide or show?"""
+        """Whether there is anything that the picture's depth must hide or show."""
         return bool(self.cameras.visible or (self.points is not None and self.points.visible) or self._gizmos)
 
     def show(self, cameras: bool, points: bool) -> None:
-        """Which of them are to be seen."""
-        for node, seen in ((self.cameras, cameras), (self.points, points)):
-            if node is not None and node.visible != seen:
-                node.visible = seen
+        """Set which of them are visible."""
+        for node, visible in ((self.cameras, cameras), (self.points, points)):
+            if node is not None and node.visible != visible:
+                node.visible = visible
 
     def add_gizmo(self, name: str, number: int, pose: np.ndarray) -> None:
         """Show the gizmo of an instrument that stands at `pose` [4, 4] mm."""
@@ -165,7 +156,7 @@ class Overlays:
             gizmo.remove()
 
     def gizmo_pose(self, name: str) -> np.ndarray | None:
-        """Where an instrument's gizmo stands [4, 4] mm; None: it has none."""
+        """Pose [4, 4] in mm of an instrument's gizmo; None without one."""
         gizmo = self._gizmos.get(name)
         return None if gizmo is None else pose_of(gizmo.wxyz, gizmo.position, self._unit)
 

@@ -53,7 +53,7 @@ class RightCamera:
     mask: Path | None  # of its border
 
     def load(self, row: int) -> np.ndarray:
-        """uint8 [H, W, 3]."""
+        """Return an image uint8 [H, W, 3]."""
         return np.asarray(open_image(self.folder / self.names[row]).convert("RGB"))
 
 

@@ -62,7 +62,7 @@ class ChosenImages:
 
     @property
     def field_of_view(self) -> np.ndarray | None:
-        """bool [H, W] within the border, undistorted as the images are; None without a border."""
+        """Pixels within the border, bool [H, W], undistorted as the images are; None without a border."""
         if self.border is None:
             return None
         visible = visible_mask(self.border, self.size)

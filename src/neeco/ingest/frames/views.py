@@ -53,7 +53,7 @@ class Views:
 
     @property
     def reduced_border(self) -> np.ndarray | None:
-        """bool [h, w] of the images `reduced`: beyond the field of view, in part or whole."""
+        """Pixels of the images `reduced`, bool [h, w], at least in part beyond the field of view."""
         return None if self.visible is None else reduced(self.visible.astype(np.uint8) * 255) < 255
 
 

@@ -72,7 +72,7 @@ class Bag:
             before = self.topics.get(connection.topic)
             kind, problem = plain(connection.msgtype.replace("/msg/", "/")), self._problem(connection)
             if plain(connection.topic) != connection.topic:
-                problem = "has a name that is none"
+                problem = "has an unprintable name"
             if before is not None and before.type != kind:
                 problem = f"holds both {before.type} and {kind}"
             count = connection.msgcount + (before.count if before else 0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -109,6 +109,7 @@ class Survey:
     """Contents of a bag by stream, without the pixels of images."""
 
     path: Path
+    _: KW_ONLY
     poses: dict[str, Poses] = field(default_factory=dict)  # by stream
     joints: dict[str, Joints] = field(default_factory=dict)
     images: dict[str, ImageLog] = field(default_factory=dict)
@@ -223,7 +224,7 @@ def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str]
         downs.pop()
     ends = [_parent(survey, where, edges[-1]) if edges else name for edges, name in ((ups, child), (downs, frame))]
     if ends[0] != ends[1]:
-        raise NeecoError(f"{where}: nothing joins {child} to {frame}; they hang from {ends[0]} and {ends[1]}")
+        raise NeecoError(f"{where}: nothing joins {child} to {frame}; their roots are {ends[0]} and {ends[1]}")
     return ups, downs
 
 
@@ -249,7 +250,7 @@ def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.n
 def _parent(survey: Survey, where: str, child: str) -> str:
     frames = survey.poses[f"tf:{child}"].frames
     if len(frames) > 1:
-        raise NeecoError(f"{where}: {child} hangs from several frames ({', '.join(sorted(frames)[:4])}); name another")
+        raise NeecoError(f"{where}: {child} has several parents ({', '.join(sorted(frames)[:4])}); name another")
     return next(iter(frames))
 
 
@@ -258,7 +259,7 @@ def _to_root(survey: Survey, where: str, name: str) -> list[str]:
     edges: list[str] = []
     while f"tf:{name}" in survey.poses:
         if name in edges:
-            raise NeecoError(f"{where}: the transforms go round in a circle at {name}; record them anew")
+            raise NeecoError(f"{where}: the transforms form a cycle at {name}; record them anew")
         edges.append(name)
         name = _parent(survey, where, name)
     return edges

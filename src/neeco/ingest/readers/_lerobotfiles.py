@@ -73,7 +73,7 @@ class Episode:
     absent: Mapping[str, str]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DataSet:
     """A data set: its folder, the first number of its version, frames a second, features and names of files."""
 
@@ -241,7 +241,10 @@ def read_data_set(path: Path) -> DataSet:
     if not isinstance(data, str) or not isinstance(video, str | None):
         raise NeecoError(f"{file}: {'video' if isinstance(data, str) else 'data'}_path: is no text; correct it")
     known = {key: _feature(file, key, value) for key, value in features.items()}
-    return DataSet(path, int(match[1] or match[2]), fps, known, data, video, chunks)
+    return DataSet(
+        path=path, version=int(match[1] or match[2]), fps=fps, features=known, data_path=data, video_path=video,
+        chunks_size=chunks,
+    )  # fmt: skip
 
 
 class ParquetFile:

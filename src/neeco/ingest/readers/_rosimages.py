@@ -120,7 +120,7 @@ def decode(message: Any) -> np.ndarray:
     return pixels.copy() if conversion is None else cv2.cvtColor(pixels, conversion)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BagImages(VideoSource):
     """Images of a topic. received: ns of each of its messages; numbers: which message each frame is."""
 
@@ -186,7 +186,9 @@ def open_topic(path: Path, topic: str, log: ImageLog, seconds: np.ndarray, notes
         raise NeecoError(f"{where}: all images have one time; record them with their own")
     numbers = np.array(log.numbers, np.int64)[order]
     received = np.array(log.received, np.int64)
-    return BagImages(path, next(iter(log.sizes)), tuple(notes), seconds[order], topic, received, numbers)
+    return BagImages(
+        path, next(iter(log.sizes)), tuple(notes), seconds[order], topic=topic, received=received, numbers=numbers
+    )
 
 
 def lens_of(where: str, info: Any, rectified: bool) -> Lens | None:
@@ -197,7 +199,7 @@ def lens_of(where: str, info: Any, rectified: bool) -> Lens | None:
     region = info.roi
     cut = region.height not in (0, info.height) or region.width not in (0, info.width)
     if max(info.binning_x, info.binning_y) > 1 or cut:
-        raise NeecoError(f"{where}: speaks of binning or of a part of the image; give the images' own `intrinsics`")
+        raise NeecoError(f"{where}: states binning or a part of the image; give the images' own `intrinsics`")
     camera = [*projection[0:3], *projection[4:7], *projection[8:11]] if rectified else [*matrix]
     if not camera[0]:
         return None

@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -31,7 +31,7 @@ _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w{1,200})")
 _UCHAR = ("met_uchar", "uchar", "unsigned char", "uint8", "uint8_t")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FrameSequence:
     """The header of a sequence. size: (width, height) px, (0, 0) without images; count: of its frames; channels: 1
     or 3; fields: by name, each frame's text by its number; data: the file that holds the images, and from which byte;
@@ -133,7 +133,7 @@ def _meta(header: _Header) -> FrameSequence:
         window = zlib.MAX_WBITS if plain.get("compresseddata", "false").lower() == "true" else None
     name = plain["elementdatafile"]
     data = (header.path, header.end) if name.upper() == "LOCAL" else (_beside(header, "ElementDataFile", name), 0)
-    return _checked(header, FrameSequence(header.path, size, count, channels, header.frames, data, window))
+    return _checked(header, size=size, count=count, channels=channels, data=data, window=window)
 
 
 def _read_nrrd(path: Path, stream: BinaryIO) -> _Header:
@@ -173,7 +173,7 @@ def _nrrd(header: _Header) -> FrameSequence:
         window = None if encoding == "raw" else zlib.MAX_WBITS | 16
     name = plain.get("data file", plain.get("datafile"))
     data = (header.path, header.end) if name is None else (_beside(header, "data file", name), 0)
-    return _checked(header, FrameSequence(header.path, size, count, channels, header.frames, data, window))
+    return _checked(header, size=size, count=count, channels=channels, data=data, window=window)
 
 
 def _dimensions(header: _Header, name: str, sizes: list[int], kinds: list[str]) -> tuple[tuple[int, int], int, int]:
@@ -187,7 +187,7 @@ def _dimensions(header: _Header, name: str, sizes: list[int], kinds: list[str]) 
         raise NeecoError(f"{header.path}: {name}: {sizes} is no sequence of images; expected width, height, frames")
     width, height, count = sizes[0], sizes[1], sizes[-1]
     if max(width, height) > MAX_SIDE or count > MAX_FRAMES:
-        raise NeecoError(f"{header.path}: {name}: {sizes} is beyond all measure; export the sequence again")
+        raise NeecoError(f"{header.path}: {name}: {sizes} is too large; export the sequence again")
     return (width, height), count, channels
 
 
@@ -199,7 +199,9 @@ def _beside(header: _Header, field_name: str, name: str) -> Path:
     return file
 
 
-def _checked(header: _Header, sequence: FrameSequence) -> FrameSequence:
+def _checked(header: _Header, **values: Any) -> FrameSequence:
+    """Return the sequence of a header, with these values. Raises NeecoError where the file cannot hold it."""
+    sequence = FrameSequence(path=header.path, fields=header.frames, **values)
     if not sequence.fields:
         what = "holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence"
         raise NeecoError(f"{sequence.path}: {what}; give one, or another file")
@@ -217,9 +219,9 @@ def _checked(header: _Header, sequence: FrameSequence) -> FrameSequence:
     promised = frame * sequence.count
     stored = header.plain.get("compresseddatasize", "")
     if sequence.window is None and held != promised:
-        what = f"holds {held / frame:.4g} images, its header speaks of {sequence.count}"
+        what = f"holds {held / frame:.4g} images, its header states {sequence.count}"
     elif sequence.window is not None and re.fullmatch(r"\d{1,18}", stored) and held < int(stored):
-        what = f"holds {held} bytes of compressed images, its header speaks of {stored}"
+        what = f"holds {held} bytes of compressed images, its header states {stored}"
     elif sequence.window is not None and promised > MAX_RATIO * (held + 64):
         what = f"holds {held} bytes, of which no {sequence.count} images of {sequence.size} can come"
     else:
@@ -227,7 +229,7 @@ def _checked(header: _Header, sequence: FrameSequence) -> FrameSequence:
     raise NeecoError(f"{file}: {what}; copy or export the sequence again")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SequenceImages(VideoSource):
     """Images of a sequence; frames: the number in the file of each."""
 

@@ -171,15 +171,17 @@ _NOTHING: _Given = MappingProxyType({})
 _Choices = list[tuple[bool, list[str]]]  # (may all stand behind one prefix, names)
 
 
-def _choices(axes: str, prefixed: bool, *stems: str) -> _Choices:
+def _choices(axes: str, prefixed: bool, stems: Sequence[str]) -> _Choices:
     return [(prefixed, [stem + axis for axis in axes]) for stem in stems]
 
 
-_POSITIONS = _choices("xyz", True, "position_", "translation_", "pos_", "trans_")
-_POSITIONS += _choices("xyz", False, "t", "p", "") + _choices("xyz", True, "t", "p", "")
-_QUATERNIONS = _choices("wxyz", True, "orientation_", "rotation_", "quaternion_", "quat_", "q_", "q")
-_QUATERNIONS += [(prefixed, ["q0", "qx", "qy", "qz"]) for prefixed in (False, True)] + _choices("wxyz", False, "")
-_ROTATION_VECTORS = _choices("xyz", True, "rotvec_", "rotation_vector_", "rodrigues_", "rv", "rvec_", "rotvec", "rvec")
+_POSITIONS = _choices("xyz", True, ["position_", "translation_", "pos_", "trans_"])
+_POSITIONS += _choices("xyz", False, ["t", "p", ""]) + _choices("xyz", True, ["t", "p", ""])
+_QUATERNIONS = _choices("wxyz", True, ["orientation_", "rotation_", "quaternion_", "quat_", "q_", "q"])
+_QUATERNIONS += [(prefixed, ["q0", "qx", "qy", "qz"]) for prefixed in (False, True)] + _choices("wxyz", False, [""])
+_ROTATION_VECTORS = _choices(
+    "xyz", True, ["rotvec_", "rotation_vector_", "rodrigues_", "rv", "rvec_", "rotvec", "rvec"]
+)
 _EULER_ANGLES = (["roll", "pitch", "yaw"], ["rx", "ry", "rz"], ["alpha", "beta", "gamma"])
 _POSE_WORDS = ("pose", "cp", "tcp", "ee", "eef", "tip", "measured", "state")  # of columns, beside their body's name
 _ROS = re.compile(r"(^|[._/])(pose|transform|transforms\d*)[._/]")

@@ -128,7 +128,7 @@ class DvrkSession(RecordingFormat):
         )
         if film.files[0].suffix.lower() != ".mp4":
             files = tuple(file for file, good in zip(film.files, keep, strict=True) if good)
-            return ImageFiles(path, open_image(files[0]).size, tuple(notes), times[keep] - start, files)
+            return ImageFiles(path, open_image(files[0]).size, tuple(notes), times[keep] - start, files=files)
         video = open_video(film.files[0])
         count = len(video.times)
         notes += compare_counts(film.files[0], count, len(times), "times", UNLIKE)
@@ -136,8 +136,8 @@ class DvrkSession(RecordingFormat):
         width, height = video.size
         size = (width if film.half is None else width // 2, height)
         return ChosenFrames(
-            path, size, (*video.notes, *notes), times[usable] - start, video, tuple(usable.tolist()), film.half,
-            pixel_aspect=video.pixel_aspect,
+            path, size, (*video.notes, *notes), times[usable] - start, video=video, frames=tuple(usable.tolist()),
+            half=film.half, pixel_aspect=video.pixel_aspect,
         )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -35,12 +35,11 @@ from neeco.ingest.readers import (
     choose_stream,
     compare_counts,
 )
+from neeco.ingest.readers._lerobotfiles import FIXED, DataSet, Episode, Feature, ParquetFile, read_data_set
 from neeco.ingest.readers.choices import find_rotations
 from neeco.ingest.readers.columns import QUATERNION_WXYZ, ROTATION_MATRIX, pose_bodies, recognise_pose, split_unit
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
-
-if TYPE_CHECKING:
-    from neeco.ingest.readers._lerobotfiles import DataSet, Episode, Feature
+from neeco.ingest.readers.video import ChosenFrames, open_video
 
 TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names
@@ -48,7 +47,6 @@ MAX_PIXELS = 90_000_000  # of an image, as for files of images
 IMAGES_AT_ONCE = 16  # of those that stand in Parquet
 DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
-_OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns that every data set has
 _JOINT = re.compile(r"(^|[_.\-/])(jaws?|grip(per)?|finger|wrist|joint)([_.\-/0-9]|$)", re.IGNORECASE)
 
 
@@ -81,8 +79,6 @@ class LeRobot(RecordingFormat):
         episode, key = self._chosen(data, stream, (POSES, READINGS))
         feature, name = data.features[key], f"episode {episode.number}/{key}"
         times, order, notes = _times(data, episode)
-        from neeco.ingest.readers._lerobotfiles import ParquetFile
-
         values = ParquetFile(episode.data).read([key], episode.number)[key]
         if values[0].size != len(feature.names):
             raise NeecoError(
@@ -100,8 +96,6 @@ class LeRobot(RecordingFormat):
         times, order, notes = _times(data, episode)
         if data.features[key].dtype == "image":
             return _open_stored(data, episode, key, times, order, notes)
-        from neeco.ingest.readers.video import ChosenFrames, open_video
-
         if key in episode.absent:
             raise NeecoError(episode.absent[key])
         film = episode.films[key]
@@ -116,7 +110,7 @@ class LeRobot(RecordingFormat):
         notes = (*notes, *compare_counts(film.file, shown, len(times), states, remedy=remedy))
         frames = tuple(np.flatnonzero(usable).tolist())
         return ChosenFrames(
-            video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames,
+            video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video=video, frames=frames,
             pixel_aspect=video.pixel_aspect,
         )  # fmt: skip
 
@@ -130,8 +124,6 @@ class LeRobot(RecordingFormat):
 
     def _data_set(self, path: Path) -> DataSet:
         self.require_package(path)
-        from neeco.ingest.readers._lerobotfiles import read_data_set
-
         return read_data_set(path)
 
     def _chosen(self, data: DataSet, stream: str | None, kinds: Sequence[str]) -> tuple[Episode, str]:
@@ -160,8 +152,6 @@ class LeRobot(RecordingFormat):
         return data.episode(number), key
 
     def _episode_streams(self, data: DataSet, episode: Episode) -> tuple[Stream, ...]:
-        from neeco.ingest.readers._lerobotfiles import ParquetFile
-
         found = []
         absent = dict(episode.absent)
         for key in set(data.features) - set(data.films) - set(ParquetFile(episode.data).names):
@@ -181,7 +171,7 @@ class LeRobot(RecordingFormat):
                 except NeecoError as error:
                     title = f"{feature.dtype} of {len(feature.names)}"
                     found.append(Stream(name, READINGS, title, episode.length, data.fps, problem=str(error)))
-            elif kind == OTHER and key not in _OWN:
+            elif kind == OTHER and key not in FIXED:
                 found.append(Stream(name, OTHER, f"{feature.dtype} {list(feature.shape)}", episode.length, data.fps))
         return tuple(found)
 
@@ -215,8 +205,6 @@ class LeRobot(RecordingFormat):
         return [plain]
 
     def _columns(self, episode: Episode, feature: Feature, columns: Sequence[str]) -> np.ndarray:
-        from neeco.ingest.readers._lerobotfiles import ParquetFile
-
         values = ParquetFile(episode.data).read([feature.key], episode.number)[feature.key]
         values = values.reshape(len(values), -1)
         if values.shape[1] != len(feature.names):
@@ -224,7 +212,7 @@ class LeRobot(RecordingFormat):
         return values[:, [feature.names.index(column) for column in columns]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Stored(VideoSource):
     """Images that stand in the Parquet file, as PNG or JPEG. rows: of the episode, in its file, of each image."""
 
@@ -258,14 +246,13 @@ def _open_stored(
         raise NeecoError(f"{where}: holds no images of episode {episode.number}; download it again")
     pixels = _decoded(f"{where}: frame 0", first[1], None)
     size = (pixels.shape[1], pixels.shape[0])
-    return _Stored(episode.data, size, notes, times, key, episode.number, tuple(order.tolist()))
+    rows = tuple(order.tolist())
+    return _Stored(episode.data, size, notes, times, key=key, episode=episode.number, rows=rows)
 
 
 def _cells(file: Path, key: str, episode: int) -> Iterator[tuple[int, Any]]:
     """Yield (row of the episode, bytes) of a column of images."""
     import pyarrow
-
-    from neeco.ingest.readers._lerobotfiles import ParquetFile
 
     row = 0
     for part in ParquetFile(file).batches(["episode_index", key], episode, IMAGES_AT_ONCE):
@@ -298,8 +285,6 @@ def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np
 
 def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Return times [R] s of an episode's rows from the first on, the rows of its file in their order, and notes."""
-    from neeco.ingest.readers._lerobotfiles import ParquetFile
-
     table = ParquetFile(episode.data).read(["timestamp", "frame_index"], episode.number)
     frames, stamps = table["frame_index"].reshape(-1), table["timestamp"].reshape(-1).astype(np.float64)
     if len(frames) != episode.length:
@@ -327,7 +312,7 @@ def _frame_numbers(video: VideoSource) -> np.ndarray:
 def _kind(feature: Feature) -> str:
     if feature.dtype in ("video", "image") and not feature.is_depth:
         return IMAGES
-    return READINGS if feature.names and feature.key not in _OWN else OTHER
+    return READINGS if feature.names and feature.key not in FIXED else OTHER
 
 
 def _meaning(key: str, columns: Sequence[str]) -> NamedFrame:

@@ -122,7 +122,7 @@ class PlusSequence(RecordingFormat):
         frames, notes = _image_frames(sequence)
         times = _times(sequence)
         seconds = np.array([times[frame] for frame in frames])
-        return SequenceImages(path, sequence.size, tuple(notes), seconds, sequence, tuple(frames))
+        return SequenceImages(path, sequence.size, tuple(notes), seconds, sequence=sequence, frames=tuple(frames))
 
 
 def _sequence_of(path: Path) -> FrameSequence:

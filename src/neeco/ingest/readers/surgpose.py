@@ -133,7 +133,9 @@ def _read(path: Path) -> _Arms:
         except OSError as error:
             raise NeecoError(f"{file}: cannot read: {error.strerror or error}; put the trajectory's there") from None
         if state.st_size > MAX_FILE_BYTES:
-            raise NeecoError(f"{file}: is {state.st_size >> 20} MB large, beyond all measure; give one trajectory")
+            raise NeecoError(
+                f"{file}: is {state.st_size >> 20} MB large, more than a trajectory has; give one trajectory"
+            )
         states += [state.st_size, state.st_mtime_ns]
     return _cached(path, tuple(states))
 

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +83,7 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     bad = [file for file, found in zip(files, sizes, strict=True) if found is None]
     notes += _left_out(folder, "cannot be read", bad) + _left_out(folder, "are of another size", other)
     usable = [index for index, found in enumerate(sizes) if found == size]
-    return ImageFiles(folder, size, tuple(notes), stamps[usable], tuple(files[i] for i in usable))
+    return ImageFiles(folder, size, tuple(notes), stamps[usable], files=tuple(files[i] for i in usable))
 
 
 def _are_few(count: int, total: int) -> bool:
@@ -117,7 +117,7 @@ def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarr
     return places
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImageFiles(VideoSource):
     """Images in files of their own."""
 
@@ -134,7 +134,7 @@ class ImageFiles(VideoSource):
             yield index, pixels
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ChosenFrames(VideoSource):
     """Some frames of a video, at times of their own. frames: their numbers in it; half: of the pixels, of a video that
     shows two cameras side by side (0: the left one, 1: the right one, None: it does not)."""
@@ -150,7 +150,7 @@ class ChosenFrames(VideoSource):
             yield places[frame], np.ascontiguousarray(pixels[:, start : start + self.size[0]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Video(VideoSource):
     stamps: tuple[int, ...]  # of each frame, in the stream's time base; or its number where the stream has no stamps
     numbered: bool
@@ -164,7 +164,7 @@ class _Video(VideoSource):
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = {self.stamps[int(index)]: int(index) for index in indices}
-        for number, frame in enumerate(_Scan(self.path, self.threads, self.part).decoded()):
+        for number, frame in enumerate(_Scan(self.path, threads=self.threads, part=self.part).decoded()):
             if not wanted:
                 return
             index = wanted.pop(number if self.numbered else frame.pts, None)
@@ -179,6 +179,7 @@ class _Scan:
     """One pass over a video's frames."""
 
     path: Path
+    _: KW_ONLY
     threads: str = "AUTO"
     part: tuple[float, float] | None = None
     stamps: list[int | None] = field(default_factory=list)
@@ -274,38 +275,26 @@ class _Scan:
         notes = self._notes()
         stamps = [stamp for stamp in self.stamps if stamp is not None]
         order = sorted(set(stamps))
+        numbered, own = False, None
         if len(stamps) == len(self.stamps) and self.time_base and len(order) > 0.9 * len(stamps):
             times = (np.array(order, dtype=np.float64) - order[0]) * self.time_base
-            own = None
             if fps is not None:
                 own = _another_rate(1 / float(np.median(np.diff(times))), fps)
                 times = np.arange(len(order)) / fps
             if own is not None:
-                notes.append(f"{self.path.name}: says itself {own:.4g} frames a second, the recording {fps:g}")
+                notes.append(f"{self.path.name}: states {own:.4g} frames a second itself, the recording {fps:g}")
             if len(order) < len(stamps):
                 notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
-            return self._video(notes, times, tuple(order), False, own)
-        rate = fps or self.rate
-        if not rate or rate > MAX_RATE:
-            raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
-        if fps is None:
-            notes.append(f"{self.path.name}: its frames have no times; taken as {rate:g} a second")
-        count = len(self.stamps)
-        times = np.arange(count) / rate
-        return self._video(notes, times, tuple(range(count)), True)
-
-    def _video(
-        self,
-        notes: list[str],
-        times: np.ndarray,
-        stamps: tuple[int, ...],
-        numbered: bool,
-        stated_fps: float | None = None,
-    ) -> _Video:
-        assert self.size is not None
+        else:
+            rate, order, numbered = fps or self.rate, list(range(len(self.stamps))), True
+            if not rate or rate > MAX_RATE:
+                raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
+            if fps is None:
+                notes.append(f"{self.path.name}: its frames have no times; taken as {rate:g} a second")
+            times = np.array(order) / rate
         return _Video(
-            self.path, self.size, tuple(notes), times, stamps, numbered, self.threads, self.part, stated_fps,
-            pixel_aspect=self.pixel_aspect,
+            self.path, self.size, tuple(notes), times, stamps=tuple(order), numbered=numbered, threads=self.threads,
+            part=self.part, stated_fps=own, pixel_aspect=self.pixel_aspect,
         )  # fmt: skip
 
     def _notes(self) -> list[str]:
@@ -326,7 +315,7 @@ class _Scan:
         if self.interlaced:
             notes.append(f"{self.path.name}: is interlaced; deinterlace it (ffmpeg -vf yadif) for sharper frames")
         if self.turned:
-            notes.append(f"{self.path.name}: says to be turned by {self.turned} degrees; its frames are used as stored")
+            notes.append(f"{self.path.name}: states a rotation by {self.turned} degrees; its frames are used as stored")
         return notes
 
 

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from neeco.ingest.readers.columns import (
     recognise_value,
     split_unit,
 )
-from neeco.ingest.readers.frame_names import without_frame
+from neeco.ingest.readers.frame_names import NamedFrame, without_frame
 from neeco.ingest.readers.logs import with_named_frame
 from neeco.ingest.readers.ndi import tool_columns, tool_names
 from neeco.ingest.readers.video import IMAGES
@@ -43,19 +43,23 @@ _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)"
 
 @dataclass(frozen=True)
 class _Log:
-    """A log: its file, relative to the folder, and which stream of it; body: what it is of, hints: lines on it, asks:
-    keys that nothing answers, clock: of its times, where the format says so; is_whole: all columns are the body's;
-    tool: which of several in an NDI export."""
+    """A log: its file, relative to the folder; stream: which of it; tool: which of several in an NDI export; meaning:
+    of the frame of a table's poses."""
 
     file: str
-    stream: str | None = None
-    _: KW_ONLY
-    body: str | None = None
-    hints: tuple[str, ...] = ()
-    asks: tuple[str, ...] = ()
-    clock: str | None = None
-    is_whole: bool = True
+    stream: Stream | None = None
     tool: str | None = None
+    meaning: NamedFrame | None = None
+
+    @property
+    def hints(self) -> tuple[str, ...]:
+        """Remarks on the body."""
+        return self.stream.hints if self.stream else self.meaning.hints if self.meaning else ()
+
+    @property
+    def asks(self) -> tuple[str, ...]:
+        """Keys that nothing in the file answers."""
+        return self.stream.asks if self.stream else self.meaning.asks if self.meaning else ()
 
     @property
     def stem(self) -> str:
@@ -64,19 +68,19 @@ class _Log:
 
     @property
     def _name(self) -> str:
-        if self.body is not None:
-            return self.body
+        if self.stream is not None:
+            return self.stream.body or re.sub(r"[^A-Za-z0-9]+", "_", self.stream.name).strip("_")
         if self.tool is not None:
             name = re.sub(r"[^A-Za-z0-9]+", "_", self.tool).strip("_")
             return name if name[:1].isalpha() else f"tool_{name}"
-        return Path(self.file).stem if self.stream is None else re.sub(r"[^A-Za-z0-9]+", "_", self.stream).strip("_")
+        return Path(self.file).stem
 
     def lines(self) -> list[str]:
-        given = [("file", self.file), ("stream", self.stream), ("tool", self.tool)]
+        given = [("file", self.file), ("stream", self.stream.name if self.stream else None), ("tool", self.tool)]
         return [f"{key}: {_scalar(value)}" for key, value in given if value is not None]
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _FolderFiles:
     """The files of a folder by their likely kind, as paths relative to it. others: those not used, in words."""
 
@@ -203,10 +207,7 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         found.leave_out(name, _without_place(str(error), path, name), images=True)
         return path.is_dir()
     for stream in streams:
-        log = _Log(
-            name, stream.name, body=stream.body, hints=stream.hints, asks=stream.asks, clock=stream.clock,
-            is_whole=stream.columns is None,
-        )  # fmt: skip
+        log = _Log(name, stream)
         used = stream.offered and stream.count > 0 and stream.problem is None
         if used and stream.kind == IMAGE_STREAMS:
             found.videos.append(log)
@@ -270,9 +271,7 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     columns = [column for column in table.header if column]
     angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
     if pose.rotation or "rotation" in pose.unclear:
-        if meaning is not None:
-            log = replace(log, hints=meaning.hints, asks=meaning.asks)
-        found.poses.append((log, pose))
+        found.poses.append((replace(log, meaning=meaning), pose))
     elif value and when.time:
         found.joints.append((log, when, value, None))
     elif len(columns) == 2 and angles and not when.time and len(table.rows) <= MAX_CALIBRATION_ROWS:
@@ -322,10 +321,10 @@ def _instruments(found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColu
 
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     of_length = (columns.rotation or ())[3:4] if columns.form == MATRIX else columns.position
-    clock = "em" if log.stream is None else log.clock
+    clock = "em" if log.stream is None else log.stream.clock
     lines = [*log.lines(), *([f"clock: {clock}"] if clock else [])]
     lines += [f"# {ask}" for ask in log.asks if not ask.startswith(" ")]
-    known_again = log.tool is not None or (log.stream is not None and log.is_whole)
+    known_again = log.tool is not None or (log.stream is not None and log.stream.columns is None)
     if known_again and columns.time and of_length and columns.rotation:
         return [*lines, *_unit_lines(columns, {"length": of_length})]  # recognised again when read
     given = [

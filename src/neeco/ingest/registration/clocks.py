@@ -30,11 +30,11 @@ def register(data: Episodes, views: Views) -> tuple[Episodes, Registration | Non
     """Register SfM's cameras to the laparoscope's tracker; return the clocks that this gives, too.
 
     views: in SfM's frame. Every episode's clock is found from its own motion first, then all of them are registered
-    together. Without a registration a note says why.
+    together. Without a registration a note states the reason.
     """
     settings = data.recording.settings
     if data.parts[0].scope is None:
-        if data.in_video is None:  # else a note on the instrument in the video says how the scale is found
+        if data.in_video is None:  # else a note on the instrument in the video states how the scale is found
             data.notes.add(
                 "the laparoscope was not tracked: "
                 + ("instrument poses stay in the tracker's frame (unregistered), and " if data.parts[0].poses else "")
@@ -82,7 +82,7 @@ def _register_episode(
     elif by_motion is None and given is not None:
         data.notes.add(f"the clock {scope.clock!r} is taken as {given.source}: {why}", episode)
     if by_motion is not None:
-        # a clock that images and logs share says when they were written, motion when they were taken
+        # a clock that images and logs share is that of writing them, motion gives that of taking them
         return _take(data, episode, scope.clock, by_motion.clock), by_motion
     try:
         if given is not None:

@@ -58,7 +58,7 @@ def require_no_base(data: Episodes) -> None:
     for item in data.recording.instruments:
         if item.base is not None:
             raise NeecoError(
-                f"{data.recording.path}: world_from_base: where the base of {item.name} stands can be told only to a "
+                f"{data.recording.path}: world_from_base: where the base of {item.name} stands can be found only for a "
                 "scope whose own poses are recorded (laparoscope) and move enough to register it; leave it out"
             )
 
@@ -121,12 +121,12 @@ class _Observed:
 
     @cached_property
     def images(self) -> np.ndarray:
-        """uint8 [F, h, w, 3], reduced."""
+        """Reduced images uint8 [F, h, w, 3]."""
         return np.stack([reduced(self.views.load(int(row))) for row in self.rows])
 
     @cached_property
     def masks(self) -> np.ndarray:
-        """bool [F, h, w] what moves."""
+        """Pixels that move, bool [F, h, w]."""
         return self.moving(self.rows)
 
     @cached_property
@@ -135,12 +135,12 @@ class _Observed:
 
     @cached_property
     def hidden(self) -> np.ndarray | None:
-        """bool [h, w] beyond a round border."""
+        """Pixels beyond a round border, bool [h, w]."""
         return self.views.reduced_border
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:
-        """Of the reduced images."""
+        """fx, fy, cx, cy px of the reduced images."""
         return self.views.reduced_pinhole.intrinsics
 
     @property
@@ -149,7 +149,7 @@ class _Observed:
 
     @property
     def cameras(self) -> np.ndarray:
-        """[F, 4, 4] world_from_camera."""
+        """world_from_camera [F, 4, 4]."""
         return self.views.world_from_camera[self.rows]
 
 
@@ -167,7 +167,7 @@ class _Arm:
 
     @property
     def travel(self) -> float:
-        """mm, root mean square distance from its mean place."""
+        """Root mean square distance from its mean place, mm."""
         places = self.poses_at(0.0)[:, :3, 3]
         places = places[np.isfinite(places[:, 0])]
         return float(np.sqrt(places.var(0).sum())) if len(places) else 0.0

@@ -99,8 +99,8 @@ def instruments_of(recording: Recording, found: FoundShaft | None) -> tuple[Inst
     for item in recording.instruments:
         if item.placed:
             limits = {name: source.limits for name, source in item.joints.items()}
-            seen = None
+            in_video = None
             if found is not None and item.from_video is not None:
-                seen = FromVideo(item.from_video.shaft_diameter_mm, found.working_length)
-            stated.append(Instrument(item.name, limits, item.kinematics, from_video=seen))
+                in_video = FromVideo(item.from_video.shaft_diameter_mm, found.working_length)
+            stated.append(Instrument(item.name, limits, item.kinematics, from_video=in_video))
     return tuple(stated)

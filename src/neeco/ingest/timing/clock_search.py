@@ -103,24 +103,24 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
     before, after = (poses_at(log, log_grid + side * STEP_S) for side in (-1, 1))
     tracked = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (2 * STEP_S)
     tracked = np.sqrt(np.where(before[1] & after[1], tracked, np.nanmedian(tracked)))
-    seen = np.sqrt(np.interp(grid, middle, speed))  # roots: a fast stroke must not outweigh all others
-    rate, lags, scores = _best_rate(seen, tracked)
+    observed = np.sqrt(np.interp(grid, middle, speed))  # roots: a fast stroke must not outweigh all others
+    rate, lags, scores = _best_rate(observed, tracked)
     if rate != 1:
-        rate = _finer_rate(seen, tracked, rate)
-        lags, scores = correlate(_stretched(seen, rate), tracked)
+        rate = _finer_rate(observed, tracked, rate)
+        lags, scores = correlate(_stretched(observed, rate), tracked)
     best, length = _peak(lags, scores, rate, log), grid[-1] - grid[0]
-    sd = _spread_of_halves(_stretched(seen, rate), tracked, best)
+    sd = _spread_of_halves(_stretched(observed, rate), tracked, best)
     rate_sd = np.sqrt(12) * sd / length if rate != 1 else 0.0  # of a line through offsets spread over the video
     seconds = log_grid[0] + _vertex(lags, scores) * STEP_S - rate * grid[0]
     return ClockOffset(float(seconds), sd, INSTRUMENT_MOTION, rate, float(rate_sd))
 
 
-def _spread_of_halves(seen: np.ndarray, tracked: np.ndarray, best: int) -> float:
+def _spread_of_halves(observed: np.ndarray, tracked: np.ndarray, best: int) -> float:
     """Return the standard deviation, s, of the offsets of the video's halves about the lag `best` of all of it."""
-    quarter = len(seen) // 4
+    quarter = len(observed) // 4
     halves = []
     for part in (slice(0, 2 * quarter), slice(quarter, 3 * quarter), slice(2 * quarter, 4 * quarter)):
-        near, fit = correlate(seen[part], tracked)
+        near, fit = correlate(observed[part], tracked)
         around = np.abs((near - part.start - best) * STEP_S) < LOBE_S
         if around.any():
             halves.append(_vertex(near[around] - part.start, fit[around]))

@@ -107,7 +107,7 @@ def check_shared_settings(other: Recording, first: Recording) -> None:
     """Raise NeecoError where a recording states a setting of the whole capture otherwise than the first."""
     for key, default in (("frames", None), ("splits", None), ("settings", IngestSettings())):
         if getattr(other, key) not in (default, getattr(first, key)):
-            raise refusal(other, f"{key}: says another than", first)
+            raise refusal(other, f"{key}: differs from that", first)
 
 
 def refusal(other: Recording, what: str, first: Recording) -> NeecoError:

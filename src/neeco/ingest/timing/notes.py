@@ -28,7 +28,7 @@ class Notes:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What was lost or assumed. A sentence about one of several episodes begins with its name."""
+        """Sentences on losses and assumptions; one about one of several episodes begins with its name."""
         found = []
         for episode, name in enumerate(self.names):
             for sentence in [sentence for sentence, of in self._sentences if of == episode]:

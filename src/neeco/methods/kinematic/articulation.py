@@ -1,4 +1,4 @@
-"""What every articulation is: a straight shaft in the tracked frame, and links beyond it that readings move."""
+"""Articulation of an instrument: a straight shaft in the tracked frame, and links beyond it that readings move."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from neeco.raster.articulated import ArticulatedBody, link_weights
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import JointMotion, Skeleton
 
-LABEL_SHARE = "label_share"  # the per-Gaussian extra [N] in [0, 1]: how far one of an instrument counts as instrument
+LABEL_SHARE = "label_share"  # the per-Gaussian extra [N] in [0, 1]: weight in the labels of its instrument
 LINK_LOGITS = "part_logits"  # the per-Gaussian extra [N, logit_count] that link weights are the softmax of
 MODULES = "hinges"  # the articulations' name in files of scenes, since version 0.1
-# in radii of the shaft
-BEHIND_JOINT = 1.0  # how far behind the first joint a link that it moves may reach
-BEHIND_SOFTNESS = 0.25  # width of that limit
-MAX_SCALE = 0.6  # standard deviation of what turns, or its far end would swing out behind the joint
-MAX_RADIUS, MAX_SOFTNESS = 1e9, 1e6  # mm: where the radius is not known, so far behind that everything is beyond it
+GATE_RADII = 1.0  # shaft radii behind the first joint up to which a link that it moves may reach
+GATE_WIDTH_RADII = 0.25  # width of that limit
+MAX_SCALE_RADII = 0.6  # standard deviation of what turns, or its far end would swing out behind the joint
+MAX_GATE_MM, MAX_GATE_WIDTH_MM = 1e9, 1e6  # where the radius is not known: everything is beyond the gate
 
 
 class Articulation(nn.Module):
@@ -28,9 +27,9 @@ class Articulation(nn.Module):
 
     The shaft is the line `shaft_origin + s * shaft_direction`, kept near a start (`base`, a buffer,
     instrument_from_shaft with z along the shaft) by two learned tilts (rad) and two shifts (mm). Links are soft: a
-    Gaussian moves by its link weights times what moves the links, as `ArticulatedBody` has it.
+    Gaussian moves by its link weights times the links' joint values (see `ArticulatedBody`).
 
-    Subclasses say which readings move which links, and name the parts of labels.
+    Subclasses define which readings move which links, and name the parts of labels.
     """
 
     base: Tensor  # [4, 4] instrument_from_shaft
@@ -39,10 +38,10 @@ class Articulation(nn.Module):
     radius: Tensor  # mm, of the shaft as carved
     rates: ClassVar[Mapping[str, float]] = {"shaft_tilt": 8e-3, "shaft_shift": 8e-2}  # of parameters, at the start
 
-    reading_names: tuple[str, ...]  # of all readings that move something
+    reading_names: tuple[str, ...]  # all readings that move a link
     part_names: tuple[str, ...]  # label columns, in their order
     link_count: int  # logits of a Gaussian, the shaft's first
-    weighs_places: ClassVar[bool] = False  # does `placed_logits` change any?
+    weighs_positions: ClassVar[bool] = False  # whether `positioned_logits` changes any
     skeleton: Skeleton
 
     def __init__(self) -> None:
@@ -56,112 +55,117 @@ class Articulation(nn.Module):
 
     @property
     def jointed(self) -> bool:
-        """Does any reading move anything?"""
+        """Whether any reading moves a link."""
         return bool(self.reading_names)
 
     def shaft(self) -> tuple[Tensor, Tensor]:
-        """(origin [3] mm, unit direction [3] towards the jaws), instrument frame."""
+        """Return (origin [3] mm, unit direction [3] towards the jaws), instrument frame."""
         one, zero = self.shaft_tilt.new_ones(1), self.shaft_tilt.new_zeros(1)
         direction = nn.functional.normalize(self.base[:3, :3] @ torch.cat([self.shaft_tilt, one]), dim=0)
         origin = self.base[:3, :3] @ torch.cat([self.shaft_shift, zero]) + self.base[:3, 3]
         return origin, direction
 
     def along_shaft(self, points: Tensor) -> Tensor:
-        """Position [M] mm of points [M, 3] along the shaft."""
+        """Return the position [M] mm of points [M, 3] along the shaft."""
         origin, direction = self.shaft()
         return (points - origin) @ direction
 
     def first_joint(self) -> Tensor:
-        """[] mm along the shaft: the rearmost joint; not learned through. 0 without joints."""
+        """Return the position [] mm of the rearmost joint along the shaft, without gradient; 0 without joints."""
         raise NotImplementedError
 
     def axes(self, shaft: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """(points [J, 3] mm, unit directions [J, 3]) of what joints move about or along, outermost first, at rest."""
+        """Return (points [J, 3] mm, unit directions [J, 3]) of the joints' axes at rest, outermost first."""
         raise NotImplementedError
 
     def values(self, readings: Mapping[str, float]) -> Tensor:
-        """[J, L - 1] by which each joint moves each link but the shaft, rad or mm."""
+        """Return the values [J, L - 1] by which each joint moves each link but the shaft, rad or mm."""
         raise NotImplementedError
 
     @property
     def slides(self) -> tuple[bool, ...]:
-        """Of each joint, whether it slides; shorter: the others turn."""
+        """Whether each joint is prismatic; those beyond the tuple's end are revolute."""
         return ()
 
     def round_until(self) -> Tensor:
-        """[] mm along the shaft up to where all is spun with it."""
+        """Return the position [] mm along the shaft up to which everything is spun with it."""
         return self.wrist_start
 
     def body(self, world_from_instrument: Tensor, readings: Mapping[str, float], roll: float = 0.0) -> ArticulatedBody:
-        """How the instrument's Gaussians stand at these readings, the round part of its shaft spun by `roll` rad."""
-        shaft = self.shaft()
+        """Return the instrument's body at these readings, the round part of its shaft spun by `roll` rad."""
+        shaft, gate = self.shaft(), self._gate()
+        origins, axes = self.axes(shaft)
         return ArticulatedBody(
-            world_from_instrument,
-            *self.axes(shaft),
-            self.values(readings),
-            *shaft,
-            self.round_until(),
-            *self._gate(),
-            MAX_SCALE * self.radius,
-            roll,
-            self.slides,
+            world_from_body=world_from_instrument,
+            origins=origins,
+            axes=axes,
+            values=self.values(readings),
+            shaft_origin=shaft[0],
+            shaft_direction=shaft[1],
+            spin_end=self.round_until(),
+            gate_start=gate[0],
+            gate_width=gate[1],
+            longest=MAX_SCALE_RADII * self.radius,
+            roll=roll,
+            slides=self.slides,
         )
 
     @torch.no_grad()
     def _gate(self) -> tuple[Tensor, Tensor]:
-        """(start [], width []) mm along the shaft: what lies far behind the first joint never moves with it."""
-        start = self.first_joint() - (BEHIND_JOINT * self.radius).clamp_max(MAX_RADIUS)
-        return start, BEHIND_SOFTNESS * self.radius.clamp_max(MAX_SOFTNESS)
+        """Return (start [], width []) mm along the shaft of the gate behind which nothing moves with the joints."""
+        start = self.first_joint() - (GATE_RADII * self.radius).clamp_max(MAX_GATE_MM)
+        return start, GATE_WIDTH_RADII * self.radius.clamp_max(MAX_GATE_WIDTH_MM)
 
     def link_weights(self, points: Tensor, logits: Tensor) -> Tensor:
-        """Link weights [M, link_count] of Gaussians at points [M, 3] mm with logits [M, link_count or more]."""
-        known = self.placed_logits(points, logits)[:, : self.link_count]
+        """Return link weights [M, link_count] of Gaussians at points [M, 3] mm with logits [M, link_count or more]."""
+        known = self.positioned_logits(points, logits)[:, : self.link_count]
         return link_weights(points, known, self.shaft(), *self._gate())
 
-    def placed_logits(self, points: Tensor, logits: Tensor) -> Tensor:
-        """Logits [M, link_count or more] with what the places [M, 3] mm of Gaussians say of them."""
+    def positioned_logits(self, points: Tensor, logits: Tensor) -> Tensor:
+        """Return logits [M, link_count or more] with the prior of the Gaussians' positions [M, 3] mm added."""
         return logits
 
     def misplaced(self, points: Tensor, weights: Tensor) -> Tensor | None:
-        """[M] at least 0: how far Gaussians at points [M, 3] mm with link weights [M, link_count] belong to links that
-        their places speak against; None where places say nothing."""
+        """Return the penalty [M] >= 0 of Gaussians at points [M, 3] mm with link weights [M, link_count] for links that
+        their positions contradict; None where positions have no prior."""
         return None
 
     def settled(self, points: Tensor, logits: Tensor) -> Tensor:
-        """Logits [M, link_count or more] of Gaussians at points [M, 3] mm once all is learned, without links that their
-        places rule out."""
+        """Return the final logits [M, link_count or more] of Gaussians at points [M, 3] mm, without links that their
+        positions rule out."""
         return logits
 
     def shaft_like(self, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """([M] shares of Gaussians that look like the shaft's surface, by their link weights; [] mm along the shaft as
-        far as they do)."""
+        """Return ([M] shares of Gaussians that look like the shaft's surface, by their link weights; [] mm along the
+        shaft up to which they do)."""
         return weights[:, 0], self.first_joint()
 
     def longest(self, weights: Tensor) -> Tensor:
-        """[M, 1] mm: largest standard deviation of Gaussians by their link weights [M, link_count]; what does not move
-        is not limited."""
+        """Return the largest standard deviation [M, 1] mm of Gaussians with link weights [M, link_count]; those that do
+        not move are not limited."""
         moving = 1 - weights[:, :1]
-        return MAX_SCALE * self.radius / moving.clamp_min(1e-6)
+        return MAX_SCALE_RADII * self.radius / moving.clamp_min(1e-6)
 
     def parts(self, points: Tensor, weights: Tensor) -> Tensor:
-        """[M, len(part_names)] shares of each part in Gaussians at points [M, 3] mm of link weights [M, link_count]."""
+        """Return the shares [M, len(part_names)] of each part in Gaussians at points [M, 3] mm with link weights
+        [M, link_count]."""
         raise NotImplementedError
 
     def moved_by(self, reading: str, weights: Tensor) -> Tensor:
-        """[M] share of each Gaussian, by its link weights [M, link_count], that a reading moves."""
+        """Return the share [M] of each Gaussian with link weights [M, link_count] that a reading moves."""
         raise NotImplementedError
 
     def motion(self, weights: Tensor) -> tuple[list[JointMotion], Tensor]:
-        """(axes in the order in which they move, [M, axes, 2] rad or mm by which each moves each Gaussian of these link
-        weights: at a reading of 0, and per unit of it)."""
+        """Return (axes in the order in which they move, values [M, axes, 2] rad or mm by which each moves each Gaussian
+        of these link weights: at a reading of 0, and per unit of it)."""
         raise NotImplementedError
 
     def joint_points(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
-        """Named pivots and tips [3] mm, instrument frame."""
+        """Return named pivots and tips [3] mm, instrument frame."""
         raise NotImplementedError
 
     def keypoints(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
-        """Named points [3] mm, instrument frame: both ends of the shaft, pivots and tips."""
+        """Return named points [3] mm, instrument frame: both ends of the shaft, pivots and tips."""
         origin, direction = self.shaft()
         rear, front = self.extent
         near = torch.maximum(self.wrist_start, rear) if self.jointed else front
@@ -169,17 +173,17 @@ class Articulation(nn.Module):
         return ends | self.joint_points(readings)
 
     def measure_tips(self, points: Tensor, weights: Tensor) -> None:
-        """Take the tips of what moves from solid Gaussians at points [M, 3] mm with link weights [M, link_count]; they
-        stay unknown where there are too few."""
+        """Estimate the tips of moving links from solid Gaussians at points [M, 3] mm with link weights [M, link_count];
+        a tip with too few stays unknown."""
         raise NotImplementedError
 
     def describe(self, reading: str) -> dict[str, Any]:
-        """What was learned of the joint that a reading drives, for reports."""
+        """Return the learned parameters of the joint that a reading drives, for reports."""
         raise NotImplementedError
 
     def prior(self) -> Tensor | None:
-        """How far what is learned departs from what was stated, a scalar in squared standard deviations; None where
-        nothing was stated."""
+        """Return the squared deviation of the learned from the stated kinematics, a scalar in standard deviations; None
+        where nothing was stated."""
         return None
 
 
@@ -188,12 +192,12 @@ class ArticulatedInstruments(nn.Module):
     its own frame."""
 
     def articulate(self, articulations: Sequence[Articulation]) -> None:
-        """Take these, one per instrument."""
+        """Set the articulations, one per instrument."""
         self.add_module(MODULES, nn.ModuleList(articulations))
 
     @property
     def articulations(self) -> tuple[Articulation, ...]:
-        """Of each instrument."""
+        """The articulation of each instrument."""
         return tuple(self.get_submodule(MODULES).children())  # type: ignore[arg-type]
 
     @property
@@ -201,22 +205,22 @@ class ArticulatedInstruments(nn.Module):
         """Columns of LINK_LOGITS: the largest link count of any instrument."""
         return max((articulation.link_count for articulation in self.articulations), default=1)
 
-    def placed_logits(self, canonical: CanonicalGaussians) -> Tensor | None:
-        """[N, logit_count] what posing takes; None without."""
+    def positioned_logits(self, canonical: CanonicalGaussians) -> Tensor | None:
+        """Return the logits [N, logit_count] by which Gaussians are posed; None without."""
         logits = canonical.extras.get(LINK_LOGITS)
-        if logits is None or not any(articulation.weighs_places for articulation in self.articulations):
+        if logits is None or not any(articulation.weighs_positions for articulation in self.articulations):
             return logits
         rows = [logits[canonical.body(0)]]
         for index, articulation in enumerate(self.articulations):
             own = canonical.body(index + 1)
-            rows.append(articulation.placed_logits(canonical.means[own], logits[own]))
+            rows.append(articulation.positioned_logits(canonical.means[own], logits[own]))
         return torch.cat(rows)
 
     def link_weights(self, canonical: CanonicalGaussians, index: int) -> Tensor:
-        """Link weights [M, link_count] of one instrument's Gaussians."""
+        """Return link weights [M, link_count] of one instrument's Gaussians."""
         rows = canonical.body(index + 1)
         return self.articulations[index].link_weights(canonical.means[rows], canonical.extras[LINK_LOGITS][rows])
 
     def spin_perturbation(self, roll: float) -> Any:
-        """The perturbation of `Scene.at` that spins everything behind the wrists by `roll` rad about the shafts."""
+        """Return the perturbation that spins everything behind the wrists by `roll` rad about the shafts."""
         raise NotImplementedError

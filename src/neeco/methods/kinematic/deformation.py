@@ -34,7 +34,7 @@ from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.label_shares import store_label_shares
 from neeco.methods.kinematic.lamp_search import find_shadow
 from neeco.methods.kinematic.stated_links import StatedLinks
-from neeco.methods.kinematic.wrist import place_wrists, replace_wrists
+from neeco.methods.kinematic.wrist import place_wrists, refine_wrists
 from neeco.methods.space_carving import CarvingSettings
 from neeco.raster.articulated import ArticulatedBody, pose_bodies
 from neeco.raster.types import Rendering
@@ -54,12 +54,12 @@ from neeco.scene.training_session import GaussianTraining, Report
 from neeco.scene.visibility import extrapolate_tissue, outside_all_views
 from neeco.training.session import gaussian_session
 
-WRISTS_AT = 0.4  # of the run: the shape is there, and time is left to learn
-WRISTS_AGAIN_AT = (0.6, 0.8)  # of the run
+WRISTS_AT = 0.4  # share of the run: shapes are formed, and steps are left to learn
+WRISTS_AGAIN_AT = (0.6, 0.8)  # shares of the run
 PRIOR_WEIGHT = 1e-5  # on what is learned of stated kinematics, in squared standard deviations
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class KinematicSettings:
     """`shaft_roll`: probability of spinning the shaft (a surface of revolution) by a random angle, from iteration
     `shaft_roll_start` on; `opacity_penalty`: on the instruments' mean opacity, a tenth of it from iteration
@@ -157,7 +157,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         for instrument, articulation in zip(self.instruments, self.articulations, strict=True):
             given = state_of(instrument, state)
             bodies.append(articulation.body(given.pose.to(canonical.means), given.joints, roll))
-        logits = self.placed_logits(canonical)
+        logits = self.positioned_logits(canonical)
         means = self.breathed(canonical.means, canonical.counts[0], state.time)
         return Posed(*pose_bodies(means, canonical.quats, canonical.log_scales, logits, canonical.counts, bodies))
 
@@ -297,7 +297,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
                 place_wrists(session, self)
         elif passed and self.settings.refine_wrists:
             with session.searching():
-                replace_wrists(session, self)
+                refine_wrists(session, self)
 
     def finish(self, training: GaussianTraining) -> None:
         session = gaussian_session(training)

@@ -1,4 +1,4 @@
-"""Find each instrument from training frames alone, and seed its Gaussians on its links."""
+"""Discovery of instruments and their joints: carve each from the training frames, and seed Gaussians on its links."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
 from neeco.methods.kinematic.hinge_search import start_hinges
 from neeco.methods.kinematic.hinges import Hinges
-from neeco.methods.kinematic.link_search import along_links, doubt_readings, readings_of, start_links
+from neeco.methods.kinematic.link_search import align_to_links, check_readings, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import carved_shape
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
@@ -27,7 +27,7 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
     scene, report = session.scene, session.report
     if not scene.instruments:
         return
-    report("looking for the instruments: fitting the tissue alone")
+    report("searching for the instruments: fitting the tissue alone")
     tissue = fit_tissue(scene, session.views, session.config)
     if isinstance(articulated, BreathingTissue) and articulated.may_breathe and session.timed:
         tissue = _learn_breathing(session, articulated, tissue)
@@ -38,27 +38,31 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
         shape = carved_shape(session, evidence, instrument.name, generator)
         articulation = articulated.articulations[index]
         if isinstance(articulation, StatedLinks):
-            shape = along_links(session, articulation, evidence, instrument.name, shape, generator)
+            shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
         articulation.base.copy_(shape.instrument_from_shaft)
         articulation.extent.copy_(torch.tensor([shape.near, shape.tip]))
         articulation.radius.fill_(shape.radius)
         columns = articulated.logit_count
         if isinstance(articulation, StatedLinks):
-            seeds, logits = start_links(session, articulation, evidence, instrument.name, shape, columns, generator)
-            doubt_readings(session, articulation, evidence, instrument, readings_of(session, evidence, instrument.name))
+            seeds, logits = start_links(
+                session, articulation, evidence, instrument.name, shape, columns=columns, generator=generator
+            )
+            check_readings(session, articulation, evidence, instrument, readings_of(session, evidence, instrument.name))
         else:
             assert isinstance(articulation, Hinges)
-            seeds, logits = start_hinges(session, articulation, evidence, instrument.name, shape, columns, generator)
+            seeds, logits = start_hinges(
+                session, articulation, evidence, instrument.name, shape, columns=columns, generator=generator
+            )
         bodies.append(seed_instrument(seeds, shape.radius).with_extras(**{LINK_LOGITS: logits}))
     scene.canonical = join_bodies(bodies)
 
 
 def _learn_breathing(session: GaussianSession, breathes: BreathingTissue, tissue: GaussianScene) -> GaussianScene:
-    """`tissue`, a fit of still tissue, or where that breathes one that was fitted anew with its breathing, with which
-    `breathes` begins then."""
+    """Return `tissue`, a fit of still tissue, or, where it breathes, a new fit with the breathing that was found, from
+    which `breathes` then starts."""
     scene, views, config = session.scene, session.views, session.config
     if len(scene.recorded.tissues) > 1:
-        session.report("several tissues: none of them is taken to breathe")
+        session.report("several tissues: breathing is not searched for")
         return tissue
     begun = find_breathing(tissue, views)
     if begun is None:

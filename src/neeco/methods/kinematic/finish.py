@@ -1,4 +1,4 @@
-"""After learning: how long each instrument is, and whether its joints were found."""
+"""After training: extent of each instrument, prolonged shafts, and the verdict on each joint."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ from torch import Tensor
 from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
 from neeco.geometry.projection import in_image
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments, Articulation
-from neeco.methods.kinematic.wrist import MIN_SOLID, SOLID_OPACITY, color_boundary, solid_extent, solid_gaussians
+from neeco.methods.kinematic.wrist import (
+    MIN_SOLID_GAUSSIANS,
+    SOLID_OPACITY,
+    color_boundary,
+    solid_extent,
+    solid_gaussians,
+)
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Recorded
@@ -20,24 +26,22 @@ from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.visibility import visible_pixels
 from neeco.training.session import GaussianSession
 
-MIN_VISIBLE_SHARE = 0.2  # of the pixels that a Gaussian takes up of its instrument rendered alone
-MIN_PIXELS_ALONE = 0.05  # px taken up there, in all frames together: below, its own instrument hides it
-OCCLUSION_FRAMES = 64  # looked at, evenly spaced
-WELL_SEEN = 0.08  # share of training frames that must see a position of the shaft for it to be copied
-END_IN_VIEW = 0.3  # share above which the instrument's rear end is its real end
-MIN_JOINT_EXPLAINED = 0.35  # share of the moving parts' error that a found joint explains, at least
+MIN_VISIBLE_SHARE = 0.2  # of the pixels that a Gaussian covers of its instrument rendered alone
+MIN_PIXELS_ALONE = 0.05  # px covered there, in all frames together: below, its own instrument occludes it
+MAX_OCCLUSION_FRAMES = 64  # evenly spaced
+MIN_COVERAGE = 0.08  # share of training frames that must observe a position of the shaft for it to be copied
+MAX_END_COVERAGE = 0.3  # share of frames above which the observed rear end is the real end
+MIN_JOINT_EXPLAINED = 0.35  # share of the moving parts' error that a found joint explains
 SLAB_RADII = 1.5  # length of the repeated slab, in shaft radii
 
 
 @torch.no_grad()
 def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Drop occluded Gaussians of instruments, set the extent of each, prolong its shaft and write the joints' verdicts
-    into `scene.diagnostics`.
-
-    Reports an instrument of which hardly anything was learned: its labels would stay empty without a message.
+    into `scene.diagnostics`. Warn of an instrument of which hardly anything was learned.
     """
     session.scene.recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
-    session.scene.canonical = settle_links(drop_occluded(session.scene), articulated)
+    session.scene.canonical = finalise_links(drop_occluded(session.scene), articulated)
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
         articulation = articulated.articulations[index]
@@ -52,10 +56,10 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
         scene = session.scene
         count = int(solid_gaussians(scene.canonical, index).sum())
         scene.diagnostics.setdefault("instruments", {}).setdefault(instrument.name, {})["solid_gaussians"] = count
-        if count < MIN_SOLID:
+        if count < MIN_SOLID_GAUSSIANS:
             session.report(
                 f"warning: {instrument.name}: hardly anything was learned of it ({count} solid Gaussians), so its "
-                "labels will be empty; the images show it too little, or another that moves alike has its place"
+                "labels will be empty; the images show it too little, or another that moves similarly has its place"
             )
         articulation.extent.copy_(solid_extent(scene.canonical, index, articulation))
         if articulation.jointed:
@@ -71,8 +75,8 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
     session.scene.diagnostics["registration"] = session.scene.registration.tolist()
 
 
-def settle_links(canonical: CanonicalGaussians, articulated: ArticulatedInstruments) -> CanonicalGaussians:
-    """The canonical Gaussians without links that their places rule out."""
+def finalise_links(canonical: CanonicalGaussians, articulated: ArticulatedInstruments) -> CanonicalGaussians:
+    """Return the canonical Gaussians without links that their positions rule out."""
     logits = canonical.extras[LINK_LOGITS].clone()
     for index, articulation in enumerate(articulated.articulations):
         rows = canonical.body(index + 1)
@@ -81,7 +85,7 @@ def settle_links(canonical: CanonicalGaussians, articulated: ArticulatedInstrume
 
 
 def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, index: int, name: str) -> dict[str, Any]:
-    """Whether the joint of a reading was found: whether the reading explains the image of the moving parts, in the
+    """Return the verdict on the joint of a reading: whether the reading explains the image of the moving parts in the
     training frames of its extremes.
 
     `explained` = 1 - error(reading) / error(mean reading), over pixels that a moving part covers in either rendering.
@@ -129,7 +133,7 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
 def _moving_weight(
     canonical: CanonicalGaussians, articulated: ArticulatedInstruments, index: int, reading: str
 ) -> Tensor:
-    """[N, 1] share of each Gaussian of instrument `index` that a reading moves."""
+    """Return the share [N, 1] of each Gaussian of instrument `index` that a reading moves."""
     weight = canonical.means.new_zeros(len(canonical), 1)
     weights = articulated.link_weights(canonical, index)
     weight[canonical.body(index + 1), 0] = articulated.articulations[index].moved_by(reading, weights)
@@ -143,15 +147,15 @@ def _with_reading(state: State, instrument: str, joint: str, reading: float) -> 
 
 
 def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
-    """The canonical Gaussians without those of instruments that other bodies occlude in nearly every frame.
+    """Return the canonical Gaussians without those of instruments that other bodies occlude in nearly every frame.
 
-    No image constrained them: they lie inside another instrument of the same arm, or in the tissue. Rendered alone,
+    No image constrains them: they lie inside another instrument of the same arm, or in the tissue. Rendered alone,
     they would widen the instrument.
     """
     canonical, recorded = scene.canonical, scene.recorded
     instruments = [canonical.bodies == body for body in range(1, len(canonical.counts))]  # bool [N] each
     visible, alone = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))
-    for index in evenly_spaced(len(recorded.cameras), OCCLUSION_FRAMES):
+    for index in evenly_spaced(len(recorded.cameras), MAX_OCCLUSION_FRAMES):
         camera = recorded.cameras[index].within(REFERENCE_PIXELS)
         with torch.no_grad():
             posed = scene.at(recorded.states[index])
@@ -167,11 +171,11 @@ def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
 def extend_shaft(
     canonical: CanonicalGaussians, body: int, name: str, articulation: Articulation, recorded: Recorded, length: float
 ) -> CanonicalGaussians:
-    """Canonical Gaussians with the shaft of instrument `body` (row group index) prolonged by about `length` mm;
-    unchanged when its real end is in view.
+    """Return canonical Gaussians with the shaft of instrument `body` (row group index) prolonged by about `length` mm;
+    unchanged when its real end is observed.
 
-    The camera sees a shaft only up to the image's border; in a new state more of it comes into view. A shaft is the
-    same all along, so the rearmost well-seen slab is repeated towards the rear.
+    A frame shows a shaft only up to the image's border; in a new state more of it comes into view. A shaft is uniform,
+    so the rearmost well observed slab is repeated towards the rear.
     """
     rows = canonical.body(body)
     along = articulation.along_shaft(canonical.means[rows])  # [M]
@@ -183,10 +187,10 @@ def extend_shaft(
         return canonical
     device = canonical.means.device
     positions = torch.linspace(rear, front, 40, device=device)
-    seen = shaft_coverage(positions, name, articulation, recorded)
-    if float(seen[0]) > END_IN_VIEW or not bool((seen >= WELL_SEEN).any()):
+    coverage = shaft_coverage(positions, name, articulation, recorded)
+    if float(coverage[0]) > MAX_END_COVERAGE or not bool((coverage >= MIN_COVERAGE).any()):
         return canonical
-    start = float(positions[seen >= WELL_SEEN][0])
+    start = float(positions[coverage >= MIN_COVERAGE][0])
     slab = SLAB_RADII * _median_radius(canonical, rows, articulation, solid)
     copied = torch.nonzero((along >= start) & (along < start + slab))[:, 0]
     if start + slab > front or len(copied) < 10:
@@ -207,7 +211,7 @@ def extend_shaft(
 
 
 def shaft_coverage(positions: Tensor, name: str, articulation: Articulation, recorded: Recorded) -> Tensor:
-    """Share [Q] of the training frames whose image holds the shaft's axis at `positions` [Q] mm."""
+    """Return the share [Q] of the training frames whose image contains the shaft's axis at `positions` [Q] mm."""
     origin, direction = articulation.shaft()
     points = origin + positions[:, None] * direction  # [Q, 3]
     counts = torch.zeros_like(positions)
@@ -218,7 +222,7 @@ def shaft_coverage(positions: Tensor, name: str, articulation: Articulation, rec
 
 
 def _median_radius(canonical: CanonicalGaussians, rows: slice, articulation: Articulation, solid: Tensor) -> float:
-    """Median distance mm of solid Gaussians behind the wrist from the axis."""
+    """Return the median distance in mm of solid Gaussians behind the wrist from the axis."""
     origin, direction = articulation.shaft()
     arm = canonical.means[rows][solid] - origin
     across = arm - (arm @ direction)[:, None] * direction

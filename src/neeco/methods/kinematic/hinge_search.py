@@ -1,4 +1,4 @@
-"""The search for hinges across a shaft, by stick figures, and the seeds of what turns about them."""
+"""Search for revolute joints across a shaft by stick figures, and seeds of the parts that turn about them."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from neeco.training.session import GaussianSession
 
 BODY_LOGIT = 2.0  # initial link logit of seeds on the shaft's side of the hinge
 GAINS = ((0.5, -0.5), (1.0, 0.0))  # jaw angle per reading: two jaws share the opening, or one takes it all
-SMALL_GAIN = 0.3  # a smaller turn, which tolerates rough evidence
-MIN_READING_RANGE = 0.05  # rad: the hinge of a joint that moves less is not searched
-STICK_POINTS = 16
+SMALL_GAIN = 0.3  # a smaller rotation, which tolerates rough evidence
+MIN_READING_RANGE = 0.05  # rad: a joint that moves less is not searched
+N_STICK_POINTS = 16
 STATE_LINKS = (
     "state its links (`kinematics`, from a ruler and a protractor, a dVRK tool file or a URDF: docs/capture.md)"
 )
-HINGE_ANGLES = 36  # hinge directions tried over half a turn
-HINGE_DEPTHS = 10  # hinge places tried along the front half
+N_HINGE_ANGLES = 36  # axis directions tried over half a turn
+N_HINGE_DEPTHS = 10  # pivots tried along the front half
 
 
 def hinge_joints(
     instrument: Instrument, joints: tuple[str, ...], frames: Sequence[Frame], report: Report
 ) -> tuple[str, ...]:
-    """Those of `joints` that are learned as hinges across the shaft: all revolute ones. Warn of prismatic joints, and
-    of several that move, for which this is the wrong model."""
+    """Return those of `joints` that are learned as hinges across the shaft: all revolute ones. Warn of prismatic
+    joints, and of several moving ones, for which this is the wrong model."""
     for joint in joints:
         if instrument.slides(joint):
             report(f"warning: {instrument.name}: joint {joint} is prismatic and moves no part; {STATE_LINKS}")
@@ -53,11 +53,12 @@ def start_hinges(
     evidence: Evidence,
     name: str,
     shape: CarvedShape,
+    *,
     columns: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Put each joint at the best hypothesis of the search; returns seeds [M, 3] mm, and their link logits
-    [M, columns]."""
+    """Set each joint to the best hypothesis of the search; return seeds [M, 3] mm and their link logits [M,
+    columns]."""
     find_hinges(session, hinges, evidence, name, shape)
     seeds = shape.seeds.to(hinges.base.device)
     logits = seed_logits(hinges, seeds, columns, generator)
@@ -65,7 +66,7 @@ def start_hinges(
 
 
 def find_hinges(session: GaussianSession, hinges: Hinges, evidence: Evidence, name: str, shape: CarvedShape) -> None:
-    """Put each joint of `hinges`, whose shaft is in place, at the best hypothesis of the search."""
+    """Set each joint of `hinges`, whose shaft is in place, to the best hypothesis of the search."""
     for index, joint in enumerate(hinges.reading_names):
         found = search_hinge(evidence, name, joint, shape, session.config.deformation.carving)
         if found is None:
@@ -85,8 +86,8 @@ def find_hinges(session: GaussianSession, hinges: Hinges, evidence: Evidence, na
 
 @torch.no_grad()
 def unbend_seeds(hinges: Hinges, seeds: Tensor, logits: Tensor) -> Tensor:
-    """Seeds [M, 3] mm, carved with the joints at their offsets, turned to the pose of zero offsets, to which the
-    hinges are set: there a change of hinge or gains moves nothing."""
+    """Return seeds [M, 3] mm, carved with the joints at their offsets, turned to zero offsets, to which the hinges are
+    set: there a change of hinge or gains moves nothing."""
     weights = torch.softmax(logits[:, : hinges.link_count], -1)
     middle = {name: float(hinges.middle[joint]) for joint, name in enumerate(hinges.reading_names)}
     turned = hinges.bend(seeds, weights, middle)
@@ -95,7 +96,7 @@ def unbend_seeds(hinges: Hinges, seeds: Tensor, logits: Tensor) -> Tensor:
 
 
 def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Generator) -> Tensor:
-    """[M, columns] part logits: behind the first hinge the body, beyond it one of the moving parts at random."""
+    """Return link logits [M, columns]: behind the first hinge the body, beyond it one of the moving parts at random."""
     logits = 0.3 * torch.randn(len(seeds), columns, generator=generator).to(seeds)
     if not hinges.reading_names:
         return logits
@@ -119,7 +120,7 @@ class HingeScores:
 
     @property
     def depth(self) -> float:
-        """Half way between the best by score and the best over rigid sticks, mm.
+        """Mean of the best depths by score and by score over rigid sticks, mm.
 
         The first prefers pivots too far back (short turns stay on the body), the second pivots too far forward.
         """
@@ -128,22 +129,22 @@ class HingeScores:
 
     @property
     def angle(self) -> float:
-        """Phase of the score's second harmonic over the hinge angle, rad in [0, pi): uses the whole landscape, not its
-        peak alone."""
+        """Phase of the score's second harmonic over the hinge angle, rad in [0, pi): uses all scores, not the peak
+        alone."""
         best = self.score.max((0, 1)).tolist()
         wave = sum(s * complex(math.cos(2 * a), math.sin(2 * a)) for a, s in zip(self.angles, best, strict=True))
         return (math.atan2(wave.imag, wave.real) / 2) % math.pi
 
     @property
     def gains(self) -> tuple[float, float]:
-        """Those of the best score."""
+        """Gains of the best score."""
         return GAINS[np.unravel_index(self.score.argmax(), self.score.shape)[1]]
 
 
 def search_hinge(
     evidence: Evidence, name: str, joint: str, shape: CarvedShape, settings: CarvingSettings
 ) -> HingeScores | None:
-    """Scores of all hinges on a grid, by a search over stick figures; None when the reading hardly varies.
+    """Score all hinges on a grid by stick figures; None when the reading hardly varies.
 
     A joint moves two parts symmetrically or one alone. Its parts are sticks: the instrument's centre line beyond the
     pivot, turned about the hinge by the reading. The right hinge keeps both sticks on evidence in every frame, above
@@ -159,14 +160,14 @@ def search_hinge(
     if len(line) < 2:
         line = shape.center_line
     camera_from_shaft = camera_from_instrument(evidence, name) @ shape.instrument_from_shaft  # [F, 4, 4]
-    angles = torch.arange(HINGE_ANGLES, device=evidence.device) * (math.pi / HINGE_ANGLES)
+    angles = torch.arange(N_HINGE_ANGLES, device=evidence.device) * (math.pi / N_HINGE_ANGLES)
     length = shape.tip - shape.near
-    depths = np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, HINGE_DEPTHS).tolist()
+    depths = np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, N_HINGE_DEPTHS).tolist()
     score, over_rigid = [], []
     for depth in depths:
         stick = _stick(line, depth, shape.tip)
         scores = {
-            gain: _stick_scores(evidence, camera_from_shaft, stick, depth, angles, gain * opening, opening)
+            gain: _stick_scores(evidence, camera_from_shaft, stick, depth, angles, turns=gain * opening, weight=opening)
             for gain in {0.0, SMALL_GAIN, -SMALL_GAIN, *GAINS[0], *GAINS[1]}
         }
         turned = torch.stack([(scores[first] + scores[second]) / 2 for first, second in GAINS])
@@ -176,10 +177,10 @@ def search_hinge(
 
 
 def _stick(line: Tensor, depth: float, tip: float) -> Tensor:
-    """[Q, 3] shaft-frame points of the centre line [Z, 3] from just beyond the pivot at `depth` to just before the
-    tip."""
+    """Return points [Q, 3], shaft frame, of the centre line [Z, 3] from just beyond the pivot at `depth` to just before
+    the tip."""
     known = line.cpu().numpy()
-    along = np.linspace(depth + 0.15 * (tip - depth), tip - 0.1 * (tip - depth), STICK_POINTS)
+    along = np.linspace(depth + 0.15 * (tip - depth), tip - 0.1 * (tip - depth), N_STICK_POINTS)
     across = [np.interp(along, known[:, 0], known[:, k]) for k in (1, 2)]
     return torch.from_numpy(np.stack([*across, along], -1)).to(line)
 
@@ -190,11 +191,12 @@ def _stick_scores(
     stick: Tensor,
     depth: float,
     angles: Tensor,
+    *,
     turns: Tensor,
     weight: Tensor,
 ) -> Tensor:
-    """[A] mean evidence on `stick` [Q, 3] for hinges at `angles` [A], turned by `turns` [F] rad, frames weighted by
-    `weight` [F]."""
+    """Return the mean evidence [A] on `stick` [Q, 3] for hinges at `angles` [A], turned by `turns` [F] rad, frames
+    weighted by `weight` [F]."""
     axis = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1)[:, None, None]  # [A, 1, 1, 3]
     arm = (stick - stick.new_tensor([0.0, 0.0, depth]))[None, None]  # [1, 1, Q, 3]
     cosine, sine = turns.cos()[None, :, None, None], turns.sin()[None, :, None, None]

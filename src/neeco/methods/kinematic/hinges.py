@@ -1,4 +1,4 @@
-"""Hinges across the shaft that are found from the images: each turns two jaws, one or both, by one reading."""
+"""Revolute joints across the shaft that are found from the images: each turns one or two jaws by one reading."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from neeco.geometry.rotations import rotate_about
 from neeco.methods.kinematic.articulation import Articulation
 from neeco.scene.drawable import JointMotion, Skeleton
 
-JAWS_BEYOND = 0.75  # radii beyond the hinge, where nothing but jaws is
+JAW_START_RADII = 0.75  # beyond the hinge, where there is nothing but jaws
 PRONGS_FROM = (
     0.55  # radii from the middle of the hinge's axis: short of that place are only the prongs that hold the jaws
 )
-PLACE_SOFTNESS = 0.2  # radii, of either border
-RULED_OUT = 10.0  # by which the logit of a link that places rule out is below all others
-FIXED_JAW_GAIN = 0.25  # rad per rad of reading: a part that turns less is a jaw that stands still
+BORDER_WIDTH_RADII = 0.2  # of either border
+RULED_OUT_MARGIN = 10.0  # by which the logit of a link that positions rule out is below all others
+MAX_FIXED_JAW_GAIN = 0.25  # rad per rad of reading: a jaw that turns less is fixed
 MIN_PART_SHARE = 0.5  # of a Gaussian that counts as belonging to a part
-MIN_AT_TIP = 10  # Gaussians of a part, with fewer its tip stays unknown
+MIN_TIP_GAUSSIANS = 10  # of a part; with fewer its tip stays unknown
 TIP_QUANTILE = 0.97  # of the distances of a part's Gaussians from its pivot: farther ones are its tip
 
 
 class Hinges(Articulation):
-    """A straight shaft and joints whose hinge axes cross it at right angles.
+    """A straight shaft and revolute joints whose axes cross it at right angles.
 
     Joint j turns two jaws about the axis at `hinge_angle[j]` (rad, around the shaft) and `hinge_depth[j]` (mm, along
     it); jaw k turns by `offsets[j, k] + gains[j, k] * (reading - middle[j])`, `middle` being the mean of the recorded
@@ -78,7 +78,7 @@ class Hinges(Articulation):
         return self.hinge_depth.detach().min() if self.jointed else torch.zeros_like(self.radius)
 
     def axes(self, shaft: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, Tensor]:
-        """No gradient reaches the shaft: only spinning it teaches where it lies, or the hinges would move it."""
+        """No gradient reaches the shaft: it is learned by spinning alone, or the hinges would move it."""
         origin, direction = (part.detach() for part in shaft or self.shaft())
         angle = self.hinge_angle
         around = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1) @ self.base[:3, :3].T
@@ -91,12 +91,13 @@ class Hinges(Articulation):
         return torch.block_diag(*angles.split(1)) if len(turned) > 1 else angles  # a joint moves its own two jaws
 
     def hinge(self, joint: int) -> tuple[Tensor, Tensor]:
-        """(pivot [3] mm, unit axis [3]) of one joint, instrument frame."""
+        """Return (pivot [3] mm, unit axis [3]) of one joint, instrument frame."""
         pivots, axes = self.axes()
         return pivots[joint], axes[joint]
 
     def bend(self, points: Tensor, weights: Tensor, joints: Mapping[str, float]) -> Tensor:
-        """Move points [M, 3] by the joints; weights [M, link_count] sum to 1: the shaft, then two jaws per joint."""
+        """Return points [M, 3] moved by the joints; weights [M, link_count] sum to 1: the shaft, then two jaws per
+        joint."""
         pivots, axes = self.axes()
         for index, name in enumerate(self.reading_names):
             angle = weights[:, 1 + 2 * index : 3 + 2 * index] @ self.turns(index, joints[name])
@@ -104,17 +105,17 @@ class Hinges(Articulation):
         return points
 
     def turns(self, joint: int, reading: float) -> Tensor:
-        """[2] rad by which a joint's two jaws are turned."""
+        """Return the angles [2] rad of a joint's two jaws."""
         return self.offsets[joint] + self.gains[joint] * (reading - self.middle[joint])
 
     def opening(self, joint: int, reading: float) -> Tensor:
-        """[2] rad between a joint's two jaws and the shaft, along which they lie where the joint is closed."""
+        """Return the angles [2] rad between a joint's two jaws and the shaft, along which they lie when closed."""
         from_closed = self.gains[joint] * (reading - self.closed[joint])
         return torch.where(self.closed[joint].isnan(), self.turns(joint, reading), from_closed)
 
     def tips_at(self, joint: int, reading: float) -> Tensor:
-        """[2, 3] mm, instrument frame: the tips of a joint's left and right jaw. A tip that was not measured starts at
-        the shaft's end where the joint is closed."""
+        """Return the tips [2, 3] mm of a joint's left and right jaw, instrument frame. A tip that was not measured lies
+        at the shaft's end when the joint is closed."""
         pivot, axis = self.hinge(joint)
         origin, direction = self.shaft()
         known = self.tips[joint].isfinite().all(1)  # [2]
@@ -123,20 +124,20 @@ class Hinges(Articulation):
         return rotate_about(points, axis, pivot, angles).index_select(0, self.left_right_order(joint))
 
     def joint_points(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
-        """The first joint's hinge and tips."""
+        """Return the first joint's hinge and tips."""
         if not self.jointed:
             return {}
         left, right = self.tips_at(0, readings[self.reading_names[0]])
         return {"hinge": self.hinge(0)[0], "tip_left": left, "tip_right": right}
 
     def parts(self, points: Tensor, weights: Tensor) -> Tensor:
-        """A fixed jaw is learned as shaft, since it moves like it: beyond the hinge there are only jaws."""
+        """A fixed jaw is learned as shaft, since it moves with it: beyond the hinge there are only jaws."""
         if not self.jointed:
             return weights.new_ones(len(weights), 1)
         along, body = self.along_shaft(points), weights[:, 0]
         jaws: list[Tensor] = []
         for joint in range(len(self.reading_names)):
-            beyond = along > self.hinge_depth[joint] + JAWS_BEYOND * self.radius  # [M]
+            beyond = along > self.hinge_depth[joint] + JAW_START_RADII * self.radius  # [M]
             fixed_jaw = body[:, None] * (beyond[:, None] & self._fixed(joint))
             pair = weights[:, 1 + 2 * joint : 3 + 2 * joint] + fixed_jaw
             body = body - fixed_jaw.sum(1)
@@ -149,32 +150,33 @@ class Hinges(Articulation):
             return logits
         own, ruled_out = logits[:, : self.link_count], self._ruled_out(points) > 0.5
         lowest = own.masked_fill(ruled_out, torch.inf).amin(1, keepdim=True)
-        settled = torch.where(ruled_out, torch.minimum(own, lowest - RULED_OUT), own)
+        settled = torch.where(ruled_out, torch.minimum(own, lowest - RULED_OUT_MARGIN), own)
         return torch.cat([settled, logits[:, self.link_count :]], 1)
 
     @torch.no_grad()
     def _ruled_out(self, points: Tensor) -> Tensor:
-        """[M, link_count] in [0, 1]: how surely links cannot be at points [M, 3] mm. Near a hinge all move alike, and
-        images hardly tell: but jaws turn between the prongs of what holds them, and beyond those there is nothing else,
-        unless a jaw stands still."""
+        """Return how strongly points [M, 3] mm rule out each link, [M, link_count] in [0, 1].
+
+        Near a hinge all links move similarly, and images hardly separate them. But jaws turn between the prongs that
+        hold them, and beyond those there is nothing else unless a jaw is fixed."""
         along, beyond, columns = self.along_shaft(points), points.new_ones(len(points)), []
         for joint in range(len(self.reading_names)):
             pivot, axis = self.hinge(joint)
             aside = ((points - pivot) @ axis).abs() / self.radius
-            past = (along - self.hinge_depth[joint]) / self.radius - JAWS_BEYOND
-            past = (0.5 + past / PLACE_SOFTNESS).clamp(0, 1)
-            prongs = (0.5 + (aside - PRONGS_FROM) / PLACE_SOFTNESS).clamp(0, 1) * (1 - past)
+            past = (along - self.hinge_depth[joint]) / self.radius - JAW_START_RADII
+            past = (0.5 + past / BORDER_WIDTH_RADII).clamp(0, 1)
+            prongs = (0.5 + (aside - PRONGS_FROM) / BORDER_WIDTH_RADII).clamp(0, 1) * (1 - past)
             columns += [prongs, prongs]
             beyond = beyond * past * ~self._fixed(joint).any()
         return torch.stack([beyond, *columns], 1)
 
     def _fixed(self, joint: int) -> Tensor:
-        """[2] bool: which of a joint's jaws stands still, if any."""
+        """Return which of a joint's jaws is fixed, [2] bool."""
         gains = self.gains[joint].detach().abs()
-        return (gains < FIXED_JAW_GAIN) & (gains == gains.min())
+        return (gains < MAX_FIXED_JAW_GAIN) & (gains == gains.min())
 
     def left_right_order(self, joint: int) -> Tensor:
-        """A joint's two jaws (0 and 1) as indices [2], the left one first.
+        """Return a joint's two jaws (0 and 1) as indices [2], the left one first.
 
         The hinge axis is given the sign that makes its largest component in the instrument frame positive; the left
         jaw opens towards (shaft direction x axis).
@@ -199,7 +201,7 @@ class Hinges(Articulation):
         return found, turns
 
     def measure_tips(self, points: Tensor, weights: Tensor) -> None:
-        """The tips of every joint's jaws are where their Gaussians lie farthest from the hinge."""
+        """Set the tips of every joint's jaws to where their Gaussians lie farthest from the hinge."""
         shares = self.parts(points, weights)
         for joint in range(len(self.reading_names)):
             pivot, _ = self.hinge(joint)
@@ -211,7 +213,7 @@ class Hinges(Articulation):
             self.tips[joint] = found
 
     def describe(self, reading: str) -> dict[str, Any]:
-        """Axis and pivot in the instrument's frame, and how the jaws turn by the reading."""
+        """Return axis and pivot in the instrument's frame, and the gains and offsets of the jaws."""
         joint = self.reading_names.index(reading)
         pivot, axis = self.hinge(joint)
         return {
@@ -223,8 +225,8 @@ class Hinges(Articulation):
 
 
 def farthest(points: Tensor, pivot: Tensor) -> Tensor | None:
-    """[3] the middle of those of points [M, 3] that lie farthest from `pivot` [3]; None where there are too few."""
-    if len(points) < MIN_AT_TIP:
+    """Return the mean [3] of the points [M, 3] farthest from `pivot` [3]; None for too few points."""
+    if len(points) < MIN_TIP_GAUSSIANS:
         return None
     away = (points - pivot).norm(dim=1)
     return points[away >= away.quantile(TIP_QUANTILE)].mean(0)

@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool2d
 from neeco.raster import rasterize
 from neeco.raster.shadow import GAMMA, Casting, blocked
 from neeco.raster.types import Gaussians
-from neeco.scene.gaussian_scene import LAMPS
+from neeco.scene.gaussian_scene import MAX_LAMPS
 from neeco.training.session import GaussianSession
 
 RADII = (0.04, 0.08)  # of the tissue's distance: a lamp nearer the lens would explain any dark edge
@@ -71,12 +71,12 @@ def find_shadow(session: GaussianSession) -> None:
     """Add to the scene's lamps those that best explain what the tissue, the solid part of the instruments and the
     shadows of known lamps do not; none where none explains enough."""
     scene = session.scene
-    free = [lamp for lamp in range(LAMPS) if float(scene.shadow_strengths[lamp]) <= 0]
+    free = [lamp for lamp in range(MAX_LAMPS) if float(scene.shadow_strengths[lamp]) <= 0]
     if not scene.instruments or not free:
         return
     offsets = _candidates(2 * session.extent, LAMP_DIRECTIONS).to(scene.center)
     equations = _normal_equations(session, offsets)
-    known = [scene.shadow_offsets[lamp] for lamp in range(LAMPS) if lamp not in free]
+    known = [scene.shadow_offsets[lamp] for lamp in range(MAX_LAMPS) if lamp not in free]
     fit = _choose(equations, offsets, known, MIN_EXPLAINED)
     agree = equations.agreement(fit)
     searches = scene.diagnostics.setdefault("shadow", [])
@@ -116,9 +116,10 @@ def _candidates(distance: float, directions: int) -> Tensor:
 
 def _choose(equations: _NormalEquations, offsets: Tensor, known: list[Tensor], min_explained: float) -> _Fit:
     """Greedy choice among the lamps at `offsets` [C, 3]: one after the other the one that explains most, as long as it
-    explains `min_explained` of the error and is far enough from those chosen and `known`; at most LAMPS with these."""
+    explains `min_explained` of the error and is far enough from those chosen and `known`; at most MAX_LAMPS with
+    these."""
     best = _Fit((), np.zeros(0), 0.0)
-    while len(known) + len(best.chosen) < LAMPS:
+    while len(known) + len(best.chosen) < MAX_LAMPS:
         taken = [*known, *(offsets[k] for k in best.chosen)]
         apart = [k for k in range(len(offsets)) if all(_cosine(offsets[k], other) < MAX_COSINE for other in taken)]
         if not apart:

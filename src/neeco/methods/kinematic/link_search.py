@@ -1,4 +1,4 @@
-"""Seeds on the links of a stated kinematic tree: each link is carved in its own frame."""
+"""Start the links of a stated kinematic tree: carve each in its own frame, and check the readings that move it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import (
-    POSSIBLE,
+    MIN_LEVEL,
     CarvedShape,
     Evidence,
     PosedViews,
@@ -27,28 +27,28 @@ from neeco.training.session import GaussianSession
 
 LINK_LOGIT = 2.0  # initial logit of a seed for the link that it was carved on
 SHAFT_SHARE = 0.4  # of the seeds
-REACH_RADII = 7.0  # how far beyond its pivot a link without links of its own is looked for
-BESIDE_RADII = 2.0  # how far about the pivots beyond it another is
-CANDIDATES = 20  # points tried per seed
-TOLERANCE = 0.03  # of evidence, by which another link may be likelier
-# a carved shaft is believed where it agrees so well with the line of the links at rest
+REACH_RADII = 7.0  # shaft radii beyond its pivot within which an end link is searched
+MARGIN_RADII = 2.0  # shaft radii about the pivots beyond it within which another link is searched
+CANDIDATES_PER_SEED = 20
+EVIDENCE_TOLERANCE = 0.03  # by which the evidence of another link may be larger
+# tolerances within which a carved shaft agrees with the line of the links at rest
 MIN_COSINE = 0.85
-MAX_OFF_RADII, MAX_OFF_MM = 1.5, 4.0
-NEAR_BEST = 0.85  # of the best evidence that a point of a link has: stated axes may be off, and all points with them
-MIN_RADIUS = 0.33  # of the shaft, of the distance between the first pivots
-ACROSS_RADII = 0.3  # how far on another side of its pivot a link may lie that is looked for on one
-MIN_SEEN = 0.05  # share of the frames that must see a seed
-# where links lie that open as nobody recorded: openings (of the limits' range) and headings (rad) that are tried, and
-# what must be evident beside the plane between them, in radii from the pivot, along the axis and from the plane
+MAX_OFFSET_RADII, MAX_OFFSET_MM = 1.5, 4.0
+MIN_RELATIVE_LEVEL = 0.85  # of the best evidence of a link's points: stated axes may be off, and all points with them
+MIN_RADIUS_RATIO = 0.33  # of the shaft's radius to the distance between the first two pivots
+SIDE_TOLERANCE_RADII = 0.3  # by which a link that is searched on one side of its pivot may lie on the other
+MIN_VISIBLE_SHARE = 0.05  # of the frames, that must observe a seed
+# jaws whose opening was not recorded: openings (of the limits' range) and headings (rad) that are tried, and the points
+# that must be evident next to the plane between them, in radii from the pivot, along the axis and from the plane
 OPENINGS = torch.linspace(0, 1, 9)
 HEADINGS = torch.linspace(-1.2, 1.2, 13)
 HEADING_SIGMA, HEADING_WEIGHT = 0.5, 0.02  # rad; of evidence, by which a stated heading may be less likely
-CLEARLY_MORE = 0.25  # evidence than half way open and straight on: where jaws move, any opening has some
-BESIDE_PLANE = torch.cartesian_prod(torch.linspace(1, 4, 7), torch.linspace(-0.3, 0.3, 3), torch.linspace(0.1, 0.3, 3))
+MIN_EVIDENCE_GAIN = 0.25  # over half way open and straight on: where jaws move, any opening has some evidence
+PLANE_OFFSETS = torch.cartesian_prod(torch.linspace(1, 4, 7), torch.linspace(-0.3, 0.3, 3), torch.linspace(0.1, 0.3, 3))
 
 
 @torch.no_grad()
-def along_links(
+def align_to_links(
     session: GaussianSession,
     links: StatedLinks,
     evidence: Evidence,
@@ -56,21 +56,22 @@ def along_links(
     shape: CarvedShape,
     generator: torch.Generator,
 ) -> CarvedShape:
-    """`shape`, or where its line is not that of the links at rest, one carved about theirs: an instrument that hardly
-    turns leaves evidence along its lines of sight, too. Not thinner than the links are near each other: where the fit
-    of the tissue took a dark shaft in, little evidence is left of it."""
+    """Return `shape`, or one carved about the line of the links at rest where its line is another.
+
+    An instrument that hardly turns leaves evidence along its lines of sight, too. The radius is at least a share of the
+    distance of the first pivots: where the tissue's fit absorbed a dark shaft, little evidence of it is left."""
     line = links.rest_line()
     if line is None:
         return shape
     pivot, step = line
     direction = nn.functional.normalize(step, dim=0)
-    thickness = MIN_RADIUS * float(step.norm())
+    thickness = MIN_RADIUS_RATIO * float(step.norm())
     origin, along = shape.instrument_from_shaft[:3, 3], shape.instrument_from_shaft[:3, 2]
     apart = pivot - origin
     off = float((apart - (apart @ along) * along).norm())
-    if float(along @ direction) > MIN_COSINE and off < max(MAX_OFF_RADII * shape.radius, MAX_OFF_MM):
+    if float(along @ direction) > MIN_COSINE and off < max(MAX_OFFSET_RADII * shape.radius, MAX_OFFSET_MM):
         return replace(shape, radius=max(shape.radius, thickness))
-    session.report(f"{name}: the shaft is looked for along the stated links: carving it found another line")
+    session.report(f"{name}: the shaft is searched along the stated links: carving found another line")
     base = frame_along(pivot, direction)
     carved = carve_along(evidence, name, base, shape.level, generator, session.config.deformation.carving)
     found = shape if carved is None else carved
@@ -84,13 +85,14 @@ def start_links(
     evidence: Evidence,
     name: str,
     shape: CarvedShape,
+    *,
     columns: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Seeds [M, 3] mm at rest on every link, and their link logits [M, columns].
+    """Return seeds [M, 3] mm at rest on every link, and their link logits [M, columns].
 
-    A point belongs to the link with which it must move to stay on evidence. Where nobody recorded how far two links
-    open, each is looked for on the side to which it does: mirrored they would look as well.
+    A point belongs to the link with which it must move to stay on evidence. Where the opening of two links was not
+    recorded, each is searched on the side to which it opens: mirrored, both would fit as well.
     """
     settings = session.config.deformation.carving
     sides = _open_links(session, links, evidence, name, shape.radius)
@@ -104,7 +106,7 @@ def start_links(
     seeds, owners = [of_shaft[chosen]], [torch.zeros(count, dtype=torch.long)]
     each = (settings.seeds - count) // max(links.link_count - 1, 1)
     for link in range(1, links.link_count):
-        found = _on_link(views, links, link, shape.radius, each, generator, sides.get(link))
+        found = _on_link(views, links, link, shape.radius, count=each, generator=generator, side=sides.get(link))
         seeds.append(found)
         owners.append(torch.full((len(found),), link))
     points, owner = torch.cat(seeds), torch.cat(owners).to(shape.seeds.device)
@@ -115,12 +117,12 @@ def start_links(
 def _open_links(
     session: GaussianSession, links: StatedLinks, evidence: Evidence, name: str, radius: float
 ) -> dict[int, tuple[Tensor, Tensor]]:
-    """(place [3] mm, unit directions [K, 3]) at rest, to which sides of it each link lies that opens as nobody
-    recorded: where it opens to, and where its heading is found, beyond its pivot.
+    """Return, by link whose opening was not recorded, the half spaces in which it lies at rest: a point [3] mm and unit
+    directions [K, 3], to the side to which it opens and, where its heading is found, beyond its pivot.
 
     Tools are held closed, or open by the same angle, for much of a recording, and the zero of what turns both is not
-    learned. So the opening and the heading are taken at which both links have most evidence beside the plane between
-    them; the reading is found from that opening on. Where none has clearly more, half way and straight on.
+    learned. So the opening and heading are taken at which both links have most evidence next to the plane between
+    them; the reading is estimated from that opening on. Without a clear maximum: half way open and straight on.
     """
     instrument = next(item for item in session.scene.instruments if item.name == name)
     sides: dict[int, tuple[Tensor, Tensor]] = {}
@@ -133,13 +135,15 @@ def _open_links(
         recorded = readings_of(session, evidence, name)
         scores = torch.stack(
             [
-                _beside_plane(links, evidence, name, radius, opening, [given | {reading: value} for given in recorded])
+                _plane_evidence(
+                    links, evidence, name, radius, opening, [given | {reading: value} for given in recorded]
+                )
                 for value in values.tolist()
             ]
         )  # [openings, headings]
         likely = scores - HEADING_WEIGHT * (HEADINGS / HEADING_SIGMA).square()
         best, heading = divmod(int(likely.argmax()), len(HEADINGS))
-        if float(scores[best, heading] - scores[len(OPENINGS) // 2, len(HEADINGS) // 2]) > CLEARLY_MORE:
+        if float(scores[best, heading] - scores[len(OPENINGS) // 2, len(HEADINGS) // 2]) > MIN_EVIDENCE_GAIN:
             turned, found = float(HEADINGS[heading]), True
             column = session.refinement.readings.index((name, reading))
             session.refinement.joints[:, column] = values[best] - instrument.halfway(reading)
@@ -150,7 +154,7 @@ def _open_links(
     return sides
 
 
-def _beside_plane(
+def _plane_evidence(
     links: StatedLinks,
     evidence: Evidence,
     name: str,
@@ -158,10 +162,10 @@ def _beside_plane(
     opening: dict[int, tuple[int, float]],
     readings: list[dict[str, float]],
 ) -> Tensor:
-    """[headings] mean evidence of links that open, each beside the plane between them."""
+    """Return the mean evidence [headings] of links that open, each next to the plane between them."""
     moved = link_motions(links, readings)  # [F, L, 4, 4]
     own = camera_from_instrument(evidence, name)
-    far, along_axis, aside = (radius * BESIDE_PLANE.to(own)).split(1, 1)  # [P, 1] each
+    far, along_axis, aside = (radius * PLANE_OFFSETS.to(own)).split(1, 1)  # [P, 1] each
     scores = []
     for link, (joint, sense) in opening.items():
         points = []
@@ -175,14 +179,14 @@ def _beside_plane(
 
 
 def readings_of(session: GaussianSession, evidence: Evidence, name: str) -> list[dict[str, float]]:
-    """The readings of every frame of the evidence; of joints that nobody recorded as found so far."""
+    """Return the readings of every frame of the evidence; those of unrecorded joints as estimated so far."""
     recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
     by_name = dict(zip(recorded.names, recorded.states, strict=True))
     return [dict(by_name[frame.name].instruments[name].joints) for frame in evidence.frames]
 
 
 def link_motions(links: StatedLinks, readings: list[dict[str, float]]) -> Tensor:
-    """[F, L, 4, 4] instrument frame: how every link has moved from rest at each frame's readings."""
+    """Return the motion [F, L, 4, 4] of every link from rest, instrument frame, at each frame's readings."""
     frame = torch.eye(4, device=links.points.device)[:, :3]  # origin and axes, as points
     corners = torch.cat([frame[3:4], frame[:3]])  # [4, 3]
     moved = []
@@ -200,51 +204,55 @@ def _on_link(
     links: StatedLinks,
     link: int,
     radius: float,
+    *,
     count: int,
     generator: torch.Generator,
     side: tuple[Tensor, Tensor] | None,
 ) -> Tensor:
-    """[count, 3] mm at rest: points that stay on evidence when moved with a link, and better than with any other; on
-    the sides of a place (mm, unit directions) where such are given."""
+    """Sample points [count, 3] mm at rest that stay on evidence when moved with a link, and better than with any other;
+    in the half spaces `side` (point mm, unit directions) where given."""
     device = links.points.device
-    centers, reaches = (part.to(device) for part in links.where(link, REACH_RADII * radius, BESIDE_RADII * radius))
-    total = CANDIDATES * count
+    centers, reaches = (part.to(device) for part in links.extent_of(link, REACH_RADII * radius, MARGIN_RADII * radius))
+    total = CANDIDATES_PER_SEED * count
     random = torch.rand(total, 4, generator=generator, device=generator.device).to(device)
     which = (random[:, 3] * len(centers)).long().clamp_max(len(centers) - 1)
     points = centers[which] + (2 * random[:, :3] - 1) * reaches[which, None]
     if side is not None:
         place, directions = (part.to(device) for part in side)
-        outside = ((points - place) @ directions.T + ACROSS_RADII * radius).clamp_max(0)  # [Q, K]
-        points = points - 2 * outside @ directions  # mirrored into it
+        outside = ((points - place) @ directions.T + SIDE_TOLERANCE_RADII * radius).clamp_max(0)  # [Q, K]
+        points = points - 2 * outside @ directions  # mirrored into the half spaces
     own, seen = views[link].scores(points)
-    likely = torch.nonzero((own > 0.5 * POSSIBLE) & (seen > MIN_SEEN))[:, 0]
+    likely = torch.nonzero((own > 0.5 * MIN_LEVEL) & (seen > MIN_VISIBLE_SHARE))[:, 0]
     others = torch.stack([view.scores(points[likely])[0] for k, view in enumerate(views) if k != link]).amax(0)
-    fits = own[likely] >= others - TOLERANCE
+    fits = own[likely] >= others - EVIDENCE_TOLERANCE
     likely, score = likely[fits], own[likely][fits]
-    if not len(likely):  # nothing tells: about its pivot, for the training to sort out
+    if not len(likely):  # no evidence: about its pivot; training moves them
         return points[:count] * 0 + centers[:1] + 0.5 * (points[:count] - centers[which[:count]])
-    best = likely[score >= NEAR_BEST * float(score.max())]
+    best = likely[score >= MIN_RELATIVE_LEVEL * float(score.max())]
     again = torch.randint(len(best), (max(0, count - len(best)),), generator=generator, device=generator.device)
     jitter = 0.1 * radius * torch.randn(len(again), 3, generator=generator, device=generator.device).to(points)
     order = torch.randperm(len(best), generator=generator, device=generator.device).to(device)[:count]
     return torch.cat([points[best[order]], points[best[again.to(device)]] + jitter])
 
 
-POINTS = 1500  # about each link
-CHECK_REACH_RADII, CHECK_BESIDE_RADII = 4.0, 2.0  # how far about the pivots they lie
-FRAMES = 80  # of the evidence
-DOUBT = 1.15  # times the volume on evidence, from which other readings are believed
-CHECK_MIN_SEEN = 0.1  # share of the frames that must see a point
+# check of the readings
+CHECK_POINTS = 1500  # per link
+CHECK_REACH_RADII, CHECK_MARGIN_RADII = 4.0, 2.0  # shaft radii about the pivots within which they lie
+MAX_CHECK_FRAMES = 80
+MIN_VOLUME_RATIO = 1.15  # of the volume on evidence with other readings, from which a warning is given
+CHECK_MIN_VISIBLE_SHARE = 0.1  # of the frames, that must observe a point
 
 Readings = dict[str, float]
 
 
 @torch.no_grad()
-def doubt_readings(
+def check_readings(
     session: GaussianSession, links: StatedLinks, evidence: Evidence, instrument: Instrument, readings: list[Readings]
 ) -> None:
     """Warn, and note in `scene.diagnostics["doubted_readings"]`, where the links keep more of their volume on evidence
-    with two readings exchanged or one's sign reversed. `readings`: those of every frame of the evidence."""
+    with two readings exchanged or one's sign reversed. `readings`: those of every frame of the evidence.
+
+    Swapped logs and reversed signs pass every check of numbers, but not the images."""
     volumes = _Volumes(links, evidence, instrument.name, readings, session.config.seed)
     named = volumes.with_readings(dict)
     recorded = [name for name in links.reading_names if name not in instrument.unrecorded]
@@ -261,7 +269,7 @@ def doubt_readings(
             f"with the sign of {name} reversed: is its axis, or its gain, the wrong way round?",
         )
     most = max(better, default=0.0)
-    if most <= DOUBT * named:
+    if most <= MIN_VOLUME_RATIO * named:
         return
     names, words = better[most]
     session.report(
@@ -280,10 +288,10 @@ def _reversed(name: str, given: Readings) -> Readings:
 
 
 class _Volumes:
-    """Of what stays on evidence, points of all links together."""
+    """Volume that stays on evidence, counted in sample points of all links together."""
 
     def __init__(self, links: StatedLinks, evidence: Evidence, name: str, readings: list[Readings], seed: int) -> None:
-        step = max(1, len(readings) // FRAMES)
+        step = max(1, len(readings) // MAX_CHECK_FRAMES)
         self.links, self.readings = links, readings[::step]
         self.evidence = evidence.subset(torch.arange(0, len(readings), step))
         self.camera_from_instrument = camera_from_instrument(self.evidence, name)  # [F, 4, 4]
@@ -291,20 +299,22 @@ class _Volumes:
         self.points = [self._about(link, generator) for link in range(1, links.link_count)]
 
     def _about(self, link: int, generator: torch.Generator) -> Tensor:
-        """[POINTS, 3] mm at rest."""
+        """Sample points [CHECK_POINTS, 3] mm about a link at rest."""
         radius = float(self.links.radius)
         centers, half = (
-            part.cpu() for part in self.links.where(link, CHECK_REACH_RADII * radius, CHECK_BESIDE_RADII * radius)
+            part.cpu() for part in self.links.extent_of(link, CHECK_REACH_RADII * radius, CHECK_MARGIN_RADII * radius)
         )
-        which = torch.randint(len(centers), (POINTS,), generator=generator)
-        away = 2 * torch.rand(POINTS, 3, generator=generator) - 1
+        which = torch.randint(len(centers), (CHECK_POINTS,), generator=generator)
+        away = 2 * torch.rand(CHECK_POINTS, 3, generator=generator) - 1
         return (centers[which] + away * half[which, None]).to(self.evidence.device)
 
     def with_readings(self, change: Callable[[Readings], Readings]) -> float:
-        """In points."""
+        """Return the volume on evidence, in points, with the readings changed by `change`."""
         moved = link_motions(self.links, [change(given) for given in self.readings])  # [F, L, 4, 4]
         total = 0.0
         for link, points in enumerate(self.points, 1):
             score, seen = score_points(self.evidence, self.camera_from_instrument @ moved[:, link], points)
-            total += float((((score - POSSIBLE) / (1 - POSSIBLE)).clamp(0, 1) * (seen > CHECK_MIN_SEEN)).sum())
+            total += float(
+                (((score - MIN_LEVEL) / (1 - MIN_LEVEL)).clamp(0, 1) * (seen > CHECK_MIN_VISIBLE_SHARE)).sum()
+            )
         return total

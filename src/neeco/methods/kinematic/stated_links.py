@@ -1,4 +1,4 @@
-"""Links whose kinematic tree was stated with the capture: what encoders and drawings get wrong is learned."""
+"""Links of a kinematic tree that the capture states; corrections of axes, pivots and readings are learned."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ from neeco.methods.kinematic.articulation import Articulation
 from neeco.methods.kinematic.hinges import MIN_PART_SHARE, farthest
 from neeco.scene.drawable import JointMotion
 
-# standard deviations of what is stated against what is so
-AXIS_SIGMA = 0.09  # rad
-PIVOT_SIGMA = 2.0  # mm
-# wide: what an offset is, is seen only by how it carries the axes beyond it along, and those are stated no better
-OFFSET_SIGMA = {False: 0.1, True: 2.0}  # rad where the joint turns, mm where it slides
-GAIN_SIGMA = 0.03
-SIDE_LOGITS = 2.0  # for each link of a joint, per radius by which a Gaussian lies on the wrong side of it
-# radii beyond the pivot where sides change, and how much farther at the ends of its axis: a link holds the next one
-# between its prongs
-SIDE_AT, PRONGS, PRONGS_FROM, PRONGS_TO = 0.4, 0.7, 0.3, 0.7  # the ends: radii along the axis
-MOST_SIDE = 4.0  # of the logits that count in a penalty
-MIN_STEP = 1.0  # mm between two pivots that tell a direction
-WRIST_WITHIN = 1.5  # radii behind the first joint in which the shaft's end is believed
+# standard deviations of the stated kinematics
+AXIS_SD = 0.09  # rad
+PIVOT_SD = 2.0  # mm
+# wide: an offset is observed only by how it moves the axes beyond it, and those are stated no better
+OFFSET_SD = {False: 0.1, True: 2.0}  # rad of a revolute joint, mm of a prismatic one
+GAIN_SD = 0.03
+SIDE_LOGITS = 2.0  # per shaft radius by which a Gaussian lies on the wrong side of a joint
+# shaft radii beyond the pivot where sides change, and how much farther at the ends of its axis, since a link holds the
+# next one between its prongs
+SIDE_START, PRONGS, PRONGS_FROM, PRONGS_TO = 0.4, 0.7, 0.3, 0.7  # the ends: radii along the axis
+MAX_SIDE_LOGITS = 4.0  # that count in the penalty
+MIN_STEP_MM = 1.0  # between two pivots that define a direction
+MAX_WRIST_RADII = 1.5  # behind the first joint within which a found shaft end is accepted
 
 
 class StatedLinks(Articulation):
-    """The links of a kinematic tree, with corrections of what was stated.
+    """The links of a kinematic tree, with learned corrections.
 
     Joint j, of those of the tree that share an axis, turns about that axis (or slides along it): `axis_turns[j]` (rad)
     turns the stated axis and `axis_shifts[j]` (mm) shifts its pivot, in the root's frame at rest. A reading r counts as
-    `(1 + reading_gains[r]) * (reading - reading_offsets[r])`, offsets in rad or mm. Of readings that move no other axis
-    no offset is learned: it would be the same as links of another shape. Links that do not move against each other are
-    one, called like the first of them.
+    `(1 + reading_gains[r]) * (reading - reading_offsets[r])`, offsets in rad or mm. No offset is
+    learned of readings that move no other axis: links of another shape would have the same effect. Links that do not
+    move relative to each other are one, named after the first of them.
     """
 
     points: Tensor  # [J, 3] mm, on the stated axes at rest, outermost first
     directions: Tensor  # [J, 3] unit
     gains: Tensor  # [J, L - 1, R] value of joint j for link l per unit of reading r
     constants: Tensor  # [J, L - 1] value at readings of 0
-    observable: Tensor  # [R] 1 where a reading's offset shows in axes that it moves, else 0
-    outer: Tensor  # [J, L] 1 for links beyond a joint that turns, else 0
+    observable: Tensor  # [R] 1 where a reading's offset moves another axis, else 0
+    outer: Tensor  # [J, L] 1 for links beyond a revolute joint, else 0
     inner: Tensor  # [J, L] 1 for the link that carries it, else 0
     tips: Tensor  # [L, 3] mm, at rest; nan: not measured, or another link follows
     rates: ClassVar[Mapping[str, float]] = {
@@ -85,7 +85,7 @@ class StatedLinks(Articulation):
         self.reading_offsets = nn.Parameter(torch.zeros(len(tree.readings)))
         self.reading_gains = nn.Parameter(torch.zeros(len(tree.readings)))
         parents = [group[0].parent for group in self.joint_groups]
-        # of every joint, that which moves its axis; -1: none
+        # index of the joint that moves each joint's axis; -1: none
         self.inner_joints = tuple(
             next((j for j, group in enumerate(self.joint_groups) if any(one.name == parent for one in group)), -1)
             for parent in parents
@@ -102,55 +102,55 @@ class StatedLinks(Articulation):
         self._ends = [k for k, link in enumerate(links) if k and not any(o.parent == link.name for o in links)]
         self.skeleton = (("shaft_far", "shaft_near"), *self._bones())
 
-    weighs_places: ClassVar[bool] = True
+    weighs_positions: ClassVar[bool] = True
 
-    def placed_logits(self, points: Tensor, logits: Tensor) -> Tensor:
-        """Near a joint motion hardly tells links apart; there a Gaussian is rather of the link on whose side of the
-        joint it lies: of a plane across the links at rest."""
+    def positioned_logits(self, points: Tensor, logits: Tensor) -> Tensor:
+        """Near a joint motion hardly separates links; there a Gaussian rather belongs to the link on whose side of the
+        joint it lies, divided by a plane across the links at rest."""
         return nn.functional.pad(self._sides(points), (0, logits.shape[1] - self.link_count)) + logits
 
     def misplaced(self, points: Tensor, weights: Tensor) -> Tensor:
-        return -(weights * self._sides(points).clamp_min(-MOST_SIDE)).sum(1)
+        return -(weights * self._sides(points).clamp_min(-MAX_SIDE_LOGITS)).sum(1)
 
     def shaft_like(self, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """What follows the shaft turns about a ball or pin that looks like its end, or slides out of it."""
+        """The link after the shaft turns about a ball or pin that looks like the shaft's end, or slides out of it."""
         return weights[:, 0] + weights[:, self._following], self._latest_end() + self.radius
 
     def _latest_end(self) -> Tensor:
-        """[] mm along the shaft: its end lies at the first joint, or where that slides, by a radius of it."""
+        """Return the last position [] mm of the shaft's end: the first joint, one radius beyond it if prismatic."""
         return self.first_joint() + self.slides[-1] * self.radius
 
     @torch.no_grad()
     def round_until(self) -> Tensor:
-        """The shaft's end, short of what moves with the first joint: spun with the shaft, that would turn its axis
-        off."""
+        """The shaft's end, without links of the first joint: spun with the shaft, they would turn its axis."""
         return torch.minimum(self.wrist_start, self.first_joint() - self.radius)
 
     @torch.no_grad()
     def _sides(self, points: Tensor) -> Tensor:
-        """[M, L] logits, at most 0, of Gaussians at points [M, 3] mm."""
+        """Return logits [M, L] <= 0 of the links by the position [M, 3] mm of Gaussians."""
         pivots, axes = self.axes()
         directions = self._link_directions(pivots)
         along = (points @ directions.T - (pivots * directions).sum(1)) / self.radius  # [M, J]
         aside = (points @ axes.T - (pivots * axes).sum(1)).abs() / self.radius  # [M, J]
         prongs = PRONGS * ((aside - PRONGS_FROM) / (PRONGS_TO - PRONGS_FROM)).clamp(0, 1)
-        beyond = SIDE_LOGITS * (along - SIDE_AT - prongs)
+        beyond = SIDE_LOGITS * (along - SIDE_START - prongs)
         return beyond.clamp_max(0) @ self.outer - beyond.clamp_min(0) @ self.inner
 
     def _link_directions(self, pivots: Tensor) -> Tensor:
-        """[J, 3] unit: of the links at every joint at rest, from the joint's own carrier's pivot; else the shaft's."""
+        """Return unit directions [J, 3] of the links at every joint at rest, from the pivot that carries it; else the
+        shaft's."""
         directions = [self.shaft()[1]] * len(pivots)
         for joint in reversed(range(len(pivots))):  # the innermost first
             inner = self.inner_joints[joint]
             if inner >= 0 and not self.slides[joint]:
                 step = pivots[joint] - pivots[inner]
-                far = float(step.norm()) > MIN_STEP
+                far = float(step.norm()) > MIN_STEP_MM
                 directions[joint] = nn.functional.normalize(step, dim=0) if far else directions[inner]
         return torch.stack(directions)
 
     @property
     def _following(self) -> int:
-        """The link that follows the shaft."""
+        """Index of the link after the shaft."""
         return next(k for k in range(1, self.link_count) if bool(self._moves(len(self.points) - 1)[k - 1]))
 
     @property
@@ -171,7 +171,7 @@ class StatedLinks(Articulation):
         )
 
     def place(self, points: Tensor, link: int, readings: Mapping[str, float]) -> Tensor:
-        """Points [M, 3] mm of one link at rest, as they stand at these readings, instrument frame."""
+        """Return points [M, 3] mm of one link at rest moved to these readings, instrument frame."""
         if link == 0:
             return points
         pivots, axes = self.axes()
@@ -182,20 +182,20 @@ class StatedLinks(Articulation):
                 points = rotate_about(points, axes[joint], pivots[joint], value.expand(len(points)))
         return points
 
-    def where(self, link: int, reach: float, beside: float) -> tuple[Tensor, Tensor]:
-        """(centres [K, 3] mm, half sizes [K] mm) of cubes at rest that hold a link: about its pivot, as far as `reach`
-        where no link follows it, else as far as the pivots beyond and `beside` those."""
+    def extent_of(self, link: int, reach: float, margin: float) -> tuple[Tensor, Tensor]:
+        """Return cubes at rest that contain a link: centres [K, 3] mm, half sizes [K] mm. They reach `reach` from its
+        pivot where no link follows, else to the pivots beyond plus `margin`."""
         pivots, _ = self.axes()
         own = next(j for j in range(len(pivots)) if bool(self._moves(j)[link - 1]))
         beyond = [j for j, group in enumerate(self.joint_groups) if self.link_of(group[0].parent) == link]
         if not beyond:
             return pivots[own][None], pivots.new_tensor([reach])
         middle = torch.stack([(pivots[own] + pivots[j]) / 2 for j in beyond])
-        half = torch.stack([(pivots[own] - pivots[j]).norm() / 2 + beside for j in beyond])
+        half = torch.stack([(pivots[own] - pivots[j]).norm() / 2 + margin for j in beyond])
         return middle, half
 
     def opened_by(self, reading: str) -> dict[int, tuple[int, float]]:
-        """{link: (joint, sense)} of links that a reading turns about one axis, some one way, some the other."""
+        """Return {link: (joint, sense)} of links that a reading turns about one axis in opposite directions."""
         found: dict[int, tuple[int, float]] = {}
         for joint, own in enumerate(self.gains[:, :, self.reading_names.index(reading)]):  # [L - 1]
             if bool((own > 0).any()) and bool((own < 0).any()) and not self.slides[joint]:
@@ -204,7 +204,7 @@ class StatedLinks(Articulation):
 
     @torch.no_grad()
     def plane_between(self, joint: int, heading: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
-        """(the pivot [3] mm, unit directions [3] of the links beyond and of positive turns) at rest, of links that lie
+        """Return (pivot [3] mm, unit directions [3] of the links beyond and of positive rotation) at rest, for links
         turned by `heading` (rad) about the joint's axis from the line of those before."""
         pivots, axes = self.axes()
         line = self.rest_line()
@@ -215,13 +215,13 @@ class StatedLinks(Articulation):
         return pivots[joint], nn.functional.normalize(ahead, dim=0), nn.functional.normalize(towards, dim=0)
 
     def joint_points(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
-        """The pivot of every joint, `pivot_` and the name of what it moves, and the tip of every link that none
-        follows, `tip_` and its name."""
+        """Return the pivot of every joint, `pivot_` + the link that it moves, and the tip of every end link, `tip_` +
+        its name."""
         found = {}
         pivots, _ = self.axes()
         for name, group, pivot in zip(self._pivot_names[::-1], self.joint_groups[::-1], pivots.flip(0), strict=True):
             carrier = self.link_of(group[0].parent)
-            if group[0].type == PRISMATIC:  # where across the axis it lies, no image shows: on the shaft's
+            if group[0].type == PRISMATIC:  # its offset across the axis is not observable: put on the shaft
                 origin, direction = self.shaft()
                 pivot = origin + ((pivot - origin) @ direction) * direction
             found[f"pivot_{name}"] = self.place(pivot[None], carrier, readings)[0]
@@ -231,26 +231,25 @@ class StatedLinks(Articulation):
         return found
 
     def parts(self, points: Tensor, weights: Tensor) -> Tensor:
-        """What turns about a ball or pin looks the same on either side of it, and a rod that slides as it did before:
-        of what moves with the shaft, all beyond the shaft's end (where its colour or its symmetry ends) is labelled as
-        the link that follows."""
+        """A ball or pin looks the same on either side, and so does a sliding rod: everything that moves with the shaft
+        but lies beyond its end (where its colour or symmetry ends) is labelled as the next link."""
         first = self.first_joint()
-        found = (self.wrist_start > first - WRIST_WITHIN * self.radius) & (self.wrist_start <= self._latest_end())
+        found = (self.wrist_start > first - MAX_WRIST_RADII * self.radius) & (self.wrist_start <= self._latest_end())
         end = torch.where(found, self.wrist_start, torch.full_like(first, torch.inf))
         beyond = weights[:, 0] * (self.along_shaft(points) > end)
         moved = nn.functional.one_hot(torch.tensor([0, self._following]), self.link_count).to(weights)
         return weights + beyond[:, None] * (moved[1] - moved[0])
 
     def rest_line(self) -> tuple[Tensor, Tensor] | None:
-        """(point [3] mm, step [3] mm) of the line along which the links lie at rest: from the first pivot to the one
-        that it carries; None where there are not two."""
+        """Return (point [3] mm, step [3] mm) of the line of the links at rest, from the first pivot to the one that it
+        carries; None without two pivots."""
         pivots, _ = self.axes()
         for joint in reversed(range(len(pivots))):
             inner = self.inner_joints[joint]
             if inner < 0 or self.slides[joint] or self.slides[inner]:
                 continue
             step = pivots[joint] - pivots[inner]
-            if float(step.norm()) > MIN_STEP:
+            if float(step.norm()) > MIN_STEP_MM:
                 return pivots[inner], step
         return None
 
@@ -264,7 +263,7 @@ class StatedLinks(Articulation):
         per_unit = self.gains * (1 + self.reading_gains)  # [J, L - 1, R]
         found, columns = [], []
         for joint, slides in enumerate(self.slides):
-            constant = rest[joint]  # moved by the first of the joint's readings
+            constant = rest[joint]  # added to the first of the joint's readings
             for r, name in enumerate(self.reading_names):
                 if bool(self.gains[joint, :, r].any()):
                     found.append(JointMotion(pivots[joint], axes[joint], name, slides))
@@ -273,7 +272,7 @@ class StatedLinks(Articulation):
         return found, torch.stack(columns, 1)
 
     def measure_tips(self, points: Tensor, weights: Tensor) -> None:
-        """The tip of a link that none follows is where its Gaussians lie farthest from its pivot."""
+        """Set the tip of each end link to where its Gaussians lie farthest from its pivot."""
         self.tips.fill_(torch.nan)
         pivots, _ = self.axes()
         for link in self._ends:
@@ -283,8 +282,8 @@ class StatedLinks(Articulation):
                 self.tips[link] = tip
 
     def describe(self, reading: str) -> dict[str, Any]:
-        """Of the outermost joint that the reading drives: axis and pivot at rest in the instrument's frame, and how far
-        they are from those stated; the reading's offset (None: nothing shows it) and gain."""
+        """Return, of the outermost joint that the reading drives, axis and pivot at rest in the instrument's frame and
+        their distance from the stated ones; the reading's offset (None: not observable) and gain."""
         r = self.reading_names.index(reading)
         joint = next(j for j in range(len(self.points)) if bool(self.gains[j, :, r].any()))
         pivots, axes = self.axes()
@@ -304,20 +303,20 @@ class StatedLinks(Articulation):
     def prior(self) -> Tensor:
         slide = [any(self.slides[j] and bool(self.gains[j, :, r].any()) for j in range(len(self.points)))
                  for r in range(len(self.reading_names))]  # fmt: skip
-        sigma = self.reading_offsets.new_tensor([OFFSET_SIGMA[s] for s in slide])
+        sigma = self.reading_offsets.new_tensor([OFFSET_SD[s] for s in slide])
         return (
-            (self.axis_turns / AXIS_SIGMA).square().sum()
-            + (self.axis_shifts / PIVOT_SIGMA).square().sum()
+            (self.axis_turns / AXIS_SD).square().sum()
+            + (self.axis_shifts / PIVOT_SD).square().sum()
             + (self.reading_offsets / sigma).square().sum()
-            + (self.reading_gains / GAIN_SIGMA).square().sum()
+            + (self.reading_gains / GAIN_SD).square().sum()
         )
 
     def _moves(self, joint: int) -> Tensor:
-        """[L - 1] bool: which links a joint moves."""
+        """Return which links a joint moves, [L - 1] bool."""
         return (self.gains[joint].abs().amax(1) > 0) | (self.constants[joint] != 0)
 
     def link_of(self, name: str | None) -> int:
-        """Index of the link that moves as `name` does; of a frame that none does, as what carries it."""
+        """Return the index of the link that moves with frame `name`, or with the nearest frame that carries it."""
         numbers = {_signature(self.tree, part): k for k, part in reversed(list(enumerate(self.part_names)))}
         parents = {link.name: link.parent for link in self.tree.links}
         while name is not None and _signature(self.tree, name) not in numbers:
@@ -325,7 +324,7 @@ class StatedLinks(Articulation):
         return 0 if name is None else numbers[_signature(self.tree, name)]
 
     def _bones(self) -> list[tuple[str, str]]:
-        """Lines from every pivot to those it carries and to the tips beyond."""
+        """Return lines from every pivot to those it carries and to the tips beyond."""
         bones = []
         for name, group in zip(self._pivot_names, self.joint_groups, strict=True):
             behind = [
@@ -340,20 +339,21 @@ class StatedLinks(Articulation):
 
 
 def _signature(tree: KinematicTree, name: str | None) -> frozenset[str]:
-    """Names of the joints that move a link."""
+    """Return the names of the joints that move a link."""
     link = next((link for link in tree.links if link.name == name), tree.links[0])
     return frozenset(joint.name for joint in tree.joints if tree.carries(joint, link))
 
 
 def _moving_apart(tree: KinematicTree) -> list[Link]:
-    """Links with a body that move against each other, one of each kind; first what no joint moves."""
+    """Return links with a body that move relative to each other, one of each group; first the one that no joint
+    moves."""
     chosen = {_signature(tree, link.name): link for link in reversed(tree.bodies)}
     still = chosen.pop(frozenset(), tree.links[0])
     return [still, *sorted(chosen.values(), key=tree.links.index)]
 
 
 def _sharing_axes(tree: KinematicTree) -> list[list[Link]]:
-    """Joints that move a body, those about the same axis of the same parent together, outermost first."""
+    """Return joints that move a body, grouped by the axis and parent that they share, outermost first."""
     groups: list[list[Link]] = []
     for joint in tree.joints:
         if not any(tree.carries(joint, body) for body in tree.bodies):
@@ -374,6 +374,6 @@ def _same_axis(one: Link, other: Link) -> bool:
 
 
 def _common_name(names: Sequence[str]) -> str:
-    """What the names begin with alike, without a separator at its end: jaw for jaw_left and jaw_right."""
+    """Return the common prefix of the names without a separator at its end: jaw for jaw_left and jaw_right."""
     alike = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
     return "".join(letters[0] for letters in alike).rstrip("_- ") or "+".join(sorted(names))

@@ -1,5 +1,5 @@
-"""Where an instrument's shaft ends and its wrist begins: where the colour along it changes, or, on an instrument of one
-colour, where it stops being a surface of revolution."""
+"""Search for the wrist, where the shaft ends: the colour along it changes, or, on an instrument of one colour, it stops
+being a surface of revolution."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformation import UNPERTURBED, Perturbation
 from neeco.training.session import GaussianSession
 
-BORDER_FRAMES = 40  # whose colours along the shaft are used
-SPIN_FRAMES = 16  # in which shafts are spun to test their symmetry
+N_PROFILE_FRAMES = 40  # whose colours along the shaft are used
+N_SPIN_FRAMES = 16  # in which shafts are spun to test their symmetry
 SPIN_ANGLE = 0.5  # rad: small, so that visible sides stay in view
-WRIST_STEPS = 14  # wrist positions whose symmetry is tested
-MAX_COST_RATIO = 1.01  # of the error with a wrist found again to that before
+N_WRIST_POSITIONS = 14  # whose symmetry is tested
+MAX_COST_RATIO = 1.01  # of the error with a new wrist position to that before
 SYMMETRY_TOLERANCE = 0.25  # of the range of losses that spinning causes
 BINS_PER_RADIUS = 6  # of the colour profile along the shaft
 MIN_BODY_SHARE = 0.95  # of a pixel whose colour counts
@@ -28,15 +28,15 @@ MIN_FACING = 0.6  # cosine between a ray and the shaft's normal, across the shaf
 MIN_COLOR = 0.02  # added to colours before the logarithm
 MIN_PIXELS = 6  # on either side of a step, in one frame
 MIN_FRAME_SHARE = 0.2  # of the frames that show both sides of a step
-MIN_CLEARNESS = 8.0  # times the median of steps along the shaft
-SOLID_OPACITY = 0.3  # of a Gaussian that counts as part of the instrument
+MIN_STEP_RATIO = 8.0  # of a step to the median of steps along the shaft
+SOLID_OPACITY = 0.3  # from which a Gaussian counts as part of the instrument
 RADIUS_SHARE = 0.9  # of the solid Gaussians lie within the shaft's radius
-MIN_SOLID = 10  # solid Gaussians, with fewer nothing is measured
+MIN_SOLID_GAUSSIANS = 10  # with fewer nothing is measured
 
 
 @torch.no_grad()
 def place_wrists(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Set every wrist to where it is found."""
+    """Set every wrist to its estimated position."""
     for index in range(len(session.scene.instruments)):
         articulation = articulated.articulations[index]
         if articulation.jointed:
@@ -45,14 +45,14 @@ def place_wrists(session: GaussianSession, articulated: ArticulatedInstruments) 
 
 
 @torch.no_grad()
-def replace_wrists(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Find every wrist again, and move it unless spinning what then lies behind it costs more than before."""
+def refine_wrists(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Estimate every wrist again, and move it unless spinning the part behind it then costs more than before."""
     for index in range(len(session.scene.instruments)):
         articulation = articulated.articulations[index]
         if not articulation.jointed:
             continue
         before, found = float(articulation.wrist_start), _boundary(session, articulated, index)
-        frames = session.frames_along_poses(SPIN_FRAMES)
+        frames = session.frames_along_poses(N_SPIN_FRAMES)
         costs = {place: _spun_error(session, articulated, index, place, frames) for place in (before, found)}
         articulation.wrist_start.fill_(found if costs[found] <= MAX_COST_RATIO * costs[before] else before)
 
@@ -63,13 +63,13 @@ def _boundary(session: GaussianSession, articulated: ArticulatedInstruments, ind
 
 
 def _symmetry_boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float:
-    """Position mm along the shaft up to which spinning what lies behind costs little."""
+    """Return the position in mm along the shaft up to which spinning the part behind costs little."""
     scene = session.scene
     articulation = articulated.articulations[index]
     before = float(articulation.wrist_start)
     joint, rear = float(articulation.first_joint()), float(solid_extent(scene.canonical, index, articulation)[0])
-    starts = torch.linspace(rear + 0.3 * (joint - rear), joint, WRIST_STEPS)
-    frames = session.frames_along_poses(SPIN_FRAMES)
+    starts = torch.linspace(rear + 0.3 * (joint - rear), joint, N_WRIST_POSITIONS)
+    frames = session.frames_along_poses(N_SPIN_FRAMES)
     base = sum(_image_error(session, frame, UNPERTURBED) for frame in frames)
     costs = [_spun_error(session, articulated, index, float(start), frames) - base for start in starts]
     articulation.wrist_start.fill_(before)
@@ -80,8 +80,8 @@ def _symmetry_boundary(session: GaussianSession, articulated: ArticulatedInstrum
 def _spun_error(
     session: GaussianSession, articulated: ArticulatedInstruments, index: int, start: float, frames: list[int]
 ) -> float:
-    """Summed error of the frames' images with what lies behind `start` spun a little, one way and the other in turn.
-    Leaves the wrist there."""
+    """Return the summed image error of the frames with the part behind `start` spun a little, alternating the
+    direction. Sets the wrist to `start`."""
     articulated.articulations[index].wrist_start.fill_(start)
     return sum(
         _image_error(session, frame, articulated.spin_perturbation(-SPIN_ANGLE if k % 2 else SPIN_ANGLE))
@@ -98,8 +98,7 @@ def _image_error(session: GaussianSession, index: int, perturbation: Perturbatio
 
 
 def color_boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float | None:
-    """Position mm along the shaft where the recorded images' colour along it changes most; None without a clear
-    step."""
+    """Return the position in mm along the shaft where the recorded colour changes most; None without a clear step."""
     articulation = articulated.articulations[index]
     radius = float(articulation.radius)
     rear = float(solid_extent(session.scene.canonical, index, articulation)[0])
@@ -108,23 +107,23 @@ def color_boundary(session: GaussianSession, articulated: ArticulatedInstruments
     if not count > 2 * BINS_PER_RADIUS:
         return None
     edges = rear + torch.arange(count + 1, device=session.views.device) * (radius / BINS_PER_RADIUS)
-    frames = session.frames_along_poses(BORDER_FRAMES)
+    frames = session.frames_along_poses(N_PROFILE_FRAMES)
     steps = torch.stack([_steps(*_profile(session, articulated, index, frame, edges, like)) for frame in frames])
-    seen = steps.isfinite().all(2).sum(0)  # [count + 1] frames
-    enough = seen >= MIN_FRAME_SHARE * len(steps)
+    observed = steps.isfinite().all(2).sum(0)  # [count + 1] frames
+    enough = observed >= MIN_FRAME_SHARE * len(steps)
     if int(enough.sum()) < BINS_PER_RADIUS:
         return None
     mean = torch.nanmean(steps[:, enough], 0).abs()  # [candidates, 3]
-    clearness = (mean / mean.median(0).values.clamp_min(1e-4)).norm(dim=1)
-    inner = clearness[1:-1]  # a maximum at the last edge is where the jaws begin, not a border
-    inner = torch.where((inner >= clearness[:-2]) & (inner >= clearness[2:]), inner, 0.0)
+    ratio = (mean / mean.median(0).values.clamp_min(1e-4)).norm(dim=1)
+    inner = ratio[1:-1]  # a maximum at the last edge is the start of the jaws, not a border
+    inner = torch.where((inner >= ratio[:-2]) & (inner >= ratio[2:]), inner, 0.0)
     best = int(inner.argmax())
-    return float(edges[enough][best + 1]) if inner[best] > MIN_CLEARNESS else None
+    return float(edges[enough][best + 1]) if inner[best] > MIN_STEP_RATIO else None
 
 
 def _steps(profile: Tensor, pixels: Tensor) -> Tensor:
-    """[B + 1, 3] at every edge between bins: the mean over one radius after it minus that before it; nan where either
-    has too few pixels. profile [B, 3] sums of colour over pixels [B]."""
+    """Return the step [B + 1, 3] at every edge between bins: the mean over one radius after it minus that before it;
+    nan where either has too few pixels. profile [B, 3] sums of colour over pixels [B]."""
     window = BINS_PER_RADIUS
     total = torch.cat([profile.new_zeros(1, 3), profile.cumsum(0)])  # [B + 1, 3]
     number = torch.cat([pixels.new_zeros(1), pixels.cumsum(0)])[:, None]
@@ -145,8 +144,9 @@ def _profile(
     edges: Tensor,
     like: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """A recorded image's colour along the shaft: sums [B, 3] over the pixels [B] of each bin, as log brightness and
-    two log ratios, to which the light's colour and distance add constants; where Gaussians are `like` [M] the shaft."""
+    """Return a recorded image's colour along the shaft: sums [B, 3] over the pixels [B] of each bin, as log brightness
+    and two log ratios, to which the light's colour and distance add constants. `like` [M]: shares of Gaussians that
+    look like the shaft."""
     scene = session.scene
     state, camera = session.corrected(frame_index)
     body = scene.canonical.means.new_zeros(len(scene.canonical), 1)
@@ -170,9 +170,10 @@ def _profile(
 
 
 def _along_shaft(camera: Camera, pose: Tensor, articulation: Articulation) -> Tensor:
-    """[H, W] mm along the shaft where the rays of pixels meet its cylinder; nan where they miss or graze it.
+    """Return the position [H, W] mm along the shaft where pixel rays meet its cylinder; nan where they miss or graze
+    it.
 
-    The Gaussians are too imprecise for this: they lie in a cloud about the surface. pose [4, 4] world_from_instrument.
+    Depths of the Gaussians are too imprecise: they lie in a cloud about the surface. pose [4, 4] world_from_instrument.
     """
     origin, direction = articulation.shaft()
     rotation = pose[:3, :3]
@@ -191,7 +192,7 @@ def _along_shaft(camera: Camera, pose: Tensor, articulation: Articulation) -> Te
 
 
 def solid_gaussians(canonical: CanonicalGaussians, index: int) -> Tensor:
-    """[M] bool: which Gaussians of instrument `index` are opaque enough to count."""
+    """Return which Gaussians of instrument `index` are solid, [M] bool."""
     return torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]) > SOLID_OPACITY
 
 
@@ -202,13 +203,13 @@ def measure_radius(canonical: CanonicalGaussians, index: int, articulation: Arti
     origin, direction = articulation.shaft()
     along = articulation.along_shaft(points)
     away = (points - origin - along[:, None] * direction)[along < articulation.first_joint() - 2 * articulation.radius]
-    if len(away) >= MIN_SOLID:
+    if len(away) >= MIN_SOLID_GAUSSIANS:
         articulation.radius.copy_(away.norm(dim=1).quantile(RADIUS_SHARE))
 
 
 def solid_extent(canonical: CanonicalGaussians, index: int, articulation: Articulation) -> Tensor:
-    """[2] mm along the shaft between which the solid Gaussians lie."""
+    """Return the interval [2] mm along the shaft that contains the solid Gaussians."""
     along = articulation.along_shaft(canonical.means[canonical.body(index + 1)][solid_gaussians(canonical, index)])
-    if len(along) < MIN_SOLID:
+    if len(along) < MIN_SOLID_GAUSSIANS:
         return articulation.extent.clone()
     return torch.quantile(along, along.new_tensor([0.02, 0.985]))

@@ -33,10 +33,10 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Camera, Instrument, State
 from neeco.errors import NeecoError
+from neeco.methods.networks import octave_angles, octave_weights
 from neeco.raster.devices import tf32_products
 from neeco.raster.resampling import draw_through
 from neeco.raster.types import Rendering
-from neeco.scene.deformation import octave_angles, octave_weights
 from neeco.scene.drawable import Recorded
 
 HEAD_RANGE = 1e-4  # the warp's heads start in U(-1e-4, 1e-4): the untrained field hardly moves anything
@@ -60,7 +60,7 @@ PUBLISHED: Mapping[str, int | float] = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NerfiesSettings:
     """`rays` per step; `coarse_samples` and `fine_samples` along each (0 fine: one network draws); template `depth` x
     `width`, with `frequencies` of points and `view_frequencies` of directions; warp `warp_depth` x `warp_width`, with

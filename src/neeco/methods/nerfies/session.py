@@ -65,7 +65,7 @@ class RayTable:
 def initial_field(method: str, capture: Capture, frames: tuple[Frame, ...], settings: NerfiesSettings) -> NerfScene:
     """The untrained field, its box and depths taken from the sparse points and the training cameras. Raises NeecoError
     where a setting does not fit."""
-    recorded = Recorded.of(frames, capture.instruments, capture.lens, still=capture.still)
+    recorded = Recorded.of(frames, capture.instruments, lens=capture.lens, still=capture.still)
     scene = NerfScene(method, settings, capture.instruments, recorded)
     points = torch.from_numpy(capture.points.positions).float()
     near, far = depth_bounds(points, frames)

@@ -1,4 +1,4 @@
-"""Which Gaussians each tile of the image has to blend, in which order."""
+"""Stage 2: lists of the Gaussians that each tile of the image blends, in order of depth."""
 
 from dataclasses import dataclass
 
@@ -11,39 +11,44 @@ from neeco.errors import NeecoError
 
 BLOCK = 128  # pairs per program
 ELLIPSE = tl.constexpr(8)  # floats of an ellipse: x, y, half height, slope, k0, k1, peak, nothing
-MOST_PAIRS = 2**31 - 1
+MAX_PAIRS = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class Tiles:
-    """How an image is cut."""
+    """Square tiles of an image."""
 
-    size: int  # px, both ways; a power of two
-    columns: int
-    rows: int
+    size: int  # px, a power of two
+    width: int  # px of the image
+    height: int
+
+    @property
+    def columns(self) -> int:
+        return -(-self.width // self.size)
 
     @property
     def count(self) -> int:
-        return self.columns * self.rows
+        return self.columns * -(-self.height // self.size)
 
 
 @dataclass(frozen=True)
 class Lists:
-    """The Gaussians of every tile, near to far, equal depths by index: one list, tile after tile.
+    """The Gaussians of every tile, near to far, equal depths by index, concatenated.
 
-    A pair (tile, Gaussian) also has a slot: pairs in the order of `order`, so that a Gaussian's own are neighbours.
+    Every (tile, Gaussian) pair has a slot: slots follow `order`, so that those of one Gaussian are contiguous.
     """
 
     gaussians: Tensor  # [pairs] int32
     slots: Tensor  # [pairs] int64
-    starts: Tensor  # [tiles + 1] int32: where a tile's part begins
+    starts: Tensor  # [tiles + 1] int32: start of each tile's part
     order: Tensor  # [N] int64: Gaussians, near to far
-    slot_ends: Tensor  # [N] int64: behind the slots of the Gaussian at this place of `order`
+    slot_ends: Tensor  # [N] int64: end of the slots of the Gaussian at this position of `order`
 
 
 @triton.jit
 def pixel_range(low, high, size):
-    """First and last pixel, as floats, whose centre lies in [low, high] (1e-3 px to spare) in an image of this size."""
+    """Return the first and last pixel, as floats, whose centre lies in [low, high] (with 1e-3 px margin) in the
+    image."""
     first = tl.ceil(tl.minimum(tl.maximum(low - 0.501, 0.0), size))
     last = tl.floor(tl.maximum(tl.minimum(high - 0.499, size - 1.0), -1.0))
     return first, last
@@ -51,7 +56,7 @@ def pixel_range(low, high, size):
 
 @triton.jit
 def tile_rows(y, half_height, height, TILE: tl.constexpr):
-    """First and last row of tiles that an ellipse may touch; last < first: none."""
+    """Return the first and last row of tiles that an ellipse may touch; last < first: none."""
     first, last = pixel_range(y - half_height, y + half_height, height)
     low, high = first.to(tl.int32) // TILE, tl.maximum(last, 0.0).to(tl.int32) // TILE
     return low, tl.where(last >= first, high, low - 1)
@@ -59,9 +64,9 @@ def tile_rows(y, half_height, height, TILE: tl.constexpr):
 
 @triton.jit
 def tile_columns(row, x, y, half_height, slope, k0, k1, peak, width, height, TILE: tl.constexpr):
-    """First column and number of columns of tiles in which an ellipse covers a pixel centre's row, in a row of tiles.
+    """Return the first column and the number of columns of tiles that an ellipse covers in a row of tiles.
 
-    The ellipse spans slope d -+ sqrt(k0 - k1 d^2) across, at d px below its centre, and is widest at d = +-peak.
+    At d px below its centre the ellipse spans slope d -+ sqrt(k0 - k1 d^2); it is widest at d = +-peak.
     """
     top = (row * TILE).to(tl.float32) + 0.5 - y
     bottom = tl.minimum((row * TILE + TILE).to(tl.float32), height) - 0.5 - y
@@ -82,7 +87,7 @@ def list_kernel(
     ellipses, counts, order, slot_ends, tiles, gaussians, count, pairs, steps, columns, nowhere, width, height,
     TILE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Tile and Gaussian of every slot. A slot whose tile is not found again gets the tile `nowhere`.
+    """Write tile and Gaussian of every slot; a slot without a tile gets `nowhere`.
 
     Lanes are slots, not Gaussians: one that covers the image is as much work as many that cover a pixel.
     """
@@ -90,7 +95,7 @@ def list_kernel(
     live = slot < pairs
     low = tl.zeros([BLOCK], tl.int32)
     high = low + count
-    for _ in range(steps):  # the first place of the order whose slots end behind this one
+    for _ in range(steps):  # binary search: the first Gaussian of the order whose slots end after this one
         middle = (low + high) // 2
         behind = tl.load(slot_ends + middle, live & (middle < count), other=0) > slot
         high = tl.where(behind, middle, high)
@@ -120,8 +125,8 @@ def list_kernel(
     tl.store(gaussians + slot, gaussian.to(tl.int32), inside)
 
 
-def list_per_tile(ellipses: Tensor, counts: Tensor, depths: Tensor, tiles: Tiles, width: int, height: int) -> Lists:
-    """Lists of the Gaussians whose `ellipses` [N, 8] px touch `counts` [N] int32 tiles, by their `depths` [N].
+def list_per_tile(ellipses: Tensor, counts: Tensor, depths: Tensor, tiles: Tiles) -> Lists:
+    """Return lists of the Gaussians whose `ellipses` [N, 8] px touch `counts` [N] int32 tiles, by `depths` [N].
 
     Waits for the device once, for the number of pairs.
     """
@@ -129,18 +134,18 @@ def list_per_tile(ellipses: Tensor, counts: Tensor, depths: Tensor, tiles: Tiles
     order = torch.sort(depths, stable=True).indices
     slot_ends = torch.cumsum(counts[order], 0)
     pairs = int(slot_ends[-1]) if len(counts) else 0
-    if pairs > MOST_PAIRS:
+    if pairs > MAX_PAIRS:
         raise NeecoError(
-            f"rasterize: triton: {pairs} pairs of a tile and a Gaussian are too many; draw a smaller image"
+            f"rasterize: triton: {pairs} pairs of a tile and a Gaussian are too many; render a smaller image"
         )
-    # A sort by small numbers takes half the passes.
+    # sorting 16-bit keys takes half the passes
     small = torch.int16 if tiles.count < 2**15 else torch.int32
     tile_of = torch.empty(pairs, dtype=small, device=device)
     gaussian_of = torch.empty(pairs, dtype=torch.int32, device=device)
     if pairs:
         list_kernel[(triton.cdiv(pairs, BLOCK),)](
             ellipses, counts, order, slot_ends, tile_of, gaussian_of, len(counts), pairs, len(counts).bit_length(),
-            tiles.columns, tiles.count, float(width), float(height),
+            tiles.columns, tiles.count, float(tiles.width), float(tiles.height),
             TILE=tiles.size, BLOCK=BLOCK, num_warps=4, enable_fp_fusion=True,
         )  # fmt: skip
     tile_of, slots = torch.sort(tile_of, stable=True)

@@ -1,9 +1,10 @@
 """Stage 3: blending, front to back, one tile of pixels per program.
 
-Values are named one by one, not held in arrays: those would be laid out anew for every Gaussian, through shared memory.
-One program blends colour, depth and the first channels (`HELD_MOST`); others do again the same with the next ones.
+Values are separate variables, not arrays, which would be rearranged through shared memory for every Gaussian. One
+program blends colour, depth and the first channels (`MAX_HELD`); further programs repeat it with the next channels.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,30 +13,30 @@ import triton.language as tl
 from torch import Tensor
 
 from neeco.raster.triton.binning import Lists, Tiles
-from neeco.raster.triton.project import LOG2_FAINTEST, RECORD
+from neeco.raster.triton.project import LOG2_MIN_ALPHA, RECORD, Inputs
 
-CHUNK = 8  # Gaussians of a list between two looks at whether all pixels are full; their loads overlap
-HELD_MOST = tl.constexpr(4)  # channels per program
-OPAQUE = tl.constexpr(0.999)
-FULL = tl.constexpr(1e-4)
+CHUNK = 8  # Gaussians of a list between two tests whether all pixels are full; their loads overlap
+MAX_HELD = tl.constexpr(4)  # channels per program
+MAX_ALPHA = tl.constexpr(0.999)
+MIN_TRANSMITTANCE = tl.constexpr(1e-4)
 NEVER = tl.constexpr(0x7FFFFFFF)
 
 
 @dataclass(frozen=True)
 class Images:
-    """What was drawn, and what the gradient wants to know of it."""
+    """Rendered images, and intermediate results for the gradient."""
 
     color: Tensor  # [H, W, 3]
     alpha: Tensor  # [H, W]
     depth: Tensor  # [H, W] mm
     channels: Tensor | None  # [H, W, C]
     left: Tensor  # [H, W] transmittance behind everything
-    full_at: Tensor  # [H, W] int32: place in the tile's list of the Gaussian that found the pixel full, or NEVER
+    full_at: Tensor  # [H, W] int32: position in the tile's list of the Gaussian at which the pixel is full, or NEVER
 
 
 @triton.jit
 def pixels_of(tile, columns, width, height, TILE: tl.constexpr):
-    """A tile's pixels [P]: their numbers in the image, whether they are in it, and their centres."""
+    """Return a tile's pixels [P]: their indices in the image, whether they are in it, and their centres."""
     lane = tl.arange(0, TILE * TILE)
     column, row = tile % columns * TILE + lane % TILE, tile // columns * TILE + lane // TILE
     inside = (column < width) & (row < height)
@@ -44,13 +45,13 @@ def pixels_of(tile, columns, width, height, TILE: tl.constexpr):
 
 @triton.jit
 def field(record, k: tl.constexpr, listed):
-    """Number k of a record, one for all pixels."""
+    """Return number k of a record, the same for all pixels."""
     return tl.load(record + k, listed, other=0.0)
 
 
 @triton.jit
 def exponent_of(record, dx, dy, listed):
-    """Binary logarithm of alpha at pixels [P]. Fused by hand: the gradient must decide as the image did."""
+    """Return the binary logarithm of alpha at pixels [P]. Fused explicitly: forward and backward must agree."""
     a, b, c = field(record, 2, listed), field(record, 3, listed), field(record, 4, listed)
     return tl.fma(tl.fma(dy, c, b * dx), dy, tl.fma(a * dx, dx, field(record, 5, listed)))
 
@@ -58,7 +59,7 @@ def exponent_of(record, dx, dy, listed):
 @triton.jit
 def write_color(color, alpha, depth, left, full_at, background, pixel, inside, red, green, blue, distance, weights,
                 transmittance, stop):  # fmt: skip
-    """The images of the program that blends colour and depth."""
+    """Store the images of the program that blends colour and depth."""
     if background is not None:
         red += transmittance * tl.load(background)
         green += transmittance * tl.load(background + 1)
@@ -78,12 +79,12 @@ def composite_kernel(
     width, height, columns, first,
     COLOR: tl.constexpr, HELD: tl.constexpr, C: tl.constexpr, TILE: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
-    """Blends the values of a tile's Gaussians; alphas as `api.rasterize` defines them.
+    """Blend the values of a tile's Gaussians; alphas as `rasterize` defines them.
 
     COLOR: colour, depth and all that is per pixel; HELD: so many channels, from first + 4 x the program's number on.
     """
     tile = tl.program_id(0)
-    ch = first + tl.program_id(1) * HELD_MOST
+    ch = first + tl.program_id(1) * MAX_HELD
     pixel, inside, x, y = pixels_of(tile, columns, width, height, TILE)
     transmittance = tl.where(inside, 1.0, 0.0)
     stop = tl.where(inside, NEVER, -1)
@@ -99,9 +100,9 @@ def composite_kernel(
             g = tl.load(gaussians + k + j, listed, other=0).to(tl.int64)
             record = records + g * RECORD
             exponent = exponent_of(record, x - field(record, 0, listed), y - field(record, 1, listed), listed)
-            weight = transmittance * tl.minimum(tl.exp2(exponent), OPAQUE)
-            offered = (exponent >= LOG2_FAINTEST) & (stop == NEVER) & listed
-            takes = transmittance - weight > FULL
+            weight = transmittance * tl.minimum(tl.exp2(exponent), MAX_ALPHA)
+            offered = (exponent >= LOG2_MIN_ALPHA) & (stop == NEVER) & listed
+            takes = transmittance - weight > MIN_TRANSMITTANCE
             stop = tl.where(offered & (takes == 0), k + j - begin, stop)
             weight = tl.where(offered & takes, weight, 0.0)
             transmittance -= weight
@@ -138,12 +139,9 @@ def composite_kernel(
             tl.store(to + 3, c3, tl.where(inside, ch + 3, C) < C)
 
 
-def composite(
-    records: Tensor, channels: Tensor | None, lists: Lists, background: Tensor | None, tiles: Tiles,
-    width: int, height: int,
-) -> Images:  # fmt: skip
-    """Blend records [N, 12] and channels [N, C] over the background [3]."""
-    device = records.device
+def composite(inputs: Inputs, records: Tensor, lists: Lists, tiles: Tiles) -> Images:
+    """Blend records [N, 12] and the inputs' channels [N, C] over their background [3]."""
+    device, channels, width, height = records.device, inputs.channels, tiles.width, tiles.height
     count = 0 if channels is None else channels.shape[1]
     out = Images(
         color=torch.empty(height, width, 3, device=device),
@@ -155,7 +153,7 @@ def composite(
     )
     for first, programs, held in groups(count):
         composite_kernel[(tiles.count, programs)](
-            records, channels, lists.gaussians, lists.starts, background,
+            records, channels, lists.gaussians, lists.starts, inputs.background,
             out.color, out.alpha, out.depth, out.channels, out.left, out.full_at,
             width, height, tiles.columns, first,
             COLOR=first == 0, HELD=held, C=count, TILE=tiles.size, CHUNK=CHUNK, num_warps=2, enable_fp_fusion=True,
@@ -164,27 +162,28 @@ def composite(
 
 
 def groups(channels: int) -> list[tuple[int, int, int]]:
-    """Launches: first channel, programs per tile, channels per program. The first launch has the colour, too."""
-    most = HELD_MOST.value
+    """Return launches: first channel, programs per tile, channels per program. The first launch also has the colour."""
+    most = MAX_HELD.value
     rest = triton.cdiv(max(0, channels - most), most)
     return [(0, 1, min(channels, most))] + ([(most, rest, most)] if rest else [])
 
 
 BACKWARD_CHUNK = 2  # Gaussians whose loads overlap in the gradient
 HEAD = tl.constexpr(10)  # sums of a Gaussian without channels
-SHAPE = tl.constexpr(6)  # those of h, which is linear in the values: every group of channels has its own
+SHAPE = tl.constexpr(6)  # sums of h, which is linear in the values: every group of channels has its own
 SLOTS = 16  # slots added at a time
 
 
 @triton.jit
 def placed(vector, index, place, value):
-    """A small vector with the sum of `value` [P] at `place`."""
+    """Return a small vector with the sum of `value` [P] at `place`."""
     return tl.where(index == place, tl.sum(value, axis=0), vector)
 
 
 @triton.jit
 def wanted_colors(to_color, to_alpha, to_depth, alpha, depth, background, pixel, inside, x):
-    """Gradients of red, green, blue and of a weight by its depth; the drawn depth; what lies behind everything."""
+    """Return gradients of red, green, blue and of a weight by its depth; the rendered depth; the term of the
+    background."""
     behind, red, green, blue = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     drawn_depth, to_distance = tl.zeros_like(x), tl.zeros_like(x)
     if to_color is not None:
@@ -206,7 +205,7 @@ def wanted_colors(to_color, to_alpha, to_depth, alpha, depth, background, pixel,
 
 @triton.jit
 def wanted_channel(to_channels, pixel, inside, ch, C: tl.constexpr, x):
-    """Gradient of a channel, 0 beyond the last."""
+    """Return the gradient of a channel, 0 beyond the last."""
     if to_channels is None:
         wanted = tl.zeros_like(x)
     else:
@@ -223,15 +222,15 @@ def composite_backward_kernel(
 ):  # fmt: skip
     """One tile and group of channels per program. sums: [pairs, WIDTH] by slots if SLOTTED, else [N, WIDTH]."""
     tile = tl.program_id(0)
-    ch = first + tl.program_id(1) * HELD_MOST
+    ch = first + tl.program_id(1) * MAX_HELD
     pixel, inside, x, y = pixels_of(tile, columns, width, height, TILE)
     stop = tl.load(full_at + pixel, inside, other=-1)
     transmittance = tl.load(left + pixel, inside, other=0.0)
-    # behind: sum over what lies behind of weight * (gradient . value), minus dL/dalpha * transmittance
+    # behind: sum over the Gaussians behind of weight * (gradient . value), minus dL/dalpha * transmittance
     behind = tl.zeros_like(x)
     index = tl.arange(0, 16)
-    # where in a row each sum goes: the group's own h, then the values
-    to_column = tl.where(index < SHAPE, (ch // HELD_MOST - 1) * SHAPE + index + (HEAD + C), ch + index + (HEAD - SHAPE))
+    # column of each sum: the group's own h, then the values
+    to_column = tl.where(index < SHAPE, (ch // MAX_HELD - 1) * SHAPE + index + (HEAD + C), ch + index + (HEAD - SHAPE))
     most = tl.minimum(C - ch, HELD) + SHAPE
     if COLOR:
         red, green, blue, to_distance, drawn_depth, behind = wanted_colors(
@@ -260,8 +259,8 @@ def composite_backward_kernel(
             dx, dy = x - field(record, 0, listed), y - field(record, 1, listed)
             exponent = exponent_of(record, dx, dy, listed)
             raw = tl.exp2(exponent)
-            covered = (exponent >= LOG2_FAINTEST) & (k - j - begin < stop) & listed
-            opacity = tl.where(covered, tl.minimum(raw, OPAQUE), 0.0)
+            covered = (exponent >= LOG2_MIN_ALPHA) & (k - j - begin < stop) & listed
+            opacity = tl.where(covered, tl.minimum(raw, MAX_ALPHA), 0.0)
             scale = 1.0 / (1.0 - opacity)
             transmittance *= scale  # now that before this Gaussian
             weight = opacity * transmittance
@@ -280,7 +279,7 @@ def composite_backward_kernel(
                 agreement += v2 * tl.load(values + 2, listed & (ch + 2 < C), other=0.0)
             if HELD > 3:
                 agreement += v3 * tl.load(values + 3, listed & (ch + 3 < C), other=0.0)
-            h = tl.where(covered & (raw <= OPAQUE), raw * (transmittance * agreement - behind * scale), 0.0)
+            h = tl.where(covered & (raw <= MAX_ALPHA), raw * (transmittance * agreement - behind * scale), 0.0)
             behind += weight * agreement
             hx, hy = h * dx, h * dy
             total = placed(tl.zeros([16], tl.float32), index, 0, h)
@@ -310,7 +309,7 @@ def composite_backward_kernel(
 def sum_slots_kernel(
     slot_sums, order, slot_ends, sums, WIDTH: tl.constexpr, PADDED: tl.constexpr, SLOTS: tl.constexpr
 ):  # fmt: skip
-    """Adds the slots of one Gaussian per program, in an order that depends on nothing else."""
+    """Add the slots of one Gaussian per program, in a fixed order."""
     place = tl.program_id(0)
     g = tl.load(order + place)
     k = tl.load(slot_ends + place - 1, place > 0, other=0)
@@ -326,17 +325,15 @@ def sum_slots_kernel(
 
 
 def composite_backward(
-    records: Tensor, channels: Tensor | None, lists: Lists, background: Tensor | None, tiles: Tiles, images: Images,
-    gradients: tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None],
-) -> Tensor:  # fmt: skip
-    """Sums [N, 10 + C] of every Gaussian, from the gradients of colour, alpha, depth and channels.
+    inputs: Inputs, records: Tensor, lists: Lists, tiles: Tiles, images: Images, gradients: Sequence[Tensor | None]
+) -> Tensor:
+    """Return the sums [N, 10 + C] of every Gaussian, from the gradients of colour, alpha, depth and channels.
 
     The same bits every time where `torch.are_deterministic_algorithms_enabled()`.
     """
-    n, device = records.shape[0], records.device
-    height, width = images.alpha.shape
+    n, device, channels = records.shape[0], records.device, inputs.channels
     count = 0 if channels is None else channels.shape[1]
-    # without a gradient of theirs, channels need no programs
+    # channels without a gradient need no programs
     launches = groups(0 if gradients[3] is None else count)
     more = sum(programs for _, programs, _ in launches[1:])
     columns = HEAD.value + count + more * SHAPE.value
@@ -344,9 +341,9 @@ def composite_backward(
     sums = torch.zeros(len(lists.gaussians) if slotted else n, columns, device=device)
     for first, programs, held in launches if len(lists.gaussians) else ():
         composite_backward_kernel[(tiles.count, programs)](
-            records, channels, lists.gaussians, lists.slots, lists.starts, background,
+            records, channels, lists.gaussians, lists.slots, lists.starts, inputs.background,
             images.alpha, images.depth, images.left, images.full_at, *gradients, sums,
-            width, height, tiles.columns, first,
+            tiles.width, tiles.height, tiles.columns, first,
             COLOR=first == 0, HELD=held, C=count, WIDTH=columns, TILE=tiles.size, CHUNK=BACKWARD_CHUNK, SLOTTED=slotted,
             num_warps=1, enable_fp_fusion=True,
         )  # fmt: skip

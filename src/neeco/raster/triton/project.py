@@ -1,6 +1,6 @@
-"""Stage 1: Gaussians to ellipses in the image, with what is blended of them."""
+"""Stage 1: projection of Gaussians to ellipses in the image, with the values that are blended."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 import triton
@@ -23,13 +23,13 @@ from neeco.raster.triton.geometry import (
 
 BLOCK = 128  # Gaussians per program
 RECORD = tl.constexpr(12)  # floats of a record: x, y, a, b, c, log2 of opacity, red, green, blue, depth, two unused
-FAINTEST = tl.constexpr(1 / 255)
-LOG2_FAINTEST = tl.constexpr(-7.994353436858858)
+MIN_ALPHA = tl.constexpr(1 / 255)
+LOG2_MIN_ALPHA = tl.constexpr(-7.994353436858858)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """What is drawn: float32, contiguous, on one device."""
+    """Tensors that are rendered: float32, contiguous, on one device."""
 
     means: Tensor  # [N, 3] mm
     quats: Tensor  # [N, 4]
@@ -38,14 +38,17 @@ class Inputs:
     sh: Tensor  # [N, K, 3]
     falloff: Tensor | None  # [N]
     channels: Tensor | None  # [N, C]
-    left: Tensor | None  # [N]: what shadows leave of the light, > 0
-    vignette: Tensor | None  # [2], there where falloff is
+    left: Tensor | None  # [N]: share of the light that shadows leave, > 0
+    vignette: Tensor | None  # [2], present with falloff
     pose: Tensor  # [4, 4] world_from_camera
     background: Tensor | None  # [3]
     frames: Tensor | None  # [N, 4]
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+
+INPUTS = tuple(field.name for field in fields(Inputs))
 
 
 @dataclass(frozen=True)
@@ -55,13 +58,13 @@ class Projected:
     records: Tensor  # [N, 12]: exponent of alpha, binary = log2 opacity + a dx^2 + b dx dy + c dy^2
     ellipses: Tensor  # [N, 8] where alpha >= 1/255 (`binning.ELLIPSE`)
     counts: Tensor  # [N] int32: tiles touched; where 0, nothing else is written
-    depths: Tensor  # [N] mm, infinite where not drawn
+    depths: Tensor  # [N] mm, infinite where not rendered
     radii: Tensor  # [N] px
 
 
 @triton.jit
 def tiles_touched(seen, x, y, half_height, slope, k0, k1, peak, width, height, TILE: tl.constexpr):
-    """How many tiles each ellipse touches, 0 where not seen."""
+    """Return the number of tiles that each ellipse touches, 0 where not visible."""
     row, last_row = tile_rows(y, half_height, height, TILE)
     touched = tl.zeros_like(row)
     searching = seen & (row <= last_row)
@@ -91,13 +94,13 @@ def project_kernel(
     xx, xy, yy, determinant = covariance(u0, u1, u2, u3, u4, u5)
     inverse = 1.0 / determinant
     seen = inside & (z > near) & finite(z) & finite(iz) & finite(wx) & finite(wy) & finite(wz)
-    # what is not finite in quaternion or scales shows in the covariance; 1 / norm is 0 where its square overflows
+    # non-finite quaternions and scales show in the covariance; 1 / norm is 0 where its square overflows
     seen = seen & (inorm > 0) & finite(xx) & finite(yy) & finite(determinant) & finite(inverse)
 
     opacity = tl.load(opacities + g, seen, other=0.0)
-    seen = seen & (opacity >= FAINTEST)
+    seen = seen & (opacity >= MIN_ALPHA)
     log2_opacity = tl.log2(tl.maximum(opacity, 1e-30))
-    reach = (log2_opacity - LOG2_FAINTEST) * (2.0 / LOG2_E)  # squared Mahalanobis radius of alpha = 1/255
+    reach = (log2_opacity - LOG2_MIN_ALPHA) * (2.0 / LOG2_E)  # squared Mahalanobis radius of alpha = 1/255
     px, py = fx * x * iz + cx, fy * y * iz + cy
     half_width, half_height = tl.sqrt(reach * xx), tl.sqrt(reach * yy)
     seen = seen & finite(px) & finite(py) & finite(half_width) & finite(half_height)
@@ -131,7 +134,7 @@ def project_kernel(
 
 @triton.jit
 def put_four(at, a, b, c, d, mask):
-    """Four neighbours in a row."""
+    """Store four consecutive numbers."""
     tl.store(at, a, mask)
     tl.store(at + 1, b, mask)
     tl.store(at + 2, c, mask)
@@ -141,7 +144,7 @@ def put_four(at, a, b, c, d, mask):
 @triton.jit
 def colors(sh, falloff, left, vignette, frames, pose, g, seen, wx, wy, wz, x, y, z, slope_x, slope_y,
            SH: tl.constexpr):  # fmt: skip
-    """Red, green and blue as drawn; not numbers where any input is none."""
+    """Return red, green and blue as rendered; NaN where any input is not finite."""
     dx, dy, dz, _ = direction(pose, wx, wy, wz)
     if frames is not None:
         f0, f1, f2, f3 = quadruple(frames, g, seen)
@@ -150,7 +153,7 @@ def colors(sh, falloff, left, vignette, frames, pose, g, seen, wx, wy, wz, x, y,
     at = sh + g * (3 * SH)
     red, green = sh_color(at, seen, dx, dy, dz, SH), sh_color(at + 1, seen, dx, dy, dz, SH)
     blue = sh_color(at + 2, seen, dx, dy, dz, SH)
-    # maximum() may turn what is not a number into 0
+    # maximum() may turn NaN into 0
     known = seen & finite(red) & finite(green) & finite(blue)
     light = tl.where(known, 1.0, float("nan"))
     if falloff is not None:
@@ -164,13 +167,13 @@ def colors(sh, falloff, left, vignette, frames, pose, g, seen, wx, wy, wz, x, y,
 
 @triton.jit
 def turned(qw, qx, qy, qz, x, y, z):
-    """Vectors turned into frames of unit quaternions, world_from_frame: by the transposed matrix."""
+    """Return vectors in frames of unit quaternions, world_from_frame: by the transposed matrix."""
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation_matrix(qw, qx, qy, qz)
     return r0 * x + r3 * y + r6 * z, r1 * x + r4 * y + r7 * z, r2 * x + r5 * y + r8 * z
 
 
 def project(inputs: Inputs, camera: Camera, tiles: Tiles) -> Projected:
-    """Every Gaussian that touches the image, projected (EWA splatting, Zwicker et al. 2001) and lit."""
+    """Project and light every Gaussian that touches the image (EWA splatting, Zwicker et al. 2001)."""
     n, device = len(inputs), inputs.means.device
     out = Projected(
         records=torch.empty(n, RECORD.value, device=device),

@@ -1,4 +1,4 @@
-"""Stage 5: from gradients of the projected Gaussians to gradients of the Gaussians and of the camera."""
+"""Stage 5: gradients of the Gaussians and of the camera from those of the projected Gaussians."""
 
 from dataclasses import dataclass
 
@@ -27,9 +27,9 @@ BLOCK = 128
 CAMERA_SUMS = tl.constexpr(18)  # camera_from_world (rotation 9, translation 3), centre 3, vignette 2, nothing
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Gradients:
-    """Of everything that goes in, and of the projected centres."""
+    """Gradients of all inputs, and of the projected centres."""
 
     centers: Tensor  # [N, 2]
     means: Tensor
@@ -49,7 +49,7 @@ def shape_gradient(
     to_xx, to_xy, to_yy, t0, t1, t2, t3, t4, t5, u0, u1, u2, u3, u4, u5,
     r0, r1, r2, r3, r4, r5, r6, r7, r8, sx, sy, sz,
 ):  # fmt: skip
-    """Through U = T R S: dL/d T (6), dL/d scales (3), dL/d R (9)."""
+    """Return, through U = T R S, dL/d T (6), dL/d scales (3), dL/d R (9)."""
     a0, a1, a2 = 2 * (to_xx * u0 + to_xy * u3), 2 * (to_xx * u1 + to_xy * u4), 2 * (to_xx * u2 + to_xy * u5)
     b0, b1, b2 = 2 * (to_xy * u0 + to_yy * u3), 2 * (to_xy * u1 + to_yy * u4), 2 * (to_xy * u2 + to_yy * u5)
     w0, w3, w6 = a0 * t0 + b0 * t3, a0 * t1 + b0 * t4, a0 * t2 + b0 * t5
@@ -66,7 +66,7 @@ def shape_gradient(
 
 @triton.jit
 def quaternion_gradient(w, x, y, z, inverse_norm, v0, v1, v2, v3, v4, v5, v6, v7, v8):
-    """From dL/d R to dL/d quaternion, of which (w, x, y, z) is the direction."""
+    """Return dL/d quaternion, whose direction is (w, x, y, z), from dL/d R."""
     gw = 2 * (x * (v7 - v5) + y * (v2 - v6) + z * (v3 - v1))
     gx = 2 * (y * (v1 + v3) + z * (v2 + v6) + w * (v7 - v5) - 2 * x * (v4 + v8))
     gy = 2 * (x * (v1 + v3) + z * (v5 + v7) + w * (v2 - v6) - 2 * y * (v0 + v8))
@@ -82,13 +82,13 @@ def quaternion_gradient(w, x, y, z, inverse_norm, v0, v1, v2, v3, v4, v5, v6, v7
 
 @triton.jit
 def put(at, value, inside, seen):
-    """0 where not seen, whatever came out there."""
+    """Store `value`, 0 where not visible."""
     tl.store(at, tl.where(seen, value, 0.0), inside)
 
 
 @triton.jit
 def put_three(at, a, b, c, inside, seen):
-    """Three neighbours in a row."""
+    """Store three consecutive numbers."""
     put(at, a, inside, seen)
     put(at + 1, b, inside, seen)
     put(at + 2, c, inside, seen)
@@ -96,7 +96,7 @@ def put_three(at, a, b, c, inside, seen):
 
 @triton.jit
 def put_sums(at, a, b, c, seen):
-    """Three sums over what was seen, side by side."""
+    """Store three consecutive sums over visible lanes."""
     tl.store(at, tl.sum(tl.where(seen, a, 0.0), axis=0))
     tl.store(at + 1, tl.sum(tl.where(seen, b, 0.0), axis=0))
     tl.store(at + 2, tl.sum(tl.where(seen, c, 0.0), axis=0))
@@ -104,7 +104,7 @@ def put_sums(at, a, b, c, seen):
 
 @triton.jit
 def ellipse_gradient(h1, h2, h3, h4, h5, xx, xy, yy, determinant):
-    """From sums over pixels of h d and h d d^T to the projected centre (2) and covariance (xx, xy, yy)."""
+    """Return gradients of projected centre (2) and covariance (xx, xy, yy) from sums over pixels of h d and h d d^T."""
     a, b, c = yy / determinant, 0.0 - xy / determinant, xx / determinant  # inverse covariance Q
     # d alpha / d covariance = 1/2 alpha Q d d^T Q
     m00, m01, m11 = 0.5 * h3, 0.5 * h4, 0.5 * h5
@@ -116,7 +116,7 @@ def ellipse_gradient(h1, h2, h3, h4, h5, xx, xy, yy, determinant):
 @triton.jit
 def mean_gradient(pose, to_x, to_y, to_z, g0, g1, g2, g3, g4, g5, x, y, iz, slope_x, slope_y, clamped_x, clamped_y,
                   fx, fy):  # fmt: skip
-    """Through the projected centre, depth and T (g0 to g5) = J camera_from_world, to the mean in the camera's frame."""
+    """Return the gradient of the mean, camera frame, through projected centre, depth and T (g0 to g5)."""
     c0, c1, c2, c3, c4, c5, c6, c7, c8 = view_rotation(pose)
     jx, jy = fx * iz, fy * iz
     to_jxx, to_jxz = g0 * c0 + g1 * c1 + g2 * c2, g0 * c6 + g1 * c7 + g2 * c8
@@ -133,7 +133,7 @@ def mean_gradient(pose, to_x, to_y, to_z, g0, g1, g2, g3, g4, g5, x, y, iz, slop
 @triton.jit
 def light_gradient(falloff, vignette, to_falloff, g, inside, seen, to_log, x, y, z, iz, slope_x, slope_y,
                    clamped_x, clamped_y):  # fmt: skip
-    """Writes that of the falloff, from that of the light's logarithm; returns the mean's (3), the factor and t."""
+    """Store the falloff's gradient from that of the light's logarithm; return the mean's (3), the factor and t."""
     power = tl.load(falloff + g, seen, other=0.0)
     light, log2_distance, t = headlight(power, vignette, x, y, z, slope_x, slope_y)
     put(to_falloff + g, 0.0 - to_log * log2_distance / LOG2_E, inside, seen)
@@ -147,7 +147,7 @@ def light_gradient(falloff, vignette, to_falloff, g, inside, seen, to_log, x, y,
 @triton.jit
 def direction_gradient(sh, to_sh, frames, pose, g, inside, seen, wx, wy, wz, red, green, blue, to_red, to_green,
                        to_blue, SH: tl.constexpr):  # fmt: skip
-    """Through max(0, sh . basis + 0.5): writes the harmonics' gradients, returns the mean's (3) by its direction."""
+    """Store the harmonics' gradients through max(0, sh . basis + 0.5); return the mean's (3) by its direction."""
     to_red, to_green = tl.where(red > 0, to_red, 0.0), tl.where(green > 0, to_green, 0.0)
     to_blue = tl.where(blue > 0, to_blue, 0.0)
     dx, dy, dz, inverse_length = direction(pose, wx, wy, wz)
@@ -233,7 +233,7 @@ def project_backward_kernel(
 def project_backward(
     inputs: Inputs, projected: Projected, camera: Camera, sums: Tensor, want_sh: bool, want_camera: bool
 ) -> Gradients:
-    """Gradients of the Gaussians from their `sums` [N, 10 + C]; of pose and vignette if `want_camera`."""
+    """Return gradients of the Gaussians from their `sums` [N, 10 + C], and of pose and vignette if `want_camera`."""
     n, device = len(inputs), inputs.means.device
     programs = triton.cdiv(n, BLOCK)
     partial = torch.zeros(programs, CAMERA_SUMS.value, device=device) if want_camera else None
@@ -255,8 +255,19 @@ def project_backward(
         total = partial.double().sum(0)
         pose, vignette = _pose_gradient(total, inputs.pose.double()), total[15:17].float()
     channels = None if inputs.channels is None else sums[:, HEAD.value :]
-    means, quats, scales, opacities = to
-    return Gradients(centers, means, quats, scales, opacities, to_sh, to_falloff, to_left, channels, vignette, pose)
+    return Gradients(
+        centers=centers,
+        means=to[0],
+        quats=to[1],
+        scales=to[2],
+        opacities=to[3],
+        sh=to_sh,
+        falloff=to_falloff,
+        left=to_left,
+        channels=channels,
+        vignette=vignette,
+        pose=pose,
+    )
 
 
 def _pose_gradient(total: Tensor, pose: Tensor) -> Tensor:

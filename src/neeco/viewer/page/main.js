@@ -1,7 +1,7 @@
-// The page: what is wished, and the loop that draws it small while something moves and sharp once all is still.
-const STILL_MS = 150; // without a change, after which it is drawn sharp
+// The page: the requested state and view, and the loop that renders it small while something moves and sharp once it rests.
+const STILL_MS = 150; // without a change, after which it is rendered sharp
 const SHARPEST = 2; // times the recorded size
-const BUDGET_MS = 60; // of a drawing while something moves; above that it is drawn smaller
+const BUDGET_MS = 60; // of a rendering while something moves; above that it is rendered smaller
 const SMALLEST = 0.25;
 const NEAREST = 0.3, FARTHEST = 1.3; // of the way to the middle of the tissue: white and black where depth is shown
 const FRAMES_A_SECOND = 10; // of playing
@@ -103,7 +103,7 @@ class Page {
     this.panel.refresh();
   }
 
-  // A drawing of the recorded size, once nothing else is drawn: {width, height, pixels (RGBA), ids, depths (mm)}.
+  // A rendering of the recorded size, once nothing else is rendered: {width, height, pixels (RGBA), ids, depths (mm)}.
   async whole(view) {
     while (this.busy) await new Promise((done) => { setTimeout(done, 10); });
     this.busy = true;
@@ -174,7 +174,7 @@ async function begin() {
 
 function fail(error) {
   element("failed").hidden = false;
-  element("failed").textContent = `This page could not be drawn here: ${error.message}`;
+  element("failed").textContent = `This page could not be rendered here: ${error.message}`;
   element("said").textContent = "";
 }
 

@@ -1,4 +1,4 @@
-// The sliders and buttons beside the picture.
+// The sliders and buttons next to the picture.
 const VIEWS = ["image", "labels over image", "labels", "depth"];
 const LABELLED = [1, 2]; // views that show labels
 const TINTS = ["#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442", "#b4b4b4"]; // as the rasteriser has them

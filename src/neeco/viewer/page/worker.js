@@ -1,4 +1,4 @@
-// Has the whole scene and draws rows of the image, one wish after the other; the page keeps several of these.
+// Has the whole scene and renders rows of the image, one request after the other; the page keeps several of these.
 let api;
 
 function view(type, at, length) {

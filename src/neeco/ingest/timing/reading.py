@@ -1,0 +1,180 @@
+"""Reading recordings into memory: logs, videos, the clocks that are given, and checks that all of it fits together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from neeco.errors import NeecoError
+from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_lengths
+from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
+from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
+from neeco.ingest.recording.model import Recording
+from neeco.ingest.timing.clock_search import GIVEN, MAX_LENGTH_S, ClockOffset
+from neeco.ingest.timing.compatibility import check_recordings, episode_names, refusal
+from neeco.ingest.timing.episodes import PAUSE_S, Episode, Episodes, assumed_clock
+from neeco.ingest.timing.notes import Notes
+
+MIN_FPS, MAX_FPS = 0.01, 10_000.0
+MIN_SIDE_PX = 32  # smaller frames have too few features to find cameras
+
+
+def read_episodes(recordings: Sequence[Recording], tissue: str | None = None) -> Episodes:
+    """Read logs and videos, and put them on one timeline, with the clocks that are given.
+
+    Raises NeecoError for recordings that cannot be used, or that one capture cannot hold.
+    """
+    notes = Notes(episode_names(recordings))
+    parts: list[Episode] = []
+    for episode, recording in enumerate(recordings):
+        part = _read(recording, notes, episode)
+        if parts:
+            before = parts[-1]
+            start = before.start + before.times[-1] + PAUSE_S - part.times[0]
+            part = replace(part, start=start, first=before.first + len(before.times))
+        parts.append(part)
+    check_episodes(parts)
+    _check_split_names(recordings[0], notes.names)
+    return Episodes(tuple(parts), parts[0].video if len(parts) == 1 else _joined_video(parts), notes, tissue)
+
+
+def check_episodes(parts: Sequence[Episode], *, tissues: bool = False) -> None:
+    """Raise NeecoError for recordings that one capture cannot hold. tissues: each may be of another one."""
+    first = parts[0]
+    for part in parts[1:]:
+        if part.video.size != first.video.size:
+            sizes = [f"{width}x{height}" for width, height in (part.video.size, first.video.size)]
+            raise refusal(part.recording, f"images: are {sizes[0]}, not {sizes[1]} as", first.recording)
+    check_recordings([part.recording for part in parts], tissues=tissues)
+    for part in parts[1:]:
+        for name, log in part.poses.items():
+            if log.frame != first.poses[name].frame:
+                raise refusal(part.recording, f"instruments: {name}: poses are in another frame than", first.recording)
+
+
+def _read(recording: Recording, notes: Notes, episode: int) -> Episode:
+    """Read one recording. Raises NeecoError for logs and videos that cannot be used."""
+    # logs are quick to read: wrong ones are found before the video is touched
+    items = recording.instruments
+    poses = {item.name: read_pose_log(item.poses) for item in items if item.poses is not None}
+    joints = {item.name: {joint: read_reading_log(source) for joint, source in item.joints.items()} for item in items}
+    rolls = {item.name: read_reading_log(item.roll) for item in items if item.roll is not None}
+    scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
+    _check_bases(recording, scope, poses)
+    video = recording.source.open()
+    logs: list[PoseLog | ReadingLog] = [*poses.values(), *([scope] if scope else [])]
+    logs += [log for held in joints.values() for log in held.values()] + [*rolls.values()]
+    for note in (*recording.notes, *(note for log in logs for note in log.notes), *video.notes):
+        notes.add(note, episode)
+    for item in items:
+        if not item.placed:
+            notes.add(f"instrument {item.name!r} was not tracked: it is left out of the capture's states", episode)
+    placed = [item.name for item in items if item.placed]
+    if not placed:
+        notes.add("no instrument was tracked: the capture has cameras and images only (method 3dgs trains)", episode)
+    _check_video(recording, video)
+    for note in _length_notes(recording, video, logs):
+        notes.add(note, episode)
+    clocks = {name: ClockOffset(float(seconds), 0.0, GIVEN) for name, seconds in recording.sync.items()}
+    if VIDEO_CLOCK in recording.clocks:
+        clocks[VIDEO_CLOCK] = ClockOffset(0.0, 0.0, "the images' own")
+    # joints' clocks that nothing gives are the video's: images determine them to some 20 ms at best; trackers' clocks,
+    # and those of joints on one of them, are found later, from motion
+    found_later = {log.clock for log in (*poses.values(), *([scope] if scope else []))}
+    for joint, log in ((joint, log) for name in placed for joint, log in joints[name].items()):
+        if log.clock not in clocks and log.clock not in found_later:
+            clocks[log.clock] = assumed_clock(log, video.times)
+            notes.add(
+                f"the clock of joint {joint!r} was not given and is taken to be the video's: at 1 rad/s, 20 ms off are "
+                "1.1 deg",
+                episode,
+            )
+    return Episode(
+        recording=recording, video=video, poses=poses, joints=joints, rolls=rolls, scope=scope, clocks=clocks
+    )
+
+
+def _check_bases(recording: Recording, scope: PoseLog | None, poses: Mapping[str, PoseLog]) -> None:
+    """Raise NeecoError where the scope's poses and an instrument's are stated in bases of different names: nothing
+    would register them."""
+    stated = None if scope is None else scope.stated_in
+    placed = {item.name for item in recording.instruments if item.base is not None}
+    for name, log in poses.items():
+        if stated is not None and name not in placed and log.stated_in not in (None, stated) and log.frame == BASE:
+            raise NeecoError(
+                f"{recording.path}: laparoscope: its poses are stated in {stated}, those of {name} in "
+                f"{log.stated_in}; where these are one frame write `frame: base` for both, else state how they stand "
+                "(world_from_base)"
+            )
+
+
+def _check_video(recording: Recording, video: VideoSource) -> None:
+    """Raise NeecoError for times that no recording has, and for frames too small."""
+    rate, length = 1 / float(np.median(np.diff(video.times))), video.times[-1] - video.times[0]
+    if not (MIN_FPS < rate < MAX_FPS and length < MAX_LENGTH_S):
+        raise NeecoError(
+            f"{video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
+            "cannot be; correct fps or the times' unit"
+        )
+    if min(video.size) < MIN_SIDE_PX:
+        width, height = video.size
+        raise NeecoError(f"{video.path}: its frames are {width}x{height} pixels; give {MIN_SIDE_PX} or more each way")
+
+
+def _length_notes(recording: Recording, video: VideoSource, logs: Sequence[PoseLog | ReadingLog]) -> list[str]:
+    """Return notes on logs on the video's clock that are longer than the video, and on those whose rows belong to
+    images one by one and are not as many. Raises NeecoError where these differ by far."""
+    notes: list[str] = []
+    times = video.times
+    for log in logs:
+        if log.clock != VIDEO_CLOCK or log.path == recording.video:
+            continue
+        if log.image_hz is not None:
+            rows = round(float(log.times[-1]) * log.image_hz) + 1
+            notes += compare_lengths(video.path, video, rows, log.image_hz)
+            continue
+        beyond = max(0.0, log.times[-1] - times[-1]) + max(0.0, times[0] - log.times[0])
+        if beyond > MAX_UNLIKE * (times[-1] - times[0]):
+            notes.append(
+                f"{log.path.name}: goes from {log.times[0]:.1f} to {log.times[-1]:.1f} s on the video's clock, the "
+                f"video from {times[0]:.1f} to {times[-1]:.1f} s: are they of one recording?"
+            )
+    return notes
+
+
+def _check_split_names(first: Recording, names: tuple[str, ...]) -> None:
+    """Raise NeecoError for splits that name no episode."""
+    single, splits = len(names) == 1, first.splits
+    for episode in splits.test_episodes + splits.unseen_episodes if splits else ():
+        if single or episode not in names:
+            listed = "one recording has none" if single else f"they are {', '.join(names)}"
+            raise NeecoError(f"{first.path}: splits: no episode is called {episode!r}; {listed}")
+    if not single and splits and (splits.test or splits.unseen):
+        raise NeecoError(
+            f"{first.path}: splits: test and unseen count one video's frames, and there are {len(names)} "
+            "recordings; name test_episodes and unseen_episodes"
+        )
+
+
+@dataclass(frozen=True)
+class _JoinedVideo(VideoSource):
+    """The frames of several videos, counted on. first: frames before each, and of all."""
+
+    videos: tuple[VideoSource, ...]
+    first: tuple[int, ...]
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        wanted = np.asarray(indices, dtype=np.int64)
+        for video, before, after in zip(self.videos, self.first, self.first[1:], strict=False):
+            own = wanted[(wanted >= before) & (wanted < after)] - before
+            if len(own):
+                for index, image in video.read(own.tolist()):
+                    yield index + before, image
+
+
+def _joined_video(parts: Sequence[Episode]) -> VideoSource:
+    videos, first = tuple(part.video for part in parts), tuple(part.first for part in parts)
+    times = np.concatenate([part.times + part.start for part in parts])
+    return _JoinedVideo(videos[0].path, videos[0].size, (), times, videos, (*first, len(times)))
