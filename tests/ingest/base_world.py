@@ -14,7 +14,7 @@ from neeco.geometry.lens import Lens
 from neeco.ingest.frames.views import Views
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.readers.logs import PoseLog
-from neeco.ingest.recording.model import InstrumentLogs, Recording
+from neeco.ingest.recording.model import InstrumentLogs, Recording, VideoFile
 from neeco.ingest.timing.clock_search import ClockOffset
 from neeco.ingest.timing.episodes import Episode, Episodes
 from neeco.ingest.timing.notes import Notes
@@ -125,7 +125,7 @@ def episodes(
     instruments: Sequence[InstrumentLogs], poses: Mapping[str, PoseLog], clocks: Mapping[str, ClockOffset]
 ) -> Episodes:
     """A recording in memory with pose logs alone."""
-    recording = Recording(Path("recording.yaml"), instruments=tuple(instruments))
+    recording = Recording(Path("recording.yaml"), VideoFile(Path("video.mp4")), instruments=tuple(instruments))
     video = VideoSource(Path("video.mp4"), (WIDTH, HEIGHT), (), np.zeros(2))
     joints: dict[str, dict] = {name: {} for name in poses}
     part = Episode(recording=recording, video=video, poses=poses, joints=joints, rolls={}, scope=None, clocks=clocks)

@@ -189,12 +189,12 @@ def test_a_video_and_a_ruler_become_a_capture(recorded, tmp_path):
         assert state.uncertainty.rotation_deg[2] < 20
     assert any("two diameters of its shaft" in note for note in result.notes)
     assert result.in_video == ("grasper",)
-    assert not any("roll is not known" in doubt for doubt in assess_ingest(result, capture).doubts)
+    assert not any("roll is not known" in doubt for doubt in assess_ingest(result, capture).warnings)
     state = capture.frames[0].state.instruments["grasper"]
     unknown = replace(state, uncertainty=replace(state.uncertainty, rotation_deg=(1.0, 1.0, 180.0)))
     first = replace(capture.frames[0], state=State({"grasper": unknown}))
     unsure = replace(capture, frames=(first, *capture.frames[1:]))
-    assert any("roll is not known" in doubt for doubt in assess_ingest(result, unsure).doubts)
+    assert any("roll is not known" in doubt for doubt in assess_ingest(result, unsure).warnings)
 
 
 def test_without_a_logged_roll_it_can_be_posed_by_hand(recorded, tmp_path):

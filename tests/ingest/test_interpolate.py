@@ -20,7 +20,7 @@ def pose_log(world, times, noise_mm=0.0, noise_rad=0.0, gaps=(), seed=0):
     noisy = world.rotations(times) * Rotation.from_rotvec(generator.normal(0, noise_rad, (len(times), 3)))
     quats = noisy.as_quat()[:, [3, 0, 1, 2]]
     signs = np.cumprod(np.sign(np.concatenate([[1], (quats[1:] * quats[:-1]).sum(axis=1)])))
-    return PoseLog(Path("log.csv"), "em", times, positions, quats * signs[:, None], gaps)
+    return PoseLog(Path("log.csv"), "em", times, positions, quats * signs[:, None], gaps=gaps)
 
 
 def errors(world, log, smooth_s=None, queries=QUERIES):

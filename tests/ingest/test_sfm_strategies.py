@@ -20,7 +20,7 @@ from neeco.ingest.recording.model import IngestSettings
 
 SIZE = (1280, 720)
 FREE = strategies(600.0)
-GOOD = Attempt(FREE[0], 80, (80,), 830.0, -0.03, 8000, 1.1, 6.0)
+GOOD = Attempt(FREE[0], 80, models=(80,), focal=830.0, distortion=-0.03, points=8000, error=1.1, parallax=6.0)
 
 
 def judged(**changes) -> str:
@@ -81,7 +81,10 @@ def search(tmp_path, monkeypatch):
         monkeypatch.setattr(sfm, "run_worker", run)
         settings = IngestSettings(sfm_minutes=minutes)
         names = [f"{index:06d}.png" for index in range(100)]
-        made_sfm = StructureFromMotion(tmp_path, Path("video.mp4"), tmp_path, names, SIZE, pinhole, None, settings)
+        made_sfm = StructureFromMotion(
+            work=tmp_path, source=Path("video.mp4"), folder=tmp_path, names=names, size=SIZE, pinhole=pinhole,
+            masks=None, settings=settings,
+        )  # fmt: skip
         return made_sfm, tasks
 
     return made

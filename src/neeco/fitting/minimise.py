@@ -41,7 +41,7 @@ class ImageResidual:
 
 
 class FitProblem(Protocol[Posed]):
-    """What is fitted to an image: parameters [P] float64, and how they are rendered."""
+    """A fit of parameters [P] float64 to an image: the image, the prior, and how parameters are rendered."""
 
     @property
     def residual(self) -> ImageResidual:

@@ -1,1 +1,1 @@
-"""Methods: what moves the Gaussians (or rays) of a scene; found by `neeco.scene.method_registry`."""
+"""Methods: deformations of a scene's Gaussians (or rays), registered by `neeco.scene.method_registry`."""

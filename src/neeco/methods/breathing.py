@@ -1,4 +1,4 @@
-"""Tissue that moves as the patient breathes: a periodic displacement, smooth in space, that any method can add."""
+"""Breathing tissue: a periodic displacement, smooth in space, and the estimate of its period from training frames."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from neeco.scene.deformation import floored_decay
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 
-HARMONICS = 2  # breath is no pure sine: the pause after breathing out is longer
-CONTROL_POINTS = 24
+N_HARMONICS = 2  # breath is no pure sine: the pause after breathing out is longer
+N_CONTROL_POINTS = 24
 RATES = {"period": 5e-4, "swings": 2e-2}  # s and mm, Adam's at the start
 
 
@@ -41,19 +41,20 @@ class Breathing(nn.Module):
     reach: Tensor  # [] mm, standard deviation of the basis functions
     origin: Tensor  # [] s, float64: when t is 0
 
-    def __init__(self, count: int = CONTROL_POINTS) -> None:
+    def __init__(self, count: int = N_CONTROL_POINTS) -> None:
         super().__init__()
         self.register_buffer("points", torch.zeros(count, 3))
         self.register_buffer("reach", torch.ones(()))
         self.register_buffer("origin", torch.zeros((), dtype=torch.float64))
         self.period = nn.Parameter(torch.ones(()))  # T, s
-        self.swings = nn.Parameter(torch.zeros(2 * HARMONICS, count, 3))  # a_1, b_1, a_2, … in mm
+        self.swings = nn.Parameter(torch.zeros(2 * N_HARMONICS, count, 3))  # a_1, b_1, a_2, … in mm
 
     @classmethod
     def of(cls, tissue: Tensor, period: float, swing: Tensor, origin: float) -> Breathing:
-        """One that moves all of the tissue, points [P, 3] mm, alike, by `swing` [2 HARMONICS, 3] mm (a_1, b_1, …)."""
+        """Return a breathing that moves all of the tissue, points [P, 3] mm, by `swing` [2 N_HARMONICS, 3] mm (a_1,
+        b_1, …)."""
         places, _ = kmeans2(
-            tissue.detach().cpu().double().numpy(), min(CONTROL_POINTS, len(tissue)), minit="++", seed=0
+            tissue.detach().cpu().double().numpy(), min(N_CONTROL_POINTS, len(tissue)), minit="++", seed=0
         )
         made = cls(len(places))
         apart = np.linalg.norm(places[:, None] - places, axis=-1) + np.diag(np.full(len(places), np.inf))
@@ -67,7 +68,7 @@ class Breathing(nn.Module):
         return made.to(tissue.device)
 
     def forward(self, means: Tensor, time: float) -> Tensor:
-        """u [N, 3] mm at `means` [N, 3] mm, where tissue rests, at `time` in s."""
+        """Return u [N, 3] mm at resting positions `means` [N, 3] mm, at `time` in s."""
         with torch.no_grad():
             weights = torch.softmax(-0.5 * torch.cdist(means, self.points).square() / self.reach**2, 1)
         breaths = ((time - self.origin) / self.period).to(self.period)
@@ -75,8 +76,8 @@ class Breathing(nn.Module):
 
     @torch.no_grad()
     def describe(self, cameras: Sequence[Camera]) -> dict[str, float]:
-        """The period, and how far the control point that moves most is from rest at most; where all the cameras that
-        recorded it stood in one place, only across the view from there: motion along it does not show."""
+        """Return the period and the largest amplitude of any control point; across the line of sight alone where all
+        cameras were in one place, since motion along it is not observable."""
         shares = torch.linspace(0, 1, 33).to(self.swings)
         moved = torch.stack([torch.einsum("w,wkd->kd", _waves(share), self.swings) for share in shares])  # [33, K, 3]
         centres = torch.stack([camera.world_from_camera[:3, 3] for camera in cameras]).to(self.points)
@@ -88,39 +89,39 @@ class Breathing(nn.Module):
 
 
 def _waves(breaths: Tensor) -> Tensor:
-    """[2 HARMONICS] cosine and sine of the fundamental after so many breaths [], then of every harmonic."""
-    angles = 2 * math.pi * breaths * torch.arange(1, HARMONICS + 1, device=breaths.device)
+    """Return cosine and sine [2 N_HARMONICS] of every harmonic after so many breaths []."""
+    angles = 2 * math.pi * breaths * torch.arange(1, N_HARMONICS + 1, device=breaths.device)
     return torch.stack([angles.cos(), angles.sin()], 1).flatten()
 
 
 class BreathingTissue(nn.Module):
-    """Mixed into a deformation whose tissue may breathe; without a `breathing` the tissue keeps still, and nothing of
-    it is stored."""
+    """Mixin of deformations whose tissue may breathe; without a `breathing` the tissue is static, and none is
+    stored."""
 
     breathing: Breathing | None
-    may_breathe: bool = False  # whether training looks for it
+    may_breathe: bool = False  # whether training searches for it
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.breathing = None
 
     def breathed(self, means: Tensor, tissue: int, time: float) -> Tensor:
-        """`means` [N, 3] mm, of which the first `tissue` rows have moved to where they are at `time`."""
+        """Return `means` [N, 3] mm with the first `tissue` rows displaced to `time`."""
         if self.breathing is None:
             return means
         moved = means[:tissue] + self.breathing(means[:tissue].detach(), time)
         return torch.cat([moved, means[tissue:]])
 
     def start_breathing(self, breathing: Breathing) -> None:
-        """Let the tissue move like a copy of `breathing`."""
+        """Start the tissue's motion from a copy of `breathing`."""
         self.breathing = copy.deepcopy(breathing)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
-        """Those of the breathing alone; a deformation with more parameters has a method of its own."""
+        """Return the rates of the breathing alone; a deformation with more parameters overrides this."""
         return {name: RATES[name.rsplit(".", 1)[-1]] * floored_decay(progress) for name, _ in self.named_parameters()}
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Tensor], prefix: str, *others: Any) -> None:
-        """Make the breathing that is stored, which is loaded then."""
+        """Create the stored breathing, whose parameters are then loaded."""
         places, period = (state_dict.get(f"{prefix}breathing.{name}") for name in ("points", "period"))
         if places is not None and period is not None and self.breathing is None:
             if not (period > 0).all():
@@ -129,14 +130,14 @@ class BreathingTissue(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *others)
 
 
-FRAMES = 240  # at most, that displacements are measured in
-PIXELS = 96 * 77  # of the images that they are measured in: the motion is a pixel or two there
-ROBUST = 0.04  # of white: residuals beyond count little (instruments, highlights)
-ROUNDS = 4  # of reweighting
-PERIODS = (1.5, 10.0)  # s, of breath
+MAX_FRAMES = 240  # in which displacements are measured
+N_PIXELS = 96 * 77  # of the images in which they are measured: the motion is a pixel or two there
+ROBUST_SCALE = 0.04  # of white: larger residuals have little weight (instruments, highlights)
+N_REWEIGHTINGS = 4
+PERIODS_S = (1.5, 10.0)  # of breath
 MIN_BREATHS = 2.0  # in the recording, so that the second confirms the first
 OVERSAMPLING = 8  # periods tried per independent frequency
-FOLDS = 4  # stretches of time, each of which is predicted from the others
+N_FOLDS = 4  # intervals of time, each of which is predicted from the others
 MIN_EXPLAINED = 0.5  # share of the displacement's variance in stretches that were left out
 MIN_AMPLITUDE = 0.2  # mm, rms over time: less does not blur
 
@@ -145,7 +146,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Found:
-    """A period, s, the Fourier series [2 HARMONICS, 3] mm of the displacement from its time `origin` on (see
+    """A period, s, the Fourier series [2 N_HARMONICS, 3] mm of the displacement from its time `origin` on (see
     `Breathing`), and the share of the displacement's variance that it predicts in times that it was not fitted to."""
 
     period: float
@@ -155,20 +156,20 @@ class Found:
 
 
 def find_period(times: Array, shifts: Array) -> Found | None:
-    """The period of displacements `shifts` [F, 3] mm at `times` [F] s, in any order and at any intervals; None where
-    none predicts clearly."""
+    """Return the period of displacements `shifts` [F, 3] mm at `times` [F] s, in any order and at any intervals; None
+    where none predicts clearly."""
     duration = float(np.ptp(times)) if len(times) else 0.0
-    longest = min(PERIODS[1], duration / MIN_BREATHS)
-    if len(times) < 8 * FOLDS or longest <= PERIODS[0]:
+    longest = min(PERIODS_S[1], duration / MIN_BREATHS)
+    if len(times) < 8 * N_FOLDS or longest <= PERIODS_S[0]:
         return None
     origin = float(times.min() + times.max()) / 2
     times, shifts = times - origin, shifts - shifts.mean(0)
-    frequencies = np.arange(1 / longest, 1 / PERIODS[0], 1 / (OVERSAMPLING * duration))
+    frequencies = np.arange(1 / longest, 1 / PERIODS_S[0], 1 / (OVERSAMPLING * duration))
     best = max(frequencies, key=lambda frequency: _explained(times, shifts, frequency, 1))
     near = best + np.linspace(-1, 1, 2 * OVERSAMPLING + 1) / (OVERSAMPLING * duration)
-    best = max(near, key=lambda frequency: _explained(times, shifts, frequency, HARMONICS))
-    explained = _explained(times, shifts, best, HARMONICS)
-    design = _design(times, best, HARMONICS)
+    best = max(near, key=lambda frequency: _explained(times, shifts, frequency, N_HARMONICS))
+    explained = _explained(times, shifts, best, N_HARMONICS)
+    design = _design(times, best, N_HARMONICS)
     swing: Array = np.linalg.lstsq(design, shifts, rcond=None)[0][1:].astype(np.float64)
     amplitude = float(np.sqrt((design[:, 1:] @ swing).var(0).sum()))
     if explained < MIN_EXPLAINED or amplitude < MIN_AMPLITUDE:
@@ -185,11 +186,11 @@ def _design(times: Array, frequency: float, harmonics: int) -> Array:
 
 
 def _explained(times: Array, shifts: Array, frequency: float, harmonics: int) -> float:
-    """Share of the variance that a fit to the other stretches of time predicts of each."""
+    """Return the share of the variance of each interval that a fit to the others predicts."""
     design = _design(times, frequency, harmonics)
-    fold = np.minimum(FOLDS * (times - times.min()) / np.ptp(times), FOLDS - 1).astype(int)
+    fold = np.minimum(N_FOLDS * (times - times.min()) / np.ptp(times), N_FOLDS - 1).astype(int)
     error = 0.0
-    for left_out in range(FOLDS):
+    for left_out in range(N_FOLDS):
         held = fold == left_out
         fitted = np.linalg.lstsq(design[~held], shifts[~held], rcond=1e-6)[0]
         error += float(((shifts[held] - design[held] @ fitted) ** 2).sum())
@@ -198,11 +199,11 @@ def _explained(times: Array, shifts: Array, frequency: float, harmonics: int) ->
 
 @torch.no_grad()
 def find_breathing(tissue: GaussianScene, views: TrainingViews) -> tuple[Breathing, Found] | None:
-    """How the tissue breathes, as far as one displacement of all of it tells, or None; `tissue`: a scene of still
-    tissue alone, learned from these views."""
-    picked = range(0, len(views), max(1, -(-len(views) // FRAMES)))
+    """Estimate the breathing from one displacement of all tissue per frame; None without a period. `tissue`: a scene of
+    static tissue alone, learned from these views."""
+    picked = range(0, len(views), max(1, -(-len(views) // MAX_FRAMES)))
     times = np.array([views.frames[index].state.time for index in picked], np.float64)
-    if np.ptp(times) < MIN_BREATHS * PERIODS[0]:
+    if np.ptp(times) < MIN_BREATHS * PERIODS_S[0]:
         return None
     shifts = torch.stack([tissue_shift(tissue, views, index) for index in picked])
     found = find_period(times, shifts.double().cpu().numpy())
@@ -213,10 +214,10 @@ def find_breathing(tissue: GaussianScene, views: TrainingViews) -> tuple[Breathi
 
 
 def tissue_shift(tissue: GaussianScene, views: TrainingViews, index: int) -> Tensor:
-    """[3] mm, world frame: the displacement of all the tissue that best explains frame `index`, to first order, beside
-    a change of each colour's gain; pixels that neither explains count little."""
+    """Return the displacement [3] mm, world frame, of all tissue that best explains frame `index` to first order,
+    together with a gain per colour; pixels that neither explains have little weight."""
     frame, target, mask = views.frames[index], views.target(index), views.mask(index)
-    camera = frame.camera.within(PIXELS)
+    camera = frame.camera.within(N_PIXELS)
     width, height = camera.width, camera.height
     rendering = rasterize(tissue.at(frame.state), camera)
     target, color = area_averaged(target, width, height), rendering.color
@@ -234,9 +235,9 @@ def tissue_shift(tissue: GaussianScene, views: TrainingViews, index: int) -> Ten
     fitted = design.new_zeros(6)
     if not len(design):
         return fitted[:3]
-    for _ in range(ROUNDS):
+    for _ in range(N_REWEIGHTINGS):
         left = (residual - design @ fitted).square().mean(-1, keepdim=True)
-        weight = (1 + left / ROBUST**2) ** -2  # Geman and McClure
+        weight = (1 + left / ROBUST_SCALE**2) ** -2  # Geman and McClure
         weighted = (design * weight[..., None]).reshape(-1, 6)
         flat = design.reshape(-1, 6)
         normal = weighted.T @ flat
@@ -247,7 +248,7 @@ def tissue_shift(tissue: GaussianScene, views: TrainingViews, index: int) -> Ten
 
 
 def _slopes(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Change of `image` [H, W, C] per px to the right and downwards, by central differences; 0 at the border."""
+    """Return the central differences of `image` [H, W, C] per px to the right and downwards; 0 at the border."""
     planes = image.permute(2, 0, 1)
     across = pad((planes[:, :, 2:] - planes[:, :, :-2]) / 2, (1, 1))
     down = pad((planes[:, 2:] - planes[:, :-2]) / 2, (0, 0, 1, 1))

@@ -49,7 +49,7 @@ from neeco.synthesis.writers.folder import (
     record_path,
     write_states,
 )
-from neeco.training.run import SCENE_FILE
+from neeco.training.run import SCENE_FILE, scene_digest
 from neeco.workers import address, check_workers
 
 if TYPE_CHECKING:
@@ -176,14 +176,14 @@ def description(
     info = {
         "schema": SCHEMA,
         "version": neeco.__version__,
-        "scene_sha256": run.scene_digest(),
+        "scene_sha256": scene_digest(run.path),
         "settings": settings,
         "soft": {"share_per_count": SHARE_PER_COUNT},
         "ignore": {"ignored": IGNORED, "clear_shares": list(CLEAR_SHARES), "reach": EDGE_WIDTH},
         "scene": str(run.path),
     }
     if instrument_runs:
-        info["settings"] = settings | {"instruments_sha256": [given.scene_digest() for given in instrument_runs]}
+        info["settings"] = settings | {"instruments_sha256": [scene_digest(given.path) for given in instrument_runs]}
         info["instruments"] = [str(given.path) for given in instrument_runs]
     return info
 

@@ -26,7 +26,7 @@ from neeco.scene.gaussian_scene import one_tissue
 from neeco.settings import with_fields
 from neeco.tracking.parameters import fitter_of
 from neeco.tracking.track import INFO
-from neeco.training.run import stored_config
+from neeco.training.run import scene_digest, stored_config
 from neeco.training.train import ShowRow, train
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def refine_run(
     folder = output / CAPTURE
     info: dict[str, Any] = {
         "schema": SCHEMA,
-        "scene_sha256": run.scene_digest(),
+        "scene_sha256": scene_digest(run.path),
         "captures_sha256": [fingerprint(read_capture(path)) for path in tracked],
     }
     if (begun := read_begun(output, BEGUN, resume, "a refinement")) is not None:

@@ -33,7 +33,7 @@ from neeco.tracking.footage_scene import adapted, over_tissue
 from neeco.tracking.footage_tissue import Progress, learn_again, learn_tissue
 from neeco.tracking.parameters import TrackedParameters, fitter_of
 from neeco.tracking.trust import Reference
-from neeco.training.run import SCENE_FILE, stored_config, write_config
+from neeco.training.run import SCENE_FILE, scene_digest, stored_config, write_config
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
@@ -134,7 +134,7 @@ def track_footage(
         "version": neeco.__version__,
         "run": os.path.abspath(run.path),
         "footage": os.path.abspath(footage.root),
-        "scene_sha256": run.scene_digest(),
+        "scene_sha256": scene_digest(run.path),
         "captures_sha256": [fingerprint(capture) for capture in (footage, trained_on)],
         "start": start,
         "tissue": tissue,

@@ -127,7 +127,7 @@ class LabelRenderer:
 
 @dataclass(frozen=True)
 class Reference:
-    """How well the scene explains frames that it was learned from."""
+    """Typical misfit and errors of the scene in frames that it was learned from."""
 
     errors: TypicalErrors
     misfit: float  # the USUAL_QUANTILE of theirs

@@ -61,11 +61,6 @@ class TrainedRun:
             raise NeecoError(f"{config}: capture: {root} no longer exists; put it back, or write there where it is")
         return self.scene.recorded.completed(read_capture(root, self.config["transforms"]), self.scene.instruments)
 
-    def scene_digest(self) -> str:
-        """Return the SHA-256 of the scene's file. Raises NeecoError when it is gone."""
-        content = read_bytes(Path(self.path) / SCENE_FILE, "a learned scene", "no such file; train the run first")
-        return hashlib.sha256(content).hexdigest()
-
     def gaussians(self, asked_by: str) -> GaussianRun:
         """Return the run as one whose scene is made of Gaussians. Raises NeecoError, in the words of the option or verb
         `asked_by`, for a radiance field."""
@@ -77,6 +72,12 @@ class GaussianRun(TrainedRun):
     """A finished training run whose scene is made of Gaussians, which can be posed and labelled."""
 
     scene: GaussianScene
+
+
+def scene_digest(path: Path) -> str:
+    """Return the SHA-256 of the scene in run folder `path`. Raises NeecoError for an unfinished run."""
+    content = read_bytes(Path(path) / SCENE_FILE, "a learned scene", "no such file; train the run first")
+    return hashlib.sha256(content).hexdigest()
 
 
 def load_run(path: Path, device: torch.device | None = None) -> TrainedRun:

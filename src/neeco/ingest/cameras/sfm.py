@@ -29,21 +29,23 @@ from neeco.ingest.frames.views import SfmResult, StageProgress
 from neeco.ingest.readers.video import require_installed
 from neeco.ingest.recording.model import MIN_FRAMES, IngestSettings
 
-KEY_NEIGHBOURS = (1, 2, 3, 4, 6, 8, 12, 16)  # keyframes a keyframe is matched with
-NEAR_KEYFRAMES = 3  # on each side of another frame, that it is matched with
-LOOP_STRIDE = 4  # every so many keyframes, one that is matched to all others of its kind: closes loops
-LARGE = 1280  # px: from this width on, features are not looked for at twice the size, which takes four times as long
-DENSE = 3  # times as many features in the attempt from more of them
-PEAK, DENSE_PEAK = 0.004, 0.002  # contrast of a feature: tissue is smooth, COLMAP's 0.0067 leaves too few
-MOTION_PAIRS = 40  # pairs of keyframes by which a scope that does not move is told
+KEY_NEIGHBOURS = (1, 2, 3, 4, 6, 8, 12, 16)  # keyframes on, that a keyframe is matched with
+N_NEAR_KEYFRAMES = 3  # on each side, that another frame is matched with
+LOOP_STRIDE = 4  # keyframes between those that are all matched with each other: closes loops
+LARGE_PX = 1280  # of an image, whose features are not detected at twice the size, which takes four times as long
+DENSE_FACTOR = 3  # on the number of features, in the attempt from more of them
+PEAK, DENSE_PEAK = 0.004, 0.002  # minimum contrast of a feature: tissue is smooth, COLMAP's 0.0067 leaves too few
+N_MOTION_PAIRS = 40  # of keyframes, that are tested for parallax
 # run by its path, not as a module of the package: nothing of ours may be loaded beside pycolmap
 WORKER = Path(__file__).with_name("_sfm_worker.py")
 
 
 def image_pairs(count: int, keys: Sequence[int], episodes: np.ndarray | None = None) -> list[tuple[int, int]]:
-    """Which of `count` images to match: keyframes `keys` with keyframes near in time, sparser farther off and in loops;
-    every other frame with the keyframes around it and the frame before. episodes [count]: which of several recordings
-    each is of; half of all pairs of keyframes of two of them are matched."""
+    """Choose which of `count` images to match: keyframes `keys` with keyframes near in time, sparser farther off and in
+    loops; every other frame with the keyframes around it and the frame before.
+
+    episodes [count]: which of several recordings each is of; half of all pairs of keyframes of two of them are matched.
+    """
     pairs = {(keys[i], keys[i + step]) for step in KEY_NEIGHBOURS for i in range(len(keys) - step)}
     anchors = keys[::LOOP_STRIDE]
     pairs |= {(a, b) for a in anchors for b in anchors if a < b}
@@ -55,7 +57,7 @@ def image_pairs(count: int, keys: Sequence[int], episodes: np.ndarray | None = N
     stride = keys[1] - keys[0] if len(keys) > 1 else 1
     for frame in range(count):
         place = frame // stride
-        for near in range(place - NEAR_KEYFRAMES + 1, place + NEAR_KEYFRAMES + 1):
+        for near in range(place - N_NEAR_KEYFRAMES + 1, place + N_NEAR_KEYFRAMES + 1):
             if 0 <= near < len(keys) and keys[near] != frame:
                 pairs.add((min(frame, keys[near]), max(frame, keys[near])))
         if frame:
@@ -74,6 +76,7 @@ class StructureFromMotion:
 
     def __init__(
         self,
+        *,
         work: Path,
         source: Path,
         folder: Path,
@@ -97,7 +100,7 @@ class StructureFromMotion:
             "work": str(work),
             "camera_model": "PINHOLE" if pinhole else "SIMPLE_RADIAL",
             "camera_params": [*pinhole.intrinsics] if pinhole else [],
-            "first_octave": -1 if max(size) < LARGE else 0,
+            "first_octave": -1 if max(size) < LARGE_PX else 0,
             "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         }
         count = len(self.names)
@@ -120,7 +123,7 @@ class StructureFromMotion:
 
     @property
     def search(self) -> tuple[str, ...]:
-        """What was tried to find cameras, in the order tried, one sentence each; the last says what was taken."""
+        """One sentence on each attempt to find cameras, in order; the last names the one taken."""
         best = best_attempt(self.attempts)
         sentences = [attempt.sentence() for attempt in self.attempts]
         if self.stopped:
@@ -151,7 +154,7 @@ class StructureFromMotion:
         return best
 
     def _parameters(self, strategy: Strategy) -> dict[str, Any]:
-        """What the worker has to know of a strategy."""
+        """Parameters of a strategy for the worker."""
         number = next(
             (i for i, attempt in enumerate(self.attempts) if attempt.strategy == strategy), len(self.attempts)
         )
@@ -186,7 +189,7 @@ class StructureFromMotion:
         features = self.settings.sfm_features
         job = {"task": "match", "pairs": pairs, "features": features, "peak": PEAK} | self._parameters(strategy)
         if strategy.dense:
-            job |= {"features": DENSE * features, "peak": DENSE_PEAK, "first_octave": -1}
+            job |= {"features": DENSE_FACTOR * features, "peak": DENSE_PEAK, "first_octave": -1}
         self._work(self.job | job, progress)
 
     def _try(self, strategy: Strategy, parameters: dict[str, Any], progress: StageProgress) -> Attempt:
@@ -199,8 +202,8 @@ class StructureFromMotion:
         return judge(Attempt(strategy, len(self.keys), **found), self.size, self._least)
 
     def _failure(self, progress: StageProgress) -> str:
-        """Why no strategy was of use, and what to do."""
-        apart = max(1, len(self.keys) // MOTION_PAIRS)
+        """Explain why no strategy was of use, and what to do."""
+        apart = max(1, len(self.keys) // N_MOTION_PAIRS)
         pairs = [(self.keys[i], self.keys[i + step]) for step in (2, 8) for i in range(0, len(self.keys) - step, apart)]
         names = [(self.names[a], self.names[b]) for a, b in pairs if (a, b) in set(self.pairs)]
         self._work(self.job | {"task": "matches", "pairs": names, "database": str(self.work / "database.db")}, progress)
@@ -249,8 +252,10 @@ class StructureFromMotion:
 
 
 def run_worker(job_file: Path, source: Path, progress: StageProgress) -> float:
-    """Pass the worker's events on; kill it when we are interrupted. Processor seconds that it took. Raises NeecoError
-    naming `source` when it fails."""
+    """Run the worker, pass its events on, and return the processor seconds that it took; kill it when interrupted.
+
+    Raises NeecoError naming `source` when it fails.
+    """
     seconds = 0.0
     log_file = job_file.with_name("worker.log")
     with (

@@ -1,8 +1,8 @@
-"""Where the tissue behind a still scope lies: from a second camera, else from what the instruments hide.
+"""Depth of the tissue behind a still scope: from a second camera, else from the instruments before it.
 
-One camera sees no depth. A second one beside it does, by semi-global matching of the two backgrounds (Hirschmueller
-2008). Without it the tissue is known to lie behind every place where an instrument was recorded: the surface is the
-smoothest one that does. Surfaces are smooth in inverse depth, of which a plane's is linear in the image.
+One camera observes no depth. With a second one it is measured by semi-global matching of the two backgrounds
+(Hirschmueller 2008). Otherwise the tissue lies behind every place where an instrument was recorded: the surface is the
+smoothest one that does. Surfaces are smooth in inverse depth, which is linear in the image for a plane.
 """
 
 from __future__ import annotations
@@ -19,18 +19,16 @@ from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project
 from neeco.ingest.foreground.rough_shape import RoughShape
 
-SPACING = 3  # px, of a reduced image, between points of the tissue
-CELL = 4  # px, of a reduced image, of the grid on which surfaces are smoothed
+SPACING_PX = 3  # px, of a reduced image, between points of the tissue
+CELL_PX = 4  # px, of a reduced image, of the grid on which surfaces are smoothed
 STIFFNESS = 30.0  # weight of bending against that of what was measured in a cell
-# times the depth of the deepest place of an instrument: its rough shape lacks what opens and closes, which tissue right
-# behind it would hide
-BEHIND = 1.5
-FARTHEST = 0.75  # of the least inverse depth at which an instrument was
-PULL = 1e-3  # weight by which the tissue is drawn towards the instruments before it, where they may be nearer
-ROUNDS = 30  # in which places are found where it would be before one
-NEAREST = 20.0  # mm from a stereo scope, where the tissue is not
-MATCHED = 0.2  # share of the image that must match for depth from stereo
-OUTLYING = 0.15  # of its depth, by which what was matched may be off its surroundings'
+BEHIND_RATIO = 1.5  # depth of the tissue over that of an instrument, whose rough shape lacks what opens and closes
+MIN_INVERSE_RATIO = 0.75  # of the least inverse depth at which an instrument was
+PULL_WEIGHT = 1e-3  # towards the instruments, in cells where the tissue may be farther
+MAX_ROUNDS = 30  # in which instruments behind the surface are found
+MIN_DEPTH_MM = 20.0  # mm from a stereo scope, where the tissue is not
+MIN_MATCHED = 0.2  # share of the image, for depth from stereo
+MAX_DEVIATION = 0.15  # of a matched depth from its surroundings', relative
 
 
 @dataclass(frozen=True)
@@ -43,11 +41,15 @@ class TissueSurface:
     measured: bool = False
 
     def points(self, colors: np.ndarray, pinhole: Lens, visible: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Points [P, 3] mm, camera frame, all over the image and their colours uint8 [P, 3], from a background float32
-        [H, W, 3] of 255 that `pinhole` sees; none where it is not visible, bool [H, W]."""
+        """Return points [P, 3] mm, camera frame, all over the image and their colours uint8 [P, 3].
+
+        colors: a background float32 [H, W, 3] of 255 through `pinhole`; visible: bool [H, W], where points may lie.
+        """
         height, width = colors.shape[:2]
         scale = width / self.depth.shape[1]
-        v, u = np.mgrid[SPACING / 2 : self.depth.shape[0] : SPACING, SPACING / 2 : self.depth.shape[1] : SPACING]
+        v, u = np.mgrid[
+            SPACING_PX / 2 : self.depth.shape[0] : SPACING_PX, SPACING_PX / 2 : self.depth.shape[1] : SPACING_PX
+        ]
         u, v = u.ravel(), v.ravel()
         depth = self.depth[v.astype(int), u.astype(int)]
         x, y = np.minimum(u * scale, width - 0.5), np.minimum(v * scale, height - 0.5)
@@ -60,7 +62,7 @@ class TissueSurface:
 def surface_behind(
     shapes: Iterable[tuple[RoughShape, np.ndarray]], pinhole: Lens, deepest: float | None, otherwise: float
 ) -> TissueSurface:
-    """The tissue behind the instruments of a still scope.
+    """Estimate the tissue behind the instruments of a still scope.
 
     shapes: each rough shape with camera_from_instrument [N, 4, 4] mm of all frames; pinhole: of reduced images;
     deepest: mm of the tracked origins where no shape was found; None: no instrument's place is known, and `otherwise`
@@ -70,14 +72,14 @@ def surface_behind(
     width, height = pinhole.size
     bound = _deepest_instrument(shapes, pinhole)
     if not bound.any():
-        flat = (otherwise if deepest is None else BEHIND * deepest) * np.ones((height, width))
+        flat = (otherwise if deepest is None else BEHIND_RATIO * deepest) * np.ones((height, width))
         how = (
             f"not known and taken to be {otherwise:.0f} mm, as nothing says where an instrument was"
             if deepest is None
             else f"not known; a plane well behind the deepest recorded pose ({deepest:.0f} mm) stands for it"
         )
         return TissueSurface(flat, how)
-    inverse = _smoothest_behind(1 / (BEHIND * np.where(bound > 0, bound, np.inf)))
+    inverse = _smoothest_behind(1 / (BEHIND_RATIO * np.where(bound > 0, bound, np.inf)))
     depth = 1 / cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
     low, high = np.quantile(depth, (0.05, 0.95))
     how = f"not measured: a smooth surface well behind all places of the instruments ({low:.0f} to {high:.0f} mm)"
@@ -85,21 +87,21 @@ def surface_behind(
 
 
 def _deepest_instrument(shapes: Iterable[tuple[RoughShape, np.ndarray]], pinhole: Lens) -> np.ndarray:
-    """[rows, columns] mm: the greatest depth of the middle of an instrument in each cell; 0 where none was."""
+    """Greatest depth [rows, columns] mm of the middle of an instrument in each cell; 0 where none was."""
     assert pinhole.size is not None
-    columns, rows = -(-pinhole.size[0] // CELL), -(-pinhole.size[1] // CELL)
+    columns, rows = -(-pinhole.size[0] // CELL_PX), -(-pinhole.size[1] // CELL_PX)
     bound = np.zeros((rows, columns))
     for shape, poses in shapes:
         for pose in poses:
             points = shape.points @ pose[:3, :3].T + pose[:3, 3]
             x, y = project(points, *pinhole.intrinsics, nearest=1.0)
             with np.errstate(invalid="ignore"):
-                column, row = np.floor(x / CELL), np.floor(y / CELL)
+                column, row = np.floor(x / CELL_PX), np.floor(y / CELL_PX)
                 inside = (points[:, 2] > 1) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
             cell = row[inside].astype(int) * columns + column[inside].astype(int)
             count = np.bincount(cell, minlength=rows * columns)
             total = np.bincount(cell, points[inside, 2], minlength=rows * columns)
-            # the mean: seen from one side only, a rough shape reaches too far to the back and to the front
+            # the mean: observed from one side only, a rough shape reaches too far to the back and to the front
             bound = np.maximum(bound, (total / np.maximum(count, 1)).reshape(rows, columns))
     return bound
 
@@ -109,18 +111,18 @@ def _smoothest_behind(most: np.ndarray) -> np.ndarray:
     it, or near the least of all: cells at which the surface would come before an instrument hold it back, until none
     does."""
     known = most > 0
-    wanted, weight = np.where(known, most, most[known].min()), np.full(most.shape, PULL)
-    for _ in range(ROUNDS):
+    wanted, weight = np.where(known, most, most[known].min()), np.full(most.shape, PULL_WEIGHT)
+    for _ in range(MAX_ROUNDS):
         found = _smoothed(wanted, weight)
         before = known & (found > most * 1.001) & (weight < 1)
         if not before.any():
             break
         weight[before] = 1.0
-    return np.maximum(found, FARTHEST * most[known].min())  # beyond all that is known it may bend to infinity
+    return np.maximum(found, MIN_INVERSE_RATIO * most[known].min())  # beyond all that is known it may bend to infinity
 
 
 def _smoothed(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """[rows, columns] what bends least and is near `values`, by `weight` of each: a thin plate on springs."""
+    """Smooth values [rows, columns] by their `weight`: a thin plate on springs."""
     rows, columns = values.shape
     across, down = (sparse.kron(sparse.eye(rows), _bend(columns)), sparse.kron(_bend(rows), sparse.eye(columns)))
     twist = sparse.kron(_step(rows), _step(columns))
@@ -152,17 +154,17 @@ def surface_from_stereo(
     """
     depth = _matched_depth(left, right, pinholes, right_from_left)
     depth[~seen] = np.nan
-    if np.isfinite(depth).mean() < MATCHED:
+    if np.isfinite(depth).mean() < MIN_MATCHED:
         return None
-    columns, rows = -(-size[0] // CELL), -(-size[1] // CELL)
+    columns, rows = -(-size[0] // CELL_PX), -(-size[1] // CELL_PX)
     inverse = _in_cells(1 / depth, rows, columns)
     for _ in range(2):  # what is far from its surroundings was matched wrongly
         weight = np.isfinite(inverse).astype(float)
         smooth = _smoothed(np.where(weight > 0, inverse, 0.0), weight)
-        inverse[np.abs(inverse / smooth - 1) > OUTLYING] = np.nan
+        inverse[np.abs(inverse / smooth - 1) > MAX_DEVIATION] = np.nan
     filled = cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR)
     fine = 1 / cv2.resize(_median_filled(depth), size, interpolation=cv2.INTER_NEAREST)
-    fine = np.where(np.abs(fine / filled - 1) < OUTLYING, fine, filled)
+    fine = np.where(np.abs(fine / filled - 1) < MAX_DEVIATION, fine, filled)
     share, far = float(weight.mean()), 1 / np.quantile(fine, (0.95, 0.05))
     return TissueSurface(
         1 / fine, f"from the stereo partner, {share:.0%} of the image ({far[0]:.0f} to {far[1]:.0f} mm)", True
@@ -170,13 +172,13 @@ def surface_from_stereo(
 
 
 def _median_filled(depth: np.ndarray) -> np.ndarray:
-    """Depth [H, W] mm without single outliers; NaN stays."""
+    """Return depth [H, W] mm without single outliers; NaN stays."""
     found = cv2.medianBlur(np.nan_to_num(depth, nan=0.0).astype(np.float32), 5)
     return np.where(found > 0, found, np.nan)
 
 
 def _in_cells(values: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """[rows, columns] medians of values [H, W] in cells; NaN where fewer than half are known."""
+    """Medians [rows, columns] of values [H, W] in cells; NaN where fewer than half are known."""
     tall = np.array_split(values, rows, axis=0)
     found = np.full((rows, columns), np.nan)
     for row, band in enumerate(tall):
@@ -190,25 +192,36 @@ def _in_cells(values: np.ndarray, rows: int, columns: int) -> np.ndarray:
 def _matched_depth(
     left: np.ndarray, right: np.ndarray, pinholes: tuple[Lens, Lens], right_from_left: np.ndarray
 ) -> np.ndarray:
-    """[H, W] mm along the left camera's z, NaN where nothing matches."""
+    """Depths [H, W] mm along the left camera's z, NaN where nothing matches."""
     height, width = left.shape[:2]
     matrices = [np.array([[p.fl_x, 0, p.cx - 0.5], [0, p.fl_y, p.cy - 0.5], [0, 0, 1]]) for p in pinholes]
     rotation, shift = right_from_left[:3, :3], right_from_left[:3, 3:]
+    none = np.zeros(5)  # no distortion
     turn_left, turn_right, new_left, new_right, *_ = cv2.stereoRectify(
-        matrices[0], np.zeros(5), matrices[1], np.zeros(5), (width, height), rotation, shift, alpha=0
+        matrices[0], none, matrices[1], none, (width, height), R=rotation, T=shift, alpha=0
     )
     views = []
     for image, matrix, turn, new in (
         (left, matrices[0], turn_left, new_left),
         (right, matrices[1], turn_right, new_right),
     ):
-        maps = cv2.initUndistortRectifyMap(matrix, np.zeros(5), turn, new[:3, :3], (width, height), cv2.CV_32FC1)
+        maps = cv2.initUndistortRectifyMap(matrix, none, turn, new[:3, :3], (width, height), cv2.CV_32FC1)
         views.append(cv2.remap(np.clip(np.rint(image), 0, 255).astype(np.uint8), *maps, cv2.INTER_LINEAR))
     length = abs(float(new_right[0, 3]))  # focal length times baseline, px mm
-    most = int(np.ceil(length / NEAREST / 16)) * 16
+    most = int(np.ceil(length / MIN_DEPTH_MM / 16)) * 16
     block = 5 if width < 800 else 7
     matcher = cv2.StereoSGBM.create(
-        0, most, block, 8 * 3 * block**2, 32 * 3 * block**2, 1, 31, 8, 100, 2, cv2.STEREO_SGBM_MODE_HH
+        minDisparity=0,
+        numDisparities=most,
+        blockSize=block,
+        P1=8 * 3 * block**2,
+        P2=32 * 3 * block**2,
+        disp12MaxDiff=1,
+        preFilterCap=31,
+        uniquenessRatio=8,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_HH,
     )
     disparity = matcher.compute(views[0], views[1]).astype(np.float32) / 16
     with np.errstate(divide="ignore"):

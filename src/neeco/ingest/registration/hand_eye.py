@@ -1,8 +1,7 @@
-"""Tie what was recorded apart: the logs' clocks to the video's, and SfM's cameras to the tracker's frame.
+"""Hand-eye calibration: register SfM's cameras to the tracker's frame, and its log's clock to the video's.
 
-A clock (t_log = offset + rate * t_video) comes from motion that both saw. SfM knows the cameras up to a similarity; the
-tracker knows a sensor on the laparoscope, up to a constant hand-eye transform and its clock. All of it is solved at
-once, robustly:
+SfM gives the cameras up to a similarity; the tracker a sensor on the laparoscope, up to a constant hand-eye transform
+and its clock (t_log = offset + rate * t_video). All of it is solved at once, robustly:
 
     world_from_sensor(offset + rate * t_i)  =  similarity(world_from_camera_sfm_i) @ camera_from_sensor
 """
@@ -24,17 +23,17 @@ from neeco.ingest.recording.model import IngestSettings
 from neeco.ingest.timing.clock_search import RATE_SIGNIFICANCE, SCOPE_MOTION, ClockOffset, clock_from_turning
 
 MIN_FRAMES = 12
-MIN_TURN = 0.05  # rad, spread of the scope's directions below which the hand-eye rotation is not determined
-MIN_TRAVEL = 3.0  # mm, spread of the scope's positions below which the scale is not determined
-DRIFT_KNOT = 2.5  # s between the knots of the tracker's drift
+MIN_TURN_RAD = 0.05  # rad, spread of the scope's directions below which the hand-eye rotation is not determined
+MIN_TRAVEL_MM = 3.0  # mm, spread of the scope's positions below which the scale is not determined
+KNOT_SPACING_S = 2.5  # s between the knots of the tracker's drift
 CORRELATED_S = 1.0  # over which residuals of neighbouring frames are correlated: smoothing and drift of the tracker
 LAG, STRETCH = 13, 14  # the unknowns of the clock
-UNKNOWNS = 15  # beside the drift: scale, rotation, origin, hand-eye rotation, lever, clock
+N_UNKNOWNS = 15  # beside the drift: scale, rotation, origin, hand-eye rotation, lever, clock
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Registration:
-    """What ties the reconstruction to the tracker. Lengths mm, angles rad, times s."""
+    """Registration of the reconstruction to the tracker. Lengths mm, angles rad, times s."""
 
     scale: float  # mm per SfM unit
     rotation: np.ndarray  # [3, 3] world_from_sfm
@@ -47,14 +46,14 @@ class Registration:
     used: np.ndarray  # [N] indices of the frames used
 
     def cameras(self, world_from_camera_sfm: np.ndarray) -> np.ndarray:
-        """[N, 4, 4] cameras in the SfM gauge to world_from_camera, mm."""
+        """Transform cameras [N, 4, 4] from the SfM gauge to world_from_camera, mm."""
         placed = np.array(world_from_camera_sfm, dtype=np.float64)
         placed[:, :3, :3] = self.rotation @ placed[:, :3, :3]
         placed[:, :3, 3] = self.points(placed[:, :3, 3])
         return placed
 
     def points(self, points: np.ndarray) -> np.ndarray:
-        """[P, 3] points in the SfM gauge to the world, mm."""
+        """Transform points [P, 3] from the SfM gauge to the world, mm."""
         return self.scale * points @ self.rotation.T + self.translation
 
 
@@ -65,7 +64,7 @@ def register_with_laparoscope(
     known: ClockOffset | None,
     settings: IngestSettings | None = None,
 ) -> Registration:
-    """Similarity, hand-eye and clock from SfM cameras [N, 4, 4] at video `times` [N] s and the scope's log.
+    """Estimate similarity, hand-eye and clock from SfM cameras [N, 4, 4] at video `times` [N] s and the scope's log.
 
     From a closed form all unknowns are refined under a soft-L1 loss, the tracker's slow drift among them: left out, it
     (a few tenths of a mm over seconds) is taken for scope motion and bends the scale by percents. A known clock is
@@ -90,7 +89,7 @@ def register_with_laparoscope(
     def sensor_poses(lag: float, stretch: float) -> tuple[np.ndarray, np.ndarray]:
         return poses_at(near, times + lag + stretch * (times - now))
 
-    hats = _hat_functions(times, DRIFT_KNOT)  # [N, K]
+    hats = _hat_functions(times, KNOT_SPACING_S)  # [N, K]
     knots = hats.shape[1]
 
     def unpack(x: np.ndarray) -> tuple[float, Rotation, np.ndarray, Rotation, np.ndarray, float, float]:
@@ -110,7 +109,7 @@ def register_with_laparoscope(
 
     def residuals(x: np.ndarray) -> np.ndarray:
         position, turn, keep = errors(x)
-        drift = x[UNKNOWNS:].reshape(knots, 3)
+        drift = x[N_UNKNOWNS:].reshape(knots, 3)
         # a frame that slid off the log counts as wrong by the noise, so that sliding off is never a gain
         rows = [
             np.where(keep[:, None], (position - hats @ drift) / settings.tracker_noise_mm, 1.0)[valid],
@@ -121,8 +120,8 @@ def register_with_laparoscope(
         return np.concatenate(rows).ravel()
 
     def solve(x: np.ndarray, held: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """All unknowns [U] from `x` on, those `held` as there, their covariance, and the standard deviations [2] of
-        LAG and STRETCH."""
+        """Solve all unknowns [U] from `x` on, except `held`; return them, their covariance, and the standard deviations
+        [2] of LAG and STRETCH."""
         free = np.setdiff1d(np.arange(len(x)), held)
 
         def of_free(values: np.ndarray) -> np.ndarray:
@@ -136,7 +135,7 @@ def register_with_laparoscope(
         covariance[np.ix_(free, free)] = np.linalg.pinv(solved.jac.T @ solved.jac)
         return found, covariance, _clock_deviations(solved.fun, jacobian, covariance, times[valid])
 
-    unknowns = np.zeros(UNKNOWNS + 3 * knots)
+    unknowns = np.zeros(N_UNKNOWNS + 3 * knots)
     if known is not None:
         solution, covariance, _ = solve(unknowns, (LAG, STRETCH))
     else:
@@ -153,23 +152,23 @@ def register_with_laparoscope(
     used = np.flatnonzero(keep)
     camera_from_sensor = rigid(hand.as_matrix(), lever)
     return Registration(
-        scale,
-        rotation.as_matrix(),
-        origin - scale * rotation.apply(centre),
-        camera_from_sensor,
-        clock,
-        float(np.sqrt(max(covariance[0, 0], 0.0))),
-        np.linalg.norm(position[used], axis=1),
-        np.linalg.norm(turn[used], axis=1),
-        used,
+        scale=scale,
+        rotation=rotation.as_matrix(),
+        translation=origin - scale * rotation.apply(centre),
+        camera_from_sensor=camera_from_sensor,
+        clock=clock,
+        scale_sd=float(np.sqrt(max(covariance[0, 0], 0.0))),
+        position_residual=np.linalg.norm(position[used], axis=1),
+        rotation_residual=np.linalg.norm(turn[used], axis=1),
+        used=used,
     )
 
 
 def _clock_deviations(
     residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, times: np.ndarray
 ) -> np.ndarray:
-    """Standard deviations [2] of LAG, s, and STRETCH: the larger of what the stated noise says and of what residuals
-    say that are correlated over CORRELATED_S (Newey & West 1987).
+    """Standard deviations [2] of LAG, s, and STRETCH: the larger of those by the stated noise and by residuals
+    that are correlated over CORRELATED_S (Newey & West 1987).
 
     residuals [Q] and jacobian [Q, U] as `least_squares` returns them: the first are not yet weighted by the soft-L1
     loss. times [N] s of the frames, whose positions and rotations come first.
@@ -198,7 +197,7 @@ _Start = tuple[float, Rotation, np.ndarray, Rotation, np.ndarray]
 
 
 def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog, clock: ClockOffset) -> _Start:
-    """Hand-eye rotation from relative turns (their rotation vectors differ by it alone), the rest linear in turn."""
+    """Solve the hand-eye rotation from relative turns (rotation vectors differ by it alone), the rest linearly."""
     poses, valid = _sensor_poses(times, log, clock)
     cameras, sensors = world_from_camera[valid], poses[valid]
     camera_turns, sensor_turns = Rotation.from_matrix(cameras[:, :3, :3]), Rotation.from_matrix(sensors[:, :3, :3])
@@ -210,7 +209,7 @@ def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog,
         for turns in (camera_turns, sensor_turns)
     )
     spread = np.linalg.svd(b, compute_uv=False) / np.sqrt(len(b))
-    if spread[1] < MIN_TURN:
+    if spread[1] < MIN_TURN_RAD:
         raise NeecoError(
             f"{log.path}: the laparoscope turned about hardly more than one axis ({np.degrees(spread[1]):.1f} deg "
             "across the others), so its hand-eye calibration cannot be found; record the scope turning about two axes "
@@ -222,7 +221,7 @@ def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog,
     travel = cameras[:, :3, 3] @ world_from_sfm.as_matrix().T  # [N, 3]
     system = np.concatenate([travel[:, :, None], np.tile(np.eye(3), (len(cameras), 1, 1)), turned], -1).reshape(-1, 7)
     solution = np.linalg.lstsq(system, sensors[:, :3, 3].ravel(), rcond=None)[0]
-    if solution[0] <= 0 or np.linalg.norm(travel.std(0)) * solution[0] < MIN_TRAVEL:
+    if solution[0] <= 0 or np.linalg.norm(travel.std(0)) * solution[0] < MIN_TRAVEL_MM:
         raise NeecoError(
             f"{log.path}: the laparoscope travelled too little to tell the scale; move it by 20 mm or more"
         )
@@ -230,6 +229,6 @@ def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog,
 
 
 def _hat_functions(times: np.ndarray, spacing: float) -> np.ndarray:
-    """[N, K] weights of piecewise linear interpolation between knots every `spacing` s."""
+    """Weights [N, K] of piecewise linear interpolation between knots every `spacing` s."""
     knots = np.arange(times[0] - spacing / 2, times[-1] + 1.5 * spacing, spacing)
     return np.maximum(0.0, 1 - np.abs(times[:, None] - knots) / spacing)

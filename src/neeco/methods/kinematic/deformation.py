@@ -1,4 +1,4 @@
-"""Rigid links on joints, method `kinematic`.
+"""Method `kinematic`: rigid links on joints. `Kinematic.pose` maps poses and joints to posed Gaussians.
 
 Tissue is static, or moves with the breath where that was found. Each instrument's Gaussians live in its own tracked
 frame and move rigidly with its pose; joints move links about axes that are learned from the images, with soft
@@ -105,7 +105,9 @@ class Spin(Perturbation):
 
 
 class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
-    """Bodies of the canonical set: 0 tissue (world frame), then one per instrument (instrument frame)."""
+    """Articulated instruments over static or breathing tissue.
+
+    Bodies of the canonical set: 0 tissue (world frame), then one per instrument (instrument frame)."""
 
     method = "kinematic"
     Settings = KinematicSettings
@@ -153,7 +155,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         roll = perturbation.shaft_roll if isinstance(perturbation, Spin) else 0.0
-        bodies: list[ArticulatedBody | None] = [None]  # tissue does not turn
+        bodies: list[ArticulatedBody | None] = [None]  # tissue is no articulated body
         for instrument, articulation in zip(self.instruments, self.articulations, strict=True):
             given = state_of(instrument, state)
             bodies.append(articulation.body(given.pose.to(canonical.means), given.joints, roll))
@@ -173,8 +175,8 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return labels if share is None else labels * share[:, None]
 
     def deltas(self, canonical: CanonicalGaussians, state: State) -> Deltas:
-        """Change from canonical to posed; tissue does not change, so the thresholds of the paper's labels separate
-        exactly."""
+        """Return the change from canonical to posed; 0 for tissue, so that the thresholds of the paper's labels
+        separate exactly."""
         deltas = super().deltas(canonical, state)
         tissue = canonical.body(0)
         for tensor in (deltas.means, deltas.quats, deltas.scales):
@@ -244,7 +246,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return Spin(shaft_roll=roll)
 
     def prune_mask(self, canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> Tensor | None:
-        """Tissue whose middle no frame sees: no image checks what it looks like."""
+        """Return tissue whose centre no frame observes: no image constrains it."""
         if not self.settings.extrapolate_tissue:
             return None
         tissue = canonical.body(0)
@@ -253,14 +255,14 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return mask
 
     def training_channels(self, canonical: CanonicalGaussians, iteration: int) -> Tensor | None:
-        """The whole instruments' label [N, 1]: parts share it out, so all of them together have 1."""
+        """Return the label [N, 1] of whole instruments, which is the sum over their parts."""
         settings = self.settings
         if not (settings.label_sharpness > 0 and iteration > settings.label_sharpness_start and self.label_names):
             return None
         return canonical.of_instruments.to(canonical.means.dtype)[:, None]
 
     def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor | None:
-        """Sparse instruments with sharp labels and decided parts."""
+        """Penalise opaque instruments, soft labels and mixed parts."""
         settings, terms = self.settings, []
         if settings.opacity_penalty > 0 and len(canonical.counts) > 1:
             weight = settings.opacity_penalty * (1.0 if iteration < settings.opacity_penalty_stop else 0.1)
@@ -275,8 +277,8 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return sum(terms[1:], terms[0]) if terms else None
 
     def _part_mixing(self, canonical: CanonicalGaussians, index: int) -> Tensor:
-        """How mixed one instrument's Gaussians are of its links, and how far they are of links that their places speak
-        against, a scalar of at least 0."""
+        """Return the penalty of Gaussians that mix several links, or belong to links that their positions contradict, a
+        scalar >= 0."""
         weights = self.link_weights(canonical, index)
         rows = canonical.body(index + 1)
         opacities = torch.sigmoid(canonical.opacity_logits[rows]).detach()

@@ -1,8 +1,8 @@
-"""Which of the instruments' Gaussians count as instrument: near edges some model what it does to the tissue beside it.
+"""Label weights of the instruments' Gaussians: near edges some model shadow or blur on the tissue.
 
 A contact shadow between jaws and tissue, or the blur of an edge, moves with the instrument, so its Gaussians learn it
-too. The recorded images tell: such pixels have the tissue's colour in another shade, others one that the inside of
-the instruments has.
+too. The recorded colours separate them: such pixels have the tissue's colour in another shade, others a colour of the
+instruments' inside.
 """
 
 from __future__ import annotations
@@ -21,39 +21,38 @@ from neeco.raster import rasterize
 from neeco.scene.visibility import visible_pixels
 from neeco.training.session import GaussianSession
 
-LABEL_FRAMES = 40  # whose colours tell instruments from shadow and blur on the tissue
-BINS = 12  # of each colour in the histogram of the instruments' colours
+N_LABEL_FRAMES = 40  # whose colours separate instruments from shadow and blur on the tissue
+N_BINS = 12  # of each colour in the histogram of the instruments' colours
 SMOOTHING = 0.7  # bins, standard deviation
 INSIDE = 0.9  # share of a pixel that is instrument, from which it may be inside one
-EDGE = 0.012  # of the images' shorter side: within it of pixels that are less, colours are asked (3 px of 256)
-SHADES = 0.5, 1.05  # of the drawn tissue that contact shadows and errors of the light leave; a dark shaft has less
+EDGE = 0.012  # of the images' shorter side: within it of pixels below INSIDE, colours decide (3 px of 256)
+SHADES = 0.5, 1.05  # range of shades of the rendered tissue in contact shadows; a dark shaft is darker
 COLOR_ERROR = 0.02, 0.06  # standard deviation of a tissue pixel across its shades: constant, and times its brightness
-OTHER_DENSITY = 0.02  # of colours that neither explains
+OTHER_DENSITY = 0.02  # of colours that neither model explains
 MIN_SHADE_LENGTH = 0.05  # of the segment in colour space that shades lie on
 LOW, HIGH = 0.25, 0.35  # mean probability of its pixels at which a Gaussian's share is 0 and 1
-MIN_INSIDE = 0.9  # mean probability inside the instruments, below which colours do not tell them from the tissue
-MIN_PIXELS = 1e-3  # that frames show of a Gaussian; one with less counts as instrument
+MIN_INSIDE = 0.9  # mean probability inside the instruments, below which colours do not separate them from the tissue
+MIN_PIXELS = 1e-3  # of a Gaussian in all frames; one with less counts as instrument
 THRESHOLD = 0.5  # of the labels then: half of a pixel
 
 
 @dataclass(frozen=True)
 class _View:
-    """One training frame with what the scene draws there: its P pixels in which there is anything of an instrument, all
-    that a frame of 1920x1080 can be kept of."""
+    """One training frame with its rendering, reduced to the P pixels that contain any instrument, to save memory."""
 
     index: int  # of the frame
     pixels: np.ndarray  # [H, W] bool: which these are
     image: np.ndarray  # [P, 3] as recorded
-    tissue: np.ndarray  # [P, 3] drawn without instruments
-    inside: np.ndarray  # [P] bool: surely instrument
+    tissue: np.ndarray  # [P, 3] rendered without instruments
+    inside: np.ndarray  # [P] bool: certainly instrument
 
 
 def store_label_shares(session: GaussianSession) -> None:
-    """Give every Gaussian of an instrument its share of label in [0, 1], as the scene's extra LABEL_SHARE, and the
-    scene its label threshold; neither where colours do not tell instruments from tissue."""
+    """Store every instrument Gaussian's label weight in [0, 1] as the extra LABEL_SHARE, and set the scene's label
+    threshold; neither where colours do not separate instruments from tissue."""
     scene = session.scene
     instrument = scene.canonical.of_instruments
-    frames = session.frames_along_poses(LABEL_FRAMES)
+    frames = session.frames_along_poses(N_LABEL_FRAMES)
     views = [_view(session, index) for index in frames]
     colors = _color_density(views)
     probable = [_probability(view, colors) for view in views]
@@ -70,8 +69,8 @@ def store_label_shares(session: GaussianSession) -> None:
 
 
 def _label_shares(session: GaussianSession, views: list[_View], probable: list[np.ndarray]) -> Tensor:
-    """[N] in [0, 1]: by the mean probability of the pixels that show a Gaussian; 1 for tissue and what no frame
-    shows."""
+    """Return label weights [N] in [0, 1] by the mean probability of the pixels that show a Gaussian; 1 for tissue and
+    unobserved Gaussians."""
     scene = session.scene
     shown = torch.zeros_like(scene.canonical.opacity_logits)
     as_instrument = torch.zeros_like(shown)
@@ -109,22 +108,22 @@ def _view(session: GaussianSession, index: int) -> _View:
 
 
 def _bins(colors: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Bins of colours [..., 3] in [0, 1], one array a channel."""
-    found = np.clip((colors * BINS).astype(int), 0, BINS - 1)
+    """Return the bins of colours [..., 3] in [0, 1], one array per channel."""
+    found = np.clip((colors * N_BINS).astype(int), 0, N_BINS - 1)
     return found[..., 0], found[..., 1], found[..., 2]
 
 
 def _color_density(views: list[_View]) -> np.ndarray:
-    """[BINS, BINS, BINS] density of the colours inside the instruments, per unit of the colour cube."""
-    counts = np.zeros((BINS,) * 3)
+    """[N_BINS, N_BINS, N_BINS] density of the colours inside the instruments, per unit of the colour cube."""
+    counts = np.zeros((N_BINS,) * 3)
     for view in views:
         np.add.at(counts, _bins(view.image[view.inside]), 1)
     smooth = gaussian_filter(counts, SMOOTHING)
-    return smooth / max(smooth.sum(), 1e-9) * BINS**3
+    return smooth / max(smooth.sum(), 1e-9) * N_BINS**3
 
 
 def _probability(view: _View, colors: np.ndarray) -> np.ndarray:
-    """[P] in (0, 1) that a pixel shows an instrument and no tissue, both equally likely beforehand.
+    """Return the probability [P] in (0, 1) that a pixel shows an instrument, with equal priors.
 
     Tissue in an unknown shade: uniform along the segment of its colour's shades, normal across it.
     """

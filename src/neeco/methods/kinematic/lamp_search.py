@@ -1,4 +1,4 @@
-"""Lamps that cast the instruments' shadows on the tissue: chosen among candidates around the lens, later learned."""
+"""Search for the lamps that cast the instruments' shadows, among candidates around the lens; training refines them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from neeco.raster.types import Gaussians
 from neeco.scene.gaussian_scene import MAX_LAMPS
 from neeco.training.session import GaussianSession
 
-RADII = (0.04, 0.08)  # of the tissue's distance: a lamp nearer the lens would explain any dark edge
+CANDIDATE_RADII = (0.04, 0.08)  # of the tissue's distance: a lamp nearer the lens would explain any dark edge
 MAX_COVERAGE = 0.05  # share of a pixel that is solid instrument, where the tissue is compared
-LAMP_FRAMES = 12  # in which lamps are tried
-LAMP_DIRECTIONS = 8  # tried around the lens
+N_LAMP_FRAMES = 12  # in which lamps are tried
+N_LAMP_DIRECTIONS = 8  # tried around the lens
 MIN_AGREEMENT = 0.75  # share of the frames that the first lamps found improve, at least
 MIN_FURTHER_AGREEMENT = 0.5  # of further lamps
 MIN_EXPLAINED = 0.005  # share of the squared error near the instruments that each lamp explains
-MARGIN = 3  # px of the images that searches take: nothing as near to a pixel may be covered more
+MARGIN_PX = 3  # of search images, around a compared pixel without instrument
 MAX_BRIGHTNESS = 0.8  # of white: errors at highlights exceed any shadow
 MIN_BRIGHTNESS = 0.05  # of white, to which rendered colours are clamped
 MAX_RESIDUAL = 0.1  # of white, to which residuals are clamped
@@ -37,11 +37,11 @@ MAX_COSINE = 0.5  # between directions from the lens: lamps closer than 60 degre
 
 @dataclass(frozen=True)
 class _Fit:
-    """Lamps chosen among the candidates, and their strengths."""
+    """Chosen candidate lamps and their strengths."""
 
     chosen: tuple[int, ...]
     strengths: NDArray[np.float64]  # [L]
-    explained: float  # squared error that they remove
+    explained: float  # squared error that they explain
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,14 @@ class _NormalEquations:
     total: float  # squared residual
 
     def fit(self, chosen: tuple[int, ...]) -> _Fit:
-        """The non-negative strengths of these lamps that explain most."""
+        """Return the non-negative least-squares strengths of these lamps."""
         gram, moment = self.gram.sum(0)[np.ix_(chosen, chosen)], self.moment.sum(0)[list(chosen)]
         root = np.linalg.cholesky(gram + 1e-6 * np.eye(len(chosen)))
         strengths, _ = nnls(root.T, np.linalg.solve(root, moment))
         return _Fit(chosen, strengths, float(2 * strengths @ moment - strengths @ gram @ strengths))
 
     def agreement(self, fit: _Fit) -> float:
-        """Share of the frames whose error the lamps reduce."""
+        """Return the share of the frames whose error the lamps reduce."""
         index = list(fit.chosen)
         common = np.einsum("i,fij,j->f", fit.strengths, self.gram[:, index][:, :, index], fit.strengths)
         return float((2 * self.moment[:, index] @ fit.strengths > common).mean())
@@ -68,13 +68,13 @@ class _NormalEquations:
 
 @torch.no_grad()
 def find_shadow(session: GaussianSession) -> None:
-    """Add to the scene's lamps those that best explain what the tissue, the solid part of the instruments and the
-    shadows of known lamps do not; none where none explains enough."""
+    """Add to the scene's lamps those that best explain the residual of tissue, solid instruments and known shadows;
+    none where none explains enough."""
     scene = session.scene
     free = [lamp for lamp in range(MAX_LAMPS) if float(scene.shadow_strengths[lamp]) <= 0]
     if not scene.instruments or not free:
         return
-    offsets = _candidates(2 * session.extent, LAMP_DIRECTIONS).to(scene.center)
+    offsets = _candidates(2 * session.extent, N_LAMP_DIRECTIONS).to(scene.center)
     equations = _normal_equations(session, offsets)
     known = [scene.shadow_offsets[lamp] for lamp in range(MAX_LAMPS) if lamp not in free]
     fit = _choose(equations, offsets, known, MIN_EXPLAINED)
@@ -98,8 +98,7 @@ def find_shadow(session: GaussianSession) -> None:
 
 
 def _fade_instruments(session: GaussianSession) -> None:
-    """Make faint Gaussians of the instruments nearly transparent, to be learned again: they may have modelled the
-    shadow."""
+    """Reset faint Gaussians of the instruments to nearly transparent: they may have modelled the shadow."""
     canonical = session.scene.canonical
     logits = canonical.opacity_logits
     faint = canonical.of_instruments & (torch.sigmoid(logits) <= FAINT_OPACITY)
@@ -108,10 +107,10 @@ def _fade_instruments(session: GaussianSession) -> None:
 
 
 def _candidates(distance: float, directions: int) -> Tensor:
-    """Lamps [C, 3] mm around the lens, camera frame, for tissue at `distance` mm."""
+    """Return candidate lamps [C, 3] mm around the lens, camera frame, for tissue at `distance` mm."""
     angles = torch.arange(directions) * (2 * math.pi / directions)
     around = torch.stack([angles.cos(), angles.sin(), torch.zeros(directions)], 1)
-    return torch.cat([radius * distance * around for radius in RADII])
+    return torch.cat([radius * distance * around for radius in CANDIDATE_RADII])
 
 
 def _choose(equations: _NormalEquations, offsets: Tensor, known: list[Tensor], min_explained: float) -> _Fit:
@@ -136,10 +135,10 @@ def _cosine(a: Tensor, b: Tensor) -> float:
 
 
 def _normal_equations(session: GaussianSession, offsets: Tensor) -> _NormalEquations:
-    """Of candidate lamps at `offsets` [C, 3] mm, from some of the training frames."""
+    """Return the normal equations of candidate lamps at `offsets` [C, 3] mm, from some of the training frames."""
     gram, moment, total = [], [], 0.0
-    margin = max(1, round(MARGIN * session.scale / session.resolution.search_scale))
-    for index in session.frames_along_poses(LAMP_FRAMES):
+    margin = max(1, round(MARGIN_PX * session.scale / session.resolution.search_scale))
+    for index in session.frames_along_poses(N_LAMP_FRAMES):
         color, shade, instrument = _render_candidates(session, index, offsets)
         target, mask = session.views.target(index), session.views.mask(index)
         counts = _clear_of_instruments(instrument, margin) & (torch.maximum(color, target).amax(-1) < MAX_BRIGHTNESS)
@@ -158,8 +157,8 @@ def _normal_equations(session: GaussianSession, offsets: Tensor) -> _NormalEquat
 
 
 def _render_candidates(session: GaussianSession, index: int, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Frame `index` without the instruments' faint Gaussians, which may model the shadow: colour [H, W, 3], the share
-    of each candidate's light [H, W, C] that is blocked there, and the share of each pixel that is instrument [H, W]."""
+    """Render frame `index` without the instruments' faint Gaussians, which may model the shadow: colour [H, W, 3], the
+    blocked share of each candidate's light [H, W, C], and the instruments' share of each pixel [H, W]."""
     state, camera = session.corrected(index)
     scene = session.scene
     posed: Gaussians = scene.at(state)
@@ -175,6 +174,6 @@ def _render_candidates(session: GaussianSession, index: int, offsets: Tensor) ->
 
 
 def _clear_of_instruments(instrument: Tensor, margin: int) -> Tensor:
-    """[H, W] bool: pixels without instrument within `margin` px; `instrument` [H, W]: the share of each pixel that is
-    one."""
+    """Return the pixels without instrument within `margin` px, [H, W] bool; `instrument` [H, W]: its share of each
+    pixel."""
     return max_pool2d(instrument[None, None], 2 * margin + 1, 1, margin)[0, 0] < MAX_COVERAGE

@@ -1,4 +1,4 @@
-"""Posing bodies of links that joints move, as `neeco.raster.articulated` defines it: a Gaussian per lane."""
+"""Posing of articulated bodies, as `neeco.raster.articulated` defines it: a Gaussian per lane."""
 
 from collections.abc import Sequence
 
@@ -10,10 +10,13 @@ from torch import Tensor
 from neeco.raster.triton.geometry import quadruple, triple
 from neeco.raster.triton.ready import working_on
 
-# where the numbers of a body begin
+# offsets into the numbers of a body
 SHAFT_ORIGIN, SHAFT_DIRECTION = tl.constexpr(12), tl.constexpr(15)
 SPIN_END, GATE_START, GATE_WIDTH, LONGEST = tl.constexpr(18), tl.constexpr(19), tl.constexpr(20), tl.constexpr(21)
-BODY, VALUES = tl.constexpr(22), tl.constexpr(6)  # how many; of each joint: origin, axis, then values of links
+BODY, VALUES = (
+    tl.constexpr(22),
+    tl.constexpr(6),
+)  # of a body without joints; per joint: origin, axis, link values
 
 
 @triton.jit
@@ -29,13 +32,13 @@ def product(aw, ax, ay, az, bw, bx, by, bz):
 
 @triton.jit
 def three(at):
-    """Three neighbours, of every lane the same."""
+    """Load three consecutive numbers, the same for every lane."""
     return tl.load(at), tl.load(at + 1), tl.load(at + 2)
 
 
 @triton.jit
 def turn_point(px, py, pz, nx, ny, nz, sine, cosine, x, y, z):
-    """Points turned about a pivot p and an axis n (Rodrigues)."""
+    """Return points turned about a pivot p and an axis n (Rodrigues)."""
     ax, ay, az = x - px, y - py, z - pz
     along = (nx * ax + ny * ay + nz * az) * (1 - cosine)
     return (
@@ -47,7 +50,7 @@ def turn_point(px, py, pz, nx, ny, nz, sine, cosine, x, y, z):
 
 @triton.jit
 def turn(pivot, axis, angle, x, y, z, qw, qx, qy, qz):
-    """Points and quaternions turned about a line by angles."""
+    """Return points and quaternions turned about a line by angles."""
     px, py, pz = three(pivot)
     nx, ny, nz = three(axis)
     s, c = tl.sin(0.5 * angle), tl.cos(0.5 * angle)
@@ -81,7 +84,7 @@ def pose_row(pose):
 
 @triton.jit
 def resting(means, quats, g, inside):
-    """Means, unit quaternions and the length they had."""
+    """Return means, unit quaternions and their original length."""
     x, y, z = triple(means, g, inside)
     qw, qx, qy, qz = quadruple(quats, g, inside)
     norm = tl.maximum(tl.sqrt(qw * qw + qx * qx + qy * qy + qz * qz), 1e-12)
@@ -114,7 +117,7 @@ def share_of(logits, link, g, inside, greatest, total, LOGITS: tl.constexpr):
 
 @triton.jit
 def moving_of(logits, g, inside, greatest, total, gate, LINKS: tl.constexpr, LOGITS: tl.constexpr):
-    """How much of a Gaussian moves with any link."""
+    """Return the share of a Gaussian that moves with any link."""
     moving = 0.0 * gate
     for link in tl.static_range(1, LINKS):
         moving += share_of(logits, link, g, inside, greatest, total, LOGITS) * gate
@@ -123,7 +126,7 @@ def moving_of(logits, g, inside, greatest, total, gate, LINKS: tl.constexpr, LOG
 
 @triton.jit
 def amount_of(logits, joint, g, inside, greatest, total, gate, LINKS: tl.constexpr, LOGITS: tl.constexpr):
-    """By how much the joint whose numbers are there turns or slides a Gaussian."""
+    """Return the angle or distance by which a joint moves a Gaussian."""
     amount = 0.0 * gate
     for link in tl.static_range(1, LINKS):
         share = share_of(logits, link, g, inside, greatest, total, LOGITS) * gate
@@ -182,7 +185,7 @@ def pose_kernel(
     SPINS: tl.constexpr, JOINTS: tl.constexpr, LINKS: tl.constexpr, SLIDES: tl.constexpr, LOGITS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One body; numbers None: it stands still."""
+    """Pose one body; numbers None: it is fixed."""
     lane = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = lane < count
     g = start + lane

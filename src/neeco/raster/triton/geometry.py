@@ -1,4 +1,4 @@
-"""What the projection and its gradient share, one Gaussian per lane: from the world to the image."""
+"""Functions of the projection and its gradient, one Gaussian per lane: from the world to the image."""
 
 import triton
 import triton.language as tl
@@ -11,13 +11,13 @@ LARGEST = tl.constexpr(3.4028234663852886e38)
 
 @triton.jit
 def finite(x):
-    """Neither NaN nor infinite."""
+    """Whether x is neither NaN nor infinite."""
     return tl.abs(x) <= LARGEST
 
 
 @triton.jit
 def rotation_matrix(w, x, y, z):
-    """The nine entries, row by row, of the matrix of unit quaternions."""
+    """Return the nine entries, row by row, of the matrix of unit quaternions."""
     return (
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -27,7 +27,7 @@ def rotation_matrix(w, x, y, z):
 
 @triton.jit
 def view_rotation(pose):
-    """Rotation camera_from_world, row by row, of a pose [4, 4] world_from_camera."""
+    """Return the rotation camera_from_world, row by row, of a pose [4, 4] world_from_camera."""
     return (
         tl.load(pose), tl.load(pose + 4), tl.load(pose + 8),
         tl.load(pose + 1), tl.load(pose + 5), tl.load(pose + 9),
@@ -37,7 +37,7 @@ def view_rotation(pose):
 
 @triton.jit
 def depth_of(pose, wx, wy, wz):
-    """Depth in float64, summed in a fixed order, rounded once: every backend sorts the same numbers.
+    """Return the depth, computed in float64 in a fixed order, rounded once: every backend sorts the same numbers.
 
     Products of float32 numbers are exact in float64, so it does not matter whether the compiler fuses them.
     """
@@ -50,7 +50,7 @@ def depth_of(pose, wx, wy, wz):
 
 @triton.jit
 def camera_mean(pose, wx, wy, wz):
-    """Means in the camera's frame, mm."""
+    """Return means in the camera's frame, mm."""
     r0, r1, r2, r3, r4, r5, _, _, _ = view_rotation(pose)
     cx, cy, cz = tl.load(pose + 3), tl.load(pose + 7), tl.load(pose + 11)
     x = r0 * wx + r1 * wy + r2 * wz - (r0 * cx + r1 * cy + r2 * cz)
@@ -60,7 +60,7 @@ def camera_mean(pose, wx, wy, wz):
 
 @triton.jit
 def field_slope(slope, size, focal, middle):
-    """x / z (or y / z) brought into the field of view and its margin, and whether it lay outside."""
+    """Return x / z (or y / z) clamped to the field of view and its margin, and whether it was outside."""
     margin = size / focal * (FIELD_MARGIN * 0.5)
     low, high = (0.0 - middle) / focal - margin, (size - middle) / focal + margin
     inside = tl.minimum(tl.maximum(slope, low), high)
@@ -80,7 +80,7 @@ def image_rows(pose, inverse_z, slope_x, slope_y, fx, fy):
 
 @triton.jit
 def shape_row(t0, t1, t2, r0, r1, r2, r3, r4, r5, r6, r7, r8, sx, sy, sz):
-    """A row of U = T R S."""
+    """Return a row of U = T R S."""
     return (
         (t0 * r0 + t1 * r3 + t2 * r6) * sx,
         (t0 * r1 + t1 * r4 + t2 * r7) * sy,
@@ -146,26 +146,26 @@ def direction(pose, wx, wy, wz):
 
 @triton.jit
 def triple_at(at, mask):
-    """Three neighbours."""
+    """Load three consecutive numbers."""
     return tl.load(at, mask, other=0.0), tl.load(at + 1, mask, other=0.0), tl.load(at + 2, mask, other=0.0)
 
 
 @triton.jit
 def quadruple_at(at, mask):
-    """Four neighbours."""
+    """Load four consecutive numbers."""
     a, b = tl.load(at, mask, other=0.0), tl.load(at + 1, mask, other=0.0)
     return a, b, tl.load(at + 2, mask, other=0.0), tl.load(at + 3, mask, other=0.0)
 
 
 @triton.jit
 def triple(base, index, mask):
-    """Rows of three floats."""
+    """Load rows of three floats."""
     return triple_at(base + index * 3, mask)
 
 
 @triton.jit
 def quadruple(base, index, mask):
-    """Rows of four floats."""
+    """Load rows of four floats."""
     return quadruple_at(base + index * 4, mask)
 
 
@@ -209,7 +209,7 @@ def sh_color(at, mask, x, y, z, COUNT: tl.constexpr):
 
 @triton.jit
 def _coefficient(sh, to_sh, k: tl.constexpr, inside, seen, basis, to_red, to_green, to_blue, WANTED: tl.constexpr):
-    """Writes the gradient of coefficient k (0 where not seen); returns dL / d basis."""
+    """Store the gradient of coefficient k (0 where not visible); return dL / d basis."""
     if WANTED:
         tl.store(to_sh + 3 * k, tl.where(seen, basis * to_red, 0.0), inside)
         tl.store(to_sh + 3 * k + 1, tl.where(seen, basis * to_green, 0.0), inside)
@@ -223,7 +223,7 @@ def _coefficient(sh, to_sh, k: tl.constexpr, inside, seen, basis, to_red, to_gre
 def sh_gradient(
     sh, to_sh, inside, seen, x, y, z, to_red, to_green, to_blue, COUNT: tl.constexpr, WANTED: tl.constexpr
 ):  # fmt: skip
-    """Writes the harmonics' gradients; returns the direction's. sh, to_sh [B]: where a Gaussian's harmonics begin."""
+    """Store the harmonics' gradients; return the direction's. sh, to_sh [B]: address of a Gaussian's first harmonic."""
     _coefficient(sh, to_sh, 0, inside, seen, SH0 + 0 * x, to_red, to_green, to_blue, WANTED)
     gx, gy, gz = 0 * x, 0 * x, 0 * x
     if COUNT > 1:

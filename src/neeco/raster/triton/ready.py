@@ -1,4 +1,4 @@
-"""Whether Triton can draw on a device, in words a user can act on. Importing this needs no `triton`."""
+"""Availability of Triton on a device, with messages for users. Importing this needs no `triton`."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ OLDEST = (7, 0)  # compute capability that Triton compiles for
 
 
 def installed() -> bool:
-    """Whether the package `triton` is there; it comes with every CUDA build of PyTorch for Linux."""
+    """Whether the package `triton` is installed; every CUDA build of PyTorch for Linux has it."""
     return importlib.util.find_spec("triton") is not None
 
 
 def interpreted() -> bool:
-    """Whether Triton's interpreter takes the place of its compiler: then kernels run on CPU tensors, slowly."""
+    """Whether Triton's interpreter replaces its compiler: then kernels run on CPU tensors, slowly."""
     return os.environ.get("TRITON_INTERPRET", "0").lower() in ("1", "true", "on", "yes", "y")
 
 
@@ -64,7 +64,7 @@ def require_triton(device: torch.device) -> None:
 
 @cache
 def starts_on(device: torch.device) -> bool:
-    """Whether `require_triton` has nothing against `device`."""
+    """Whether `require_triton` accepts `device`."""
     try:
         require_triton(device)
     except NeecoError:
@@ -73,7 +73,7 @@ def starts_on(device: torch.device) -> bool:
 
 
 def runs_triton(tensor: Tensor) -> bool:
-    """Whether Triton's kernels work on `tensor`: float32 on a CUDA device on which they can be started."""
+    """Whether Triton's kernels process `tensor`: float32 on a CUDA device on which they start."""
     return tensor.is_cuda and tensor.dtype == torch.float32 and starts_on(tensor.device)
 
 
