@@ -19,13 +19,11 @@ TRITON = "neeco.raster.triton"  # kernels, whose arguments are addresses and str
 
 # Offenders left in each room: a number may fall, never rise. Lower it with every change that removes some.
 LONG_CALLS = {
-    "ingest": 12,
-    "labels": 1,
+    "ingest": 3,
 }
 LONG_DATACLASSES = {
     "geometry": 1,
-    "ingest": 8,
-    "labels": 2,
+    "ingest": 3,
 }
 PRIVATE_IMPORTS: dict[str, int] = {}
 PRIVATE_IN_TESTS = {  # to become at most ten

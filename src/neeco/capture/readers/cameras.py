@@ -262,7 +262,7 @@ class CameraFields:
         stated = stated_distortion(self._node)
         if stated is None or stated.place is None or self.parsed.as_source:
             return stated
-        message = f"is {printable(stated.place.value)}: the images are distorted, and cameras must be PINHOLE"
+        message = f"is {printable(stated.place.value)}: cameras must be PINHOLE, and the images are distorted"
         stated.place.error(message, f"undistort them: neeco ingest {self.parsed.root} --output CAPTURE")
         return None
 
