@@ -74,7 +74,8 @@ def test_a_name_that_is_not_there_is_told_so() -> None:
 
 def test_the_page_of_the_api_documents_every_name_and_no_other() -> None:
     page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
-    assert set(re.findall(r"^::: neeco\.(\w+)$", page, re.MULTILINE)) == set(neeco.__all__)
+    # the site's generator takes `neeco.ingest` for the folder of that name
+    assert set(re.findall(r"^::: neeco\.(?:api\.(?=ingest$))?(\w+)$", page, re.MULTILINE)) == set(neeco.__all__)
 
 
 def examples_of(name: str) -> str:

@@ -1,7 +1,7 @@
 """Settings as frozen dataclasses: read from YAML or JSON by their types, written back, described for help texts.
 
-cattrs structures nested dataclasses, tuples and optional fields. The scalars are ours: a library's would take "3" for a
-number and any text for true.
+cattrs structures nested dataclasses, tuples and optional fields. Scalars have their own hooks: cattrs would accept "3"
+as a number and any text as true.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from neeco.errors import NeecoError
 
 Device = Annotated[str, tyro.conf.arg(help="cpu, cuda, cuda:N, or auto: a CUDA device where there is one.")]
 T = TypeVar("T")
-MOST = 2**63  # no whole number of ours is as large, and torch takes none that is
+MAX_INTEGER = 2**63  # torch accepts no larger one
 WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
 
 def structure(kind: type[T], values: Mapping[str, Any], where: str = "", owner: str = "it") -> T:
-    """The dataclass `kind` with `values`; fields left out keep their defaults. `owner` has them, in messages.
+    """Return the dataclass `kind` with `values`; missing fields keep their defaults. `owner` names their owner in
+    messages.
 
     Raises NeecoError naming the field (`where` and its dotted path) that is unknown or does not fit its type.
     """
@@ -39,7 +40,7 @@ def structure(kind: type[T], values: Mapping[str, Any], where: str = "", owner: 
 
 
 def name_and_value(option: str, text: str, example: str) -> tuple[str, str]:
-    """NAME=VALUE in two. Raises NeecoError naming `option`, with an `example` of what to write."""
+    """Split NAME=VALUE. Raises NeecoError naming `option`, with an `example` of what to write."""
     name, equals, value = text.partition("=")
     if not (name and equals and value):
         raise NeecoError(f"{option}: {text!r} is not NAME=VALUE; write such as {example}")
@@ -47,14 +48,14 @@ def name_and_value(option: str, text: str, example: str) -> tuple[str, str]:
 
 
 def plain(settings: Any) -> dict[str, Any]:
-    """`settings` as dicts, lists and scalars; `structure` is the inverse."""
+    """Return `settings` as dicts, lists and scalars; `structure` is the inverse."""
     value = _plain(dataclasses.asdict(settings))
     assert isinstance(value, dict)
     return value
 
 
 def with_fields(settings: Any, values: Mapping[str, Any]) -> Any:
-    """The dataclass `settings` with fields changed by name; dots reach into nested ones (`refine.latency`)."""
+    """Return the dataclass `settings` with fields changed by name; dots reach nested ones (`refine.latency`)."""
     for name, value in values.items():
         first, _, rest = name.partition(".")
         changed = with_fields(getattr(settings, first), {rest: value}) if rest else value
@@ -63,7 +64,7 @@ def with_fields(settings: Any, values: Mapping[str, Any]) -> Any:
 
 
 def described(kind: type[Any]) -> Iterator[tuple[str, str, str]]:
-    """Every field of the dataclass `kind` as (name, type, default), in words."""
+    """Yield every field of the dataclass `kind` as (name, type, default), in words."""
     for field in dataclasses.fields(kind):
         hint = field.type if isinstance(field.type, str) else getattr(field.type, "__name__", str(field.type))
         default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
@@ -97,7 +98,7 @@ def _scalar(value: Any, kind: type[Any]) -> Any:
     allowed = (int, float) if kind is float else (kind,)  # a whole number is a number too
     if not isinstance(value, allowed) or (isinstance(value, bool) and kind is not bool):
         raise ValueError(f"{value!r} is not {WORDS[kind]}")
-    if isinstance(value, int) and abs(value) >= MOST:
+    if isinstance(value, int) and abs(value) >= MAX_INTEGER:
         raise ValueError("a huge integer is out of range")
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"{value!r} is not a finite number")
@@ -128,7 +129,7 @@ def _tuple(converter: Any, value: Any, kind: Any) -> Any:
 
 
 def _problems(error: BaseException, where: str, owner: str) -> Iterator[str]:
-    """What is wrong, field by field."""
+    """Yield the messages of a structuring error, field by field."""
     from cattrs.errors import AttributeValidationNote, BaseValidationError, ForbiddenExtraKeysError
 
     if isinstance(error, BaseValidationError):

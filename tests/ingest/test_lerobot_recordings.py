@@ -16,6 +16,7 @@ from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
+from neeco.ingest.registration import hand_eye
 
 pytest.importorskip("av")
 pytest.importorskip("pyarrow")
@@ -72,7 +73,7 @@ def test_where_motion_does_not_tell_the_clock_that_of_the_file_is_taken(recorded
     def refuse(*given):
         raise NeecoError("its clock cannot be determined from the images; give it")
 
-    monkeypatch.setattr("neeco.ingest.registration.hand_eye.clock_from_turning", refuse)
+    monkeypatch.setattr(hand_eye, "clock_from_turning", refuse)
     recording = read_recording(recorded.folder / "lerobot" / "v2.1" / "recording.yaml")
     result = ingest(recording, tmp_path / "capture", lambda what, done, total: None)
     assert result.registration is not None

@@ -13,7 +13,7 @@ from scene_worlds import GRASPER, grasper_state, pose_of, random_canonical
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
-from neeco.methods.nps import MEMBER_LOGITS, NPS, SURE, NPSSettings, members
+from neeco.methods.nps import INITIAL_LOGIT, MEMBER_LOGITS, NPS, NPSSettings, members
 from neeco.scene.deformation import Posed
 
 
@@ -58,7 +58,7 @@ def test_seeds_stand_where_the_state_of_rest_puts_them_and_belong_to_the_instrum
     assert torch.allclose(joined.means[40], points[0] @ pose[:3, :3].T + pose[:3, 3], atol=1e-4)
     assert (members(joined)[40:, 1] > 0.99).all()
     assert (members(joined)[:40, 1] < 0.01).all()
-    assert SURE > 0
+    assert INITIAL_LOGIT > 0
 
 
 def posed_members(net: NPS, *states: State) -> list[Posed]:

@@ -29,12 +29,12 @@ from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Perturbation,
 from neeco.scene.training_session import GaussianTraining
 from neeco.training.session import gaussian_session
 
-# What one unit of the head's output means. With unit features a first Adam step moves every output by about
-# width * rate = 0.2; without these the first steps throw Gaussians across the scene.
+# Units of the head's output. With unit features the first Adam step moves every output by about width * rate = 0.2;
+# without these units the first steps would move Gaussians across the scene.
 MEAN_UNIT = 0.05  # of the points' half extent
 SHAPE_UNIT = 0.1  # of quaternion and log scale
 MEMBER_LOGITS = "member_logits"  # the per-Gaussian extra [N, I] of learned membership
-SURE = 6.0  # its size at the start: 0.2 % of a motion smear what does not take part
+INITIAL_LOGIT = 6.0  # its magnitude at the start: 0.2 % of a motion affects Gaussians that do not take part
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +171,8 @@ class NPS(LabelledByMotion):
         nn.init.zeros_(self.head.bias)
 
     def state_size(self) -> int:
-        """Numbers in the state vector p; at least one, which is 0 where no joint is recorded and poses do not count."""
+        """Return the size of the state vector p, at least one: 0 where no joint is recorded and poses are not
+        encoded."""
         per_instrument = {"full": 7, "rotation_jaw": 4, "joints": 0}[self.settings.state]
         return max(1, sum(per_instrument + len(instrument.joints) for instrument in self.instruments))
 
@@ -192,13 +193,13 @@ class NPS(LabelledByMotion):
         self.mean_center, self.mean_halfwidth = robust_bounds(means)
 
     def _poses(self, state: State) -> Tensor:
-        """World-from-instrument [I, 4, 4] mm."""
+        """Return world_from_instrument [I, 4, 4] mm."""
         return torch.stack([state_of(instrument, state).pose.to(self.state_center) for instrument in self.instruments])
 
     def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
         if not self.settings.membership:
             return {}
-        return {MEMBER_LOGITS: canonical.means.new_full((len(canonical), len(self.instruments)), -SURE)}
+        return {MEMBER_LOGITS: canonical.means.new_full((len(canonical), len(self.instruments)), -INITIAL_LOGIT)}
 
     def begin(self, training: GaussianTraining) -> None:
         session = gaussian_session(training)
@@ -211,8 +212,8 @@ class NPS(LabelledByMotion):
             session.scene.canonical = self._with_seeds(session.scene.canonical, found)
 
     def _with_seeds(self, canonical: CanonicalGaussians, found: Sequence[tuple[Tensor, float]]) -> CanonicalGaussians:
-        """`canonical` with Gaussians on the carved instruments, given as points [P, 3] mm in each one's frame and the
-        radius of its shaft, where the state of rest puts them: all together half as many as there are."""
+        """Return `canonical` with Gaussians on the carved instruments, given as points [P, 3] mm in each one's frame
+        and the radius of its shaft, at the state of rest: at most half as many as there are."""
         most = max(1, len(canonical) // (2 * len(found)))
         bodies = [canonical]
         for index, (points, radius) in enumerate(found):
@@ -221,7 +222,7 @@ class NPS(LabelledByMotion):
             body = seed_instrument(points @ pose[:3, :3].T + pose[:3, 3], radius)
             extras = self.initial_extras(body)
             if extras:
-                extras[MEMBER_LOGITS][:, index] = SURE
+                extras[MEMBER_LOGITS][:, index] = INITIAL_LOGIT
             bodies.append(body.with_extras(**extras))
         joined = join_bodies(bodies)
         return joined.map(lambda tensor: tensor, (len(joined),))
@@ -231,8 +232,8 @@ class NPS(LabelledByMotion):
             self.opened.fill_(min(1.0, training.progress / self.settings.anneal))
 
     def _raw_state(self, state: State, kind: str | None = None) -> Tensor:
-        """p before normalisation [S], or the state as another `kind` has it: position mm, sign-continuous quaternion,
-        joints rad."""
+        """Return p before normalisation [S], or that of another `kind`: position mm, sign-continuous quaternion, joints
+        rad."""
         kind, parts = kind or self.settings.state, []
         for index, instrument in enumerate(self.instruments):
             given = state_of(instrument, state)
@@ -244,7 +245,7 @@ class NPS(LabelledByMotion):
         return torch.cat(parts) if parts else self.first_quats.new_zeros(1)
 
     def state_vector(self, state: State) -> Tensor:
-        """p [S], each number in [-1, 1] over the recording."""
+        """Return p [S], each component in [-1, 1] over the recording."""
         return (self._raw_state(state) - self.state_center) / self.state_halfwidth
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
@@ -260,11 +261,11 @@ class NPS(LabelledByMotion):
         return self._carried(deformed, members(canonical), state) if self.settings.membership else deformed
 
     def _motions(self, state: State) -> Tensor:
-        """[I, 4, 4] mm: how each instrument moved since the state of rest, world frame."""
+        """Return the motion [I, 4, 4] mm of each instrument from the state of rest, world frame."""
         return self._poses(state) @ self.rest.inverse()
 
     def _carried(self, deformed: Posed, shares: Tensor, state: State) -> Posed:
-        """What stays where it is and what moves with each instrument, blended by shares [N, 1 + I]."""
+        """Return the static geometry and that moved with each instrument, blended by shares [N, 1 + I]."""
         means, quats, carried = deformed.means, deformed.quats, self._motions(state)
         turns = matrix_to_quat(carried[:, :3, :3])  # [I, 4]
         turns = torch.where(turns[:, :1] < 0, -turns, turns)

@@ -13,42 +13,40 @@ from neeco.methods.tissue_fit import tissue_evidence
 from neeco.raster.devices import CachedPredicate
 from neeco.training.session import GaussianSession
 
-CELLS = 64  # per side of a swept volume
+N_CELLS = 64  # per side of a swept volume
 MIN_SHARE_INSIDE = 0.01  # of the Gaussians in a bounded volume: with fewer the network cannot form an instrument
 
 
 class SweptVolume(nn.Module):
-    """All of space until `cover` is called, then what lies within `margin_mm` of the points given to it.
-
-    Its buffers are saved with its owner.
-    """
+    """All of space until `cover` is called, then the volume within `margin_mm` of its points."""
 
     low: Tensor  # [3] mm, world frame: corner of the grid
     cell: Tensor  # [3] mm; 0 while nothing is covered
-    occupied: Tensor  # [CELLS, CELLS, CELLS] bool
+    occupied: Tensor  # [N_CELLS, N_CELLS, N_CELLS] bool
 
     def __init__(self, margin_mm: float) -> None:
         super().__init__()
         self.margin_mm = margin_mm
         self.register_buffer("low", torch.zeros(3))
         self.register_buffer("cell", torch.zeros(3))
-        self.register_buffer("occupied", torch.zeros(CELLS, CELLS, CELLS, dtype=torch.bool))
+        self.register_buffer("occupied", torch.zeros(N_CELLS, N_CELLS, N_CELLS, dtype=torch.bool))
         self._covered = CachedPredicate(lambda cell: cell.any())
 
     @property
     def bounded(self) -> bool:
-        """Has a volume been covered?"""
+        """Whether `cover` was called."""
         return self._covered(self.cell)
 
     def cover(self, points: Tensor) -> None:
-        """Make it the cells whose centre lies within the margin of a cell that holds one of `points` [P, 3] mm."""
+        """Set the volume to the cells whose centre lies within the margin of a cell that contains one of `points` [P,
+        3] mm."""
         margin = self.margin_mm
         low = points.min(0).values - margin
         size = (points.max(0).values + margin - low).clamp_min(1e-3)
         self.low.copy_(low)
-        self.cell.copy_(size / CELLS)
-        index = ((points - self.low) / self.cell).long().clamp(0, CELLS - 1)
-        holds = np.zeros((CELLS,) * 3, bool)
+        self.cell.copy_(size / N_CELLS)
+        index = ((points - self.low) / self.cell).long().clamp(0, N_CELLS - 1)
+        holds = np.zeros((N_CELLS,) * 3, bool)
         holds[tuple(index.T.cpu().numpy())] = True
         distance = distance_transform_edt(~holds, sampling=self.cell.tolist())
         self.occupied.copy_(torch.from_numpy(distance <= margin))
@@ -58,8 +56,8 @@ class SweptVolume(nn.Module):
         if not self.bounded:
             return torch.ones(len(points), dtype=torch.bool, device=points.device)
         index = ((points - self.low) / self.cell).floor().long()
-        inside = ((index >= 0) & (index < CELLS)).all(1)
-        x, y, z = index.clamp(0, CELLS - 1).unbind(1)
+        inside = ((index >= 0) & (index < N_CELLS)).all(1)
+        x, y, z = index.clamp(0, N_CELLS - 1).unbind(1)
         return inside & self.occupied[x, y, z]
 
 
@@ -71,7 +69,7 @@ def bound_volume(session: GaussianSession, volume: SweptVolume) -> None:
     Gaussian lies inside: the network moves tissue onto the instrument, so the volume has to reach the tissue.
     """
     scene, views, report = session.scene, session.views, session.report
-    report("looking for the instruments, to bound where the network is evaluated")
+    report("searching for the instruments, to bound where the network is evaluated")
     evidence = tissue_evidence(scene, views, session.config)
     generator = torch.Generator().manual_seed(session.config.seed)
     shapes = []

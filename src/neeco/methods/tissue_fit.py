@@ -23,8 +23,8 @@ DENSITY_START = 200  # steps of a longer fit of the tissue before it adds Gaussi
 def tissue_evidence(
     scene: GaussianScene, views: TrainingViews, config: TrainConfig, tissue: GaussianScene | None = None
 ) -> Evidence:
-    """Fit a copy of the tissue without motion but that of breathing; the residual is the evidence. `tissue`: that fit,
-    where it was made before.
+    """Return the silhouette evidence: residuals of a fit of the tissue, static or breathing. `tissue`: that fit, if
+    made.
 
     A few hundred steps suffice on textured tissue with enough sparse points. Where the residual is large, a longer fit
     may add Gaussians.
@@ -47,8 +47,8 @@ def fit_tissue(
     density_start: int = 10**9,
     breathing: Breathing | None = None,
 ) -> GaussianScene:
-    """A copy of the tissue of `scene`, which holds it alone, after `steps` steps (None: `tissue_steps`), with density
-    control from `density_start` on; still, or breathing as it begins to with `breathing`."""
+    """Return a copy of the tissue of `scene`, which has no instruments yet, after `steps` steps (None: `tissue_steps`),
+    with density control from `density_start` on; static, or breathing from a start at `breathing`."""
     steps = config.deformation.carving.tissue_steps if steps is None else steps
     canonical = scene.canonical.map(lambda tensor: tensor.clone())
     deformation = Static()
@@ -75,9 +75,9 @@ def fit_tissue(
 
 
 def carve_seeds(session: GaussianSession) -> list[tuple[Tensor, float]]:
-    """Points [P, 3] mm on every instrument in its own frame, and its shaft's radius, mm. Raises NeecoError as
-    `find_instruments` does."""
-    session.report("looking for the instruments, on which Gaussians begin")
+    """Return points [P, 3] mm on every instrument in its own frame, and its shaft's radius, mm. Raises NeecoError for
+    an instrument without evidence."""
+    session.report("searching for the instruments, on which Gaussians start")
     evidence = tissue_evidence(session.scene, session.views, session.config)
     generator = torch.Generator().manual_seed(session.config.seed)
     names = [instrument.name for instrument in session.scene.instruments]
