@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 from pathlib import Path
 
 import pytest
@@ -136,6 +137,31 @@ def test_every_room_has_its_place() -> None:
 
 def test_a_room_imports_only_from_rooms_below() -> None:
     assert upward(graph()) == []
+
+
+def reduced(edges: Graph) -> Graph:
+    """The edges that follow from no others (the transitive reduction of a graph without circles)."""
+
+    def reached(start: str) -> set[str]:
+        return edges[start].union(*(reached(other) for other in edges[start]))
+
+    return {a: edges[a] - set().union(*(reached(b) for b in edges[a])) for a in edges if edges[a]}
+
+
+def test_the_drawing_in_contributing_is_of_the_imports() -> None:
+    low = {*OUTSIDE, *ROOMS[-1], *ROOMS[-2]}  # what every room may import is not in the drawing
+    edges: Graph = {name: set() for line in ROOMS for name in line if name not in low}
+    for module, others in graph().items():
+        if room(module) in edges:
+            edges[room(module)] |= {room(other) for other in others} - {room(module), *low}
+    drawing = (SOURCE.parent / "CONTRIBUTING.md").read_text().split("graph TD\n")[1].split("```")[0]
+    drawn: Graph = {}
+    for line in drawing.splitlines():
+        steps = [step.split(" & ") for step in line.strip().split(" --> ")]
+        for sources, targets in itertools.pairwise(steps):
+            for source in sources:
+                drawn.setdefault(source, set()).update(targets)
+    assert drawn == reduced(edges)
 
 
 def test_no_circle_between_modules() -> None:
