@@ -27,15 +27,12 @@ LONG_DATACLASSES = {
 }
 PRIVATE_IMPORTS: dict[str, int] = {}
 PRIVATE_IN_TESTS = {  # to become at most ten
-    "_Work",
     "_bagfile",
     "_best_rate",
     "_dispatch",
-    "_groups",
     "_kernel",
     "_labels",
     "_lerobotfiles",
-    "_light_camera",
     "_output",
     "_print_tables",
     "_progress",
@@ -44,7 +41,6 @@ PRIVATE_IN_TESTS = {  # to become at most ten
     "_table",
     "_tag",
     "_verb",
-    "_write",
 }
 
 

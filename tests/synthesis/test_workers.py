@@ -89,14 +89,15 @@ def test_the_error_of_a_worker_is_reported_in_a_line(ball_run, tmp_path: Path) -
 
 
 def test_workers_that_keep_dying_end_it(ball_run, tmp_path: Path, monkeypatch) -> None:
-    real = Processes.start_worker
+    real = Processes.submit
 
-    def start(pool):
-        worker = real(pool)
-        os.kill(worker.process.pid, signal.SIGKILL)
-        return worker
+    def submit(pool, index: int, task) -> None:
+        real(pool, index, task)
+        if index == 0:
+            (worker,) = (worker for worker, at in pool.running.values() if at == 0)
+            os.kill(worker.process.pid, signal.SIGKILL)
 
-    monkeypatch.setattr(Processes, "start_worker", start)
+    monkeypatch.setattr(Processes, "submit", submit)
     with pytest.raises(NeecoError, match=r"--workers: workers keep dying over image 0 \(exit status -9\)"):
         synthesize(ball_run, tmp_path / "set", replace(SETTINGS, count=2), workers=2)
 
