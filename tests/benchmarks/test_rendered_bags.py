@@ -41,7 +41,7 @@ def test_a_bag_written_from_a_recording_reads_back_as_the_same(recorded: Path, n
     assert main(["ingest", "--init", str(folder / "bags" / name / BAGS[name])]) == 0
     before = read_recording(folder / "recording.yaml")
     after = read_recording(folder / "bags" / name / "recording.yaml")
-    film, bag = before.open(), after.open()
+    film, bag = before.source.open(), after.source.open()
     np.testing.assert_allclose(bag.times, film.times, atol=2 * NANOSECOND)
     for (_, first), (_, second) in zip(film.read(range(6)), bag.read(range(6)), strict=True):
         np.testing.assert_array_equal(first, second)

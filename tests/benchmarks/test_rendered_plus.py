@@ -36,7 +36,7 @@ def test_a_sequence_written_from_a_recording_reads_back_as_the_same(recorded: Pa
     clocks = json.loads((recorded / "truth" / "recording.json").read_text())["clocks_s"]
     before = read_recording(folder / "recording.yaml")
     after = read_recording(folder / "plus" / "recording.yaml")
-    film, sequence = before.open(), after.open()
+    film, sequence = before.source.open(), after.source.open()
     assert len(film.times) == 11
     np.testing.assert_allclose(sequence.times, film.times, atol=1e-9)
     for (_, first), (_, second) in zip(film.read(range(11)), sequence.read(range(11)), strict=True):
