@@ -105,7 +105,7 @@ def _same_view(one: Camera, other: Camera) -> bool:
 
 @dataclass(frozen=True)
 class Hidden:
-    """What one loss mask hides."""
+    """Content hidden by one loss mask."""
 
     pixels: float | None  # share of the lit pixels; None: too few are lit
     points: int  # projected sparse points
@@ -145,7 +145,7 @@ def masks_fault(found: Sequence[Hidden]) -> Fault | None:
 
 @dataclass(frozen=True)
 class _Decoded:
-    """What decoding one frame's files found."""
+    """Result of decoding one frame's files."""
 
     digest: bytes | None  # of the pixels; None when not readable
     grey: np.ndarray | None  # uint8 [h, w], every few pixels
