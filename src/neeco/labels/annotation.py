@@ -381,8 +381,8 @@ def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bo
 
         run = load_run("runs/liver")
         state, camera = sample_states(run, 1)[0]
-        drawn = draw_labelled(run.scene, state, camera)
-        drawn.image, drawn.masks, drawn.boxes  # [H, W, 3], [I, H, W], [I, 4]
+        rendering = draw_labelled(run.scene, state, camera)
+        rendering.image, rendering.masks, rendering.boxes  # [H, W, 3], [I, H, W], [I, 4]
 
     Raises NeecoError where the state lacks an instrument or joint of the scene; and with `labels` where the scene's
     method learns none.

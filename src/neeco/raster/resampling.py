@@ -1,7 +1,7 @@
 """Resampling of images of another size than the learned one, or through a lens with distortion.
 
 The backends render pinholes of the learned size. Everything else is rendered by such a pinhole and resampled: colour,
-alpha, depth and channels alike, so that labels follow the resampled pixels.
+alpha, depth and channels, so that labels follow the resampled pixels.
 """
 
 from __future__ import annotations

@@ -275,8 +275,8 @@ def check_readings(
     session.report(
         f"warning: {instrument.name}: its links fit the images {most / max(named, 1):.1f} times as well {words}"
     )
-    doubts = session.scene.diagnostics.setdefault("doubted_readings", {})
-    doubts |= {f"{instrument.name}.{name}": f"the links fit the images better {words}" for name in names}
+    warnings = session.scene.diagnostics.setdefault("doubted_readings", {})
+    warnings |= {f"{instrument.name}.{name}": f"the links fit the images better {words}" for name in names}
 
 
 def _exchanged(one: str, other: str, given: Readings) -> Readings:
