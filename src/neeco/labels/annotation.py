@@ -238,7 +238,7 @@ def _outer_loops(mask: np.ndarray) -> list[np.ndarray]:
     for contour, (*_, parent) in zip(contours[::-1], hierarchy[0][::-1], strict=True):
         if parent >= 0:  # a hole
             continue
-        corners = (contour[::-1, 0] + MAGNIFICATION // 2) // MAGNIFICATION  # clockwise as seen
+        corners = (contour[::-1, 0] + MAGNIFICATION // 2) // MAGNIFICATION  # clockwise in the image
         corners = corners[(corners != np.roll(corners, 1, axis=0)).any(1)]
         first = np.lexsort(corners.T)[0]  # the leftmost of the top row
         loops.append(np.roll(corners, -first, axis=0) + np.array([x, y], dtype=float))
