@@ -13,8 +13,8 @@ from neeco.capture.readers import read_capture
 from neeco.errors import NeecoError
 from neeco.files import read_begun, require_content, require_same, write_json
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recording.file import recording_from_flags
 from neeco.ingest.result import IngestResult
+from neeco.ingest.sources import recording_from_flags
 from neeco.scene import GaussianScene
 from neeco.tracking.footage_tissue import Progress
 from neeco.tracking.track import FOOTAGE
