@@ -20,7 +20,7 @@ MIN_OVERLAP = 0.8  # of a base's outline with what moves: nine tenths are usual,
 MIN_PLAUSIBLE_OVERLAP = 0.6
 MAX_SHOWN = 5  # warnings listed by `lines`
 VERDICTS = {"good": "good", "careful": "usable", "bad": "doubtful"}
-USABLE = ("not among the", "beside an unseen frame")  # beginnings of reasons that are no fault of a frame
+USABLE = ("not among the", "next to an unseen frame")  # beginnings of reasons that are no fault of a frame
 
 
 @dataclass(frozen=True)

@@ -145,7 +145,7 @@ def _left_out(world: World, splits: np.ndarray) -> dict[int, str]:
     for row in np.flatnonzero(~world.usable).tolist():
         unseen = shaft is not None and not shaft.known[row]
         why[int(views.frames[row])] = NOT_VISIBLE if unseen else "no instrument state at its time (gap in a log)"
-    return why | dict.fromkeys(views.frames[world.usable & (splits == LEFT_OUT)].tolist(), "beside an unseen frame")
+    return why | dict.fromkeys(views.frames[world.usable & (splits == LEFT_OUT)].tolist(), "next to an unseen frame")
 
 
 def _unregistered(world: World, chosen: np.ndarray) -> dict[str, np.ndarray]:
