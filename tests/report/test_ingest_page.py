@@ -28,7 +28,7 @@ from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.result import IngestResult
 from neeco.ingest.timing.clock_search import ClockOffset
-from neeco.ingest.timing.notes import Contradiction
+from neeco.ingest.timing.episodes import Contradiction
 from neeco.report import ingest_page
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
 from neeco.report.ingest_figures import in_view, main_axes, posed_picture, read_tracks, round_length

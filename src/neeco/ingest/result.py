@@ -12,7 +12,7 @@ from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.timing.clock_search import ClockOffset
-from neeco.ingest.timing.notes import Contradiction
+from neeco.ingest.timing.episodes import Contradiction
 
 
 @dataclass(frozen=True, kw_only=True)
