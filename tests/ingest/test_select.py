@@ -24,7 +24,7 @@ def test_a_blurred_frame_is_dropped_and_says_so() -> None:
     features = frame_features(picture(4 * i, blur=15 if i == 12 else 1) for i in range(30))
     _, dropped = choose_frames(features, np.ones(30, dtype=bool), STATES, None)
     assert dropped.keys() == {12}
-    assert "blurred" in dropped[12]
+    assert "blurred" in dropped[12].why
     assert not choose_frames(features, np.ones(30, dtype=bool), STATES, None, min_sharpness=0.01)[1]
 
 
@@ -49,7 +49,7 @@ def test_frames_of_a_frozen_video_are_dropped_where_the_state_goes_on() -> None:
     assert frozen_frames(features, usable, STATES).tolist() == list(range(13, 20))
     assert frozen_frames(features, usable, resting).tolist() == [18, 19]
     _, dropped = choose_frames(features, usable, STATES, None)
-    assert {dropped[i] for i in range(13, 20)} == {"frozen: the state changed, not the picture"}
+    assert {dropped[i].why for i in range(13, 20)} == {"frozen: the state changed, not the picture"}
     assert describe_ranges(np.array([3, 13, 14, 15, 19, 25])) == "3, 13-15, 19, ..."
 
 

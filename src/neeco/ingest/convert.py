@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.capture.checks.frames import masks_fault, measure_hidden, sample_points
 from neeco.capture.documents import ProblemReport, condensed
 from neeco.capture.images import read_mask, write_image, write_labels
+from neeco.capture.masks import masks_fault, measure_hidden
 from neeco.capture.model import Capture, Frame, evenly_spaced
+from neeco.capture.points import measured_sample
 from neeco.capture.readers import capture_of, parse_capture
 from neeco.capture.readers.endonerf import MASKS, folder_images
 from neeco.capture.readers.parsed import Parsed
@@ -83,7 +84,7 @@ def _inverted_masks(capture: Capture) -> list[str]:
         frame, mask = masked[index], masked[index].load_mask()
         points = {tissue.name: tissue.points for tissue in capture.tissues}.get(str(frame.state.tissue), capture.points)
         assert mask is not None
-        found.append(measure_hidden(frame.load_image(), mask, frame.camera, sample_points(points)))
+        found.append(measure_hidden(frame.load_image(), mask, frame.camera, measured_sample(points)))
     fault = masks_fault(found)
     return [] if fault is None else [f"Warning: {fault[0]} {fault[1]}."]
 

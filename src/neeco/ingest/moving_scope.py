@@ -18,15 +18,15 @@ from neeco.ingest.frames.views import SfmResult, StageProgress, Views
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.clocks import find_instrument_clocks, register
-from neeco.ingest.registration.find_bases import check_frames, find_bases, require_no_base
+from neeco.ingest.registration.find_bases import check_reference_frames, find_bases, require_no_base
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.shaft.video_instruments import find_in_video, on_masks
 from neeco.ingest.timing.episodes import Episodes
 from neeco.ingest.world import (
     NAME_TISSUES,
     World,
-    check_motion,
     longest_lag,
+    note_motion_contradiction,
     residual_flow,
 )
 
@@ -36,7 +36,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
 
     folder: for temporary files. Raises NeecoError where too few images get a camera.
     """
-    check_frames(data, moving=True)
+    check_reference_frames(data, moving=True)
     settings = data.recording.settings
     lens = images.lens
     motion = StructureFromMotion(
@@ -166,7 +166,9 @@ def _carve_instruments(
         camera_from_instrument, valid = before_cameras(0.0, np.arange(len(views.times)))
         usable = valid[rows]
         shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], flow.pinhole)
-        check_motion(data, name, shape is not None, best_lag(evidence, before_cameras, flow.pinhole, longest_lag(data)))
+        note_motion_contradiction(
+            data, name, shape is not None, best_lag(evidence, before_cameras, flow.pinhole, longest_lag(data))
+        )
         if shape is None:
             continue
         shapes[name] = shape

@@ -27,6 +27,7 @@ from neeco.errors import NeecoError
 from neeco.ingest.cameras.still_scene import right_frames
 from neeco.ingest.convert import staged
 from neeco.ingest.frames.images import choose_images
+from neeco.ingest.frames.selection import DropReason
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.moving_scope import find_moving_world
 from neeco.ingest.posing.posed_capture import prepare
@@ -137,15 +138,17 @@ def finish(
     )
 
 
-def _left_out(world: World, splits: np.ndarray) -> dict[int, str]:
+def _left_out(world: World, splits: np.ndarray) -> dict[int, DropReason]:
     """Return why chosen video frames are not in the capture, by frame."""
     views, shaft = world.views, world.shaft
     found = set(world.images.selected.tolist()) - set(views.frames.tolist())
-    why = dict.fromkeys(found, "no camera: too few of its features match other frames")
+    reasons = dict.fromkeys(found, DropReason("no camera: too few of its features match other frames"))
     for row in np.flatnonzero(~world.usable).tolist():
         unseen = shaft is not None and not shaft.known[row]
-        why[int(views.frames[row])] = NOT_VISIBLE if unseen else "no instrument state at its time (gap in a log)"
-    return why | dict.fromkeys(views.frames[world.usable & (splits == LEFT_OUT)].tolist(), "beside an unseen frame")
+        why = NOT_VISIBLE if unseen else "no instrument state at its time (gap in a log)"
+        reasons[int(views.frames[row])] = DropReason(why)
+    left_out = views.frames[world.usable & (splits == LEFT_OUT)].tolist()
+    return reasons | dict.fromkeys(left_out, DropReason("beside an unseen frame", frame_usable=True))
 
 
 def _unregistered(world: World, chosen: np.ndarray) -> dict[str, np.ndarray]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from neeco.ingest.foreground.rough_shape import RoughShape
+from neeco.ingest.frames.selection import DropReason
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.timing.clock_search import ClockOffset
@@ -26,7 +27,7 @@ class IngestResult:
     size: tuple[int, int]  # width, height px
     selected: np.ndarray  # [K] indices of the video frames in the capture
     selected_times: np.ndarray  # [K] s, video clock
-    dropped: tuple[tuple[int, str], ...]  # video frame, why
+    dropped: tuple[tuple[int, DropReason], ...]  # video frame, why
     clocks: dict[str, ClockOffset]  # by the clock's name: "em", or a joint's
     registration: Registration | None  # None: instrument poses stay in their tracker's frame
     registered_frames: np.ndarray  # [R] row of `selected` of each entry of `registration.used`; -1: not in the capture
@@ -100,7 +101,7 @@ class IngestResult:
             "capture": str(self.capture),
             "video_frames": self.video_frames,
             "kept": len(self.selected),
-            "dropped": [{"frame": frame, "why": why} for frame, why in self.dropped],
+            "dropped": [{"frame": frame, "why": reason.why} for frame, reason in self.dropped],
             "clocks": clocks,
             "registration": registration,
             "reprojection_px": self.reprojection_px,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from neeco.errors import NeecoError
 from neeco.ingest.readers import format_of
-from neeco.ingest.recording.file import check_frames, read_recording
+from neeco.ingest.recording.file import check_frame_count, read_recording
 from neeco.ingest.recording.model import Recording
 
 RECORDING = "recording.yaml"
@@ -34,6 +34,6 @@ def folder_to_convert(sources: Sequence[Path]) -> Path | None:
 
 def read_recordings(sources: Sequence[Path], frames: int | None = None) -> list[Recording]:
     """Read recording files. frames: how many to keep, instead of what they state. Raises NeecoError."""
-    check_frames(frames)
+    check_frame_count(frames)
     recordings = [read_recording(source) for source in sources]
     return [item if frames is None else replace(item, frames=frames) for item in recordings]

@@ -19,14 +19,14 @@ from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.recording.model import STILL
 from neeco.ingest.registration.clocks import find_instrument_clocks
-from neeco.ingest.registration.find_bases import check_frames, find_bases
+from neeco.ingest.registration.find_bases import check_reference_frames, find_bases
 from neeco.ingest.shaft.video_instruments import find_in_video
 from neeco.ingest.timing.episodes import Episodes
 from neeco.ingest.world import (
     NAME_TISSUES,
     World,
-    check_motion,
     longest_lag,
+    note_motion_contradiction,
     residual_flow,
 )
 
@@ -59,7 +59,7 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
         )
     if data.parts[0].scope is not None:
         data.notes.add("the scope stands still: the laparoscope's log adds nothing to its images, and is ignored")
-    check_frames(data, moving=False)
+    check_reference_frames(data, moving=False)
     _check_one_place(data, images, progress)
     right = _right_camera(data, images, folder, progress)
     count = len(images.selected)
@@ -92,7 +92,7 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     for note in behind.notes:
         data.notes.add(note)
     for name, lag in behind.lags.items():
-        check_motion(data, name, name in behind.shapes, lag)
+        note_motion_contradiction(data, name, name in behind.shapes, lag)
     states, usable = data.states_at(views.times)
     return World(
         data=data, images=images, views=views, states=states, usable=usable,

@@ -59,7 +59,7 @@ def longest_lag(data: Episodes) -> float:
     return float(max(np.ptp(part.times) for part in data.parts)) / 2
 
 
-def check_motion(data: Episodes, name: str, moves: bool, lag: float) -> None:
+def note_motion_contradiction(data: Episodes, name: str, moves: bool, lag: float) -> None:
     """Note an instrument with whose poses nothing in the images moves, or something moves at another time."""
     logs = data.parts[0].poses
     clock, sentence = logs[name].clock if name in logs else "", ""

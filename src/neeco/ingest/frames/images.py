@@ -16,7 +16,7 @@ from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
-from neeco.ingest.frames.selection import choose_frames, describe_ranges, frame_features, frozen_frames
+from neeco.ingest.frames.selection import DropReason, choose_frames, describe_ranges, frame_features, frozen_frames
 from neeco.ingest.frames.views import StageProgress, Views
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import MIN_FRAMES
@@ -34,7 +34,7 @@ class ChosenImages:
     size: tuple[int, int]  # width, height px
     lens: Lens | None  # None: not known yet
     selected: np.ndarray  # [K] video frames
-    dropped: Mapping[int, str]  # of other video frames, why
+    dropped: Mapping[int, DropReason]  # of other video frames, why
     border: Border | None  # the endoscope's, in the frames as recorded
 
     @property
@@ -162,7 +162,7 @@ def _check_pixels(video: VideoSource, lens: Lens | None, where: str, data: Episo
             )
 
 
-def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[int, str]]:
+def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[int, DropReason]]:
     """Return the video frames to keep, and why others are not."""
     count, recording = len(data.times), data.recording
     settings = recording.settings
@@ -187,7 +187,7 @@ def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[i
     if recording.frames is None and count > limit:
         data.notes.add(f"{limit} of {count} frames are kept; ask for more with --frames")
     if len(selected) < MIN_FRAMES:
-        reasons = Counter(why.split(":")[0] for why in dropped.values())
+        reasons = Counter(reason.why.split(":")[0] for reason in dropped.values())
         why = reasons.most_common(1)[0][0] if reasons else "the video is short"
         raise NeecoError(
             f"{data.video.path}: only {len(selected)} of {count} frames are usable (at least {MIN_FRAMES} are "

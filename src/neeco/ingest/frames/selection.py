@@ -8,15 +8,22 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from neeco.capture.images import is_repeated
+from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, is_repeated
 
 N_NEIGHBOURS = 7  # frames on each side, whose sharpness a frame is compared with
 NOISE = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
 NOISE_PLACE = 0.06  # the same at one place of a thumbnail
 NOISE_MM, NOISE_RAD = 0.3, 0.005  # and of the state, within the tracker's noise
-FROZEN_MM, FROZEN_RAD = 1.0, 0.03  # by which a state changes visibly while the picture does not
 MAX_RANGES = 3  # of frames, named in a note
 THUMBNAIL_PX = 64  # px, width
+
+
+@dataclass(frozen=True)
+class DropReason:
+    """Why a video frame is not in the capture."""
+
+    why: str
+    frame_usable: bool = False  # it could have been in it as well
 
 
 @dataclass(frozen=True)
@@ -48,7 +55,7 @@ def frozen_frames(features: FrameFeatures, usable: np.ndarray, states: np.ndarra
     """Return the frames whose picture repeats an earlier one, though the state changed since; see `choose_frames`."""
     source = np.maximum.accumulate(np.where(features.repeats, 0, np.arange(len(states))))
     change = states - states[source]
-    moved = (np.linalg.norm(change[:, :3], axis=1) > FROZEN_MM) | (np.linalg.norm(change[:, 3:], axis=1) > FROZEN_RAD)
+    moved = (np.linalg.norm(change[:, :3], axis=1) > VISIBLE_MM) | (np.linalg.norm(change[:, 3:], axis=1) > VISIBLE_RAD)
     return np.flatnonzero(moved & usable & usable[source])
 
 
@@ -61,32 +68,32 @@ def describe_ranges(frames: np.ndarray) -> str:
 
 def choose_frames(
     features: FrameFeatures, usable: np.ndarray, states: np.ndarray, count: int | None, min_sharpness: float = 0.5
-) -> tuple[np.ndarray, dict[int, str]]:
+) -> tuple[np.ndarray, dict[int, DropReason]]:
     """Choose at most `count` sharp frames that differ, spread over states and views; return them, and why not others.
 
     usable [N] bool: frames with a known state (the others are dropped); states [N, 6+J]: position mm, rotation vector
     rad, joints rad of the instrument; min_sharpness: of the neighbours' median.
     """
-    dropped = {int(i): "no instrument state at its time" for i in np.flatnonzero(~usable)}
-    dropped |= dict.fromkeys(
-        frozen_frames(features, usable, states).tolist(), "frozen: the state changed, not the picture"
-    )
+    dropped = {int(i): DropReason("no instrument state at its time") for i in np.flatnonzero(~usable)}
+    frozen = DropReason("frozen: the state changed, not the picture")
+    dropped |= dict.fromkeys(frozen_frames(features, usable, states).tolist(), frozen)
     for i in np.flatnonzero(usable).tolist():
         around = features.sharpness[max(0, i - N_NEIGHBOURS) : i + N_NEIGHBOURS + 1]
         if features.sharpness[i] < min_sharpness * np.median(around):
-            dropped[i] = f"blurred: {features.sharpness[i] / np.median(around):.0%} of its neighbours' sharpness"
+            share = features.sharpness[i] / np.median(around)
+            dropped[i] = DropReason(f"blurred: {share:.0%} of its neighbours' sharpness")
     last: int | None = None
     for i in range(len(usable)):
         if i in dropped:
             continue
         if last is not None and _same(features, states, last, i):
-            dropped[i] = f"the same as frame {last}: neither picture nor state changed"
+            dropped[i] = DropReason(f"the same as frame {last}: neither picture nor state changed")
         else:
             last = i
     selected = np.array([i for i in range(len(usable)) if i not in dropped], dtype=int)
     if count is not None and len(selected) > count:
         chosen = selected[_farthest_points(_embedding(features, states)[selected], count)]
-        reason = f"not among the {count} that cover states and views best"
+        reason = DropReason(f"not among the {count} that cover states and views best", frame_usable=True)
         dropped |= dict.fromkeys((int(i) for i in set(selected) - set(chosen)), reason)
         selected = np.sort(chosen)
     return selected, dropped

@@ -102,7 +102,7 @@ def recording_from_flags(
         raise NeecoError("--shaft-diameter: finds an instrument that was not tracked, and --instrument says it was")
     if shaft_diameter is not None and not 0 < shaft_diameter < MAX_SHAFT_MM:
         raise NeecoError(f"--shaft-diameter: {shaft_diameter:g} is no shaft's; give it in mm, as in 5")
-    check_frames(frames)
+    check_frame_count(frames)
     if fps is not None and not 0 < fps < 1e6:  # NaN compares false
         raise NeecoError(f"--fps: {fps:g} is no frame rate; give frames per second")
     if intrinsics is not None and not isinstance(intrinsics, str | Path) and len(intrinsics) != 4:
@@ -133,7 +133,7 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else [*value] if isinstance(value, list | tuple) else value
 
 
-def check_frames(frames: int | None) -> None:
+def check_frame_count(frames: int | None) -> None:
     """Raise NeecoError when the option asks for too few frames."""
     if frames is not None and frames < MIN_FRAMES:
         raise NeecoError(f"--frames: {frames} is too few; give {MIN_FRAMES} or more")
