@@ -74,7 +74,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         data = data.with_assumed_clocks()
         progress("finding the instrument", 0, 0)
         on_instruments, shapes, evidence = _carve_instruments(data, sfm, views, flow, registration)
-    if data.in_video is not None:
+    if data.video_instrument is not None:
         progress("finding what moves", 0, 0)
         masks = foreground(np.arange(len(sfm.indices)))
         on_instruments |= on_masks(masks, sfm, images.size)
@@ -85,19 +85,19 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     data, registration = register(data, views)  # first: it may find clocks
     distance, shaft = settings.scene_distance_mm, None
     placed, points = _in_mm(sfm, views, registration, distance)
-    if data.in_video is not None:
+    if data.video_instrument is not None:
         assert masks is not None
         masks = masks[np.isin(first, sfm.indices)]
         tissue = None if registration is not None else float(np.median(_distances(points, placed.world_from_camera)))
         progress("finding the shaft", 0, 0)
-        data, shaft = find_in_video(data, data.in_video, placed, masks, tissue)
+        data, shaft = find_in_video(data, data.video_instrument, placed, masks, tissue)
         placed, points = _in_mm(sfm, views, registration, shaft.axes.scale * distance)
     data = data.with_assumed_clocks()
     states, usable = data.states_at(views.times)
     return World(
         data=data, images=images, views=placed, states=states, usable=usable, tissue=_reliable(data, sfm, points),
         shapes=shapes, bases=bases, shaft=shaft, masks=masks, registration=registration,
-        reprojection_px=sfm.reprojection_px, search=motion.search, moving=evidence,
+        reprojection_px=sfm.reprojection_px, search=motion.search, moving=evidence, still=False,
     )  # fmt: skip
 
 
@@ -105,10 +105,10 @@ def _check_joined(data: Episodes, placed: np.ndarray) -> None:
     """Raise NeecoError for an episode that structure from motion did not join to the others. placed [M]: the frames
     that got a camera."""
     counts = np.bincount(data.episode_of(placed), minlength=len(data.parts))
-    for name, part, count in zip(data.notes.names, data.parts, counts, strict=True):
+    for part, count in zip(data.parts, counts, strict=True):
         if count < MIN_FRAMES and not data.single:
             raise NeecoError(
-                f"{part.recording.path}: {name} stands alone: {count} of its frames show enough of what the other "
+                f"{part.recording.path}: {part.name} stands alone: {count} of its frames show enough of what the other "
                 f"recordings show to find their cameras together (at least {MIN_FRAMES} are needed); where it "
                 f"shows another tissue, {NAME_TISSUES}, else leave it out"
             )

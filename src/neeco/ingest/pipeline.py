@@ -82,11 +82,19 @@ def finish(
 
     everywhere: the readings over all tissues, by instrument and joint, where there are several.
     """
-    data, images, views, registration = world.data, world.images, world.views, world.registration
+    data, views = world.data, world.views
     note_frame_rates(data)
     splits, rule = split_frames(data, views.frames, world.states, world.usable, everywhere)
     chosen = np.flatnonzero(world.usable & (splits != LEFT_OUT))
-    item, shaft = data.in_video, world.shaft
+    capture = _capture(world, splits, chosen)
+    dropped = {**world.images.dropped, **_left_out(world, splits)}
+    return capture, _result(world, output, capture, chosen, dropped, rule)
+
+
+def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
+    """Return the capture of the `chosen` rows of the views."""
+    data, images, views, shaft = world.data, world.images, world.views, world.shaft
+    item = data.video_instrument
     deviations = uncertainties(item, shaft) if item and shaft else None
     frames = tuple(
         Frame(
@@ -101,14 +109,22 @@ def finish(
     if world.right is not None:  # one camera more to learn from; what is tested stays one
         frames += right_frames(world.right, frames, views.rows[chosen].tolist())
     assert images.lens is not None
-    registered = registration is not None or set(data.parts[0].poses) <= set(data.world_from_base)
+    registered = world.registration is not None or set(data.parts[0].poses) <= set(data.world_from_base)
     lens = replace(images.lens, size=images.size, border=images.border)
     instruments = instruments_of(data.recording, shaft)
-    capture = Capture(
+    return Capture(
         images.folder, frames, instruments, world.tissue, registered=registered, lens=lens, still=world.still
     )
+
+
+def _result(
+    world: World, output: Path, capture: Capture, chosen: np.ndarray, dropped: Mapping[int, DropReason], rule: str
+) -> IngestResult:
+    """Return the report on a capture of the `chosen` rows of the views, split by `rule`."""
+    data, images, views, registration = world.data, world.images, world.views, world.registration
     row_of = {row: index for index, row in enumerate(chosen.tolist())}
-    return capture, IngestResult(
+    item = data.video_instrument
+    return IngestResult(
         capture=output,
         recording=", ".join(dict.fromkeys(str(part.recording.path) for part in data.parts)),
         video_frames=len(data.times),
@@ -116,24 +132,25 @@ def finish(
         size=images.size,
         selected=views.frames[chosen],
         selected_times=views.times[chosen],
-        dropped=tuple(sorted({**images.dropped, **_left_out(world, splits)}.items())),
+        dropped=tuple(sorted(dropped.items())),
         clocks=data.reported_clocks,
         registration=registration,
         registered_frames=np.array([row_of.get(int(row), -1) for row in registration.used] if registration else []),
         reprojection_px=world.reprojection_px,
         points=len(world.tissue.positions),
         shapes=dict(world.shapes),
-        tissue=world.tissue_depth,
+        still=world.still,
+        depth_source=world.depth_source,
         split_rule=rule,
         notes=data.notes.sentences,
         search=world.search,
         unregistered=_unregistered(world, chosen) if registration is not None else {},
         moving=dict(world.moving),
-        registered=registered,
+        registered=capture.registered,
         bases=dict(world.bases),
         episodes=data.ranges,
         in_video=() if item is None else (item.name,),
-        episode_starts={name: part.start for name, part in zip(data.ranges, data.parts, strict=False)},
+        episode_starts={} if data.single else {part.name: part.start_s for part in data.parts},
         contradictions=data.notes.contradictions,
     )
 
@@ -172,7 +189,7 @@ def _state(states: States, row: int, time: float, uncertainty: Uncertainty | Non
 def _measure_roll(world: World, result: IngestResult, capture: Path, progress: StageProgress) -> None:
     """Measure roll and joints of an instrument found in the video in the written capture, for `neeco view --annotate`;
     not where the roll was logged, nor with a second camera, whose masks are not known."""
-    item = world.data.in_video
+    item = world.data.video_instrument
     if item is None or item.roll is not None or world.right is not None or world.masks is None:
         return
     progress("measuring roll and joints", 0, 0)

@@ -79,13 +79,13 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
             "or camera_from_base): they stay in their own frame (unregistered)"
         )
     shaft = masks = None
-    if data.in_video is not None:
+    if data.video_instrument is not None:
         progress("finding what moves", 0, 0)
         masks = moving(cameras.indices)
         progress("finding the shaft", 0, 0)
-        data, shaft = find_in_video(data, data.in_video, views, masks, None)
+        data, shaft = find_in_video(data, data.video_instrument, views, masks, None)
     data = data.with_assumed_clocks()
-    names = (*data.world_from_base, *data.found)
+    names = (*data.world_from_base, *data.video_poses)
     tracked = {name: partial(data.instrument_poses, name, views.times) for name in names}
     progress("finding the tissue behind the instrument", 0, 0)
     behind = look_behind(views, tracked, longest_lag(data), data.recording.settings, right)
@@ -97,7 +97,8 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     return World(
         data=data, images=images, views=views, states=states, usable=usable,
         tissue=PointCloud(behind.points.astype(np.float32), (behind.colors / 255).astype(np.float32)),
-        shapes=behind.shapes, bases=bases, shaft=shaft, masks=masks, tissue_depth=behind.how, right=right,
+        shapes=behind.shapes, bases=bases, shaft=shaft, masks=masks, still=True, depth_source=behind.how,
+        right=right,
     )  # fmt: skip
 
 
@@ -120,7 +121,7 @@ def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgre
     first, *others = backgrounds
     for episode in others:
         share = same_place(backgrounds[first], backgrounds[episode])
-        name, before = data.notes.names[episode], data.notes.names[first]
+        name, before = data.parts[episode].name, data.parts[first].name
         if share is not None and share < SAME_PLACE:
             raise NeecoError(
                 f"{data.parts[episode].recording.path}: {name} shows another place than {before}: {share:.0%} of "
@@ -142,7 +143,7 @@ def _right_camera(data: Episodes, images: ChosenImages, folder: Path, progress: 
     for episode, rows in _rows_by_episode(data, images).items():
         part = data.parts[episode]
         assert part.recording.stereo is not None
-        own, stems = images.selected[rows] - part.first, [names[row] for row in rows]
+        own, stems = images.selected[rows] - part.first_frame, [names[row] for row in rows]
         found = read_right_camera(part.recording.stereo, own, part.times, stems, folder / "right", progress)
         cameras.append(replace(found, names={int(rows[row]): name for row, name in found.names.items()}))
     return replace(cameras[0], names={row: name for camera in cameras for row, name in camera.names.items()})

@@ -121,9 +121,9 @@ def _spread_of_halves(observed: np.ndarray, tracked: np.ndarray, best: int) -> f
     halves = []
     for part in (slice(0, 2 * quarter), slice(quarter, 3 * quarter), slice(2 * quarter, 4 * quarter)):
         near, fit = correlate(observed[part], tracked)
-        around = np.abs((near - part.start - best) * STEP_S) < LOBE_S
+        around = np.abs((near - part.start_s - best) * STEP_S) < LOBE_S
         if around.any():
-            halves.append(_vertex(near[around] - part.start, fit[around]))
+            halves.append(_vertex(near[around] - part.start_s, fit[around]))
     return max(float(np.std(halves)) * STEP_S if len(halves) > 1 else LOBE_S, STEP_S / 4)
 
 

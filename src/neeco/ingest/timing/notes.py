@@ -18,21 +18,21 @@ class Notes:
     """The one value of an ingest that grows: every stage adds to it. names: of the episodes."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        self.names = tuple(names)
+        self._names = tuple(names)
         self._sentences: dict[tuple[str, int | None], None] = {}  # in order; one without an episode holds for all
         self._contradictions: dict[tuple[str, int | None], Contradiction] = {}
 
     def add(self, sentence: str, episode: int | None = None) -> None:
         """Add a sentence, once: about one episode, or about all."""
-        self._sentences[sentence, 0 if len(self.names) == 1 else episode] = None
+        self._sentences[sentence, 0 if len(self._names) == 1 else episode] = None
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """Sentences on losses and assumptions; one about one of several episodes begins with its name."""
         found = []
-        for episode, name in enumerate(self.names):
+        for episode, name in enumerate(self._names):
             for sentence in [sentence for sentence, of in self._sentences if of == episode]:
-                everywhere = all((sentence, other) in self._sentences for other in range(len(self.names)))
+                everywhere = all((sentence, other) in self._sentences for other in range(len(self._names)))
                 found.append(sentence if everywhere else f"{name}: {sentence}")
         return tuple(dict.fromkeys([*found, *(sentence for sentence, of in self._sentences if of is None)]))
 
@@ -42,7 +42,7 @@ class Notes:
         if not sentence:
             self._contradictions.pop((subject, episode), None)
             return
-        named = sentence if len(self.names) == 1 or episode is None else f"{self.names[episode]}: {sentence}"
+        named = sentence if len(self._names) == 1 or episode is None else f"{self._names[episode]}: {sentence}"
         self._contradictions[subject, episode] = Contradiction(named, severe)
 
     def is_contradicted(self, subject: str) -> bool:
