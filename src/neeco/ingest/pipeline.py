@@ -25,19 +25,19 @@ from neeco.capture.model import Capture, Frame, InstrumentState, State, Uncertai
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.cameras.still_scene import right_frames
-from neeco.ingest.convert import staged
 from neeco.ingest.frames.images import choose_images
 from neeco.ingest.frames.selection import DropReason
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.moving_scope import find_moving_world
 from neeco.ingest.posing.posed_capture import prepare
+from neeco.ingest.recording.compatibility import separate
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.registration.clocks import note_frame_rates
 from neeco.ingest.result import IngestResult
 from neeco.ingest.shaft.video_instruments import NOT_VISIBLE, instruments_of, uncertainties
 from neeco.ingest.splits import LEFT_OUT, split_frames
+from neeco.ingest.staging import staged
 from neeco.ingest.still_scope import find_still_world, is_still
-from neeco.ingest.timing.compatibility import separate
 from neeco.ingest.timing.episodes import Episodes, States
 from neeco.ingest.timing.reading import read_episodes
 from neeco.ingest.world import World

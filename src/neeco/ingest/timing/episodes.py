@@ -19,10 +19,10 @@ from neeco.errors import NeecoError
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import PoseLog, ReadingLog
+from neeco.ingest.recording.compatibility import file_name
 from neeco.ingest.recording.model import InstrumentLogs, Recording
+from neeco.ingest.recording.notes import Notes
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, ClockOffset
-from neeco.ingest.timing.compatibility import file_name
-from neeco.ingest.timing.notes import Notes
 
 PAUSE_S = 2.0  # longer than any smoothing over time reaches
 SAME_INSTANT = 1e-6  # s
