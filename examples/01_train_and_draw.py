@@ -1,4 +1,4 @@
-"""Train a scene on the sample capture, draw a state that nobody recorded, and save the image with its labels.
+"""Train a scene on the sample capture, render a state that nobody recorded, and save the image with its labels.
 
 python examples/01_train_and_draw.py --output runs/example        # under a minute; the other examples use this run
 """
@@ -22,10 +22,10 @@ def main(output: Path, iterations: int) -> None:
     print(run.scene)
 
     state, camera = neeco.sample_states(run, count=1, seed=1)[0]
-    drawn = run.scene.draw(state, camera)
-    Image.fromarray((drawn.image.numpy() * 255).round().astype("uint8")).save(output / "drawn.png")
-    Image.fromarray(drawn.parts.numpy() * 60).save(output / "parts.png")
-    for name, box in zip(drawn.instruments, drawn.boxes.tolist(), strict=True):
+    rendering = run.scene.draw(state, camera)
+    Image.fromarray((rendering.image.numpy() * 255).round().astype("uint8")).save(output / "drawn.png")
+    Image.fromarray(rendering.parts.numpy() * 60).save(output / "parts.png")
+    for name, box in zip(rendering.instruments, rendering.boxes.tolist(), strict=True):
         print(f"{name}: box {[round(edge, 1) for edge in box]} px, joints {dict(state.instruments[name].joints)}")
 
     scores = run.evaluate(["test"])["given"]["test"]

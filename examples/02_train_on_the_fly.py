@@ -1,4 +1,4 @@
-"""Teach a U-Net from images that are drawn while it learns; nothing is written to disk.
+"""Train a U-Net on images that are rendered while it learns; nothing is written to disk.
 
     python examples/02_train_on_the_fly.py RUN        # RUN: of examples/01_train_and_draw.py, or any of your own
 

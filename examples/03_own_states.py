@@ -1,4 +1,4 @@
-"""Draw states of your own: a jaw that opens and a shaft that turns, from numpy arrays.
+"""Render states of your own: a jaw that opens and a shaft that turns, from numpy arrays.
 
 python examples/03_own_states.py RUN
 """

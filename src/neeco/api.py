@@ -94,7 +94,7 @@ class Scene:
     @overload
     def draw(self, state: State, camera: Camera, labels: bool) -> RGBDImage: ...
     def draw(self, state: State, camera: Camera, labels: bool = True) -> RGBDImage:
-        """Render `state` as seen by `camera`: image and depth; with `labels` also masks, parts, boxes and keypoints.
+        """Render `state` from `camera`: image and depth; with `labels` also masks, parts, boxes and keypoints.
 
         state: poses world_from_instrument [4, 4] in mm and joints in rad, of every instrument of the scene. camera:
         intrinsics in px and world_from_camera [4, 4] in mm, OpenCV axes (x right, y down, z forward). Poses may be
@@ -104,11 +104,11 @@ class Scene:
         recorded range), focal lengths that fit no lens, and with `labels` where the method learns none.
 
             run = neeco.load("runs/sample")
-            drawn = run.scene.draw(state, camera)
-            drawn.image, drawn.depth                      # float32 [H, W, 3] in [0, 1]; float32 [H, W] mm, 0 = none
-            drawn.masks, drawn.parts                      # bool [I, H, W]; uint8 [H, W], 0 tissue
-            drawn.boxes, drawn.keypoints                  # float32 [I, 4] px; float32 [I, K, 3]
-            run.scene.draw(state, camera.resized(1280, 1024))  # the same, larger
+            rendering = run.scene.draw(state, camera)
+            rendering.image, rendering.depth                # float32 [H, W, 3] in [0, 1]; float32 [H, W] mm, 0 = none
+            rendering.masks, rendering.parts                # bool [I, H, W]; uint8 [H, W], 0 tissue
+            rendering.boxes, rendering.keypoints            # float32 [I, 4] px; float32 [I, K, 3]
+            run.scene.draw(state, camera.resized(1280, 1024))     # the same, larger
         """
         state.check(self._limited)
         if (fault := _view_fault(camera)) is not None:

@@ -168,7 +168,7 @@ def test_masks_of_others_stand_in_a_table_of_their_own(tmp_path, comparison, cap
     assert "split test: masks" in text
     assert "split unseen: masks" not in text
     assert ">0.650</td>" in text
-    assert "Masks of SAM2 are scored beside theirs" in text
+    assert "Masks of SAM2 are scored next to theirs" in text
     assert command_of(comparison).endswith("--masks SAM2=/masks/sam2")
 
 

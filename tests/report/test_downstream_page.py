@@ -178,7 +178,7 @@ def test_no_difference_and_harm_stand_as_plainly(capture, output):
 def test_one_fold_is_no_answer(capture, output):
     experiment = experiment_of(capture, jobs_of(capture, output, folds=1), folds=1)
     text, _ = page_of(output, experiment, capture)
-    assert "One fold: whether synthetic images help cannot be told from chance" in text
+    assert "One fold: whether synthetic images help cannot be distinguished from chance" in text
     assert ">helps<" not in text
     assert "one fold has no interval" in text
 
@@ -186,7 +186,7 @@ def test_one_fold_is_no_answer(capture, output):
 def test_without_labelled_frames_sets_stand_alone(capture, output):
     jobs = jobs_of(capture, output, conditions=("kinematic", "neeco"))
     text, page = page_of(output, experiment_of(capture, jobs, sets=("kinematic", "neeco"), labelled=0), capture)
-    assert "No condition has synthetic images beside labelled frames" in text
+    assert "No condition has synthetic images with labelled frames" in text
     assert "one set against another" in text
     assert "best and worst; fold 0" in text
     assert 'over labelled frames"' not in text
@@ -302,7 +302,7 @@ def test_differences_go_by_what_they_answer(experiment):
     assert verdict({"low": -0.2, "high": -0.1}) == "hurts"
     chart = difference_chart(experiment, experiment["models"][0], "test")
     assert "var(--good)" in chart
-    asked = ("beside labelled frames, against these", "with classical augmentation", "the most labelled frames alone")
+    asked = ("with labelled frames, against these", "with classical augmentation", "the most labelled frames alone")
     assert all(words in chart for words in asked)
 
 

@@ -50,7 +50,7 @@ class Ingest:
     """How many frames to keep, spread over states and views."""
     init: bool = False
     """Look at the files in SOURCE (a folder; default: here), or into a file of several streams, and write a commented
-    recording.yaml into it, or beside it."""
+    recording.yaml into it, or next to it."""
     formats: bool = False
     """List the formats that recordings are read from."""
     rrd: Path | None = None

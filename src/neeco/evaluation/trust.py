@@ -42,7 +42,7 @@ class TypicalErrors:
     """The TYPICAL_QUANTILE of pixels' errors (mean over colours) in training frames."""
 
     inside: float  # the label
-    beside: float  # in its neighbourhood
+    nearby: float  # in its neighbourhood
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class _Errors:
     """Pixels [H, W] of the label and its neighbourhood, and errors of the rendering and of the tissue alone."""
 
     label: np.ndarray
-    beside: np.ndarray
+    nearby: np.ndarray
     whole: np.ndarray
     tissue: np.ndarray
 
@@ -72,11 +72,11 @@ def typical_errors_of(drawings: Sequence[tuple[LabelledRendering, Tensor, Tensor
     """Return the typical errors of renderings of training frames, each with its image [H, W, 3] and loss mask."""
     errors = [_errors(*drawing) for drawing in drawings]
     inside = np.concatenate([frame.whole[frame.label] for frame in errors])
-    beside = np.concatenate([frame.whole[frame.beside] for frame in errors])
-    inside_error, beside_error = (
-        round(float(np.quantile(values, TYPICAL_QUANTILE)), 5) if len(values) else 1.0 for values in (inside, beside)
+    nearby = np.concatenate([frame.whole[frame.nearby] for frame in errors])
+    inside_error, nearby_error = (
+        round(float(np.quantile(values, TYPICAL_QUANTILE)), 5) if len(values) else 1.0 for values in (inside, nearby)
     )
-    return TypicalErrors(inside_error, beside_error)
+    return TypicalErrors(inside_error, nearby_error)
 
 
 def estimate_trust(
@@ -94,7 +94,7 @@ def estimate_trust(
     errors = _errors(drawing, image, mask, neighbourhood)
     unexplained = (errors.whole > typical.inside) & (errors.whole > MAX_SHARE * errors.tissue)
     against = errors.label & ((errors.whole > errors.tissue) | unexplained)
-    missed = errors.beside & (errors.whole > typical.beside)
+    missed = errors.nearby & (errors.whole > typical.nearby)
     size = max(1, int(errors.label.sum()))
     n_against, n_missed = (int(binary_opening(votes).sum()) for votes in (against, missed))  # no single pixels
     return Trust((int(errors.label.sum()) - n_against) / (size + n_missed), n_against / size, n_missed / size)

@@ -19,7 +19,7 @@ _DIRECTIONS = {
 
 @dataclass(frozen=True)
 class AxisConvention:
-    """Axes of a camera. name: as `frame` in recording.yaml; x, y, z: their directions seen from the camera."""
+    """Axes of a camera. name: as `frame` in recording.yaml; x, y, z: their directions from the camera."""
 
     name: str
     producer: str

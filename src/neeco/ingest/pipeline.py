@@ -165,7 +165,7 @@ def _left_out(world: World, splits: np.ndarray) -> dict[int, DropReason]:
         why = NOT_VISIBLE if unseen else "no instrument state at its time (gap in a log)"
         reasons[int(views.frames[row])] = DropReason(why)
     left_out = views.frames[world.usable & (splits == LEFT_OUT)].tolist()
-    return reasons | dict.fromkeys(left_out, DropReason("beside an unseen frame", frame_usable=True))
+    return reasons | dict.fromkeys(left_out, DropReason("next to an unseen frame", frame_usable=True))
 
 
 def _unregistered(world: World, chosen: np.ndarray) -> dict[str, np.ndarray]:

@@ -43,7 +43,7 @@ def is_still(data: Episodes, images: ChosenImages, progress: StageProgress) -> b
     progress("looking whether the scope moves", 0, 0)
     still = all(stands_still(images.loader(rows), len(rows)) for rows in _rows_by_episode(data, images).values())
     if still:
-        data.notes.add("the scope stands still: nothing but what passes before it moves in the images")
+        data.notes.add("the scope stands still: nothing but the foreground moves in the images")
     return still
 
 

@@ -238,7 +238,7 @@ def _outer_loops(mask: np.ndarray) -> list[np.ndarray]:
     for contour, (*_, parent) in zip(contours[::-1], hierarchy[0][::-1], strict=True):
         if parent >= 0:  # a hole
             continue
-        corners = (contour[::-1, 0] + MAGNIFICATION // 2) // MAGNIFICATION  # clockwise as seen
+        corners = (contour[::-1, 0] + MAGNIFICATION // 2) // MAGNIFICATION  # clockwise in the image
         corners = corners[(corners != np.roll(corners, 1, axis=0)).any(1)]
         first = np.lexsort(corners.T)[0]  # the leftmost of the top row
         loops.append(np.roll(corners, -first, axis=0) + np.array([x, y], dtype=float))
@@ -381,8 +381,8 @@ def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bo
 
         run = load_run("runs/liver")
         state, camera = sample_states(run, 1)[0]
-        drawn = draw_labelled(run.scene, state, camera)
-        drawn.image, drawn.masks, drawn.boxes  # [H, W, 3], [I, H, W], [I, 4]
+        rendering = draw_labelled(run.scene, state, camera)
+        rendering.image, rendering.masks, rendering.boxes  # [H, W, 3], [I, H, W], [I, 4]
 
     Raises NeecoError where the state lacks an instrument or joint of the scene; and with `labels` where the scene's
     method learns none.

@@ -199,10 +199,10 @@ def without_part_islands(parts: np.ndarray, ids: Sequence[int], share: float) ->
             x, y, width, height = statistics[k, : cv2.CC_STAT_AREA]
             around = slice(max(0, y - 1), y + height + 1), slice(max(0, x - 1), x + width + 1)
             island = components[around] == k
-            beside = cleaned[around][cv2.dilate(island.astype(np.uint8), NEIGHBOURS).astype(bool) & ~island]
-            beside = beside[np.isin(beside, ids)]
-            if len(beside):
-                cleaned[around][island] = np.bincount(beside).argmax()
+            nearby = cleaned[around][cv2.dilate(island.astype(np.uint8), NEIGHBOURS).astype(bool) & ~island]
+            nearby = nearby[np.isin(nearby, ids)]
+            if len(nearby):
+                cleaned[around][island] = np.bincount(nearby).argmax()
     return cleaned
 
 

@@ -39,7 +39,7 @@ INITIAL_LOGIT = 6.0  # its magnitude at the start: 0.2 % of a motion affects Gau
 
 @dataclass(frozen=True, kw_only=True)
 class NPSSettings:
-    """depth, width, L_mean, L_state as published; `identity` keeps the raw inputs beside their encodings.
+    """depth, width, L_mean, L_state as published; `identity` keeps the raw inputs in addition to their encodings.
 
     `preset`: what the fields below were set to before each was set for itself; "practical" departs from the paper.
     `state`: "full" (position, quaternion, joints), "rotation_jaw" (the 2024 drafts: quaternion and joints) or, with

@@ -181,13 +181,13 @@ def score_points(evidence: Evidence, transforms: Tensor, points: Tensor, chunk: 
 
     `transforms` [F, 4, 4] take the points' frame to each camera's.
     """
-    scores, seen = [], []
+    scores, visible = [], []
     rotation, translation = transforms[:, :3, :3].transpose(1, 2), transforms[:, None, :3, 3]
     for part in points.split(chunk):
         hits, inside = evidence.look_up_camera(part @ rotation + translation)
         scores.append((hits * inside).sum(0) / inside.sum(0).clamp_min(1))
-        seen.append(inside.float().mean(0))
-    return torch.cat(scores), torch.cat(seen)
+        visible.append(inside.float().mean(0))
+    return torch.cat(scores), torch.cat(visible)
 
 
 @dataclass(frozen=True)
@@ -206,11 +206,11 @@ class PosedViews:
 
     def scores(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return `score_points` with 0 where the evidence is nearly as strong under exchanged poses."""
-        score, seen = score_points(self.evidence, self.own, points)
+        score, visible = score_points(self.evidence, self.own, points)
         likely = torch.nonzero(score > 0.5 * MIN_LEVEL)[:, 0]  # the others are far below all thresholds
         static = score[likely] <= self.motion_ratio * self.exchanged_scores(points[likely])
         score[likely[static]] = 0
-        return score, seen
+        return score, visible
 
     def exchanged_scores(self, points: Tensor) -> Tensor:
         """Mean evidence [Q] at points [Q, 3] over all exchanges of the poses."""
@@ -339,8 +339,8 @@ def _solid_points(views: PosedViews, reach: float, side: int) -> tuple[Tensor, f
     the strictest of SOLID_LEVELS that MIN_SOLID_POINTS of them reach."""
     ticks = torch.linspace(-reach, reach, side, device=views.evidence.device)
     grid = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
-    score, seen = views.scores(grid)
-    score[seen <= 0.25] = 0
+    score, visible = views.scores(grid)
+    score[visible <= 0.25] = 0
     level = next((level for level in SOLID_LEVELS if int((score > level).sum()) >= MIN_SOLID_POINTS), SOLID_LEVELS[-1])
     return grid[score > level], level
 
@@ -354,8 +354,8 @@ def _shaft_frame(views: PosedViews, solid: Tensor) -> Tensor:
     direction = torch.from_numpy(np.linalg.eigh(covariance.cpu().numpy())[1][:, -1].copy()).to(solid)
     along = (solid - center) @ direction
     ends = torch.stack([center + along.min() * direction, center + along.max() * direction])
-    _, seen = score_points(views.evidence, views.own, ends)
-    if seen[0] > seen[1]:
+    _, visible = score_points(views.evidence, views.own, ends)
+    if visible[0] > visible[1]:
         direction = -direction
     return frame_along(center, direction)
 
@@ -380,13 +380,13 @@ def _refine_axis(views: PosedViews, base: Tensor, spacing: float, level: float) 
         rows, radius = _solid_line(views.in_frame(base), spacing, half, level)
         if len(rows) < 4:
             return base, base.new_zeros(0, 3), radius
-        line, area, seen = rows[:, :3], rows[:, 3], rows[:, 4]
+        line, area, visible = rows[:, :3], rows[:, 3], rows[:, 4]
         near, tip = float(line[0, 0]), float(line[-1, 0])
         # the ends are rarely observed (rear) or bend and open (front)
-        middle = (line[:, 0] > near + 0.15 * (tip - near)) & (line[:, 0] < near + 0.65 * (tip - near)) & (seen > 0.3)
+        middle = (line[:, 0] > near + 0.15 * (tip - near)) & (line[:, 0] < near + 0.65 * (tip - near)) & (visible > 0.3)
         if middle.sum() < 3:
             middle = line[:, 0] < near + 0.65 * (tip - near)
-        slope = _robust_line(line[middle, 0], line[middle, 1:], (area * seen)[middle])
+        slope = _robust_line(line[middle, 0], line[middle, 1:], (area * visible)[middle])
         direction = base[:3, :3] @ torch.nn.functional.normalize(torch.cat([slope[0], slope.new_ones(1)]), dim=0)
         origin = base[:3, :3] @ torch.cat([slope[1], slope.new_zeros(1)]) + base[:3, 3]
         base = frame_along(origin, direction)
@@ -418,15 +418,15 @@ def _slice_centers(views: PosedViews, spacing: float, half: float, level: float)
     reach = 0.6 * views.evidence.distance
     for z in torch.arange(-reach, reach, spacing, device=device):
         plane = torch.stack([x.flatten(), y.flatten(), z.expand(x.numel())], -1)
-        score, seen = views.scores(plane)
-        score = torch.where(seen > 0.15, score, 0.0)
+        score, visible = views.scores(plane)
+        score = torch.where(visible > 0.15, score, 0.0)
         if score.max() < MIN_LEVEL:
             continue
         weight = (score - level).clamp_min(0)
         weight = weight if weight.sum() > 0 else (score - 0.95 * score.max()).clamp_min(0)
         center = (weight[:, None] * plane).sum(0) / weight.sum()
         area = (score > level).sum() * cell
-        rows.append(torch.stack([z, center[0], center[1], area, seen.max()]))
+        rows.append(torch.stack([z, center[0], center[1], area, visible.max()]))
     return torch.stack(rows) if rows else ticks.new_zeros(0, 5)
 
 
@@ -458,8 +458,8 @@ def _sample_seeds(
     random = torch.rand(20 * count, 3, generator=generator, device=device).to(target)
     along = near - 0.1 * length + random[:, 2] * 1.2 * length
     points = torch.stack([(2 * random[:, 0] - 1) * width, (2 * random[:, 1] - 1) * width, along], -1)
-    score, seen = views.scores(points)
-    chosen = points[(score > MIN_LEVEL) & (seen > 0.05)]
+    score, visible = views.scores(points)
+    chosen = points[(score > MIN_LEVEL) & (visible > 0.05)]
     if len(chosen) < count:  # thin instruments: fill up with jittered copies
         source = chosen if len(chosen) else points
         extra = torch.randint(len(source), (count - len(chosen),), generator=generator, device=device)

@@ -73,8 +73,8 @@ class _Photometric(torch.autograd.Function):
     def forward(
         ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, kernel: Kernel
     ) -> Tensor:
-        plain, seen = image.detach().contiguous(), target.detach().to(torch.float32).contiguous()
-        loss, gradient = kernel(plain, seen, mask, ssim_weight, ctx.needs_input_grad[0])
+        plain, observed = image.detach().contiguous(), target.detach().to(torch.float32).contiguous()
+        loss, gradient = kernel(plain, observed, mask, ssim_weight, ctx.needs_input_grad[0])
         if gradient is not None:
             ctx.save_for_backward(gradient)
         return loss

@@ -1,7 +1,7 @@
 """Resampling of images of another size than the learned one, or through a lens with distortion.
 
 The backends render pinholes of the learned size. Everything else is rendered by such a pinhole and resampled: colour,
-alpha, depth and channels alike, so that labels follow the resampled pixels.
+alpha, depth and channels, so that labels follow the resampled pixels.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ def draw_through(camera: Camera, draw: Draw) -> Rendering:
     a pinhole whose field contains the lens's, and sampled bilinearly; beyond border and field the image is empty.
     """
     fine = supersampled(camera)
-    seen = field_pinhole(fine)
-    rendering = draw(seen)
+    source = field_pinhole(fine)
+    rendering = draw(source)
     if fine is camera and camera.is_pinhole:
         return rendering
     alpha = rendering.alpha[..., None]
     planes = [rendering.color, alpha, rendering.depth[..., None] * alpha]
     planes += [] if rendering.channels is None else [rendering.channels]
-    found = resampled(torch.cat(planes, -1), seen, fine, camera)
+    found = resampled(torch.cat(planes, -1), source, fine, camera)
     alpha = found[..., 3]
     return replace(
         rendering,
@@ -88,12 +88,12 @@ def of_learned_size(camera: Camera) -> Camera:
     return camera.resized(*(max(1, round(size / scale)) for size in (camera.width, camera.height)))
 
 
-def resampled(image: Tensor, seen: Camera, fine: Camera, camera: Camera) -> Tensor:
-    """Resample an image [H, W, C] of the pinhole `seen` for `camera`, by the supersampled pixels of `fine`; 0 outside
+def resampled(image: Tensor, source: Camera, fine: Camera, camera: Camera) -> Tensor:
+    """Resample an image [H, W, C] of the pinhole `source` for `camera`, by the supersampled pixels of `fine`; 0 outside
     the image."""
     planes = image.permute(2, 0, 1)[None]
     if not fine.is_pinhole:
-        pinhole = (seen.fx, seen.fy), (seen.cx, seen.cy), (seen.width, seen.height)
+        pinhole = (source.fx, source.fy), (source.cx, source.cy), (source.width, source.height)
         grid = _sampling_grid(replace(fine, world_from_camera=ORIGIN), pinhole)
         planes = grid_sample(planes, grid.to(planes), align_corners=False)
     if fine.width != camera.width:

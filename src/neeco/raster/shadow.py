@@ -101,8 +101,8 @@ def _blocked_by(among: Casting, width: Tensor, offset: Tensor, draw: Draw) -> Te
     """`blocked` of one lamp, [N]. Any float type and device."""
     at_light = light_camera(among.camera, offset.detach())
     with torch.no_grad():
-        seen = draw(among.bare, at_light)
-    return blocked_reference(seen.alpha, seen.depth, width, offset, among, at_light)
+        from_light = draw(among.bare, at_light)
+    return blocked_reference(from_light.alpha, from_light.depth, width, offset, among, at_light)
 
 
 def blocked_reference(
@@ -143,12 +143,12 @@ class _Blocked(torch.autograd.Function):
         ctx.save_for_backward(width, offsets, means, among.casters, shares)
         for lamp in lamps:
             at_light = light_camera(among.camera, offsets[lamp])
-            seen = draw(among.bare, at_light)
+            from_light = draw(among.bare, at_light)
             maps = torch.empty(3, at_light.height, at_light.width)
             focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy, float(width) * at_light.fx, MIN_DISTANCE)
             given = torch.tensor([*view, *offsets[lamp].tolist(), *focus], dtype=torch.float32)
             wanted = ctx.needs_input_grad[0]
-            alpha, depth = (image.detach().contiguous() for image in (seen.alpha, seen.depth))
+            alpha, depth = (image.detach().contiguous() for image in (from_light.alpha, from_light.depth))
             place = torch.empty(4, dtype=torch.int32)
             native().cast(alpha, depth, means, among.casters, given, wanted, maps, place, shares[lamp])
             ctx.lamps.append((lamp, given, maps, place, at_light.fx))

@@ -147,7 +147,7 @@ def line_chart(
 ) -> str:
     """Lines and marks over a shared x axis as inline SVG; "" when nothing has two points.
 
-    starts: (x, what begins there), drawn as dashed vertical lines. levels: thin dashed lines from side to side; beside
+    starts: (x, what begins there), shown as dashed vertical lines. levels: thin dashed lines from side to side; with
     them a single point is a chart. note: stands at the right, above the chart. over_logarithmic: the axis of x, whose
     ticks are then the points' own.
     """

@@ -31,7 +31,7 @@ CHOICES = "recording_choices.png"
 
 def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
     """Write a recording.yaml for what lies at `source`, and a picture of the choices that its file leaves open, into
-    the folder or beside the file. Return lines on what was written; `report` is called with what is left out.
+    the folder or next to the file. Return lines on what was written; `report` is called with what is left out.
 
     Raises NeecoError where a recording.yaml exists, and where there are no images.
     """

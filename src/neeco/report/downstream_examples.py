@@ -205,7 +205,7 @@ def _with_truth(example: Example, predicts: str) -> Pixels:
 
 
 def _outlined(pixels: Pixels, example: Example) -> Pixels:
-    """The true outline of every class drawn over `pixels`."""
+    """Draw the true outline of every class over `pixels`."""
     for number in np.unique(example.classes[example.classes > 0]):
         pixels = overlay_outline(pixels, example.classes == number, TRUTH_COLOR)
     return pixels
@@ -213,7 +213,7 @@ def _outlined(pixels: Pixels, example: Example) -> Pixels:
 
 def draw_boxes(pixels: Pixels, boxes: np.ndarray, classes: np.ndarray, scores: np.ndarray | None) -> Pixels:
     """`pixels` [H, W, 3], shrunk to at most MAX_WIDTH px wide, with boxes [n, 4] px in their classes' colours and their
-    scores [n] beside them; scores None: in the truth's colour."""
+    scores [n] next to them; scores None: in the truth's colour."""
     image = Image.fromarray(pixels)
     scale = min(1.0, MAX_WIDTH / image.width)
     if scale < 1:

@@ -46,7 +46,7 @@ from neeco.studies.machine import machine_words
 
 FALSE_POSITIVES = round(1 / (1 - CONFIDENCE))  # of so many comparisons without a difference, one shows one
 QUESTIONS = {  # what a paired difference answers, as `question` finds it
-    "beside": "synthetic images beside labelled frames, against these frames alone",
+    "beside": "synthetic images with labelled frames, against these frames alone",
     "augmented": "the same, against these frames with classical augmentation",
     "alone": "synthetic images alone, against the most labelled frames alone",
     "sets": "one set against another",
@@ -115,14 +115,14 @@ def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
     rows = [row for pair in models_and_splits(experiment) for row in main_differences(experiment, *pair)]
     counts = Counter(verdict(row) for row in rows if question(row, experiment) == "beside")
     if not counts:
-        sentences.append("No condition has synthetic images beside labelled frames to compare with these frames alone.")
+        sentences.append("No condition has synthetic images with labelled frames to compare with these frames alone.")
     elif set(counts) == {""}:
-        sentences.append("One fold: whether synthetic images help cannot be told from chance; give --folds 5.")
+        sentences.append("One fold: whether synthetic images help cannot be distinguished from chance; give --folds 5.")
     else:
         verbs = {HELPS: "help", HURTS: "hurt", NONE_SHOWN: "show no difference"}
         parts = [f"{verb} in {counts[word]}" for word, verb in verbs.items() if counts[word]]
         kind = {(True, False): "yes", (False, True): "no"}.get((counts[HELPS] > 0, counts[HURTS] > 0), "")
-        sentence = "Beside the same labelled frames, synthetic images {} of {} comparisons."
+        sentence = "Added to the same labelled frames, synthetic images {} of {} comparisons."
         text = Markup(f'<b class="{{}}">{sentence}</b>').format(kind, ", ".join(parts), sum(counts.values()))
         sentences.append(text)
     if failed:
@@ -178,7 +178,7 @@ def _results(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
             sections.append(Section(title=differences.title, level=3, results=differences))
     text = (
         "Scores: mean ± standard deviation over folds; the best is bold. Curves: bold the mean over folds, thin each "
-        "fold, dashed from side to side a set alone, without any labelled frame, in the colour it has beside labelled "
+        "fold, dashed from side to side a set alone, without any labelled frame, in the colour it has with labelled "
         "frames. Differences are of the same folds, with the interval that holds their mean with 95 % confidence "
         "(Student's t over folds): one that reaches 0 shows no difference, green is better than its reference, red is "
         f"worse. Of {FALSE_POSITIVES} comparisons that differ in nothing about one is called a difference all the same."
@@ -280,7 +280,7 @@ def _trainings(experiment: Experiment, files: Mapping[str, str]) -> list[Section
     if charts:
         text += (
             " The curves are scores on these images over steps, of the first fold. The images differ between "
-            "conditions: read a curve by its shape. A set alone has the colour that it has beside labelled frames."
+            "conditions: read a curve by its shape. A set alone has the colour that it has with labelled frames."
         )
     key = legend(families(experiment), families(experiment))
     figures = [Figure(chart, key) for chart in charts]

@@ -122,7 +122,7 @@ def write_comparison_report(output: Path, comparison: ComparisonResult, capture:
     ]
     if images:
         text = (
-            "The median frame of each split by PSNR over all methods, drawn at the poses the capture states. Under "
+            "The median frame of each split by PSNR over all methods, rendered at the poses the capture states. Under "
             "each drawing its difference from the recorded image: black is equal, bright is wrong, full scale "
             f"{FULL_SCALE:g} of the range from black to white. In yellow, where known, the true outline of the "
             "instrument."
@@ -141,7 +141,7 @@ def write_comparison_report(output: Path, comparison: ComparisonResult, capture:
         subtitle="methods compared",
         version=comparison.version,
         stamps=[machine_words(comparison.machine)],
-        intro=[intro + (f" Masks of {masks} are scored beside theirs." if masks else "")],
+        intro=[intro + (f" Masks of {masks} are scored next to theirs." if masks else "")],
         findings=findings(comparison),
         sections=[*sections, Section(title="How it was made", facts=facts, listings=configs)],
     )

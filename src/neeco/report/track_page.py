@@ -19,7 +19,7 @@ from neeco.report.charts import SMALL, Level, Series, line_chart
 from neeco.report.page import jpeg, write_page
 from neeco.tracking.track import Tracked, state_of
 
-STRIP, DOUBTED = 24, 12  # frames shown: spread over the footage, and the least trusted
+N_STRIP, N_LEAST_TRUSTED = 24, 12  # frames shown: spread over the footage, and the least trusted
 BAND = 2.0  # standard deviations
 HOWS = {
     "begun": "begun from the given state",
@@ -36,7 +36,7 @@ def write_track_page(tracked: Tracked) -> Path:
     records = tracked.records
     frames = sorted(tracked.footage.frames, key=lambda frame: frame.state.time)
     values = [record["trust"]["value"] for record in records]
-    least = sorted(range(len(records)), key=lambda k: values[k])[:DOUBTED]
+    least = sorted(range(len(records)), key=lambda k: values[k])[:N_LEAST_TRUSTED]
     missing = sum(record["how"] == "lost" for record in records)
     return write_page(
         tracked.page,
@@ -54,8 +54,8 @@ def write_track_page(tracked: Tracked) -> Path:
         ],
         hows=[[words, str(sum(record["how"] == how for record in records))] for how, words in HOWS.items()],
         charts=[chart for chart in _charts(tracked) if chart],
-        strip=[_figure(tracked, frames[k], records[k]) for k in evenly_spaced(len(records), STRIP)],
-        doubted=[_figure(tracked, frames[k], records[k]) for k in least],
+        strip=[_figure(tracked, frames[k], records[k]) for k in evenly_spaced(len(records), N_STRIP)],
+        least_trusted=[_figure(tracked, frames[k], records[k]) for k in least],
     )
 
 

@@ -277,12 +277,12 @@ class GaussianScene(nn.Module):
 
 
 def is_gaussian(scene: DrawableScene) -> TypeGuard[GaussianScene]:
-    """Whether `scene` is made of Gaussians, which can be posed and labelled."""
+    """Whether `scene` consists of Gaussians, which can be posed and labelled."""
     return scene.has_gaussians
 
 
 def require_gaussians(scene: DrawableScene, asked_by: str) -> GaussianScene:
-    """Return `scene`, which must be made of Gaussians. Raises NeecoError, in the words of the option or verb
+    """Return `scene`, which must consist of Gaussians. Raises NeecoError, in the words of the option or verb
     `asked_by`, for a radiance field."""
     if not is_gaussian(scene):
         raise NeecoError(

@@ -192,7 +192,7 @@ def distinct_variants(chosen: Sequence[Ablation]) -> list[Variant]:
 
 
 def _open_capture(plan: AblationPlan, variants: Sequence[Variant]) -> Capture:
-    """The capture. Raises NeecoError for what no run could be made of."""
+    """Return the capture. Raises NeecoError where no run could train on it."""
     for name, value in (("iterations", plan.iterations), ("kinematic-iterations", plan.kinematic_iterations)):
         if value is not None and value < 1:
             raise NeecoError(f"--{name}: {value} is no training; give at least 1")

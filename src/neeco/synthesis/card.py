@@ -19,10 +19,10 @@ MARK = "<!-- Written by neeco, which writes it anew with --resume. Remove this l
 SIZES = {"n<1K": 10**3, "1K<n<10K": 10**4, "10K<n<100K": 10**5, "100K<n<1M": 10**6, "1M<n<10M": 10**7}
 TASKS = ["image-segmentation", "object-detection", "keypoint-detection", "depth-estimation"]
 TAGS = ["surgical-instruments", "endoscopy", "6d-pose-estimation", "gaussian-splatting"]
-SYNTHETIC = """The images were drawn by a Gaussian-splatting model learned from a recording, in states of the
-instruments that were not recorded. Labels come from the same model: exact for what is drawn."""
-RECORDED = """The images were recorded. Their labels were drawn by a Gaussian-splatting model of the recording, at poses
-fitted to each image; images whose labels could not be trusted were left out."""
+SYNTHETIC = """The images were rendered by a Gaussian-splatting model learned from a recording, in states of the
+instruments that were not recorded. Labels come from the same model: exact for what is rendered."""
+RECORDED = """The images were recorded. Their labels were rendered by a Gaussian-splatting model of the recording, at
+poses fitted to each image; images whose labels could not be trusted were left out."""
 TEXT = """---
 {front}---
 
@@ -50,7 +50,7 @@ Keypoints, where an instrument has them: {keypoints}.
 - `ignore`: 255 where a loss had better ignore the pixel: uncertain edges, and what no training frame saw
 - `parts`: part ids, see above
 - `depth`: 16 bit, in counts of {mm_per_count} mm; 0 is none
-- `silhouettes`: bit k is set where instrument k would be seen if nothing else were there
+- `silhouettes`: bit k is set where instrument k would be visible if nothing else were there
 - `states.jsonl`: one line per image: instrument states (mm, rad), camera (OpenGL axes), intrinsics, labels
 - `dataset.json`: how the set was made, in full
 - `preview.png`: a look at the labels

@@ -1,4 +1,4 @@
-"""preview.png: a contact sheet of the data set, its labels drawn over the images."""
+"""preview.png: a contact sheet of the data set, with the labels over the images."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def write_preview(
 
 
 def draw_tile(root: Path, record: Record, bones: Sequence[tuple[str, str]] = ()) -> Image.Image:
-    """Return one image with its labels drawn over it, and a caption below; `bones` join keypoints."""
+    """Return one image with its labels over it, and a caption below; `bones` join keypoints."""
     with Image.open(root / record["image"]) as stored:
         pixels = np.asarray(stored.convert("RGB"), dtype=float)
     with Image.open(root / "parts" / f"{stem(record['index'])}.png") as stored:

@@ -112,7 +112,7 @@ def format_names() -> tuple[str, ...]:
 
 def formats_help() -> str:
     """Return the help of `--formats`."""
-    return f"Index files beside the plain images, masks, parts and depth: {', '.join(format_names())}."
+    return f"Index files in addition to the plain images, masks, parts and depth: {', '.join(format_names())}."
 
 
 RECORDED_SIZE, AS_RECORDED = SizeSettings(), ImageSettings()

@@ -64,8 +64,8 @@ class Colors:
     def of(self, scene: GaussianScene) -> GaussianScene:
         """Return the scene with recoloured instruments.
 
-        Colours seen head on are exact, view dependence is right to first order, and dimming with the distance as far as
-        it is a power of it.
+        Colours viewed head on are exact, view dependence is right to first order, and dimming with the distance as far
+        as it is a power of it.
         """
         canonical, rows = scene.canonical, scene.canonical.of_instruments
         gain = canonical.sh_dc.new_tensor(self.gain)

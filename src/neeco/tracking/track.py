@@ -48,7 +48,7 @@ PAGE = "track.html"
 RUN = "run"  # the folder of the run with which footage over another tissue was tracked
 OTHER_TISSUE_MISFIT = 3.0  # of instruments over tissue learned from footage, times that over their own
 MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
-MIN_TRUSTED_SHARE = 0.5  # of the frames, below which the result is doubtful
+MIN_TRUSTED_SHARE = 0.5  # of the frames, below which the result is DOUBTFUL
 CERTAIN = 0.8  # trust with which following begins at once
 N_BEGINNINGS = 8  # frames in which the instruments are searched for, until one is CERTAIN
 FOLLOW_AGAIN = 0.7  # trust below which a stretch is followed once more, from its far end
@@ -78,7 +78,7 @@ class Tracked:
 
     @property
     def verdict(self) -> str:
-        """One sentence on the trust in the states; a doubtful verdict is in capitals."""
+        """One sentence on the trust in the states; the verdict DOUBTFUL is in capitals."""
         count, missing = len(self.records), sum(record["how"] == "lost" for record in self.records)
         typical = median(record["trust"]["value"] for record in self.records)
         found = f"trust is {typical:.2f} in the median, and in {missing} of {count} frames nothing was found"
@@ -249,7 +249,7 @@ class StepFiles:
     def _again(self, steps: dict[int, Step]) -> None:
         """Follow backwards through every stretch of low trust that a trusted frame follows.
 
-        Other rolls are searched for in every frame of it, so that both results are judged alike.
+        Other rolls are searched for in every frame of it, so that both results are judged by the same measure.
         """
         before: Step | None = None
         for frame in range(len(steps) - 1, -1, -1):

@@ -153,7 +153,7 @@ class Reference:
         if not misfits:
             raise NeecoError("track: no training frame of the run shows an instrument; train it again")
         typical = typical_errors_of(judged)
-        errors = TypicalErrors(max(MIN_ERROR, typical.inside), max(MIN_ERROR, typical.beside))
+        errors = TypicalErrors(max(MIN_ERROR, typical.inside), max(MIN_ERROR, typical.nearby))
         return cls(errors, max(MIN_MISFIT, float(np.quantile(misfits, USUAL_QUANTILE))), min(shares))
 
     def to_json(self) -> dict[str, float]:

@@ -62,14 +62,14 @@ class TrainedRun:
         return self.scene.recorded.completed(read_capture(root, self.config["transforms"]), self.scene.instruments)
 
     def gaussians(self, asked_by: str) -> GaussianRun:
-        """Return the run as one whose scene is made of Gaussians. Raises NeecoError, in the words of the option or verb
-        `asked_by`, for a radiance field."""
+        """Return the run as one whose scene consists of Gaussians. Raises NeecoError, in the words of the option or
+        verb `asked_by`, for a radiance field."""
         return GaussianRun(self.path, require_gaussians(self.scene, asked_by), self.config)
 
 
 @dataclass(frozen=True)
 class GaussianRun(TrainedRun):
-    """A finished training run whose scene is made of Gaussians, which can be posed and labelled."""
+    """A finished training run whose scene consists of Gaussians, which can be posed and labelled."""
 
     scene: GaussianScene
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 MAX_INSTRUMENTS, MAX_JOINTS = 8, 24  # instruments that get controls; joints of one that get a slider
 SLIDE_MM, YAW_DEG = 30.0, 45.0
-SPLIT, BESIDE = "split picture", "side by side"
+SPLIT, SIDE_BY_SIDE = "split picture", "side by side"
 NONE_CHOSEN = "—"
 PLOTS_EVERY_S = 0.5  # while more becomes known
 PLOT_HEIGHT = 140  # px
@@ -47,7 +47,7 @@ class Actions:
 
 
 class Panel:
-    """Made of the first run that is looked at; `runs` are all."""
+    """Controls of the first run that is shown; `runs` are all."""
 
     def __init__(self, client: viser.ClientHandle, runs: Sequence[LoadedRun], actions: Actions) -> None:
         self._gui, self._runs, self._actions = client.gui, tuple(runs), actions
@@ -77,7 +77,7 @@ class Panel:
     @property
     def side_by_side(self) -> bool:
         """Whether each run has its own part of the window."""
-        return len(self._runs) > 1 and self.layout.value == BESIDE
+        return len(self._runs) > 1 and self.layout.value == SIDE_BY_SIDE
 
     def show_timelines(self, timelines: Sequence[Timeline]) -> None:
         """Draw what is known of the frames' PSNR, and list the worst."""
@@ -108,8 +108,8 @@ class Panel:
             self.view = gui.add_dropdown("show", views, initial_value=IMAGE)
             self.layout = gui.add_dropdown(
                 "two runs",
-                (SPLIT, BESIDE),
-                initial_value=BESIDE,
+                (SPLIT, SIDE_BY_SIDE),
+                initial_value=SIDE_BY_SIDE,
                 visible=len(self._runs) > 1,
                 hint="Side by side, cameras, points and arrows are hidden.",
             )
@@ -323,8 +323,8 @@ class InstrumentPanel:
 
 
 def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: float) -> viser.GuiSliderHandle[float]:
-    """Add a slider in mm where `per_unit` is 1, else in degrees. Ends are rounded outwards; what lies outside is
-    drawn at its end."""
+    """Add a slider in mm where `per_unit` is 1, else in degrees. Ends are rounded outwards; a reading outside is
+    rendered at its end."""
     lower, upper = per_unit * span.lower, per_unit * span.upper
     digits = max(0, 1 - math.floor(math.log10((upper - lower) / 5)))
     step = 10.0**-digits

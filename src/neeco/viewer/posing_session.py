@@ -54,7 +54,7 @@ class PosingSession:
             return self._overview(instrument)
 
     def frame(self, instrument: str, index: int) -> dict[str, Any]:
-        """Estimates in one frame, and what the page's lines are drawn with. Raises NeecoError."""
+        """Estimates in one frame, and the geometry of the page's lines. Raises NeecoError."""
         with self._lock:
             posing = self._posing(instrument, index)
             origin = posing.shafts.origins[index]
@@ -119,8 +119,8 @@ class PosingSession:
             now = datetime.datetime.now().strftime("%Y-%m-%d %H:%M")
             answer = HandPose(self.posed.frames[index], instrument, roll_deg, joints_deg, now)
             self._keep([*read_answers(self.posed.root), answer])
-            doubts = [doubt for doubt in self._posings[instrument].outliers() if doubt.frame == index]
-            return self._overview(instrument) | {"said": [str(doubt) for doubt in doubts]}
+            outliers = [outlier for outlier in self._posings[instrument].outliers() if outlier.frame == index]
+            return self._overview(instrument) | {"said": [str(outlier) for outlier in outliers]}
 
     def undo(self, instrument: str) -> dict[str, Any]:
         """Take the last answer for an instrument out again; the overview, and under `frame` what it was of. Raises
@@ -155,9 +155,9 @@ class PosingSession:
     def _overview(self, instrument: str) -> dict[str, Any]:
         posing = self._posing(instrument)
         answered = {frame for frame, _ in posing.answers}
-        doubts: dict[int, list[str]] = {}
-        for doubt in posing.outliers():
-            doubts.setdefault(doubt.frame, []).append(str(doubt))
+        outliers: dict[int, list[str]] = {}
+        for outlier in posing.outliers():
+            outliers.setdefault(outlier.frame, []).append(str(outlier))
         return {
             "ghost": self.scene is not None,
             "capture": self.posed.root.resolve().name,
@@ -175,7 +175,7 @@ class PosingSession:
                     "name": answer.frame,
                     "roll": answer.roll_deg,
                     "joints": answer.joints_deg,
-                    "doubts": doubts.get(frame, []),
+                    "doubts": outliers.get(frame, []),
                 }
                 for frame, answer in posing.answers
             ],

@@ -70,8 +70,8 @@ def splats_of(scene: GaussianScene, state: State, camera: Camera) -> Splats:
     sh = _in_world(posed)
     if posed.headlight is not None:
         view = camera.world_from_camera.to(posed.means)
-        seen = (posed.means - view[:3, 3]) @ view[:3, :3]
-        sh = brightened(sh, headlight_factor(posed.headlight, camera, seen)[:, None, None])
+        in_camera = (posed.means - view[:3, 3]) @ view[:3, :3]
+        sh = brightened(sh, headlight_factor(posed.headlight, camera, in_camera)[:, None, None])
     opacities = posed.opacities.clamp(1e-6, 1 - 1e-6)
     tensors = (posed.means, normalize(posed.quats, dim=1), posed.scales.log(), torch.logit(opacities), sh)
     return Splats(*(tensor.float().cpu().numpy() for tensor in tensors))

@@ -29,7 +29,7 @@ IMAGE, OVERLAY, PARTS = "image", "labels over image", "parts"
 DEPTH, UNOBSERVED, DIFFERENCE = "depth", "unobserved", "difference to the recorded image"
 VIEWS = (IMAGE, OVERLAY, PARTS, DEPTH, UNOBSERVED, DIFFERENCE)
 LABELLED = (OVERLAY, PARTS)
-ONLY_RECORDED = "difference: only of a recorded state seen by its camera; press “go to this frame's camera”"
+ONLY_RECORDED = "difference: only of a recorded state from its camera; press “go to this frame's camera”"
 
 UNOBSERVED_COLOR = np.array([255.0, 0.0, 255.0])  # nothing inside a body has it
 DEPTH_PERCENTILES = 2, 98  # that are white and black
@@ -134,7 +134,7 @@ def split(left: Picture, right: Picture, share: float) -> Picture:
 
 
 def render_run(runs: ViewedRuns, number: int, controls: Controls, camera: Camera, view: str) -> RunPicture:
-    """Render run `number` as seen by `camera`, at the controls, which were made for the first run. Raises
+    """Render run `number` from `camera`, at the controls, which were made for the first run. Raises
     NeecoError."""
     first, loaded = runs.loaded[0], runs.loaded[number]
     frames = len(first.recorded.states), len(loaded.recorded.states)

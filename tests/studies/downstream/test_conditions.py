@@ -51,7 +51,7 @@ def test_a_condition_is_a_sum_of_words(name: str, expected: Condition) -> None:
         ("real+", "'' is neither"),
         ("real+real", "a word stands in it twice"),
         ("kin+soft+ignore", "one of hard, soft, ignore at most"),
-        ("real+soft", "only beside a set"),
+        ("real+soft", "only together with a set"),
         ("augment", "nothing to learn from; add real or a set"),
     ],
 )

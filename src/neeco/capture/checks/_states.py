@@ -95,7 +95,7 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
 
 
 def _check_coupling(parsed: Parsed, name: str, known: Sequence[str], states: Sequence[InstrumentState]) -> None:
-    """Warn of readings that the others explain: the axes of their joints cannot be told apart."""
+    """Warn of readings that the others explain: the axes of their joints cannot be distinguished."""
     if len(states) < MIN_STATES:
         return
     readings = np.array([[state.joints[joint] for joint in known] for state in states])  # [S, R]

@@ -148,7 +148,7 @@ def find_border(images: Iterable[np.ndarray]) -> Border | None:
     """The dark border around a round field of view; None when the images have no such border.
 
     images: uint8 [H, W, 3], frames spread over the recording (10 or more; at most MAX_BORDER_FRAMES are used). The
-    border stays at the black level although the scene lights up pixels beside it. Only one with a circular edge, sharp
+    border stays at the black level although the scene lights up pixels next to it. Only one with a circular edge, sharp
     all along, counts: dark corners of a dim scene are none."""
     brightness = _brightest(images)
     if brightness is None or min(brightness.shape) < 32:

@@ -46,9 +46,9 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
     """Return the left lens, the right lens, and right_from_left [4, 4] mm, which maps points of the left camera's frame
     to the right one's (OpenCV axes).
 
-    Read are OpenCV's stereo YAML or XML (`M1 D1 M2 D2 R T`, or `K1 ...`; R and T may stand in `extrinsics.yml` beside
+    Read are OpenCV's stereo YAML or XML (`M1 D1 M2 D2 R T`, or `K1 ...`; R and T may stand in `extrinsics.yml` next to
     `intrinsics.yml`), Kalibr's camchain, settings of ORB-SLAM (`LEFT.K ...`, `Camera1.fx ...`), ROS's camera_info of
-    two cameras (a folder with a left and a right file, or the left file, the right one beside it), the da Vinci's
+    two cameras (a folder with a left and a right file, or the left file, the right one next to it), the da Vinci's
     `.ini` ([StereoLeft], [StereoRight]) and JSON (`intrinsics`, `extrinsics`, or `KL DL KR DR R T`). T is in mm or m,
     by its length, and is refused where both could be. Raises NeecoError naming file, field and remedy.
     """
@@ -92,7 +92,7 @@ def _two_cameras(
     if turn is None and path.stem.lower().startswith("intrinsics"):
         source = path.with_name("ex" + path.name[2:])
         if not source.is_file():
-            raise NeecoError(f"{path}: R: missing; put {source.name}, which OpenCV writes with it, beside it")
+            raise NeecoError(f"{path}: R: missing; put {source.name}, which OpenCV writes with it, next to it")
         found = read_calibration(source)
         keys = {word(str(name)): value for name, value in found.items()} if isinstance(found, dict) else {}
         turn, shift = first_of(keys, _TURNS), first_of(keys, _SHIFTS)
@@ -221,7 +221,7 @@ def _right_beside(path: Path) -> Path:
         other = path.with_name(path.name.replace(left, right))
         if left in path.name and other.is_file():
             return other
-    raise NeecoError(f"{path}: is one camera's; put the right camera's beside it, as left.yaml and right.yaml")
+    raise NeecoError(f"{path}: is one camera's; put the right camera's next to it, as left.yaml and right.yaml")
 
 
 def _numbers(path: Path, document: Mapping[str, Any], names: tuple[str, ...], count: int) -> np.ndarray:

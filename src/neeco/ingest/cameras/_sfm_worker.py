@@ -253,11 +253,11 @@ def save(model: pycolmap.Reconstruction, path: Path) -> None:
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     point_ids = sorted(model.points3D)
     row = {point: index for index, point in enumerate(point_ids)}
-    poses, seen = [], []
+    poses, observations_found = [], []
     for index, image in enumerate(images):
         pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
         poses.append(np.vstack([pose.inverse().matrix(), [0, 0, 0, 1]]))
-        seen += [
+        observations_found += [
             (index, row[spot.point3D_id], *spot.xy, number)
             for number, spot in enumerate(image.points2D)
             if spot.has_point3D()
@@ -271,7 +271,7 @@ def save(model: pycolmap.Reconstruction, path: Path) -> None:
         colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
         errors=np.array([point.error for point in points]),
         lengths=np.array([point.track.length() for point in points]),
-        observations=np.array(seen, dtype=np.float64).reshape(-1, 5),
+        observations=np.array(observations_found, dtype=np.float64).reshape(-1, 5),
         reprojection=model.compute_mean_reprojection_error(),
     )
 

@@ -36,7 +36,7 @@ LARGE_PX = 1280  # of an image, whose features are not detected at twice the siz
 DENSE_FACTOR = 3  # on the number of features, in the attempt from more of them
 PEAK, DENSE_PEAK = 0.004, 0.002  # minimum contrast of a feature: tissue is smooth, COLMAP's 0.0067 leaves too few
 N_MOTION_PAIRS = 40  # of keyframes, that are tested for parallax
-# run by its path, not as a module of the package: nothing of ours may be loaded beside pycolmap
+# run by its path, not as a module of the package: nothing of ours may be loaded together with pycolmap
 WORKER = Path(__file__).with_name("_sfm_worker.py")
 
 
@@ -112,9 +112,9 @@ class StructureFromMotion:
         best = self._search(progress)
         return self._run(self.job | self._parameters(best.strategy) | {"task": "register"}, progress, best)
 
-    def adjust(self, found: SfmResult, doubtful: np.ndarray, progress: StageProgress) -> SfmResult:
-        """The same after bundle adjustment without the observations marked in `doubtful` [Q]."""
-        rows = found.observations[doubtful]
+    def adjust(self, found: SfmResult, outliers: np.ndarray, progress: StageProgress) -> SfmResult:
+        """The same after bundle adjustment without the observations marked in `outliers` [Q]."""
+        rows = found.observations[outliers]
         names = [self.names[index] for index in found.indices]
         drop = [(names[int(row)], int(number)) for row, number in zip(rows[:, 0], rows[:, 4], strict=True)]
         best = best_attempt(self.attempts)

@@ -58,7 +58,7 @@ def find_background(
     """Estimate the background of `count` images (load: one of them, uint8 [H, W, 3]).
 
     hidden: bool [H, W] of one of them, True where an instrument is known to hide the background; a pixel that it hides
-    in all frames has the colours of all of them, and is `seen` in none.
+    in all frames has the colours of all of them, and is visible in none.
     """
     first = load(0)
     rows = evenly_spaced(count, max(8, min(N_FRAMES, MAX_BYTES // first.nbytes)))

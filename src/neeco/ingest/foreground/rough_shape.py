@@ -91,14 +91,14 @@ def _agreement(
         return np.zeros((0, 3)), 0.0, np.zeros(0), np.zeros(0, dtype=bool)
     axis = np.linspace(-REACH, REACH, cells) * distance
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)  # [G, 3]
-    total, seen = np.zeros(len(grid)), np.zeros(len(grid))
+    total, visible = np.zeros(len(grid)), np.zeros(len(grid))
     for pixels, pose in zip(evidence, camera_from_instrument, strict=True):
         x, y, inside = _raster_cells(grid, pose, pinhole.intrinsics, pixels.shape)
         inside &= ~np.isnan(pixels[y, x])
         total[inside] += pixels[y[inside], x[inside]]
-        seen += inside
-    enough = seen > MIN_VISIBLE * len(evidence)
-    share = np.where(enough, total / np.maximum(seen, 1), 0.0)
+        visible += inside
+    enough = visible > MIN_VISIBLE * len(evidence)
+    share = np.where(enough, total / np.maximum(visible, 1), 0.0)
     return grid, float(axis[1] - axis[0]), share, enough
 
 

@@ -67,7 +67,7 @@ def describe_ranges(frames: np.ndarray) -> str:
 
 
 def choose_frames(
-    features: FrameFeatures, usable: np.ndarray, states: np.ndarray, count: int | None, min_sharpness: float = 0.5
+    features: FrameFeatures, usable: np.ndarray, states: np.ndarray, count: int, min_sharpness: float
 ) -> tuple[np.ndarray, dict[int, DropReason]]:
     """Choose at most `count` sharp frames that differ, spread over states and views; return them, and why not others.
 
@@ -91,7 +91,7 @@ def choose_frames(
         else:
             last = i
     selected = np.array([i for i in range(len(usable)) if i not in dropped], dtype=int)
-    if count is not None and len(selected) > count:
+    if len(selected) > count:
         chosen = selected[_farthest_points(_embedding(features, states)[selected], count)]
         reason = DropReason(f"not among the {count} that cover states and views best", frame_usable=True)
         dropped |= dict.fromkeys((int(i) for i in set(selected) - set(chosen)), reason)

@@ -41,8 +41,8 @@ class Shafts:
     def of(cls, capture: Capture, instrument: Instrument) -> Shafts:
         """Return those of an instrument found in the video. Raises NeecoError for one that was not, or not in every
         frame."""
-        seen = instrument.from_video
-        if seen is None:
+        shaft_video = instrument.from_video
+        if shaft_video is None:
             raise NeecoError(
                 f"{capture.root}: instrument {instrument.name}: was not found in the video, its poses are known; "
                 "give a capture made by `neeco ingest --shaft-diameter`"
@@ -58,8 +58,8 @@ class Shafts:
             camera_from_instrument[:, :3, 2],
             world_from_camera[:, :3, :3],
             np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras], np.float64),
-            seen.shaft_diameter_mm,
-            seen.working_length_mm,
+            shaft_video.shaft_diameter_mm,
+            shaft_video.working_length_mm,
         )
 
     @cached_property

@@ -116,15 +116,15 @@ def solve_joint(
 ) -> AnglePosterior:
     """Solve one joint of all frames, with hand-posed values (frame -> answers, rad), within its limits. Without
     hand-posed frames: by the silhouette's width, over a typical range."""
-    seen = np.maximum(np.abs(np.cos(rolls.values)), MIN_COSINE)
-    opening = np.maximum(shapes.widths - np.quantile(shapes.widths, 0.03), 0.0) / seen
+    foreshortening = np.maximum(np.abs(np.cos(rolls.values)), MIN_COSINE)
+    opening = np.maximum(shapes.widths - np.quantile(shapes.widths, 0.03), 0.0) / foreshortening
     opening /= max(np.quantile(opening, 0.95), 1e-6)
     apart = np.maximum(_squares(shapes.shapes), 0.0)
     covariance = (
         WIDTH_SD**2 * np.outer(opening, opening)
         + SHAPE_SD**2 * np.exp(-0.5 * apart / max(SHAPE_SCALE**2 * np.median(apart), 1e-9))
         + JOINT_SD**2 * _correlation(times, CORRELATION_S * 2 / 3)
-        + np.diag((np.radians(WIDTH_NOISE_DEG) / seen) ** 2)
+        + np.diag((np.radians(WIDTH_NOISE_DEG) / foreshortening) ** 2)
     )
     frames, angles = _answers(posed)
     if not len(frames):

@@ -3,7 +3,7 @@
     - {frame: '000123', instrument: maryland, roll_deg: 152.0, joints_deg: {jaw_angle: 31.0}, when: 2026-03-01 14:05}
 
 roll_deg: angle about the shaft from the direction towards the camera to the hinge's axis (the instrument's x axis);
-joints_deg: as they were drawn. `when` and `who` are optional. Several answers for one frame are all kept.
+joints_deg: as they were posed. `when` and `who` are optional. Several answers for one frame are all kept.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ class SolvedPosing:
             return "jaws at their narrowest"
         names = ["roll", *self.joints]
         least = int(np.argmax(deviations))
-        return f"least sure: {names[least]} ± {deviations[least]:.0f}°"
+        return f"largest deviation: {names[least]} ± {deviations[least]:.0f}°"
 
     def outliers(self) -> list[OutlierAnswer]:
         """Answers that differ from an earlier one of the same frame; and of roll and of each joint the one that differs

@@ -46,29 +46,29 @@ def unrolled_textures(shafts: Shafts, load: Load) -> tuple[np.ndarray, np.ndarra
     """Return textures [F, A, B, C] float32 without the view's shading, and which frames [F] show enough of theirs."""
     along = np.arange(BAND[0] * shafts.working_length_mm, BAND[1] * shafts.working_length_mm, ROW_MM)
     azimuths = np.arange(-MAX_AZIMUTH, MAX_AZIMUTH + 0.01, COLUMN_RAD)
-    seen = np.empty(len(shafts), bool)
+    visible = np.empty(len(shafts), bool)
     textures = np.empty((len(shafts), len(along), len(azimuths), 3), np.float32)
     for frame in range(len(shafts)):
         pixels = unroll(shafts, frame, load(frame), along, azimuths)
-        seen[frame] = (pixels.max(-1) > 0).mean() > MIN_VISIBLE
+        visible[frame] = (pixels.max(-1) > 0).mean() > MIN_VISIBLE
         textures[frame] = np.log(pixels.astype(np.float32) + 10)
     textures -= np.median(textures, axis=(1, 2), keepdims=True)
-    if seen.any():
-        _take_out_shading(textures, seen)
+    if visible.any():
+        _take_out_shading(textures, visible)
     np.clip(textures, -MAX_CONTRAST, MAX_CONTRAST, out=textures)
     for texture in textures:
         cv2.GaussianBlur(texture, (0, 0), 0.8, dst=texture)
         # light from elsewhere varies slowly across the shaft
         texture -= cv2.blur(texture, (15, 1), borderType=cv2.BORDER_REPLICATE)
-    return textures, seen
+    return textures, visible
 
 
-def _take_out_shading(textures: np.ndarray, seen: np.ndarray) -> None:
+def _take_out_shading(textures: np.ndarray, visible: np.ndarray) -> None:
     """Subtract from each texture the mean of those about it in time, in which the instrument has turned."""
     frames = np.arange(len(textures))
-    weights = np.exp(-0.5 * ((frames[:, None] - frames) / SHADING_FRAMES) ** 2) * seen
+    weights = np.exp(-0.5 * ((frames[:, None] - frames) / SHADING_FRAMES) ** 2) * visible
     # a frame without neighbours: the mean over the whole video
-    weights = weights + 1e-3 * seen
+    weights = weights + 1e-3 * visible
     flat = textures.reshape(len(textures), -1)
     flat -= (weights / weights.sum(1, keepdims=True)).astype(np.float32) @ flat
 
@@ -95,8 +95,8 @@ def _normalised(textures: np.ndarray) -> np.ndarray:
     return np.asarray(flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-6))
 
 
-def roll_pairs(textures: np.ndarray, seen: np.ndarray) -> RollPairs:
-    """Compare frames near in time, and every frame with the most similar ones long after it; only those `seen`."""
+def roll_pairs(textures: np.ndarray, visible: np.ndarray) -> RollPairs:
+    """Compare frames near in time, and every frame with the most similar ones long after it; only those `visible`."""
     blocks = [
         RollPairs(
             *(np.zeros((0, *shape), kind) for shape, kind in ((((), int),) * 2 + (((MAX_HYPOTHESES,), float),) * 2))
@@ -105,7 +105,7 @@ def roll_pairs(textures: np.ndarray, seen: np.ndarray) -> RollPairs:
     for start in range(0, len(textures), BLOCK):
         # pairs are counted once: the second comes later
         scores = _correlations(textures[start:], slice(0, BLOCK))
-        first, second = _chosen(scores.max(-1), seen[start:])
+        first, second = _chosen(scores.max(-1), visible[start:])
         turns, found = _peaks(scores[first, second])
         good = found[:, 0] >= MIN_SCORE
         blocks.append(RollPairs(first[good] + start, second[good] + start, turns[good], found[good]))
@@ -114,10 +114,10 @@ def roll_pairs(textures: np.ndarray, seen: np.ndarray) -> RollPairs:
     )
 
 
-def _chosen(best: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _chosen(best: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Choose pairs [R, F] from their highest correlations."""
     apart = np.arange(best.shape[1]) - np.arange(best.shape[0])[:, None]
-    both = seen & seen[: len(best), None]
+    both = visible & visible[: len(best), None]
     far = np.where((apart > FAR_FRAMES) & both, best, -1.0)
     similar = np.argsort(-far, axis=1, kind="stable")[:, :FAR_PAIRS]
     chosen = np.isin(apart, NEAR_FRAMES)

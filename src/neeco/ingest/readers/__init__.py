@@ -50,7 +50,7 @@ class Table:
     file's line (or record) of each row, from 1; stream: which of the file's; record: what a row is called; stated_in:
     the file's own name of the frame that poses are stated in, meaning: what that says (None: nothing, taken as a base);
     notes: what reading it changed or left out, in words; image_hz: images a second of the video, where every row is the
-    state of one of its images; None: rows have times of their own; bodies: where the columns of several stand beside
+    state of one of its images; None: rows have times of their own; bodies: where the columns of several stand next to
     each other, behind those that all share."""
 
     path: Path
@@ -240,7 +240,7 @@ def compare_counts(
 ) -> tuple[str, ...]:
     """A note where images and the rows of a log that belong to them one by one are not equally many.
 
-    file: of the images; noun: what a row is; unlike: share by which the numbers may differ, beside one. Raises
+    file: of the images; noun: what a row is; unlike: share by which the numbers may differ, in addition to one. Raises
     NeecoError, with the remedy, when they differ by more.
     """
     found = f"has {images} images for {rows} {noun}"

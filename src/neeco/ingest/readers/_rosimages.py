@@ -51,7 +51,7 @@ class ImageLog:
         self.received = array("q")  # of every message, ns
         self.stamps = array("q")  # of those that can be used, ns; 0 where the header has none
         self.numbers = array("q")  # which message each of these is
-        self.sizes: dict[tuple[int, int], None] = {}  # (width, height), in the order seen
+        self.sizes: dict[tuple[int, int], None] = {}  # (width, height), in the order found
         self.encodings: dict[str, None] = {}
         self.frames: set[str] = set()
         self.bad: Counter[str] = Counter()  # messages that cannot be used, by why

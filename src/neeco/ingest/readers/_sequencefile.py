@@ -1,6 +1,6 @@
 """MetaImage and NRRD files of a sequence of frames: the text before the data, and the images, with limits on both.
 
-A header may promise anything: nothing is allocated for what it says before the file is seen to be large enough, and
+A header may promise anything: nothing is allocated for what it says before the file is known to be large enough, and
 compressed data is unpacked frame by frame.
 """
 
@@ -194,7 +194,7 @@ def _dimensions(header: _Header, name: str, sizes: list[int], kinds: list[str]) 
 def _beside(header: _Header, field_name: str, name: str) -> Path:
     file = header.path.parent / name
     if Path(name).name != name or not file.is_file():
-        problem = f"{printable(name)} is no file beside {header.path.name}"
+        problem = f"{printable(name)} is no file next to {header.path.name}"
         raise NeecoError(f"{header.path}: {field_name}: {problem}; put there what was written with it")
     return file
 

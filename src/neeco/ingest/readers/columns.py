@@ -183,7 +183,7 @@ _ROTATION_VECTORS = _choices(
     "xyz", True, ["rotvec_", "rotation_vector_", "rodrigues_", "rv", "rvec_", "rotvec", "rvec"]
 )
 _EULER_ANGLES = (["roll", "pitch", "yaw"], ["rx", "ry", "rz"], ["alpha", "beta", "gamma"])
-_POSE_WORDS = ("pose", "cp", "tcp", "ee", "eef", "tip", "measured", "state")  # of columns, beside their body's name
+_POSE_WORDS = ("pose", "cp", "tcp", "ee", "eef", "tip", "measured", "state")  # of columns, next to their body's name
 _ROS = re.compile(r"(^|[._/])(pose|transform|transforms\d*)[._/]")
 
 
@@ -192,7 +192,7 @@ def recognise_time(header: Sequence[str]) -> RecognisedColumns:
     plain = _by_plain_name(header, "time")
     seconds = [name for name in plain if name.endswith("stamp_sec")]
     fraction = [name for name in plain if name.endswith(("stamp_nanosec", "stamp_nsec"))]
-    if not seconds:  # `header.stamp.sec` reads as a stamp in seconds beside its nanoseconds
+    if not seconds:  # `header.stamp.sec` reads as a stamp in seconds next to its nanoseconds
         split = {_plain(name): name for name in header}
         seconds = [name for name in split if name.endswith(("stamp_sec", "stamp_secs"))]
         fraction = [name for name in split if name.endswith(("stamp_nanosec", "stamp_nsec", "stamp_nsecs"))]
@@ -263,8 +263,8 @@ def pose_bodies(header: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def recognise_value(header: Sequence[str], given: _Given = _NOTHING) -> tuple[str | None, RecognisedColumns]:
-    """The one column beside the time that can be a joint's reading (None when there are none or several). given: as
-    for `recognise_pose`."""
+    """Return the one column, other than the time, that can be a joint's reading; None when there are none or several.
+    given: as for `recognise_pose`."""
     header = _left(header, given)
     when = RecognisedColumns() if "time" in given else recognise_time(header)
     counters = {"frame", "seq", "index", "header_seq", "field_header_seq", "frame_id", "header_frame_id", "state"}
@@ -294,7 +294,7 @@ def _plain(name: str) -> str:
 
 
 def _by_plain_name(header: Sequence[str], kind: str) -> dict[str, str]:
-    """Columns by their plain names without the unit; of two alike, the first."""
+    """Columns by their plain names without the unit; of two that are equal, the first."""
     plain: dict[str, str] = {}
     for name in header:
         plain.setdefault(_plain(split_unit(name, kind)[0]), name)

@@ -166,8 +166,8 @@ def _delimiter(lines: Sequence[str]) -> str:
     """Return the sign between the cells of the rows, which are most of the second half of a file."""
     rows = lines[len(lines) // 2 :][:SAMPLE_LINES]
     for delimiter in "\t;":  # before commas, which may be those of decimals then
-        count, alike = Counter(row.count(delimiter) for row in rows).most_common(1)[0]
-        if count and alike > 0.9 * len(rows):
+        count, n_similar = Counter(row.count(delimiter) for row in rows).most_common(1)[0]
+        if count and n_similar > 0.9 * len(rows):
             return delimiter
     delimiter = max(",;\t", key=lambda sign: sum(row.count(sign) for row in rows))
     return delimiter if any(delimiter in row for row in rows) else " "

@@ -1,6 +1,6 @@
 """Sessions of the dVRK's data_collection: videos with the time of every frame, topics in a bag or as CSV.
 
-A session is a folder with `index.json`, videos, beside each a JSON file with its frames' times, and a bag; its
+A session is a folder with `index.json`, videos, next to each a JSON file with its frames' times, and a bag; its
 `extract` writes images named by their times, and a CSV file of each topic. Both count Unix time.
 """
 
@@ -156,7 +156,7 @@ def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:
             continue
         file = path / name
         if not file.is_file():
-            absent[file.stem] = f"{path / INDEX}: videos: {printable(name)} is not there; put it beside {INDEX}"
+            absent[file.stem] = f"{path / INDEX}: videos: {printable(name)} is not there; put it next to {INDEX}"
             continue
         try:
             times, layout = _frame_times(file.with_suffix(".json"))

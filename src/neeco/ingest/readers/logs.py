@@ -378,9 +378,9 @@ def _cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
     rows.drop(missing, f"no value for {', '.join(names)}" if len(names) < 3 else "values are missing")
     bad = [(row, what) for row, what in bad if rows.keep[row]]
     if len(bad) > max(3, 0.5 * rows.keep.sum()):
-        alike = f"{len(bad)} of {count_rows(len(table.rows))} like it"
+        similar = f"{len(bad)} of {count_rows(len(table.rows))} like it"
         raise NeecoError(
-            f"{table.where}: {table.record} {table.lines[bad[0][0]]}: {bad[0][1]} ({alike}); name other columns or "
+            f"{table.where}: {table.record} {table.lines[bad[0][0]]}: {bad[0][1]} ({similar}); name other columns or "
             "repair the file"
         )
     if bad:

@@ -132,7 +132,7 @@ class IngestSettings:
     sfm_minutes: float = 20.0  # of processor time looking for cameras, after which no further way is tried
     shape_frames: int = 60  # from which an instrument's rough shape is carved
     moving_px: float = 1.5  # optical flow in images of 320x256 that the still scene does not explain: the pixel moves
-    tracker_noise_mm: float = 0.25  # of a tracker's samples: where the robust loss begins to doubt one
+    tracker_noise_mm: float = 0.25  # residual of a tracker's samples beyond which the robust loss discounts one
     tracker_noise_rad: float = 0.002
     tracker_drift_mm: float = 0.3  # of a tracker over seconds
     registration_steps: int = 40  # evaluations of the least-squares solver

@@ -107,7 +107,7 @@ class _FolderFiles:
 
 def write_template(source: Path, report: Callable[[str], None] = lambda problem: None) -> str:
     """The text of a recording.yaml for the files in a folder and its subfolders, or for one file or folder that holds
-    several streams, to stand beside it; `read_recording` accepts it. report: called with each
+    several streams, to stand next to it; `read_recording` accepts it. report: called with each
     file that cannot be read, which is left out.
 
     Raises NeecoError when there are no images.

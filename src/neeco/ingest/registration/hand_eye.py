@@ -28,7 +28,7 @@ MIN_TRAVEL_MM = 3.0  # mm, spread of the scope's positions below which the scale
 KNOT_SPACING_S = 2.5  # s between the knots of the tracker's drift
 CORRELATED_S = 1.0  # over which residuals of neighbouring frames are correlated: smoothing and drift of the tracker
 LAG, STRETCH = 13, 14  # the unknowns of the clock
-N_UNKNOWNS = 15  # beside the drift: scale, rotation, origin, hand-eye rotation, lever, clock
+N_UNKNOWNS = 15  # in addition to the drift: scale, rotation, origin, hand-eye rotation, lever, clock
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -183,12 +183,12 @@ def shaded_edges(
         light = LINEAR_LIGHT[images[frame]]  # shading and blur are of light, not of its gamma-coded values
         normals = contour_normals(axes.points[frame], axes.directions[frame], radius)
         for side, line in enumerate(image_lines(normals, intrinsics)):
-            places, sure, misfit = _edge(light, ends, line, width / 2, blur)
+            places, sds, misfit = _edge(light, ends, line, width / 2, blur)
             misfits += misfit.tolist()
             keep = evenly_spaced(len(places), MAX_PLACES)
             pixels[frame, side, : len(keep)] = places[keep]
             # an edge has an error as a whole, too: its places are not independent
-            deviations[frame, side, : len(keep)] = np.hypot(sure[keep], SYSTEMATIC_SD_PX * np.sqrt(max(len(keep), 1)))
+            deviations[frame, side, : len(keep)] = np.hypot(sds[keep], SYSTEMATIC_SD_PX * np.sqrt(max(len(keep), 1)))
     return ShaftEdges(pixels, deviations), diameters, float(np.mean(misfits)) if misfits else np.inf
 
 
@@ -250,10 +250,10 @@ def _edge(
     shift = _candidates()[best] + STEP_PX * 0.5 * (low - high) / curvature
     noise = np.maximum(least, MIN_MISFIT) / (3 * used.sum())
     independent = SAMPLE_PX  # neighbouring samples are of one pixel
-    sure = np.sqrt(2 * noise / independent * STEP_PX**2 / curvature)
+    sds = np.sqrt(2 * noise / independent * STEP_PX**2 / curvature)
     centers = foot[:cut].reshape(blocks, BLOCK_PX, 2).mean(1)[whole]
     found = centers - shift[:, None] * line[:2]
-    return found[inner], sure[inner], noise[inner]
+    return found[inner], sds[inner], noise[inner]
 
 
 def _offsets() -> np.ndarray:

@@ -119,7 +119,7 @@ def find_shaft(
     share = float((diameters >= MIN_DIAMETERS).mean())
     if share < MIN_SHARE:
         raise NeecoError(
-            f"two diameters of shaft are seen in {share:.0%} of the frames (at least {MIN_SHARE:.0%} are needed to "
+            f"two diameters of shaft are visible in {share:.0%} of the frames (at least {MIN_SHARE:.0%} are needed to "
             "find its direction); hold the scope back, or the instrument farther in, so that its shaft shows"
         )
     by_color = bool(ends.any()) and heads is not None
@@ -175,8 +175,8 @@ def _require_one(masks: np.ndarray) -> None:
         )
     if two > SECOND_SHARE * seen:
         raise NeecoError(
-            f"two instruments are seen in {two} of {len(masks)} frames, and from video alone they are not told apart; "
-            "film one at a time"
+            f"two instruments are visible in {two} of {len(masks)} frames, and from video alone they cannot be "
+            "distinguished; film one at a time"
         )
 
 
@@ -193,7 +193,7 @@ def _first_axes(
     axes, edges, found = outline_edges(masks, ends, lines.directions, video.radius, video.intrinsics)
     if found.sum() < max(MIN_FRAMES, MIN_FRAMES_SHARE * len(masks)):
         raise NeecoError(
-            f"a shaft is seen in {int(found.sum())} of {len(masks)} frames; hold the scope back, so that more than "
+            f"a shaft is visible in {int(found.sum())} of {len(masks)} frames; hold the scope back, so that more than "
             "the instrument's end shows"
         )
     axes, edges = _bridged(video, axes, edges, found)

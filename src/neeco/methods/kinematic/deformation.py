@@ -63,13 +63,13 @@ PRIOR_WEIGHT = 1e-5  # on what is learned of stated kinematics, in squared stand
 class KinematicSettings:
     """`shaft_roll`: probability of spinning the shaft (a surface of revolution) by a random angle, from iteration
     `shaft_roll_start` on; `opacity_penalty`: on the instruments' mean opacity, a tenth of it from iteration
-    `opacity_penalty_stop` on; `label_sharpness`: weight of l (1 - l) on the drawn instrument label, after iteration
+    `opacity_penalty_stop` on; `label_sharpness`: weight of l (1 - l) on the rendered instrument label, after iteration
     `label_sharpness_start`; `part_sharpness`: weight of how mixed Gaussians are of parts, after iteration
     `hinge_start`, from which on hinges are learned, by rates that `rate_scale` multiplies; `refine_wrists`: whether
     wrists are looked for again at 60 and 80 % of the run; `shadow`: whether the instruments' shadow on the tissue is
-    looked for and drawn (see `neeco.raster.shadow`), first at the iterations `shadow_at`; `extrapolate_tissue`: whether
-    tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`); `label_shares`: whether
-    Gaussians that model shadow or blur beside an instrument count less in its labels, by the images' colours;
+    looked for and rendered (see `neeco.raster.shadow`), first at the iterations `shadow_at`; `extrapolate_tissue`:
+    whether tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`); `label_shares`:
+    whether Gaussians that model shadow or blur next to an instrument count less in its labels, by the images' colours;
     `breathing`: whether a period is looked for with which the tissue moves, and its motion learned (see
     `neeco.methods.breathing`); `kinematics`: whether joints move as the capture's kinematics state, where they do (else
     as found from the images); `stated_axes`, `stated_readings`: whether the axes stated there, and offsets and gains of

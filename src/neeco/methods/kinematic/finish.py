@@ -112,9 +112,9 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
         given, middle = given + errors[0], middle + errors[1]
     explained = 1 - given / middle if middle > 0 else 0.0
     explains = bool(explained > MIN_JOINT_EXPLAINED and math.isfinite(explained))
-    doubt = scene.diagnostics.get("doubted_readings", {}).get(f"{instrument.name}.{name}")
-    if doubt is not None:
-        verdict = f"NOT found: {doubt}"
+    warning = scene.diagnostics.get("doubted_readings", {}).get(f"{instrument.name}.{name}")
+    if warning is not None:
+        verdict = f"NOT found: {warning}"
     elif explains:
         verdict = f"found: the reading explains {explained:.0%} of the moving parts' error"
     else:
@@ -123,7 +123,7 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
             "unseen joint angles will look wrong (record a wider joint range, or check the joint's log)"
         )
     return {
-        "found": explains and doubt is None,
+        "found": explains and warning is None,
         "explained": round(explained, 4),
         **articulation.describe(name),
         "verdict": verdict,

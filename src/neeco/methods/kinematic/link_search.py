@@ -221,8 +221,8 @@ def _on_link(
         place, directions = (part.to(device) for part in side)
         outside = ((points - place) @ directions.T + SIDE_TOLERANCE_RADII * radius).clamp_max(0)  # [Q, K]
         points = points - 2 * outside @ directions  # mirrored into the half spaces
-    own, seen = views[link].scores(points)
-    likely = torch.nonzero((own > 0.5 * MIN_LEVEL) & (seen > MIN_VISIBLE_SHARE))[:, 0]
+    own, visible = views[link].scores(points)
+    likely = torch.nonzero((own > 0.5 * MIN_LEVEL) & (visible > MIN_VISIBLE_SHARE))[:, 0]
     others = torch.stack([view.scores(points[likely])[0] for k, view in enumerate(views) if k != link]).amax(0)
     fits = own[likely] >= others - EVIDENCE_TOLERANCE
     likely, score = likely[fits], own[likely][fits]
@@ -275,8 +275,8 @@ def check_readings(
     session.report(
         f"warning: {instrument.name}: its links fit the images {most / max(named, 1):.1f} times as well {words}"
     )
-    doubts = session.scene.diagnostics.setdefault("doubted_readings", {})
-    doubts |= {f"{instrument.name}.{name}": f"the links fit the images better {words}" for name in names}
+    warnings = session.scene.diagnostics.setdefault("doubted_readings", {})
+    warnings |= {f"{instrument.name}.{name}": f"the links fit the images better {words}" for name in names}
 
 
 def _exchanged(one: str, other: str, given: Readings) -> Readings:
@@ -313,8 +313,8 @@ class _Volumes:
         moved = link_motions(self.links, [change(given) for given in self.readings])  # [F, L, 4, 4]
         total = 0.0
         for link, points in enumerate(self.points, 1):
-            score, seen = score_points(self.evidence, self.camera_from_instrument @ moved[:, link], points)
+            score, visible = score_points(self.evidence, self.camera_from_instrument @ moved[:, link], points)
             total += float(
-                (((score - MIN_LEVEL) / (1 - MIN_LEVEL)).clamp(0, 1) * (seen > CHECK_MIN_VISIBLE_SHARE)).sum()
+                (((score - MIN_LEVEL) / (1 - MIN_LEVEL)).clamp(0, 1) * (visible > CHECK_MIN_VISIBLE_SHARE)).sum()
             )
         return total

@@ -375,5 +375,5 @@ def _same_axis(one: Link, other: Link) -> bool:
 
 def _common_name(names: Sequence[str]) -> str:
     """Return the common prefix of the names without a separator at its end: jaw for jaw_left and jaw_right."""
-    alike = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
-    return "".join(letters[0] for letters in alike).rstrip("_- ") or "+".join(sorted(names))
+    common = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+    return "".join(letters[0] for letters in common).rstrip("_- ") or "+".join(sorted(names))

@@ -1,7 +1,7 @@
 """The radiance field of method `nerfies`: settings, SE(3) warp, template, volume rendering, and its scene.
 
 Nerfies (Park et al., ICCV 2021): a template NeRF, and for every time a code from which an SE(3) field warps each
-sample of a ray into the template. Faithful to the source: SE(3) field with a skip at layer 4, heads drawn from
+sample of a ray into the template. Faithful to the source: SE(3) field with a skip at layer 4, heads initialised from
 U(1e-4), its frequencies opened from coarse to fine over the first 32 % of the run (80k of 250k), elastic and background
 loss, a rate that falls to a tenth along a line of its logarithms, a sample at infinity, codes of 8 numbers.
 
@@ -229,7 +229,7 @@ class Template(nn.Module):
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays and when each was seen. A sample at depth z (mm along the camera's axis) lies at origin + z direction."""
+    """Rays, each with its time. A sample at depth z (mm along the camera's axis) lies at origin + z direction."""
 
     origins: Tensor  # [R, 3] mm
     directions: Tensor  # [R, 3] per mm of depth, so not unit
@@ -378,7 +378,7 @@ class NerfScene(nn.Module):
         return nullcontext()
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Nothing beside the state of its modules."""
+        """Return nothing: the state of its modules is complete."""
         return {}, {}
 
     def codes_at(self, codes: Tensor, times: Tensor) -> Tensor:

@@ -157,7 +157,7 @@ def articulate(
     numbers, logits, roll, g, inside, x, y, z, qw, qx, qy, qz,
     SPINS: tl.constexpr, JOINTS: tl.constexpr, LINKS: tl.constexpr, SLIDES: tl.constexpr, LOGITS: tl.constexpr,
 ):  # fmt: skip
-    """Resting means and quaternions moved by roll and joints, and what shares of links are made of: the gate, the
+    """Resting means and quaternions moved by roll and joints, and the terms of the shares of links: the gate, the
     greatest logit, the sum of exponentials, the share that moves; 0 without joints."""
     gate, greatest, total, moving = 0.0 * x, 0.0 * x, 0.0 * x, 0.0 * x
     if JOINTS > 0:

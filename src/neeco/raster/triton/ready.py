@@ -26,7 +26,7 @@ def interpreted() -> bool:
 
 
 def missing(device: torch.device) -> str | None:
-    """What Triton lacks to draw on `device`, as far as it can be told without trying, with the remedy; None: nothing"""
+    """Return what Triton lacks to render on `device`, as far as is known without trying, with the remedy, or None."""
     if not installed():
         return "package triton is missing; on Linux pip install 'neeco[triton]', or draw on the CPU"
     if interpreted():

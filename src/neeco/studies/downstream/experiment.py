@@ -197,7 +197,7 @@ def _notes(settings: DownstreamSettings, counts: Sequence[int]) -> list[str]:
     if few := [count for count in counts if 0 < count < settings.min_validated]:
         notes.append(
             f"{', '.join(map(str, few))} labelled frames: too few to hold some out; trained on them alone the last "
-            "weights are taken, beside a set those that do best on synthetic images"
+            "weights are taken, together with a set those that do best on synthetic images"
         )
     if settings.labels is not None:
         notes.append(f"labels of recorded training frames: {settings.labels}; tests are scored by the capture's truth")

@@ -75,7 +75,7 @@ def parse_condition(name: str, sets: Collection[str]) -> Condition:
     edges = [edge for edge in EDGES if edge in words]
     chosen = tuple(word for word in words if word in sets)
     if len(edges) > 1 or (edges and not chosen):
-        raise NeecoError(f"--conditions {name}: one of {', '.join(EDGES)} at most, and only beside a set")
+        raise NeecoError(f"--conditions {name}: one of {', '.join(EDGES)} at most, and only together with a set")
     if not chosen and REAL not in words:
         raise NeecoError(f"--conditions {name}: nothing to learn from; add real or a set")
     return Condition(name, chosen, REAL in words, AUGMENT in words, edges[0] if edges else DEFAULT_EDGES)

@@ -1,6 +1,6 @@
 """Formats of dataset hubs: `imagefolder/` (Hugging Face) and WebDataset shards.
 
-imagefolder/{train,validation}/metadata.jsonl beside the images and their masks:
+imagefolder/{train,validation}/metadata.jsonl next to the images and their masks:
                                              datasets.load_dataset("imagefolder", data_dir="DATASET/imagefolder")
 webdataset/{train,val}-NNNNNN.tar            samples read in a row, a sample's files with its number as key: .png or
                                              .jpg (image), .mask.png, .parts.png, .ignore.png, .depth.png and .json

@@ -1,7 +1,7 @@
 """YOLO: detect, segment, pose and oriented-box label files that Ultralytics-style tools read.
 
 Such tools find an image's labels by replacing the last `/images/` of its path by `/labels/`, so every variant has an
-`images` folder of its own beside its `labels`: hard links to the data set's images (copies where the file system has
+`images` folder of its own next to its `labels`: hard links to the data set's images (copies where the file system has
 no hard links), never symbolic ones.
 
     yolo/{data.yaml, images/{train,val}, labels/{train,val}}     detect

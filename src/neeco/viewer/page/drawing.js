@@ -22,7 +22,7 @@ class Drawing {
     return new Drawing(workers);
   }
 
-  // Drops what is still to be drawn.
+  // Drops the bands still to be rendered.
   drop() {
     this.job++;
   }

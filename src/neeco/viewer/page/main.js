@@ -54,7 +54,7 @@ class Page {
     return { ...this.eye.lensAt(scale), state: packedState(this.head, this.wish), matrix: Float32Array.from(this.eye.matrix), show, depths, all };
   }
 
-  // Draws and shows; false where it was dropped on the way.
+  // Renders and shows; false where it was dropped on the way.
   async show(scale) {
     const began = performance.now(), wish = this.wished(scale, this.wish.view, false);
     const bands = await this.drawing.draw(wish);

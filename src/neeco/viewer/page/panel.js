@@ -76,7 +76,7 @@ class Panel {
     this.sliders.push(() => { input.value = read(); output.textContent = written(read()); });
   }
 
-  // Shows what is wished.
+  // Shows the requested state.
   refresh() {
     const { page } = this;
     this.sliders.forEach((refresh) => refresh());

@@ -27,7 +27,7 @@ function wholeNumbers(fields, bytes, n) {
   return found;
 }
 
-// What the rasteriser takes, in the order of its inputs.
+// The rasteriser's inputs, in their order.
 function rasteriserInputs(head, raw, n) {
   const { ranges, light } = head;
   const count = (head.degree + 1) ** 2;

@@ -1,4 +1,4 @@
-// What the sliders say -> where the instruments stand. Lengths in mm, angles in rad, cameras in OpenCV axes.
+// Values of the sliders -> poses of the instruments. Lengths in mm, angles in rad, cameras in OpenCV axes.
 
 function multiply(a, b) {
   const c = new Array(12).fill(0);

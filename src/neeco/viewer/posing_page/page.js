@@ -52,7 +52,7 @@ async function go(index, reason) {
   haunt();
 }
 
-// the trained scene at the sliders' state; one drawing at a time, the last one wished for
+// the trained scene at the sliders' state; one rendering at a time, the last one requested
 let haunting = false, wished = false;
 async function haunt() {
   wished = true;
@@ -146,11 +146,11 @@ function draw() {
     stroke(context, [point(0, 0, hinge), point(0, reach * Math.sin(angle), hinge + reach * Math.cos(angle))], JAW, 3);
 }
 
-function slider(label, kind, low, high, value, change, sure) {
+function slider(label, kind, low, high, value, change, deviation) {
   const row = document.createElement("label"), said = document.createElement("output"), input = document.createElement("input");
   row.append(label, said, input);
   Object.assign(input, { type: "range", min: low, max: high, step: 1, value, className: kind });
-  const show = () => said.textContent = `${Math.round(input.value)}°` + (sure ? `  (expected ± ${Math.round(sure)}°)` : "");
+  const show = () => said.textContent = `${Math.round(input.value)}°` + (deviation ? `  (expected ± ${Math.round(deviation)}°)` : "");
   input.oninput = () => { change(Number(input.value)); show(); draw(); haunt(); };
   show();
   return row;
@@ -159,8 +159,8 @@ function slider(label, kind, low, high, value, change, sure) {
 function sliders() {
   const rows = [slider("roll", "pin", -180, 180, pose.roll, value => pose.roll = value, overview.done ? frame.roll.deviation : 0)];
   for (const [name, [low, high]] of Object.entries(overview.joints)) {
-    const sure = overview.done ? frame.joints[name].deviation : 0;
-    rows.push(slider(name, "jaw", low, high, pose.joints[name], value => pose.joints[name] = value, sure));
+    const deviation = overview.done ? frame.joints[name].deviation : 0;
+    rows.push(slider(name, "jaw", low, high, pose.joints[name], value => pose.joints[name] = value, deviation));
   }
   $("sliders").replaceChildren(...rows);
 }
@@ -253,7 +253,7 @@ function report() {
   $("answers").replaceChildren(...overview.answered.map(item => {
     const row = document.createElement("li");
     const joints = Object.entries(item.joints).map(([name, value]) => `, ${name} ${Math.round(value)}°`).join("");
-    row.textContent = `${item.name}: roll ${Math.round(item.roll)}°${joints}` + item.doubts.map(doubt => `; ${doubt}`).join("");
+    row.textContent = `${item.name}: roll ${Math.round(item.roll)}°${joints}` + item.doubts.map(warning => `; ${warning}`).join("");
     row.className = item.doubts.length ? "doubted" : "";
     row.onclick = () => go(item.frame, "posed before").catch(fail);
     return row;
@@ -308,9 +308,9 @@ function toggleGhost() {
   haunt();
 }
 
-function say(text, doubted) {
+function say(text, warned) {
   $("said").textContent = text;
-  $("said").className = doubted ? "doubted" : "";
+  $("said").className = warned ? "doubted" : "";
 }
 
 function keep() {
