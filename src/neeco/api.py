@@ -370,8 +370,7 @@ def ingest(
         print(made.output, made.verdict, len(made.capture.frames))
     """
     from neeco.ingest.convert import convert_folder
-    from neeco.ingest.recording.file import recording_from_flags
-    from neeco.ingest.sources import folder_to_convert, read_recordings
+    from neeco.ingest.sources import folder_to_convert, read_recordings, recording_from_flags
     from neeco.report.ingested import Ingested, ingest_and_report
 
     sources, output, report = [Path(path) for path in recordings], Path(output), progress or _silent

@@ -375,7 +375,7 @@ def read_begun(
     if not resume:
         raise NeecoError(f"{output}: not empty; give another folder, or --resume to continue {work} begun there")
     if not file.exists():
-        raise NeecoError(f"{output}: not empty and no {name} in it; --resume continues only {work} begun by neeco")
+        raise NeecoError(f"{output}: not empty and no {name} in it; give another folder (only {work} is continued)")
     require_inside(file, output)
     begun = read_json(file) if read is None else read(output)
     if not isinstance(begun, dict):

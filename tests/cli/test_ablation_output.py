@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from neeco.cli.ablate import _print_tables
+from neeco.cli.ablate import print_tables
 from neeco.studies.ablation_study import AblationResult, AblationRow, AblationTable
 
 MEASURES = ["psnr.test", "psnr.unseen", "mask_iou.test", "mask_iou.unseen"]
@@ -64,7 +64,7 @@ def test_own_tables_are_printed_whole_and_the_papers_as_their_verdict(width: int
         notes=["[few] steps"],
     )
     console = Console(width=width, record=True, file=io.StringIO())
-    _print_tables(console, ablation)
+    print_tables(console, ablation)
     shown = console.export_text()
     assert "The paper's: 1 of 1 as in the paper" in shown
     assert all(text in shown for text in ("21.25 (+0.25)", "20.50", "0.700 (+0.250)", "0.500"))

@@ -6,7 +6,7 @@ import io
 
 from rich.console import Console
 
-from neeco.cli.evaluate import COLUMNS, _table
+from neeco.cli.evaluate import COLUMNS, evaluation_table
 from neeco.evaluation.mask_folders import USUAL_NAMES
 from neeco.evaluation.mask_metrics import part_scores
 
@@ -16,7 +16,7 @@ def test_no_number_is_cut_at_eighty_columns() -> None:
     numbers["part_iou"] = dict.fromkeys(part_scores(USUAL_NAMES))
     evaluation = {kind: {"test": numbers, "unseen": numbers} for kind in ("given", "aligned")}
     out = io.StringIO()
-    Console(file=out, width=80).print(_table(evaluation))
+    Console(file=out, width=80).print(evaluation_table(evaluation))
     assert out.getvalue().count("31.42") == 4
     assert "…" not in out.getvalue()
     assert "jaws" not in out.getvalue(), "parts without a number take no row"

@@ -15,9 +15,8 @@ from neeco.ingest.frames.views import Views
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.model import InstrumentLogs, Recording, VideoFile
-from neeco.ingest.recording.notes import Notes
 from neeco.ingest.timing.clock_search import ClockOffset
-from neeco.ingest.timing.episodes import Episode, Episodes
+from neeco.ingest.timing.episodes import Episode, Episodes, Notes
 
 WIDTH, HEIGHT, FOCAL = 160, 128, 145.0
 INTRINSICS = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)

@@ -20,9 +20,10 @@ from neeco.ingest.assessment import assess_ingest
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.posing.hand_posed import HandPose
 from neeco.ingest.posing.posed_capture import PosedCapture
-from neeco.ingest.recording.file import read_recording, recording_from_flags
+from neeco.ingest.recording.file import read_recording
 from neeco.ingest.shaft.axis import axis_between, contour_normals, image_lines
 from neeco.ingest.shaft.from_video import find_shaft
+from neeco.ingest.sources import recording_from_flags
 from neeco.ingest.timing.episodes import with_roll
 
 

@@ -421,7 +421,7 @@ def test_timestamps_that_stand_still_are_replaced_with_a_note(tmp_path):
 
 
 def test_only_the_rows_of_the_episode_are_read(tmp_path, monkeypatch):
-    from neeco.ingest.readers._lerobotfiles import ParquetFile
+    from neeco.ingest.readers.lerobot_files import ParquetFile
 
     states = [{STATE: arm(20, number)} for number in range(40)]
     path = data_set(tmp_path, states=states, names={}, cameras=(), group=20)

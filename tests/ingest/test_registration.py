@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from neeco.errors import NeecoError
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.registration.hand_eye import register_with_laparoscope
-from neeco.ingest.timing.clock_search import GIVEN, STEP_S, ClockOffset, _best_rate, clock_from_instrument, correlate
+from neeco.ingest.timing.clock_search import GIVEN, STEP_S, ClockOffset, best_rate, clock_from_instrument, correlate
 
 HAND_EYE = np.eye(4)
 HAND_EYE[:3, :3] = Rotation.from_euler("xyz", [20, -10, 35], degrees=True).as_matrix()
@@ -165,7 +165,7 @@ def test_rates_are_found_in_long_recordings_too() -> None:
     known = np.random.default_rng(2).normal(size=int(length / 0.5))
     speed = np.abs(np.interp(np.arange(0, length, STEP_S), np.arange(len(known)) * 0.5, known))
     video = np.interp(np.arange(0, 120, STEP_S) * 1.01 + 20, np.arange(0, length, STEP_S), speed)
-    rate, lags, scores = _best_rate(video, speed)
+    rate, lags, scores = best_rate(video, speed)
     assert rate == pytest.approx(1.01, abs=0.001)
     assert lags[scores.argmax()] * STEP_S == pytest.approx(20, abs=0.1)
 

@@ -20,8 +20,9 @@ from neeco.errors import NeecoError
 from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
-from neeco.ingest.recording.file import read_recording, recording_from_flags
+from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
+from neeco.ingest.sources import recording_from_flags
 from neeco.ingest.timing.reading import read_episodes
 
 SIZE = (64, 48)  # px

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neeco.ingest.frames.selection import choose_frames, describe_ranges, frame_features, frozen_frames
+from neeco.ingest.frames.images import choose_frames, describe_ranges, frame_features, frozen_frames
 
 
 def picture(shift: float, blur: int = 1) -> np.ndarray:

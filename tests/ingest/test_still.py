@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from neeco.ingest.cameras.still import stands_still
+from neeco.ingest.cameras.still_scene import stands_still
 from neeco.ingest.foreground.background import exposure, find_background
 from neeco.ingest.foreground.masks import moving_masks
 

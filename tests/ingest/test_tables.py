@@ -5,7 +5,7 @@ import pytest
 
 from neeco.errors import NeecoError
 from neeco.ingest.readers import read_table, recording_formats
-from neeco.ingest.readers.logs import Rows
+from neeco.ingest.readers.rows import Rows
 
 
 @pytest.fixture

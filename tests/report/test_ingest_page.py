@@ -24,12 +24,12 @@ from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.ingest.assessment import MAX_SHOWN, assess_ingest
 from neeco.ingest.foreground.rough_shape import RoughShape
-from neeco.ingest.frames.selection import DropReason
-from neeco.ingest.recording.notes import Contradiction
+from neeco.ingest.frames.images import DropReason
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.result import IngestResult
 from neeco.ingest.timing.clock_search import ClockOffset
+from neeco.ingest.timing.episodes import Contradiction
 from neeco.report import ingest_page
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
 from neeco.report.ingest_figures import in_view, main_axes, posed_picture, read_tracks, round_length

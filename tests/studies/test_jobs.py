@@ -85,7 +85,7 @@ def test_a_begun_run_keeps_what_its_processor_decided(make_job) -> None:
     for half in (True, False):  # one of them is not what this processor would decide
         write_config(job.folder, job.capture, with_fields(job.train_config, {"deformation.half": half}), "")
         job.check()
-    with pytest.raises(NeecoError, match="deformation: this run has"):
+    with pytest.raises(NeecoError, match="deformation: begun with"):
         make_job(config=training_config("neeco", {}, ["deformation.half=true"])).check()
 
 
@@ -259,14 +259,14 @@ def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytes
 @pytest.mark.parametrize(
     ("changes", "reported"),
     [
-        ({"budget": Budget(None, 13)}, "budget: this run has 12 iterations, not 13 iterations"),
+        ({"budget": Budget(None, 13)}, "budget: begun with 12 iterations, now 13 iterations"),
         (
             {"budget": Budget(None, 12, "processor")},
-            "budget: this run has 12 iterations, not 12 iterations, CPU time",
+            "budget: begun with 12 iterations, now 12 iterations, CPU time",
         ),
         (
             {"config": training_config("3dgs", {"max_tissue_gaussians": 99})},
-            "max_tissue_gaussians: this run has None, not 99",
+            "max_tissue_gaussians: begun with None, now 99",
         ),
     ],
 )
@@ -280,7 +280,7 @@ def test_a_folder_of_another_job_is_refused_before_any_work(make_job, changes, r
 def test_a_run_of_another_capture_is_refused(make_job, tmp_path) -> None:
     job = make_job()
     job.run()
-    with pytest.raises(NeecoError, match="capture: this run was trained on"):
+    with pytest.raises(NeecoError, match="capture: begun with"):
         run_jobs([replace(job, capture=tmp_path / "other")])
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFont
 
-from neeco.synthesis.preview import BOX, TILE_WIDTH, _tag, wrap
+from neeco.synthesis.preview import BOX, TILE_WIDTH, draw_name, wrap
 
 ITEMS = ["arm1 16% seen", "arm1_shaft 99% seen", "arm2 0% seen", "arm2_shaft 97% seen", "camera_holder 5% seen"]
 
@@ -35,6 +35,6 @@ def test_no_items_no_lines():
 @pytest.mark.parametrize("x", [10.0, TILE_WIDTH - 5.0])
 def test_a_name_beside_the_right_edge_is_read_whole(x):
     image = Image.new("RGB", (TILE_WIDTH, 60))
-    _tag(ImageDraw.Draw(image), x, 40, "arm1_shaft")
+    draw_name(ImageDraw.Draw(image), x, 40, "arm1_shaft")
     columns = np.flatnonzero((np.asarray(image)[24:40] == BOX).all(-1).any(0))
     assert columns[-1] - columns[0] >= ImageFont.load_default(11).getlength("arm1_shaft") + 6

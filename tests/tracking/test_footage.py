@@ -244,7 +244,7 @@ def test_the_video_that_a_folder_was_begun_with_is_asked_for(
     file.write_bytes(b"one")
     kept.mkdir(parents=True)
     (kept / "source.json").write_text('{"video_sha256": "another"}')
-    with pytest.raises(NeecoError, match="is of another video"):
+    with pytest.raises(NeecoError, match="video_sha256: begun with 'another'"):
         read_footage(file, tmp_path / "out", tracked_run.scene, True, lambda what, done, total: None)
     with pytest.raises(NeecoError, match="not empty"):
         read_footage(file, tmp_path / "out", tracked_run.scene, False, lambda what, done, total: None)

@@ -22,13 +22,13 @@ def run(plan: AblationPlan) -> int:
     with Bars() as bars:
         ablation = run_ablations(plan, bars.job)
     page = write_ablation_report(plan.output, ablation)
-    _print_tables(Console(), ablation)
+    print_tables(Console(), ablation)
     for line in (f"tables: {plan.output}/tables/: NAME.csv, .md, .tex", f"report: {page}"):
         print(line)
     return 1 if ablation.failures else 0
 
 
-def _print_tables(console: Console, ablation: AblationResult) -> None:
+def print_tables(console: Console, ablation: AblationResult) -> None:
     """Print how many of the paper's directions hold, our tables in full, then the notes."""
     from neeco.studies.ablation_study import agreement, grid
 

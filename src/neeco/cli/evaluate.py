@@ -66,7 +66,7 @@ def run(args: Evaluate) -> int:
         page = write_report(args.run, evaluation, capture, trained.scene, playable=embedded_page(trained))
         if args.json is not None:
             write_json(args.json, evaluation)
-    console.print(_table(evaluation))
+    console.print(evaluation_table(evaluation))
     for note in evaluation["notes"]:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
     for name, joint in trained.scene.diagnostics.get("joints", {}).items():
@@ -76,8 +76,8 @@ def run(args: Evaluate) -> int:
     return 0
 
 
-def _table(evaluation: dict[str, Any]) -> Table:
-    """One column per split and kind of pose, so that it fits a narrow terminal."""
+def evaluation_table(evaluation: dict[str, Any]) -> Table:
+    """Return the scores, one column per split and kind of pose, so that they fit a narrow terminal."""
     scored = [(kind, split) for kind in ("given", "aligned") for split in evaluation.get(kind, {})]
     table = Table("poses", *(Column(f"{kind}\n{split}", justify="right") for kind, split in scored))
     for title, key, form in COLUMNS:

@@ -125,8 +125,7 @@ def _list_formats() -> int:
 def recordings_of(args: Ingest) -> list[Recording]:
     """Return the recordings that the arguments name. Raises NeecoError naming the option."""
     from neeco.errors import NeecoError
-    from neeco.ingest.recording.file import recording_from_flags
-    from neeco.ingest.sources import read_recordings
+    from neeco.ingest.sources import read_recordings, recording_from_flags
 
     if args.source:
         keep = ("output", "frames", "rrd", "json", "strict")

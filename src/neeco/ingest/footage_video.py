@@ -11,10 +11,10 @@ import torch
 from neeco.capture.model import Capture
 from neeco.capture.readers import read_capture
 from neeco.errors import NeecoError
-from neeco.files import is_vacant, read_json, require_content, write_json
+from neeco.files import read_begun, require_content, require_same, write_json
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recording.file import recording_from_flags
 from neeco.ingest.result import IngestResult
+from neeco.ingest.sources import recording_from_flags
 from neeco.scene import GaussianScene
 from neeco.tracking.footage_tissue import Progress
 from neeco.tracking.track import FOOTAGE
@@ -37,12 +37,10 @@ def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, r
     capture_folder = output / FOOTAGE
     with path.open("rb") as stream:
         source = {"video_sha256": hashlib.file_digest(stream, "sha256").hexdigest()}
-    if capture_folder.exists() and resume:
-        if read_json(capture_folder / SOURCE) != source:
-            raise NeecoError(f"{capture_folder}: is of another video than {path}; use a new folder")
+    name = f"{FOOTAGE}/{SOURCE}"
+    if (begun := read_begun(output, name, resume, "tracked footage")) is not None:
+        require_same(str(output / name), ((key, begun.get(key), source[key]) for key in source))
         return read_capture(capture_folder)
-    if not is_vacant(output):
-        raise NeecoError(f"{output}: not empty; give another folder, or --resume to go on with footage tracked there")
     recording = recording_from_flags(path)
     recording = replace(
         recording,

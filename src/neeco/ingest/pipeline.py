@@ -25,8 +25,7 @@ from neeco.capture.model import Capture, Frame, InstrumentState, State, Uncertai
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.cameras.still_scene import right_frames
-from neeco.ingest.frames.images import choose_images
-from neeco.ingest.frames.selection import DropReason
+from neeco.ingest.frames.images import DropReason, choose_images
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.moving_scope import find_moving_world
 from neeco.ingest.posing.posed_capture import prepare

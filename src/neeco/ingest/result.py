@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from neeco.ingest.foreground.rough_shape import RoughShape
-from neeco.ingest.frames.selection import DropReason
-from neeco.ingest.recording.notes import Contradiction
+from neeco.ingest.frames.images import DropReason
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.timing.clock_search import ClockOffset
+from neeco.ingest.timing.episodes import Contradiction
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,8 +10,15 @@ import numpy as np
 
 from neeco.capture.model import PointCloud, evenly_spaced
 from neeco.errors import NeecoError
-from neeco.ingest.cameras.still import N_FRAMES, same_place, stands_still
-from neeco.ingest.cameras.still_scene import RightCamera, look_behind, read_right_camera, still_cameras
+from neeco.ingest.cameras.still_scene import (
+    N_FRAMES,
+    RightCamera,
+    look_behind,
+    read_right_camera,
+    same_place,
+    stands_still,
+    still_cameras,
+)
 from neeco.ingest.foreground.background import find_background
 from neeco.ingest.foreground.masks import moving_masks
 from neeco.ingest.frames.images import ChosenImages

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.files import write_atomically, write_text
 from neeco.ingest.readers import IMAGES, VideoSource, format_of
@@ -147,7 +148,7 @@ class _Scene:
 def _draw_lines(axes: Axes, poses: OpenPoses, reading: Reading) -> None:
     """Draw the tool's path, and lines along that of its axes whose lines pass nearest to one point."""
     shaft = shaft_of(poses.positions, reading.quats)
-    chosen = np.unique(np.linspace(0, len(poses.positions) - 1, N_LINES).round().astype(int))
+    chosen = evenly_spaced(len(poses.positions), N_LINES)
     directions = axis_directions(reading.quats, shaft.axis)
     middle = poses.positions.mean(0)
     # the plane that shows most of the path and of the lines

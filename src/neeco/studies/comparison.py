@@ -22,7 +22,7 @@ from neeco.scene.method_registry import unmet_need
 from neeco.settings import plain
 from neeco.studies.machine import machine, machine_words, measure_speed
 from neeco.studies.masks import check_masks, score_folder, score_runs, splits_with_truth
-from neeco.studies.study import JobEvent, Result, check_output, check_workers, run_and_record, spread
+from neeco.studies.study import REMEDY, JobEvent, Result, check_output, check_workers, run_and_record, spread
 from neeco.studies.tables import (
     Column,
     ResultTable,
@@ -251,15 +251,14 @@ def _configs(spec: ComparisonSpec) -> dict[str, TrainConfig]:
 
 def _check_output(spec: ComparisonSpec) -> None:
     """Raises NeecoError when `output` holds something else, or the comparison of another capture or budget."""
-    noun, about = "comparison", "compares methods on"
-    stored = check_output(spec.output, COMPARISON_FILE, COMPARISON_SCHEMA, spec.capture, noun, about)
+    stored = check_output(spec.output, COMPARISON_FILE, COMPARISON_SCHEMA, spec.capture, "a comparison")
     if stored is None:
         return
-    file, differs = spec.output / COMPARISON_FILE, "give another --output"
-    require_like(stored, {"budget": BUDGET}, str(file), differs)
+    file = str(spec.output / COMPARISON_FILE)
+    require_like(stored, {"budget": BUDGET}, file, REMEDY)
     if stored["budget"] != asdict(spec.budget):
         before = Budget(*(stored["budget"][key] for key in BUDGET))
-        raise NeecoError(f"{file}: budget: compares after {before}, not {spec.budget}; {differs}")
+        raise NeecoError(f"{file}: budget: begun with {before}, now {spec.budget}; {REMEDY}")
 
 
 def _result(plan: ComparisonPlan, jobs: Sequence[Result]) -> ComparisonResult:

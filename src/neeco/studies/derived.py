@@ -16,11 +16,11 @@ import torch
 
 from neeco.capture.model import Capture, Frame, InstrumentState, State, evenly_spaced
 from neeco.capture.writer import write_capture
-from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import MASK_FOLDERS
-from neeco.files import is_vacant, read_json, write_atomically, write_json
+from neeco.files import read_begun, require_same, write_atomically, write_json
 from neeco.geometry.rotations import rotation_from_vector
 from neeco.studies.ablations import NOISE_DEGREES_PER_MM, Derived
+from neeco.studies.study import REMEDY
 
 RECIPE_FILE = "derived.json"
 
@@ -34,15 +34,11 @@ def derive_capture(capture: Capture, transforms: str, derived: Derived, seed: in
     """
     recipe: dict[str, Any] = {"source": str(capture.root.absolute()), "transforms": transforms}
     recipe |= {"states_sha256": _digest(capture), "seed": seed, **asdict(derived)}
-    if (path := output / RECIPE_FILE).exists():
-        stored = asdict(Derived(derived.name)) | read_json(path)  # written when there were fewer fields, perhaps
-        for key, value in recipe.items():
-            if stored.get(key) != value:
-                raise NeecoError(f"{path}: {key}: is {stored.get(key)!r}, not {value!r}; give another --output")
+    if (begun := read_begun(output, RECIPE_FILE, resume=True, work="a capture made by ablate")) is not None:
+        begun = asdict(Derived(derived.name)) | begun  # it may lack fields that are newer
+        require_same(str(output / RECIPE_FILE), ((key, begun.get(key), recipe[key]) for key in recipe), REMEDY)
         if (output / "transforms.json").exists():
             return output
-    elif not is_vacant(output):
-        raise NeecoError(f"{output}: not empty, and not made by ablate; give another --output")
     changed = replace(capture, frames=_frames(capture, derived, seed))
     write_json(output / RECIPE_FILE, recipe)
     scored = [frame.name for frame in changed.frames if frame.split != "train"]

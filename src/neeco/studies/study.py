@@ -26,7 +26,7 @@ import torch
 
 from neeco.capture import Capture
 from neeco.errors import NeecoError
-from neeco.files import TEMPORARY, is_vacant, read_json, require_inside, write_text
+from neeco.files import TEMPORARY, read_begun, require_same, write_text
 from neeco.raster.devices import device_of, readable_failures
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.studies.machine import threads_per_worker
@@ -34,6 +34,7 @@ from neeco.workers import Workers, address, check_gpus, run_tasks
 from neeco.workers import check_workers as check_reachable
 
 CHECKPOINT_S = 60.0  # that interrupted jobs get to write their checkpoints
+REMEDY = "give another --output"  # where a folder holds other work
 
 JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], what is going on
 Result = dict[str, Any]  # what a job returns and writes; of a failed one its identity, "error" and empty "splits"
@@ -85,23 +86,16 @@ class JobEvent:
     result: Result | None = None
 
 
-def check_output(output: Path, file: str, schema: str, capture: Path, noun: str, about: str) -> dict[str, Any] | None:
+def check_output(output: Path, file: str, schema: str, capture: Path, noun: str) -> dict[str, Any] | None:
     """Return what a study begun earlier in `output` wrote into its `file`; None where nothing was begun.
 
-    noun, about: names of the study and of its use of the capture, for messages. Raises NeecoError when `output` is no
-    folder, holds something else, or the study of another capture.
+    noun: name of the study, for messages. Raises NeecoError when `output` is no folder, holds something else, or the
+    study of another capture.
     """
-    if output.exists() and not output.is_dir():
-        raise NeecoError(f"{output}: is a file; give another --output")
-    if is_vacant(output):
-        return None
-    if not (output / file).exists():
-        raise NeecoError(f"{output}: not empty, and no {noun}; give another --output")
-    stored = read_json(require_inside(output / file, output))
-    if not isinstance(stored, dict) or stored.get("schema") != schema:
-        raise NeecoError(f"{output / file}: schema: is not {schema}; give another --output")
-    if stored.get("capture") != str(capture.absolute()):
-        raise NeecoError(f"{output / file}: capture: {about} {stored.get('capture')}; give another --output")
+    stored = read_begun(output, file, resume=True, work=noun)
+    if stored is not None:
+        now = {"schema": schema, "capture": str(capture.absolute())}
+        require_same(str(output / file), ((key, stored.get(key), now[key]) for key in now), REMEDY)
     return stored
 
 

@@ -22,12 +22,12 @@ from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.image_metrics import find_lpips, psnr
-from neeco.files import finite, read_json, read_text, require_like, write_json, write_text
+from neeco.files import finite, read_json, read_text, require_like, require_same, write_json, write_text
 from neeco.labels.drawing import draw
 from neeco.raster.devices import device_of
 from neeco.scene.method_registry import method_class
 from neeco.studies.machine import peak_memory_mb, reset_peak_memory
-from neeco.studies.study import JobProgress, Result
+from neeco.studies.study import REMEDY, JobProgress, Result
 from neeco.training.config import TrainConfig
 from neeco.training.run import open_run, read_config, require_same_capture, stored_config
 from neeco.training.train import ProgressRow, train
@@ -47,7 +47,7 @@ FIELD_CURVE_POINTS = (0.1, 0.4, 1.0)  # a field takes seconds for an image
 FIELD_CURVE_FRAMES = 2
 CLOCKS: dict[str, Callable[[], float]] = {"wall": time.monotonic, "processor": time.process_time}
 SECONDS_ON = {"wall": "seconds", "processor": "processor_seconds"}  # fields of files, by clock
-ANEW = "give another --output, or remove that run's folder"
+ANEW = f"{REMEDY}, or remove that run's folder"
 OWN_OPTION = {"transforms": "--transforms", "iterations": "the budget's option", "minutes": "the budget's option"}
 SPLIT_SCORES = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou", "frames")
 # how files must look, for `require_like`
@@ -134,10 +134,9 @@ class TrainingJob:
         self.budget.check()
         if not (self.folder / "config.yaml").exists():
             return
-        folder, differs = self.folder, "give another --output"
+        folder = self.folder
         stored = read_config(folder)
-        if stored["capture"] != str(self.capture.absolute()):
-            raise NeecoError(f"{folder}: capture: this run was trained on {stored['capture']}; {differs}")
+        require_same(str(folder), [("capture", stored["capture"], str(self.capture.absolute()))], REMEDY)
         identity = self.identity()
         for file in (folder / name for name in (JOB_FILE, BEGUN_FILE) if (folder / name).exists()):
             values = require_like(read_json(file), IDENTITY, str(file), ANEW)
@@ -147,20 +146,18 @@ class TrainingJob:
                     before.check()
                 except NeecoError as error:
                     raise NeecoError(f"{file}: {error}; {ANEW}") from None
-                raise NeecoError(f"{folder}: budget: this run has {before}, not {self.budget}; {differs}")
-            for key in (key for key in identity if values[key] != identity[key]):
-                raise NeecoError(f"{file}: {key}: is {values[key]}, not {identity[key]}; {differs}")
+                raise NeecoError(f"{folder}: budget: begun with {before}, now {self.budget}; {REMEDY}")
+            require_same(str(file), ((key, values[key], identity[key]) for key in identity), REMEDY)
         try:
             begun = stored_config(folder, stored)
         except NeecoError as error:  # of another version
-            raise NeecoError(f"{str(error).removesuffix('; train again')}; {differs}") from None
+            raise NeecoError(f"{str(error).removesuffix('; train again')}; {REMEDY}") from None
         wanted = self.train_config
         if begun.method == wanted.method:
             kind = method_class(wanted.method)
             wanted = replace(wanted, deformation=kind.resolved(wanted.deformation, begun.deformation))
         old, new = vars(begun), vars(wanted)
-        for field in (name for name in new if old[name] != new[name]):
-            raise NeecoError(f"{folder}: {field}: this run has {old[field]}, not {new[field]}; {differs}")
+        require_same(str(folder), ((name, old[name], new[name]) for name in new), REMEDY)
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:
         """Train, score, write `folder`/job.json last, and return what it holds; at once when it is there already.

@@ -97,7 +97,7 @@ def _draw_label(
         canvas.rectangle((x, y, x + width - 1, y + height - 1), outline=BOX)
         corners = [(px * scale, py * scale) for px, py in label["rectangle"]]
         canvas.line([*corners, corners[0]], fill=RECTANGLE, width=2)
-        _tag(canvas, x, y, label["name"])
+        draw_name(canvas, x, y, label["name"])
     points = {name: (x * scale, y * scale, v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
     for start, end in bones:
         if start in points and end in points:
@@ -107,8 +107,8 @@ def _draw_label(
         canvas.ellipse((x - 4, y - 4, x + 4, y + 4), fill=fill, outline=BONE, width=2)
 
 
-def _tag(canvas: ImageDraw.ImageDraw, x: float, y: float, text: str) -> None:
-    """The name above the box, or inside it where there is no room above; never beyond the tile's right edge."""
+def draw_name(canvas: ImageDraw.ImageDraw, x: float, y: float, text: str) -> None:
+    """Draw a name above its box, or inside it where there is no room above; never beyond the tile's right edge."""
     font = ImageFont.load_default(11)
     width = canvas.textlength(text, font=font) + 8
     left, top = min(x, TILE_WIDTH - width), y - 16 if y >= 16 else y

@@ -287,13 +287,13 @@ def test_a_failure_that_nobody_foresaw_leaves_its_traceback(spec: DownstreamSett
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"steps": 7}, "steps: is 6, not 7"),
-        ({"min_validated": 40}, "min_validated: is 5, not 40"),
-        ({"validation_every": 4}, "validation_every: is 5, not 4"),
-        ({"batch": 3}, "batch: is 2, not 3"),
-        ({"size": 24}, "side: is 48, not 24"),
-        ({"frame_selection": "first"}, "pick: is 'spread', not 'first'"),
-        ({"classes": "parts"}, "classes: is 'instrument', not 'parts'"),
+        ({"steps": 7}, "steps: begun with 6, now 7"),
+        ({"min_validated": 40}, "min_validated: begun with 5, now 40"),
+        ({"validation_every": 4}, "validation_every: begun with 5, now 4"),
+        ({"batch": 3}, "batch: begun with 2, now 3"),
+        ({"size": 24}, "side: begun with 48, now 24"),
+        ({"frame_selection": "first"}, "pick: begun with 'spread', now 'first'"),
+        ({"classes": "parts"}, "classes: begun with 'instrument', now 'parts'"),
     ],
 )
 def test_a_folder_of_other_jobs_is_refused_before_the_work(spec, change, told: str, monkeypatch) -> None:
@@ -308,28 +308,31 @@ def test_another_set_under_the_same_name_is_refused(spec: DownstreamSettings, tm
     small = replace(spec, conditions=("kin",), folds=1)
     trained(small)
     for data in (ImageSet("kin", write_set(tmp_path / "else")), replace(spec.sets[0], count=3)):
-        with refused("job.json: sets: is", "give another --output"):
+        with refused("job.json: sets: begun with", "give another --output"):
             plan_downstream(replace(small, sets=(data,)))
 
 
 def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSettings, capture: Path) -> None:
     small = replace(spec, conditions=("kin",), folds=1)
     spec.output.write_text("a file")
-    with refused(str(spec.output), "is a file; give another --output"):
+    with refused(str(spec.output), "is a file; give a folder"):
         plan_downstream(small)
     spec.output.unlink()
     spec.output.mkdir()
     plan_downstream(small)
     (spec.output / "precious.txt").write_text("kept")
-    with refused("not empty, and no downstream experiment; give another --output"):
+    with refused("not empty and no downstream.json in it; give another folder"):
         plan_downstream(small)
     (spec.output / "precious.txt").unlink()
     trained(small)
-    with refused("downstream.json: capture: is about", "give another --output"):
+    with refused("downstream.json: capture: begun with", "give another --output"):
         plan_downstream(replace(small, capture=capture))
-    for text in ('{"schema": "else"}', "[]"):
+    for text, reason in (
+        ('{"schema": "else"}', "schema: begun with 'else'"),
+        ("[]", "not as neeco writes it; use a new folder"),
+    ):
         (spec.output / "downstream.json").write_text(text)
-        with refused("downstream.json: schema", "give another --output"):
+        with refused(f"downstream.json: {reason}"):
             plan_downstream(small)
     (spec.output / "downstream.json").write_text('{"schema": "neeco-downstream/1"}')
     with refused("downstream.json: capture", "give another --output"):

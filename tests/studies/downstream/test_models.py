@@ -127,7 +127,7 @@ def test_what_dfine_is_told_of_an_image() -> None:
     classes = np.zeros((40, 80), np.uint8)
     classes[10:20, 20:60] = 2
     example = Example(np.zeros((40, 80, 3), np.uint8), classes, (classes > 0).astype(np.uint8))
-    labels = dfine._labels(example, torch.device("cpu"))
+    labels = dfine.detection_labels(example, torch.device("cpu"))
     assert labels["class_labels"].tolist() == [1]
     assert labels["boxes"].tolist() == [[0.5, 0.375, 0.5, 0.25]]
 

@@ -12,21 +12,39 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
 
+from neeco.capture.documents import Node, printable
 from neeco.errors import NeecoError
 from neeco.files import YamlDumper, parse_yaml, read_text, write_text
+from neeco.ingest.recording.sections import Fault, faults_in, list_of, node_of
 
 FILE = "hand_posed.yaml"
 HEADER = """\
 # Frames posed by hand (`neeco view CAPTURE --annotate`), one answer a line; lines may be added, mended and removed.
 # roll_deg: about the shaft, from the direction towards the camera to the hinge's axis. joints_deg: as they stand.
 """
-KEYS = ("frame", "instrument", "roll_deg", "joints_deg")
 OPTIONAL = ("when", "who")
 REMEDY = "mend or remove that line"
+MAX_DEGREES = 720
+
+
+def _degrees(node: Node) -> float:
+    if type(node.value) not in (int, float) or not abs(node.value) <= MAX_DEGREES:
+        raise Fault(node.field, f"{printable(node.value)} is no angle in degrees; {REMEDY}")
+    return float(node.value)
+
+
+def _joints(node: Node) -> dict[str, float]:
+    if not isinstance(node.value, dict):
+        raise Fault(node.field, f"is not name: degrees; {REMEDY}")
+    return {str(name): _degrees(node_of(value, Path(node.file), str(name))) for name, value in node.value.items()}
+
+
+def _remark(node: Node) -> str:
+    return str(node.value)  # YAML reads some as dates
 
 
 @dataclass(frozen=True)
@@ -35,10 +53,10 @@ class HandPose:
 
     frame: str
     instrument: str
-    roll_deg: float
-    joints_deg: dict[str, float] = field(default_factory=dict)
-    when: str | None = None
-    who: str | None = None
+    roll_deg: Annotated[float, _degrees]
+    joints_deg: Annotated[dict[str, float], _joints] = field(default_factory=dict)
+    when: Annotated[str, _remark] | None = None
+    who: Annotated[str, _remark] | None = None
 
 
 def read_answers(capture: Path) -> list[HandPose]:
@@ -47,11 +65,8 @@ def read_answers(capture: Path) -> list[HandPose]:
     if not path.exists():
         return []
     entries = parse_yaml(path, read_text(path, "YAML"), REMEDY)
-    if entries is None:
-        return []
-    if not isinstance(entries, list):
-        raise NeecoError(f"{path}: is not a list of answers; {REMEDY}")
-    return [_answer(entry, f"{path}: answer {index + 1}") for index, entry in enumerate(entries)]
+    with faults_in(path):
+        return list(list_of(HandPose)(node_of([] if entries is None else entries, path, "answers")))
 
 
 def write_answers(capture: Path, answers: Iterable[HandPose]) -> None:
@@ -89,29 +104,3 @@ def _line(answer: HandPose) -> str:
     value |= {key: getattr(answer, key) for key in OPTIONAL if getattr(answer, key) is not None}
     style: dict[str, Any] = {"default_flow_style": True, "sort_keys": False, "width": math.inf, "allow_unicode": True}
     return str(yaml.dump(value, Dumper=YamlDumper, **style)).strip()
-
-
-def _answer(entry: Any, place: str) -> HandPose:
-    if not isinstance(entry, dict):
-        raise NeecoError(f"{place}: is no answer; expected {', '.join(KEYS)}; {REMEDY}")
-    unknown = sorted(str(key) for key in set(entry) - {*KEYS, *OPTIONAL})
-    missing = [key for key in KEYS if key not in entry and key != "joints_deg"]
-    if unknown or missing:
-        what = f"unknown {unknown[0]!r}" if unknown else f"{missing[0]} is missing"
-        raise NeecoError(f"{place}: {what}; expected {', '.join((*KEYS, *OPTIONAL))}")
-    joints = entry.get("joints_deg") or {}
-    if not isinstance(joints, dict):
-        raise NeecoError(f"{place}: joints_deg: is not name: degrees; {REMEDY}")
-    return HandPose(
-        str(entry["frame"]),
-        str(entry["instrument"]),
-        _degrees(entry["roll_deg"], f"{place}: roll_deg"),
-        {str(name): _degrees(value, f"{place}: joints_deg: {name}") for name, value in joints.items()},
-        *(None if entry.get(key) is None else str(entry[key]) for key in OPTIONAL),
-    )
-
-
-def _degrees(value: Any, place: str) -> float:
-    if type(value) not in (int, float) or not abs(value) <= 720:
-        raise NeecoError(f"{place}: {value!r} is no angle in degrees; {REMEDY}")
-    return float(value)

@@ -35,10 +35,10 @@ from neeco.ingest.readers import (
     choose_stream,
     compare_counts,
 )
-from neeco.ingest.readers._lerobotfiles import FIXED, DataSet, Episode, Feature, ParquetFile, read_data_set
 from neeco.ingest.readers.choices import find_rotations
 from neeco.ingest.readers.columns import QUATERNION_WXYZ, ROTATION_MATRIX, pose_bodies, recognise_pose, split_unit
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
+from neeco.ingest.readers.lerobot_files import FIXED, DataSet, Episode, Feature, ParquetFile, read_data_set
 from neeco.ingest.readers.video import ChosenFrames, open_video
 
 TIME = "timestamp_s"

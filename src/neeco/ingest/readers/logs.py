@@ -23,15 +23,10 @@ from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_in, meaning_of, of_dvrk
 from neeco.ingest.readers.ndi import tool_columns
+from neeco.ingest.readers.rows import Rows, drop_stuck, find_gaps, in_order, keep_measured, read_cells, read_times
 
-MIN_SAMPLES = 4  # of a usable log
-MAX_WRONG = 0.05  # share of rows that may be wrong (not missing) before the file is refused
 _FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)
 _FRAME_COLUMN = re.compile(r"(?!.*child)(.*[._/])?(reference[._ ]?)?frame([._ ]?id)?")
-MAX_LISTED_STATES = 8  # of those that drop rows, in the notes
-MAX_SAME_TIME = 0.5  # share of rows at the time of another: more, and times are too coarse
-STUCK_S, STUCK_SAMPLES = 0.5, 10  # a tracker's noise leaves no pose unchanged for as long
-GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
 MAX_DISTANCE_MM = 20_000.0  # no tracker of instruments reaches farther: the unit is wrong
 MAX_ANGLE = 4 * np.pi  # rad, more than any joint turns: the unit is wrong
 CLAMPED_SHARE = 0.05  # of a calibration table's range: readings that far outside it count as its end
@@ -76,40 +71,6 @@ class ReadingLog:
     image_hz: float | None = None
 
 
-class Rows:
-    """The rows of a table in use; those left out, by reason, and those repaired, for the notes."""
-
-    def __init__(self, table: Table) -> None:
-        self.table = table
-        self.keep = np.ones(len(table.rows), dtype=bool)
-        self.reasons: dict[str, list[int]] = {}  # the file's lines
-        self.repairs: list[str] = []
-
-    def drop(self, which: np.ndarray | list[int], reason: str) -> None:
-        """Leave rows out (bool [R], or their numbers), and note those that were in use."""
-        lines = self.table.lines[which][self.keep[which]]
-        if len(lines):
-            self.reasons.setdefault(reason, []).extend(lines.tolist())
-        self.keep[which] = False
-
-    def drop_wrong(self, wrong: np.ndarray, reason: str) -> None:
-        """Leave out a few rows that are wrong (bool [R]). Raises NeecoError when they are more than a few."""
-        lines, count = self.table.lines[wrong & self.keep], int(self.keep.sum())
-        if len(lines) > max(1, MAX_WRONG * count):
-            share = f"{self.table.list_rows(lines)} ({len(lines)} of {count_rows(count)})"
-            raise NeecoError(f"{self.table.where}: {share}: {reason}")
-        self.drop(wrong, reason.split(";")[0])
-
-    def notes(self) -> tuple[str, ...]:
-        """Return the changes to the rows, one sentence each."""
-        name = self.table.title
-        dropped = (
-            f"{name}: {count_rows(len(lines))} dropped: {reason} ({self.table.list_rows(lines)})"
-            for reason, lines in self.reasons.items()
-        )
-        return (*self.table.notes, *dropped, *(f"{name}: {repair}" for repair in self.repairs))
-
-
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
     table = tool_columns(read_table(source.path, source.stream), source)
@@ -118,17 +79,17 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     table = with_named_frame(table, (*(source.position or found.position or ()), *(source.rotation or ())))
     frame = _frame_of(table, source)
     rows = Rows(table)
-    _keep_measured(rows, source, found.state)
-    times = _times(rows, source, found)
+    keep_measured(rows, source, found.state)
+    times = read_times(rows, source, found)
     positions, quats = _poses(rows, source, found)
-    _drop_stuck(rows, times, np.column_stack([positions, quats]))
-    times, order = _in_order(rows, times)
+    drop_stuck(rows, times, np.column_stack([positions, quats]))
+    times, order = in_order(rows, times)
     if np.ptp(quats[order], axis=0).max() == 0 and np.ptp(positions[order], axis=0).max() > 0:
         rows.repairs.append("its rotation never changes: does it hold positions alone?")
     quats, flips = continuous(quats[order])
     if flips:
         rows.repairs.append(f"the quaternion's sign flipped {flips} times; undone")
-    gaps, gap_notes = _gaps(table, times)
+    gaps, gap_notes = find_gaps(table, times)
     notes = (*rows.notes(), *gap_notes)
     stated_in = table.stated_in if source.frame is None else None
     positions = positions[order]
@@ -207,8 +168,8 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     if value is None:
         raise NeecoError(f"{source.path}: header: which column is the joint's reading? Name it as columns.value")
     rows = Rows(table)
-    times = _times(rows, source, found)
-    values = _cells(rows, (value,))[:, 0]
+    times = read_times(rows, source, found)
+    values = read_cells(rows, (value,))[:, 0]
     clamped: tuple[str, ...] = ()
     if source.calibration is not None:
         values, clamped = _calibrated(rows, value, values, source, source.calibration)
@@ -218,8 +179,8 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
         impossible = np.abs(np.where(rows.keep, values, 0)) > MAX_ANGLE
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
         rows.drop_wrong(impossible, reason)
-    times, order = _in_order(rows, times)
-    gaps, gap_notes = _gaps(table, times)
+    times, order = in_order(rows, times)
+    gaps, gap_notes = find_gaps(table, times)
     notes = (*rows.notes(), *clamped, *gap_notes)
     return ReadingLog(table.path, source.clock, times, values[order], gaps=gaps, notes=notes, image_hz=table.image_hz)
 
@@ -256,7 +217,7 @@ def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[n
     angle = 1.0
     if form in (EULER, ROTATION_VECTOR):
         angle = named.scale_of(table.where, rotation, "angle", source.units.angle, None, "")
-    positions, turns = _parts(table, form, _cells(rows, read))
+    positions, turns = _parts(table, form, read_cells(rows, read))
     positions = positions * scale
     if form not in (EULER, ROTATION_VECTOR):  # trackers write zeros where they have no rotation
         rows.drop((turns == 0).all(axis=1), "the rotation is all zeros (no measurement)")
@@ -312,86 +273,6 @@ def continuous(quats: np.ndarray) -> tuple[np.ndarray, int]:
     return quats * signs[:, None], int(flips.sum())
 
 
-def _keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
-    """Drop the rows whose state does not say that they were measured."""
-    table, name = rows.table, source.state or found
-    if name is None:
-        return
-    index = column_index(table, name)
-    good = {value.lower() for value in source.good}
-    states = [cells[index] if index < len(cells) else "" for cells in table.rows]
-    by_state: dict[str, list[int]] = {}
-    for row, state in enumerate(states):
-        if state.lower() not in good:
-            by_state.setdefault(state[:20], []).append(row)
-    for number, (state, members) in enumerate(by_state.items()):
-        if number < MAX_LISTED_STATES:
-            rows.drop(members, f"{name} is {state or 'empty'!r}")
-        rows.keep[members] = False
-    if not rows.keep.any():
-        raise NeecoError(
-            f"{table.where}: {name}: no row is {' or '.join(source.good)} ({table.list_rows(table.lines[:1])} has "
-            f"{states[0][:20]!r}); list the values that mark measured rows in the recording: columns.good"
-        )
-
-
-def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColumns) -> np.ndarray:
-    """Times [R] in s; rows without one are dropped."""
-    table, names, rate = rows.table, source.time or found.time, source.rate_hz
-    if names is None and rate is not None:
-        return np.arange(len(table.rows)) / rate
-    if names is None:
-        raise NeecoError(
-            f"{table.where}: header: no column of times found; name it as columns.time (or add t_s), or say rate_hz "
-            "where its rows come at a fixed rate"
-        )
-    cells = _cells(rows, names)
-    known = named.recognise_time(names)
-    if rate is not None and (len(names) == 2 or known.time_unit or named.split_unit(names[0], "time")[1]):
-        raise NeecoError(
-            f"{table.where}: rate_hz: {', '.join(names)} holds times and counts no frames; leave rate_hz out, or name "
-            "the column that counts as columns.time"
-        )
-    if len(names) == 2:
-        return cells[:, 0] + cells[:, 1] * 1e-9
-    if rate is not None:
-        return cells[:, 0] / rate
-    if known.counts_frames:
-        raise NeecoError(
-            f"{table.where}: {names[0]}: counts frames, and nothing says how many a second; say rate_hz in the "
-            "recording (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
-        )
-    steps = np.diff(cells[rows.keep, 0])
-    steps = steps[steps > 0]
-    hint = ""
-    if len(steps):
-        rates = {unit: 1 / (np.median(steps) * scale) for unit, scale in (("s", 1), ("ms", 1e-3), ("ns", 1e-9))}
-        likely = [f"{unit} would be {rate:.3g} Hz" for unit, rate in rates.items() if 1 <= rate <= 5000]
-        hint = f" Its steps in {', '.join(likely)}." if likely else ""
-    return cells[:, 0] * named.scale_of(table.where, names, "time", source.units.time, known.time_unit, hint)
-
-
-def _cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
-    """Numbers [R, C]; rows with missing or unreadable cells are dropped. Raises NeecoError when those are most."""
-    table = rows.table
-    values, missing, bad = numbers(table, names)
-    rows.drop(missing, f"no value for {', '.join(names)}" if len(names) < 3 else "values are missing")
-    bad = [(row, what) for row, what in bad if rows.keep[row]]
-    if len(bad) > max(3, 0.5 * rows.keep.sum()):
-        similar = f"{len(bad)} of {count_rows(len(table.rows))} like it"
-        raise NeecoError(
-            f"{table.where}: {table.record} {table.lines[bad[0][0]]}: {bad[0][1]} ({similar}); name other columns or "
-            "repair the file"
-        )
-    if bad:
-        rows.drop([row for row, _ in bad], f"not readable, first: {bad[0][1]}")
-    if not rows.keep.any():
-        raise NeecoError(
-            f"{table.where}: {', '.join(names)}: no row has values; name other columns or another file in the recording"
-        )
-    return values
-
-
 def _rotation_columns(table: Table, source: PoseColumns, found: RecognisedColumns) -> tuple[str, tuple[str, ...]]:
     """Form and columns of the rotation."""
     rotation, form = (source.rotation, source.form) if source.rotation else (found.rotation, found.form)
@@ -425,65 +306,6 @@ def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.n
         if np.nanmedian(np.abs(last[:, :3])) > 1e-6 and np.nanmax(np.abs(column)) < 1e-9:
             raise NeecoError(f"{table.where}: matrix: is written by columns; list them in the recording row by row")
     return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
-
-
-def _drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
-    """Drop the rows of a tracker that repeats its last pose [R, 7] after it lost its tool: exactly the same pose for
-    long, and a jump at an end. What comes to rest slows down before."""
-    used = np.flatnonzero(rows.keep)
-    if len(used) < MIN_SAMPLES:
-        return
-    steps = np.linalg.norm(np.diff(poses[used, :3], axis=0), axis=1)
-    same = np.concatenate([[False], (np.diff(poses[used], axis=0) == 0).all(axis=1), [False]])
-    edges = np.diff(same.astype(int))
-    moving = steps[steps > 0]
-    if not len(moving):
-        return
-    for first, last in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
-        # the pose of row `first` is repeated until `last`
-        around = [steps[first - 1]] if first > 0 else []
-        around += [steps[last]] if last < len(steps) else []
-        lasted = times[used[last]] - times[used[first]]
-        if last - first >= STUCK_SAMPLES and lasted > STUCK_S and max(around, default=0.0) > np.median(moving):
-            rows.drop(used[first + 1 : last + 1], "the pose of the row before, repeated (a tracker that lost its tool)")
-
-
-def _in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left."""
-    table, usable = rows.table, np.flatnonzero(rows.keep)
-    order = usable[np.argsort(times[usable], kind="stable")]
-    late = usable[1:][times[usable][1:] < np.maximum.accumulate(times[usable])[:-1]]
-    doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
-    if doubled.sum() > max(MIN_SAMPLES, MAX_SAME_TIME * len(order)):
-        raise NeecoError(
-            f"{table.where}: {count_rows(int(doubled.sum()))} of {len(order)} have the time of another; its times are "
-            "too coarse, or of several tools: name a finer column as columns.time"
-        )
-    rows.drop(np.sort(order[doubled]), "a second row at one time")
-    order = order[~doubled]
-    if len(order) < MIN_SAMPLES:
-        why = "; ".join(note.partition(": ")[2] for note in rows.notes()[:2])
-        raise NeecoError(
-            f"{table.where}: {count_rows(len(order))} of {len(table.rows)} can be used{f' ({why})' if why else ''}; "
-            "record again or name the right columns"
-        )
-    if len(late):
-        listed = table.list_rows(table.lines[late])
-        rows.repairs.append(f"{count_rows(len(late))} out of order in time; sorted ({listed})")
-    return times[order], order
-
-
-def _gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:
-    """Return the gaps in time (steps longer than 4 usual ones and 0.15 s), and a note of them."""
-    steps = np.diff(times)
-    longest = max(GAP_STEPS * float(np.median(steps)), GAP_SECONDS)
-    gaps = tuple((float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest))
-    if not gaps:
-        return (), ()
-    total = sum(end - start for start, end in gaps)
-    first = ", ".join(f"{start:.2f}-{end:.2f} s" for start, end in gaps[:3])
-    count = f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''}"
-    return gaps, (f"{table.title}: {count}, {total:.2f} s in all ({first}); not bridged",)
 
 
 def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -32,8 +32,8 @@ from neeco.ingest.readers import (
     choose_stream,
     compare_lengths,
 )
-from neeco.ingest.readers.logs import MAX_WRONG
 from neeco.ingest.readers.rosbag import DVRK_HINT
+from neeco.ingest.readers.rows import MAX_WRONG
 from neeco.ingest.readers.video import open_images, open_video
 
 POSE_FILE, JOINT_FILE = "api_cp_data.yaml", "api_jp_data.yaml"

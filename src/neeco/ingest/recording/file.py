@@ -1,10 +1,10 @@
-"""The schema of recording.yaml, and recordings from it or from the command line."""
+"""The schema of recording.yaml, and recordings from it."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -22,7 +22,6 @@ from neeco.ingest.readers.frame_names import CAMERA_FRAMES, FRAMES
 from neeco.ingest.recording.base import BASE_KEY, WORLD_KEY, StatedBase, parse_base, parse_world_base
 from neeco.ingest.recording.model import (
     MAX_EPISODES,
-    MAX_SHAFT_MM,
     MIN_FRAMES,
     MOVING,
     STILL,
@@ -69,74 +68,6 @@ def read_recording(path: Path) -> Recording:
         raise NeecoError(f"{path}: the file is empty; {advice}")
     with faults_in(path):
         return read_section(RecordingSection, node_of(document, path)).recording(path)
-
-
-def recording_from_flags(
-    video: Path,
-    instrument: Path | None = None,
-    laparoscope: Path | None = None,
-    joints: Sequence[tuple[str, Path, Path | None]] = (),
-    intrinsics: Path | Sequence[float] | None = None,
-    sync: Path | None = None,
-    frames: int | None = None,
-    fps: float | None = None,
-    shaft_diameter: float | None = None,
-) -> Recording:
-    """Return a recording from the command line's options: columns are recognised from the headers. `video`: a file or a
-    folder of images; joints: (name, log, calibration or None); shaft_diameter: mm, of an instrument that was not
-    tracked. Raises NeecoError naming the option."""
-    given = [("--video", video), ("--instrument", instrument), ("--laparoscope", laparoscope), ("--sync", sync)]
-    given += [(f"--joint {joint}", file) for joint, *files in joints for file in files]
-    for option, file in given:
-        if file is not None and not Path(file).exists():
-            raise NeecoError(f"{option}: {file}: no such file; correct the path")
-    names = [joint for joint, *_ in joints]
-    twice = next((joint for joint in names if names.count(joint) > 1), None)
-    if twice is not None:
-        raise NeecoError(f"--joint {twice}: given twice; give each joint once")
-    if joints and instrument is None and shaft_diameter is None:
-        raise NeecoError(
-            f"--joint {names[0]}: needs --instrument, the log of the instrument it belongs to, or --shaft-diameter"
-        )
-    if shaft_diameter is not None and instrument is not None:
-        raise NeecoError("--shaft-diameter: finds an instrument that was not tracked, and --instrument says it was")
-    if shaft_diameter is not None and not 0 < shaft_diameter < MAX_SHAFT_MM:
-        raise NeecoError(f"--shaft-diameter: {shaft_diameter:g} is no shaft's; give it in mm, as in 5")
-    check_frame_count(frames)
-    if fps is not None and not 0 < fps < 1e6:  # NaN compares false
-        raise NeecoError(f"--fps: {fps:g} is no frame rate; give frames per second")
-    if intrinsics is not None and not isinstance(intrinsics, str | Path) and len(intrinsics) != 4:
-        raise NeecoError(f"--intrinsics: takes FX FY CX CY, not {len(intrinsics)} numbers")
-    video = Path(video)
-    is_folder = video.is_dir() and format_of(video) is None
-    tool = {
-        "name": "instrument",
-        "poses": _plain(instrument),
-        "joints": {joint: {"file": _plain(log), "calibration": _plain(table)} for joint, log, table in joints},
-        "from_video": shaft_diameter and {"shaft_diameter_mm": shaft_diameter},
-    }
-    document = {
-        "images" if is_folder else "video": {"folder" if is_folder else "file": _plain(video), "fps": fps},
-        "intrinsics": _plain(intrinsics),
-        "instruments": [] if instrument is None and shaft_diameter is None else [tool],
-        "laparoscope": _plain(laparoscope),
-        "sync": _plain(sync),
-        "frames": frames,
-    }
-    where = Path("command line")
-    with faults_in(where):
-        return replace(read_section(RecordingSection, node_of(document, where)).recording(where), path=video)
-
-
-def _plain(value: Any) -> Any:
-    """Return an option as recording.yaml has it."""
-    return str(value) if isinstance(value, Path) else [*value] if isinstance(value, list | tuple) else value
-
-
-def check_frame_count(frames: int | None) -> None:
-    """Raise NeecoError when the option asks for too few frames."""
-    if frames is not None and frames < MIN_FRAMES:
-        raise NeecoError(f"--frames: {frames} is too few; give {MIN_FRAMES} or more")
 
 
 Names = tuple[str, ...]

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from neeco.geometry.lines import places_nearest_to_rays, unit
-from neeco.ingest.foreground.colors import LEVELS, color_odds
+from neeco.ingest.foreground.masks import LEVELS, color_odds
 from neeco.ingest.shaft.axis import Intrinsics, ShaftAxes
 
 SHAFT_SHARE, HEAD_SHARE = 0.3, 0.3  # of a long mask's length from the border, and from the tip, at first

@@ -82,7 +82,7 @@ def clock_from_turning(world_from_camera: np.ndarray, times: np.ndarray, log: Po
         raise NeecoError(f"{log.path}: video or log is shorter than a second; give its clock offset in `sync`")
     video = _turning_speed(video_grid, times, Rotation.from_matrix(world_from_camera[:, :3, :3]))
     sensor = _turning_speed(log_grid, log.times, Rotation.from_quat(log.quats, scalar_first=True))
-    rate, lags, scores = _best_rate(video, sensor)
+    rate, lags, scores = best_rate(video, sensor)
     seconds = log_grid[0] + _peak(lags, scores, rate, log) * STEP_S - rate * video_grid[0]
     return ClockOffset(float(seconds), float("nan"), SCOPE_MOTION, rate)
 
@@ -104,7 +104,7 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
     tracked = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (2 * STEP_S)
     tracked = np.sqrt(np.where(before[1] & after[1], tracked, np.nanmedian(tracked)))
     observed = np.sqrt(np.interp(grid, middle, speed))  # roots: a fast stroke must not outweigh all others
-    rate, lags, scores = _best_rate(observed, tracked)
+    rate, lags, scores = best_rate(observed, tracked)
     if rate != 1:
         rate = _finer_rate(observed, tracked, rate)
         lags, scores = correlate(_stretched(observed, rate), tracked)
@@ -139,7 +139,7 @@ def _check_span(log: PoseLog) -> None:
         )
 
 
-def _best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+def best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the rate at which motions [V] and [L], sampled every STEP_S, fit best; all lags, and their correlation.
 
     All rates are tried on the segment of most variance; it grows to the whole video while the rates narrow down.

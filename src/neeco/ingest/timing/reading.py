@@ -13,9 +13,8 @@ from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording.compatibility import check_recordings, episode_names, refusal
 from neeco.ingest.recording.model import Recording
-from neeco.ingest.recording.notes import Notes
 from neeco.ingest.timing.clock_search import GIVEN, MAX_LENGTH_S, ClockOffset
-from neeco.ingest.timing.episodes import PAUSE_S, Episode, Episodes, assumed_clock
+from neeco.ingest.timing.episodes import PAUSE_S, Episode, Episodes, Notes, assumed_clock
 
 MIN_FPS, MAX_FPS = 0.01, 10_000.0
 MIN_SIDE_PX = 32  # smaller frames have too few features to find cameras

@@ -78,7 +78,7 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
     if [entry.name for entry in entries if not entry.name.startswith(".")] != [
         "jobs"
     ]:  # not just before its first result
-        check_output(settings.output, FILE, SCHEMA, settings.capture, "downstream experiment", "is about")
+        check_output(settings.output, FILE, SCHEMA, settings.capture, "a downstream experiment")
     jobs = _jobs(settings, conditions, counts)
     if not jobs:
         raise NeecoError("--num-real: leaves nothing to train; add 0 for sets alone, or a number of labelled frames")

@@ -17,7 +17,7 @@ from neeco.capture import Capture, read_capture
 from neeco.capture.images import write_labels
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
-from neeco.files import read_json, write_json
+from neeco.files import read_json, require_like, require_same, write_json
 from neeco.raster.devices import device_of
 from neeco.studies.downstream.model import Model, TrainedModel, TrainingTask, input_size, model_class
 from neeco.studies.downstream.samples import (
@@ -33,7 +33,7 @@ from neeco.studies.downstream.samples import (
     synthetic_samples,
 )
 from neeco.studies.downstream.scores import Detections, box_scores, mask_scores, mean_scores, near
-from neeco.studies.study import JobProgress
+from neeco.studies.study import REMEDY, JobProgress
 
 JOB_SCHEMA = "neeco-downstream-job/1"
 JOB_FILE = "job.json"
@@ -254,13 +254,10 @@ class DownstreamJob:
         file = self.folder / JOB_FILE
         if not file.exists():
             return
-        stored = read_json(file)
-        if not isinstance(stored, dict) or stored.get("schema") != JOB_SCHEMA:
-            raise NeecoError(f"{file}: schema: is not {JOB_SCHEMA}; give another --output")
+        stored = require_like(read_json(file), {"schema": str}, str(file), REMEDY)
         stored = {key: getattr(DownstreamSettings, key) for key in HELD_OUT} | stored
-        for key, value in ({key: getattr(self.settings, key) for key in HELD_OUT} | self.identity()).items():
-            if stored.get(key) != value:
-                raise NeecoError(f"{file}: {key}: is {stored.get(key)!r}, not {value!r}; give another --output")
+        now = {"schema": JOB_SCHEMA} | {key: getattr(self.settings, key) for key in HELD_OUT} | self.identity()
+        require_same(str(file), ((key, stored.get(key), now[key]) for key in now), REMEDY)
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> dict[str, Any]:
         """Train, test, write `folder`/job.json last, and return what it holds; at once when it is there already."""

@@ -83,7 +83,7 @@ class DFine(TorchModel):
         return DFineForObjectDetection(config)
 
     def loss(self, module: Any, images: Tensor, examples: Sequence[Example]) -> Tensor:
-        labels = [_labels(example, images.device) for example in examples]
+        labels = [detection_labels(example, images.device) for example in examples]
         return module(pixel_values=images, labels=labels).loss
 
     def predictions(self, module: Any, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Prediction]:
@@ -99,8 +99,8 @@ class DFine(TorchModel):
         return found
 
 
-def _labels(example: Example, device: torch.device) -> dict[str, Tensor]:
-    """One image's labels as transformers takes them: classes from 0, boxes relative to the image's size."""
+def detection_labels(example: Example, device: torch.device) -> dict[str, Tensor]:
+    """Return one image's labels as transformers takes them: classes from 0, boxes relative to the image's size."""
     boxes, classes = example.relative_boxes()
     return {
         "class_labels": torch.from_numpy(classes - 1).to(device),

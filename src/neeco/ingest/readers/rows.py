@@ -1,0 +1,190 @@
+"""The rows of a log's table that are in use: which were measured, their times and numbers, their order and gaps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neeco.errors import NeecoError
+from neeco.ingest.readers import Table, column_index, count_rows, numbers
+from neeco.ingest.readers import columns as named
+from neeco.ingest.readers.columns import JointColumns, PoseColumns, RecognisedColumns
+
+MIN_SAMPLES = 4  # of a usable log
+MAX_WRONG = 0.05  # share of rows that may be wrong (not missing) before the file is refused
+MAX_LISTED_STATES = 8  # of those that drop rows, in the notes
+MAX_SAME_TIME = 0.5  # share of rows at the time of another: more, and times are too coarse
+STUCK_S, STUCK_SAMPLES = 0.5, 10  # a tracker's noise leaves no pose unchanged for as long
+GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
+
+
+class Rows:
+    """The rows of a table in use; those left out, by reason, and those repaired, for the notes."""
+
+    def __init__(self, table: Table) -> None:
+        self.table = table
+        self.keep = np.ones(len(table.rows), dtype=bool)
+        self.reasons: dict[str, list[int]] = {}  # the file's lines
+        self.repairs: list[str] = []
+
+    def drop(self, which: np.ndarray | list[int], reason: str) -> None:
+        """Leave rows out (bool [R], or their numbers), and note those that were in use."""
+        lines = self.table.lines[which][self.keep[which]]
+        if len(lines):
+            self.reasons.setdefault(reason, []).extend(lines.tolist())
+        self.keep[which] = False
+
+    def drop_wrong(self, wrong: np.ndarray, reason: str) -> None:
+        """Leave out a few rows that are wrong (bool [R]). Raises NeecoError when they are more than a few."""
+        lines, count = self.table.lines[wrong & self.keep], int(self.keep.sum())
+        if len(lines) > max(1, MAX_WRONG * count):
+            share = f"{self.table.list_rows(lines)} ({len(lines)} of {count_rows(count)})"
+            raise NeecoError(f"{self.table.where}: {share}: {reason}")
+        self.drop(wrong, reason.split(";")[0])
+
+    def notes(self) -> tuple[str, ...]:
+        """Return the changes to the rows, one sentence each."""
+        name = self.table.title
+        dropped = (
+            f"{name}: {count_rows(len(lines))} dropped: {reason} ({self.table.list_rows(lines)})"
+            for reason, lines in self.reasons.items()
+        )
+        return (*self.table.notes, *dropped, *(f"{name}: {repair}" for repair in self.repairs))
+
+
+def keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
+    """Drop the rows whose state does not say that they were measured."""
+    table, name = rows.table, source.state or found
+    if name is None:
+        return
+    index = column_index(table, name)
+    good = {value.lower() for value in source.good}
+    states = [cells[index] if index < len(cells) else "" for cells in table.rows]
+    by_state: dict[str, list[int]] = {}
+    for row, state in enumerate(states):
+        if state.lower() not in good:
+            by_state.setdefault(state[:20], []).append(row)
+    for number, (state, members) in enumerate(by_state.items()):
+        if number < MAX_LISTED_STATES:
+            rows.drop(members, f"{name} is {state or 'empty'!r}")
+        rows.keep[members] = False
+    if not rows.keep.any():
+        raise NeecoError(
+            f"{table.where}: {name}: no row is {' or '.join(source.good)} ({table.list_rows(table.lines[:1])} has "
+            f"{states[0][:20]!r}); list the values that mark measured rows in the recording: columns.good"
+        )
+
+
+def read_times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColumns) -> np.ndarray:
+    """Return times [R] in s; rows without one are dropped."""
+    table, names, rate = rows.table, source.time or found.time, source.rate_hz
+    if names is None and rate is not None:
+        return np.arange(len(table.rows)) / rate
+    if names is None:
+        raise NeecoError(
+            f"{table.where}: header: no column of times found; name it as columns.time (or add t_s), or say rate_hz "
+            "where its rows come at a fixed rate"
+        )
+    cells = read_cells(rows, names)
+    known = named.recognise_time(names)
+    if rate is not None and (len(names) == 2 or known.time_unit or named.split_unit(names[0], "time")[1]):
+        raise NeecoError(
+            f"{table.where}: rate_hz: {', '.join(names)} holds times and counts no frames; leave rate_hz out, or name "
+            "the column that counts as columns.time"
+        )
+    if len(names) == 2:
+        return cells[:, 0] + cells[:, 1] * 1e-9
+    if rate is not None:
+        return cells[:, 0] / rate
+    if known.counts_frames:
+        raise NeecoError(
+            f"{table.where}: {names[0]}: counts frames, and nothing says how many a second; say rate_hz in the "
+            "recording (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
+        )
+    steps = np.diff(cells[rows.keep, 0])
+    steps = steps[steps > 0]
+    hint = ""
+    if len(steps):
+        rates = {unit: 1 / (np.median(steps) * scale) for unit, scale in (("s", 1), ("ms", 1e-3), ("ns", 1e-9))}
+        likely = [f"{unit} would be {rate:.3g} Hz" for unit, rate in rates.items() if 1 <= rate <= 5000]
+        hint = f" Its steps in {', '.join(likely)}." if likely else ""
+    return cells[:, 0] * named.scale_of(table.where, names, "time", source.units.time, known.time_unit, hint)
+
+
+def read_cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
+    """Return numbers [R, C], without rows of missing or unreadable cells. Raises NeecoError when those are most."""
+    table = rows.table
+    values, missing, bad = numbers(table, names)
+    rows.drop(missing, f"no value for {', '.join(names)}" if len(names) < 3 else "values are missing")
+    bad = [(row, what) for row, what in bad if rows.keep[row]]
+    if len(bad) > max(3, 0.5 * rows.keep.sum()):
+        similar = f"{len(bad)} of {count_rows(len(table.rows))} like it"
+        raise NeecoError(
+            f"{table.where}: {table.record} {table.lines[bad[0][0]]}: {bad[0][1]} ({similar}); name other columns or "
+            "repair the file"
+        )
+    if bad:
+        rows.drop([row for row, _ in bad], f"not readable, first: {bad[0][1]}")
+    if not rows.keep.any():
+        raise NeecoError(
+            f"{table.where}: {', '.join(names)}: no row has values; name other columns or another file in the recording"
+        )
+    return values
+
+
+def drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
+    """Drop the rows of a tracker that repeats its last pose [R, 7] after it lost its tool: exactly the same pose for
+    long, and a jump at an end. What comes to rest slows down before."""
+    used = np.flatnonzero(rows.keep)
+    if len(used) < MIN_SAMPLES:
+        return
+    steps = np.linalg.norm(np.diff(poses[used, :3], axis=0), axis=1)
+    same = np.concatenate([[False], (np.diff(poses[used], axis=0) == 0).all(axis=1), [False]])
+    edges = np.diff(same.astype(int))
+    moving = steps[steps > 0]
+    if not len(moving):
+        return
+    for first, last in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+        # the pose of row `first` is repeated until `last`
+        around = [steps[first - 1]] if first > 0 else []
+        around += [steps[last]] if last < len(steps) else []
+        lasted = times[used[last]] - times[used[first]]
+        if last - first >= STUCK_SAMPLES and lasted > STUCK_S and max(around, default=0.0) > np.median(moving):
+            rows.drop(used[first + 1 : last + 1], "the pose of the row before, repeated (a tracker that lost its tool)")
+
+
+def in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left."""
+    table, usable = rows.table, np.flatnonzero(rows.keep)
+    order = usable[np.argsort(times[usable], kind="stable")]
+    late = usable[1:][times[usable][1:] < np.maximum.accumulate(times[usable])[:-1]]
+    doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
+    if doubled.sum() > max(MIN_SAMPLES, MAX_SAME_TIME * len(order)):
+        raise NeecoError(
+            f"{table.where}: {count_rows(int(doubled.sum()))} of {len(order)} have the time of another; its times are "
+            "too coarse, or of several tools: name a finer column as columns.time"
+        )
+    rows.drop(np.sort(order[doubled]), "a second row at one time")
+    order = order[~doubled]
+    if len(order) < MIN_SAMPLES:
+        why = "; ".join(note.partition(": ")[2] for note in rows.notes()[:2])
+        raise NeecoError(
+            f"{table.where}: {count_rows(len(order))} of {len(table.rows)} can be used{f' ({why})' if why else ''}; "
+            "record again or name the right columns"
+        )
+    if len(late):
+        listed = table.list_rows(table.lines[late])
+        rows.repairs.append(f"{count_rows(len(late))} out of order in time; sorted ({listed})")
+    return times[order], order
+
+
+def find_gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:
+    """Return the gaps in time (steps longer than 4 usual ones and 0.15 s), and a note of them."""
+    steps = np.diff(times)
+    longest = max(GAP_STEPS * float(np.median(steps)), GAP_SECONDS)
+    gaps = tuple((float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest))
+    if not gaps:
+        return (), ()
+    total = sum(end - start for start, end in gaps)
+    first = ", ".join(f"{start:.2f}-{end:.2f} s" for start, end in gaps[:3])
+    count = f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''}"
+    return gaps, (f"{table.title}: {count}, {total:.2f} s in all ({first}); not bridged",)
