@@ -26,9 +26,9 @@ from PIL import Image, ImageOps
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.checks import inspect_capture
-from neeco.capture.checks._colors import _Colors, check_images
-from neeco.capture.checks._motion import check_motion, evidence_by_chance, root_poses
-from neeco.capture.checks._motion_evidence import MotionEvidence
+from neeco.capture.checks.colors import _Colors, check_images
+from neeco.capture.checks.motion import check_motion, evidence_by_chance, root_poses
+from neeco.capture.checks.motion_evidence import MotionEvidence
 from neeco.capture.documents import ProblemReport
 from neeco.capture.readers import parse_capture
 from neeco.capture.readers.parsed import Parsed

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neeco.capture.checks import _colors as checked
-from neeco.capture.checks._colors import agreements, check_colors
+from neeco.capture.checks import colors as checked
+from neeco.capture.checks.colors import agreements, check_colors
 from neeco.capture.documents import Node, ProblemReport
 from neeco.capture.model import Frame, State
 from neeco.capture.points import PointCloud

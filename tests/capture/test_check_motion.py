@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from neeco.capture import check_capture
 from neeco.capture.checks import read_checked
-from neeco.capture.checks._motion import check_motion
+from neeco.capture.checks.motion import check_motion
 from neeco.capture.documents import ProblemReport
 from neeco.capture.kinematics import KinematicTree, Link
 from neeco.capture.readers import parse_capture

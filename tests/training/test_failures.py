@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 
 import neeco.files
 import neeco.training.session
-from neeco.capture.checks import _inspection as check
+from neeco.capture.checks import inspection as check
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY

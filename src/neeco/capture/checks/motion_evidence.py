@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from neeco.capture.checks._cameras import MIN_DEPTH, CameraArrays
+from neeco.capture.checks.cameras import MIN_DEPTH, CameraArrays
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.projection import project

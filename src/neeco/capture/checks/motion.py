@@ -14,8 +14,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.checks._mistakes import placement_mistakes, rotation_mistakes
-from neeco.capture.checks._motion_evidence import MotionEvidence, TimeSteps
+from neeco.capture.checks.mistakes import placement_mistakes, rotation_mistakes
+from neeco.capture.checks.motion_evidence import MotionEvidence, TimeSteps
 from neeco.capture.documents import printable
 from neeco.capture.model import Instrument, InstrumentState
 from neeco.capture.readers.parsed import Parsed

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neeco.capture.checks._cameras import CameraArrays
-from neeco.capture.checks._mistakes import camera_mistakes
-from neeco.capture.checks._motion_evidence import gain_certainty
+from neeco.capture.checks.cameras import CameraArrays
+from neeco.capture.checks.mistakes import camera_mistakes
+from neeco.capture.checks.motion_evidence import gain_certainty
 from neeco.capture.images import exif_orientation
 from neeco.capture.model import evenly_spaced
 from neeco.capture.readers.parsed import Parsed

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neeco.capture.checks._cameras import CameraArrays
-from neeco.capture.checks._colors import agreements
-from neeco.capture.checks._mistakes import camera_axes_mistakes, frame_mistakes, unit_mistakes
-from neeco.capture.checks._motion import POSES, MotionVerdict, judge_motion
-from neeco.capture.checks._motion_evidence import MotionEvidence
+from neeco.capture.checks.cameras import CameraArrays
+from neeco.capture.checks.colors import agreements
+from neeco.capture.checks.mistakes import camera_axes_mistakes, frame_mistakes, unit_mistakes
+from neeco.capture.checks.motion import POSES, MotionVerdict, judge_motion
+from neeco.capture.checks.motion_evidence import MotionEvidence
 from neeco.capture.documents import Node, errors_only, printable
 from neeco.capture.model import Instrument
 from neeco.capture.points import sampled

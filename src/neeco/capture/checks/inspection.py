@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from neeco.capture.checks._colors import check_colors
-from neeco.capture.checks._frames import check_frames, check_image_files
-from neeco.capture.checks._motion import check_motion
-from neeco.capture.checks._placement import check_placement
-from neeco.capture.checks._states import check_states
+from neeco.capture.checks.colors import check_colors
+from neeco.capture.checks.frames import check_frames, check_image_files
+from neeco.capture.checks.motion import check_motion
+from neeco.capture.checks.placement import check_placement
+from neeco.capture.checks.states import check_states
 from neeco.capture.documents import Problem, ProblemReport, condensed, errors_only, key_name
 from neeco.capture.model import Capture
 from neeco.capture.readers import capture_of, parse_capture
