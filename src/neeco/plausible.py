@@ -1,4 +1,4 @@
-"""Limits of plausible cameras, joints, times and masks, for all readers of files and the Python API.
+"""Limits of plausible cameras, joints, times, masks and frame counts, for all readers of files and the Python API.
 
 Each function returns what is wrong and what to do, or None. Poses: `neeco.geometry.rotations.rigid_fault`.
 """
@@ -16,6 +16,7 @@ FULL_TURN = 2 * math.pi  # rad; a joint without stated limits turns no farther
 MAX_SLIDE_MM = 1000.0  # mm; nor slides farther
 LIMIT_TOLERANCE = 1e-3  # rad (mm of sliding joints) by which rounding and noise may exceed a limit
 MAX_TIME_S = 1e10  # s, beyond the seconds since 1970 that clocks give
+FEW_TRAIN_FRAMES = 20  # fewer: expect little
 MAX_HIDDEN = 0.5  # share of the lit pixels of most images that a loss mask may hide
 MAX_POINTS_HIDDEN = 0.8  # share of the projected sparse points that loss masks may hide
 

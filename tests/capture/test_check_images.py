@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from neeco.capture.checks import colors as checked
-from neeco.capture.checks.colors import agreements, check_images
+from neeco.capture.checks.colors import agreements, check_colors
 from neeco.capture.documents import Node, ProblemReport
 from neeco.capture.model import Frame, State
 from neeco.capture.points import PointCloud
@@ -63,7 +63,7 @@ def capture(tmp_path_factory) -> Parsed:
 def found(capture: Parsed) -> list[str]:
     report = ProblemReport()
     places = [replace(place, report=report) for place in capture.places]
-    check_images(replace(capture, places=places))
+    check_colors(replace(capture, places=places))
     assert all(problem.severity == "warning" for problem in report.problems)
     return [problem.message for problem in report.problems]
 

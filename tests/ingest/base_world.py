@@ -127,7 +127,16 @@ def episodes(
     recording = Recording(Path("recording.yaml"), VideoFile(Path("video.mp4")), instruments=tuple(instruments))
     video = VideoSource(Path("video.mp4"), (WIDTH, HEIGHT), (), np.zeros(2))
     joints: dict[str, dict] = {name: {} for name in poses}
-    part = Episode(recording=recording, video=video, poses=poses, joints=joints, rolls={}, scope=None, clocks=clocks)
+    part = Episode(
+        name="recording",
+        recording=recording,
+        video=video,
+        poses=poses,
+        joints=joints,
+        rolls={},
+        scope=None,
+        clocks=clocks,
+    )
     return Episodes((part,), video, Notes(["recording"]))
 
 

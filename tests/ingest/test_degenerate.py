@@ -48,7 +48,7 @@ def test_frames_without_a_camera_are_left_out_and_listed(recorded):
     recorded.mapped = lambda number: number < 26
     result = run(recorded, laparoscope=None)
     assert result.selected.max() < 26
-    assert any("no camera" in why for frame, why in result.dropped if frame >= 26)
+    assert any("no camera" in reason.why for frame, reason in result.dropped if frame >= 26)
 
 
 def test_frames_in_a_gap_of_the_tracker_are_left_out(recorded):
@@ -81,7 +81,7 @@ def test_a_joint_log_that_ends_early_ends_the_capture_there(recorded):
     keep_rows(recorded.folder / "jaw.csv", lambda t: t < 1.0)
     result = run(recorded, laparoscope=None)
     assert result.selected_times.max() < 1.02
-    assert any("no instrument state" in why for _, why in result.dropped)
+    assert any("no instrument state" in reason.why for _, reason in result.dropped)
 
 
 def test_a_scope_on_a_clock_of_its_own(recorded):

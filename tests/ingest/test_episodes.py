@@ -16,10 +16,10 @@ from neeco.cli.ingest import Ingest, recordings_of, run
 from neeco.errors import NeecoError
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers.interpolate import poses_at
+from neeco.ingest.recording.compatibility import episode_names, separate
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.splits import assign_splits
-from neeco.ingest.timing.compatibility import episode_names, separate
 from neeco.ingest.timing.episodes import PAUSE_S
 from neeco.ingest.timing.reading import read_episodes
 

@@ -19,9 +19,9 @@ from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.columns import CAMERA as CAMERA_FRAME
 from neeco.ingest.readers.columns import PoseColumns, Units
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.recording.compatibility import separate
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.timing.compatibility import separate
 
 pytest.importorskip("av")
 pyarrow = pytest.importorskip("pyarrow")

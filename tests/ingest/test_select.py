@@ -22,10 +22,10 @@ STATES[:, 0] = 2.0 * np.arange(30)
 
 def test_a_blurred_frame_is_dropped_and_says_so() -> None:
     features = frame_features(picture(4 * i, blur=15 if i == 12 else 1) for i in range(30))
-    _, dropped = choose_frames(features, np.ones(30, dtype=bool), STATES, None)
+    _, dropped = choose_frames(features, np.ones(30, dtype=bool), STATES, 30, 0.5)
     assert dropped.keys() == {12}
-    assert "blurred" in dropped[12]
-    assert not choose_frames(features, np.ones(30, dtype=bool), STATES, None, min_sharpness=0.01)[1]
+    assert "blurred" in dropped[12].why
+    assert not choose_frames(features, np.ones(30, dtype=bool), STATES, 30, 0.01)[1]
 
 
 def test_a_frame_like_the_one_before_is_dropped_unless_the_instrument_moved() -> None:
@@ -35,7 +35,7 @@ def test_a_frame_like_the_one_before_is_dropped_unless_the_instrument_moved() ->
     features = frame_features(pictures)
     still = STATES.copy()
     still[25:] = still[24]
-    selected, _ = choose_frames(features, np.ones(30, dtype=bool), still, None)
+    selected, _ = choose_frames(features, np.ones(30, dtype=bool), still, 30, 0.5)
     assert selected.tolist() == list(range(25))
 
 
@@ -48,8 +48,8 @@ def test_frames_of_a_frozen_video_are_dropped_where_the_state_goes_on() -> None:
     resting[12:18] = resting[12]
     assert frozen_frames(features, usable, STATES).tolist() == list(range(13, 20))
     assert frozen_frames(features, usable, resting).tolist() == [18, 19]
-    _, dropped = choose_frames(features, usable, STATES, None)
-    assert {dropped[i] for i in range(13, 20)} == {"frozen: the state changed, not the picture"}
+    _, dropped = choose_frames(features, usable, STATES, 30, 0.5)
+    assert {dropped[i].why for i in range(13, 20)} == {"frozen: the state changed, not the picture"}
     assert describe_ranges(np.array([3, 13, 14, 15, 19, 25])) == "3, 13-15, 19, ..."
 
 
@@ -58,7 +58,7 @@ def test_a_limit_keeps_extremes_and_both_ends() -> None:
     states = STATES.copy()
     states[:, 5] = 0.0
     states[17, 5] = 3.0  # a state like no other
-    selected, _ = choose_frames(features, np.ones(30, dtype=bool), states, 6)
+    selected, _ = choose_frames(features, np.ones(30, dtype=bool), states, 6, 0.5)
     assert len(selected) == 6
     assert {0, 17, 29} <= set(selected.tolist())
 
@@ -67,4 +67,4 @@ def test_frames_without_a_state_are_dropped() -> None:
     features = frame_features(picture(4 * i) for i in range(30))
     usable = np.ones(30, dtype=bool)
     usable[:5] = False
-    assert choose_frames(features, usable, STATES, None)[0].min() == 5
+    assert choose_frames(features, usable, STATES, 30, 0.5)[0].min() == 5

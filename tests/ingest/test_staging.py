@@ -9,7 +9,7 @@ import pytest
 
 from neeco.errors import NeecoError
 from neeco.files import TEMPORARY
-from neeco.ingest.convert import staged
+from neeco.ingest.staging import staged
 
 
 def fill(folder: Path) -> None:

@@ -49,7 +49,7 @@ def test_the_tissue_lies_behind_every_place_of_the_instrument_and_shows_none_of_
     truth = theatre.tissue[rows.astype(int).clip(0, HEIGHT - 1), columns.astype(int)] / 255
     assert np.abs(points.colors - truth).mean() < 0.02
     assert result.still
-    assert "not measured" in str(result.tissue)
+    assert "not measured" in str(result.depth_source)
 
 
 def test_a_stereo_partner_measures_the_tissue_and_is_one_view_more_to_learn_from(theatre: Theatre) -> None:
@@ -86,7 +86,7 @@ def test_poses_in_an_unknown_frame_stay_unregistered_and_the_notes_say_so(theatr
     result = theatre.ingest(instruments=[{"name": "bar", "poses": "bar.csv"}])
     assert not read_capture(result.capture).registered
     assert any("poses of bar" in note for note in result.notes)
-    assert "100 mm" in str(result.tissue)
+    assert "100 mm" in str(result.depth_source)
 
 
 def test_a_still_capture_has_few_cameras_and_check_says_so(theatre: Theatre) -> None:

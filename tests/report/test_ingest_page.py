@@ -24,6 +24,7 @@ from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.ingest.assessment import MAX_SHOWN, assess_ingest
 from neeco.ingest.foreground.rough_shape import RoughShape
+from neeco.ingest.frames.images import DropReason
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.result import IngestResult
@@ -55,10 +56,12 @@ def made(folder: Path, **changes) -> IngestResult:
         scale_sd=0.004, position_residual=np.full(count, 0.5), rotation_residual=np.full(count, 0.003),
         used=np.arange(count),
     )  # fmt: skip
-    dropped = tuple((frame, f"blurred: {frame % 50}% of its neighbours' sharpness") for frame in (96, 97, 98, 105))
+    dropped = tuple(
+        (frame, DropReason(f"blurred: {frame % 50}% of its neighbours' sharpness")) for frame in (96, 97, 98, 105)
+    )
     result = IngestResult(
         capture=folder, recording="rec <1>.yaml", video_frames=106, video_fps=25.0, size=(240, 192),
-        selected=np.arange(count), selected_times=times, dropped=(*dropped, (99, "no camera")),
+        selected=np.arange(count), selected_times=times, dropped=(*dropped, (99, DropReason("no camera"))),
         clocks={"em": clock, "jaw_angle": ClockOffset(-0.0097, 0.0, "given")}, registration=registration,
         registered_frames=np.arange(count), reprojection_px=0.36, points=len(capture.points.positions),
         shapes={capture.instruments[0].name: shaft()} if capture.instruments else {},
@@ -236,12 +239,12 @@ def test_the_side_view_has_the_tissue_ahead_of_the_camera():
         ({"points": 40}, "careful", "40 tissue points"),
         ({"clocks": {"em": ClockOffset(0.0, 0.08, "scope motion")}}, "bad", "Clock em"),
         ({"clocks": {"jaw_angle": ClockOffset(0.0, float("nan"), "assumed")}}, "careful", "jaw_angle"),
-        ({"dropped": tuple((i, "blurred") for i in range(60))}, "careful", "60 of 106"),
+        ({"dropped": tuple((i, DropReason("blurred")) for i in range(60))}, "careful", "60 of 106"),
         ({"contradictions": (Contradiction("nothing moves with the tool", True),)}, "bad", "Doubtful: nothing moves"),
         ({"contradictions": (Contradiction("the video is fast", False),)}, "careful", "with care: the video is"),
         ({"bases": {"psm1": based(0.68)}}, "careful", "overlap by 0.68"),
         ({"bases": {"psm1": based(0.92)}}, "good", "Ready"),
-        ({"dropped": tuple((i, "not among the 40 that cover") for i in range(60))}, "good", "Ready"),
+        ({"dropped": tuple((i, DropReason("not best", frame_usable=True)) for i in range(60))}, "good", "Ready"),
     ],
 )  # fmt: skip
 def test_the_verdict_names_what_is_doubtful(changes, level, piece):
@@ -336,7 +339,7 @@ def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(tmp_path, 
 
     clock = ClockOffset(0.0, float("nan"), HOSTILE)
     names = {"recording": HOSTILE, "clocks": {HOSTILE: clock}, "split_rule": HOSTILE, "notes": (HOSTILE,)}
-    result = made(edited(tmp_path / HOSTILE, rename), dropped=((3, HOSTILE),), **names)
+    result = made(edited(tmp_path / HOSTILE, rename), dropped=((3, DropReason(HOSTILE)),), **names)
     path = tmp_path / "page.html"
 
     def write():

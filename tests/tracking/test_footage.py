@@ -16,7 +16,7 @@ from neeco.capture.images import write_image
 from neeco.capture.model import Capture, PointCloud, State
 from neeco.cli import main
 from neeco.errors import NeecoError
-from neeco.fitting.layers import InstrumentRenderer, TissueRenderer
+from neeco.fitting.crop_rendering import InstrumentRenderer, TissueRenderer
 from neeco.fitting.parameters import DEG
 from neeco.geometry.camera import Camera
 from neeco.ingest.footage_video import read_footage

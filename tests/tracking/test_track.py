@@ -20,9 +20,9 @@ from neeco.capture.model import Capture, State
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import TypicalErrors
-from neeco.fitting.fitter import loose_prior
-from neeco.fitting.layers import FrameView, InstrumentRenderer, TissueRenderer, color_matched, view_of
+from neeco.fitting.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer, color_matched, view_of
 from neeco.fitting.parameters import DEG
+from neeco.fitting.state_fitter import loose_prior
 from neeco.report.track_page import write_track_page
 from neeco.tracking.follow import SEARCH_ROLLS_EVERY, Follower, Step
 from neeco.tracking.motion import MotionModel
@@ -53,7 +53,7 @@ def tracked(tracked_run: RecordedRun, footage: Capture, tmp_path_factory: pytest
 def test_an_increment_leads_from_one_state_to_another(tracked_run: RecordedRun) -> None:
     parameters = TrackedParameters.of(tracked_run.scene)
     one, other = grasper_state(jaw=0.4), grasper_state(3, -2, 75, 0.3, -0.5, 0.7)
-    reached = parameters.moved(one, parameters.between(one, other))
+    reached = parameters.moved(one, parameters.increments_between(one, other))
     assert off(reached, other) == pytest.approx((0, 0, 0), abs=1e-4)
 
 

@@ -23,6 +23,7 @@ warnings.simplefilter("error", Image.DecompressionBombWarning)
 # Levels of 255, mean and largest, by which a picture differs that is coded again: 0.07 and 19 by H.264 at its coarsest;
 # 0.4 and 40 or more where a camera or an instrument moves
 REPEATED_MEAN, REPEATED_MAX = 0.2, 24
+VISIBLE_MM, VISIBLE_RAD = 1.0, 0.03  # changes that a picture shows: of a position; of an angle, or a rotation's entries
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 

@@ -11,6 +11,7 @@ from neeco.errors import NeecoError
 from neeco.files import read_bytes, write_atomically
 from neeco.geometry.lines import across_projectors, nearest_point
 
+MAX_SAMPLED_POINTS = 500
 UNKNOWN_DISTANCE_MM = 100.0  # how far a single, still camera is taken to look
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -44,6 +45,18 @@ class PointCloud:
 
     def __repr__(self) -> str:
         return f"PointCloud({len(self.positions)} points, measured={self.measured})"
+
+
+def sampled(positions: np.ndarray) -> np.ndarray:
+    """Return MAX_SAMPLED_POINTS to twice as many of positions [P, 3], evenly spaced in their order; all of fewer."""
+    return positions[:: max(1, len(positions) // MAX_SAMPLED_POINTS)]
+
+
+def measured_sample(cloud: PointCloud | None) -> np.ndarray:
+    """Return some of the measured points, [P, 3] float64 mm; none where there are none."""
+    if cloud is None or not cloud.measured:
+        return np.zeros((0, 3))
+    return sampled(cloud.positions).astype(np.float64)
 
 
 def read_ply(path: Path) -> PointCloud:

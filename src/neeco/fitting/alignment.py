@@ -17,6 +17,7 @@ from torch import Tensor
 
 from neeco.capture.images import area_averaged
 from neeco.capture.model import Frame, Instrument, State
+from neeco.fitting.crop_rendering import MAX_PIXELS
 from neeco.fitting.minimise import ImageResidual, minimise
 from neeco.fitting.parameters import InstrumentParameters, StateParameters, moved_camera, precision_of
 from neeco.geometry.camera import Camera
@@ -39,8 +40,8 @@ class AlignConfig:
     sigma_camera_mm: float = 1.5
     sigma_camera_deg: float = 0.3
     levels: tuple[float, ...] = (0.25, 0.5, 1.0)  # sizes of the images compared, coarse to fine
-    max_pixels: int = 160_000  # of the largest of them, to which larger images are reduced
-    steps: tuple[int, ...] = (3, 2, 2)  # Gauss-Newton steps at each
+    max_pixels: int = MAX_PIXELS  # of the largest of them, to which larger images are reduced
+    steps: tuple[int, ...] = (3, 2, 2)  # Levenberg-Marquardt iterations at each
     huber: float = 0.05  # colour residual beyond which the cost is linear: highlights and unobserved tissue
     correlation_px: float = 100.0  # pixels that count as one observation, since residuals of neighbours correlate
     step_mm: float = 0.1  # finite difference at the last level, larger at coarse ones

@@ -1,7 +1,8 @@
 """Levenberg-Marquardt on the difference between a rendering and an image.
 
 Residuals have Huber weights. Columns of the Jacobian are finite differences of renderings, so that no scene needs to
-be differentiable. `alignment` fits poses to recorded frames with it, `fitter` the instruments of footage.
+be differentiable. `alignment` fits poses to recorded frames with it, `state_fitter` the
+instruments of footage.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ class ImageResidual:
     scale: float  # of a squared residual against the prior
 
     def of(self, image: Tensor) -> Tensor:
-        """Return the residual [h, w, 3] of a rendering."""
-        return smoothed(image - self.target, self.weight)
+        """Return the residual [h, w, 3] of a rendering, weighted and blurred."""
+        return weighted_blur(image - self.target, self.weight)
 
     def cost(self, image: Tensor) -> float:
         """Return the Huber cost of a rendering, -log probability."""
@@ -96,7 +97,7 @@ def minimise(
         weight = residual.scale / (off.abs() / residual.huber).clamp_min(1.0)
         if step % linearised_for == 0:
             columns = [
-                smoothed(moved - image, residual.weight).flatten() / change
+                weighted_blur(moved - image, residual.weight).flatten() / change
                 for moved, change in problem.differences(parameters, posed)
             ]
             jacobian = torch.stack(columns)  # [P, h * w * 3]
@@ -122,9 +123,9 @@ def minimise(
     return Minimum(parameters=parameters, cost=cost, posed=posed, image=image, information=information, settled=settled)
 
 
-def smoothed(difference: Tensor, weight: Tensor) -> Tensor:
-    """Return [h, w, 3] blurred (3x3 binomial) over the counted pixels: an edge's residual stays linear over a larger
-    shift."""
+def weighted_blur(difference: Tensor, weight: Tensor) -> Tensor:
+    """Return a difference [h, w, 3] times its weight [h, w], blurred (3x3 binomial): an edge's residual stays linear
+    over a larger shift."""
     counted = (difference * weight[..., None]).flatten(1)  # [h, w * 3]
     down = counted + counted
     down[1:] += counted[:-1]

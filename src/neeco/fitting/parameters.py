@@ -1,6 +1,7 @@
 """The parameters by which states and cameras are corrected, and priors on them.
 
-Every fit uses them: Levenberg-Marquardt on one image (`alignment`, `fitter`) and Adam during training (`refinement`).
+Every fit uses them: Levenberg-Marquardt on one image (`alignment`, `state_fitter`) and Adam during training
+(`refinement`).
 """
 
 from __future__ import annotations
@@ -103,32 +104,33 @@ class StateParameters:
             values[-6:] = torch.tensor([camera[0]] * 3 + [camera[1]] * 3, dtype=torch.float64)
         return values
 
-    def each(self, degrees: float, millimetres: float, joint_degrees: float, joint_millimetres: float) -> Tensor:
+    def vector_from_degrees(
+        self, degrees: float, millimetres: float, joint_degrees: float, joint_millimetres: float
+    ) -> Tensor:
         """Return the `vector` [P] of numbers given in degrees and mm."""
         return self.vector(degrees * DEG, millimetres, (joint_degrees * DEG, joint_millimetres))
 
-    def corrected(self, state: State, poses: Sequence[Tensor], joints: Sequence[Sequence[Any]]) -> State:
+    def moved_by_parts(self, state: State, poses: Sequence[Tensor], joints: Sequence[Sequence[Any]] | None) -> State:
         """Return `state` with every instrument's pose moved by [6] of `poses`, its joints by [J] of `joints`, within
-        their bounds; differentiable where these are tensors."""
+        their bounds (None: joints stay); differentiable where these are tensors."""
         instruments = dict(state.instruments)
-        for item, increment, changes in zip(self.instruments, poses, joints, strict=True):
+        for number, (item, increment) in enumerate(zip(self.instruments, poses, strict=True)):
             given = instruments[item.name]
-            values = {
-                name: item.within_bounds(index, given.joints[name] + change)
-                for index, (name, change) in enumerate(zip(item.joints, changes, strict=False))
-            }
-            pose = moved_pose(given.pose, increment, item.pivot)
-            instruments[item.name] = InstrumentState(pose, {**given.joints, **values})
+            values = dict(given.joints)
+            if joints is not None:
+                for index, (name, change) in enumerate(zip(item.joints, joints[number], strict=True)):
+                    values[name] = item.within_bounds(index, given.joints[name] + change)
+            instruments[item.name] = InstrumentState(moved_pose(given.pose, increment, item.pivot), values)
         return replace(state, instruments=instruments)
 
     def moved(self, state: State, parameters: Tensor) -> State:
-        """Return `state` corrected by `parameters` [P] float64."""
+        """Return `state` moved by `parameters` [P] float64."""
         poses, joints = zip(*self.rows, strict=True)
-        return self.corrected(
+        return self.moved_by_parts(
             state, [parameters[rows] for rows in poses], [parameters[rows].tolist() for rows in joints]
         )
 
-    def between(self, state: State, other: State) -> Tensor:
+    def increments_between(self, state: State, other: State) -> Tensor:
         """Return the parameters [P] with which `moved(state, …)` is `other`."""
         found = torch.zeros(self.size, dtype=torch.float64)
         for item, (pose, joints) in zip(self.instruments, self.rows, strict=True):
@@ -141,7 +143,7 @@ class StateParameters:
             found[joints] = torch.tensor([b.joints[name] - a.joints[name] for name in item.joints], dtype=torch.float64)
         return found
 
-    def inwards(self, state: State, index: int, step: float) -> int:
+    def step_sign(self, state: State, index: int, step: float) -> int:
         """Return 1, or -1 where parameter `index` is a joint that `step` upwards would move beyond its bounds."""
         for item, (_, joints) in zip(self.instruments, self.rows, strict=True):
             if joints.start <= index < joints.stop:

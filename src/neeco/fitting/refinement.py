@@ -72,54 +72,28 @@ class Refinement:
         self, config: RefineConfig, frames: tuple[Frame, ...], instruments: tuple[Instrument, ...], device: torch.device
     ) -> None:
         self.config = config
-        self.parameters = StateParameters(tuple(map(InstrumentParameters.of, instruments)))
-        items = self.parameters.instruments
+        self.layout = StateParameters(tuple(map(InstrumentParameters.of, instruments)))
+        items = self.layout.instruments
         names = tuple(item.name for item in items)
         self.readings = tuple((item.name, reading) for item in items for reading in item.joints)
         missing = {(item.name, reading) for item in instruments for reading in item.unrecorded}
         self.unrecorded = torch.tensor(
             [reading in missing for reading in self.readings], dtype=torch.bool, device=device
         )  # [R]
-        slides = [slides for item in items for slides in item.slides]
-        per_rad = torch.tensor([MM_PER_RAD if each else 1.0 for each in slides], device=device)
         self.instants, self.neighbours = _instants(frames, names)
         self.pose_rows = _numbered(
             [(instant, _scope(frame)) for instant, frame in zip(self.instants, frames, strict=True)]
         )
-        self.posed: list[list[int]] = [[] for _ in range(max(self.pose_rows, default=-1) + 1)]  # frames of each pose
-        for index, row in enumerate(self.pose_rows):
-            self.posed[row].append(index)
-        tissues = [frames[shown[0]].state.tissue for shown in self.posed]
-        self.worlds = [  # poses of each tissue
-            torch.tensor([row for row, other in enumerate(tissues) if other == tissue], device=device)
-            for tissue in dict.fromkeys(tissues)
-        ]
+        self.frames_of_pose = _members(self.pose_rows)
+        first = tuple(frames[shown[0]] for shown in self.frames_of_pose)
+        tissues = _members(_numbered([frame.state.tissue for frame in first]))
+        self.pose_rows_of_tissue = [torch.tensor(rows, device=device) for rows in tissues]
         self.joints = torch.zeros(len(self.neighbours), len(self.readings), device=device)
-        self.poses = torch.zeros(len(self.posed), len(names), 6, device=device)
+        self.poses = torch.zeros(len(first), len(names), 6, device=device)
         self.cameras = torch.zeros(len(frames), 6, device=device)
         self.latency = torch.zeros(1, device=device)
-        first = tuple(frames[shown[0]] for shown in self.posed)
         self.velocities = _velocities(first, names).to(device)  # [P, I, 6] per s, body frame
-        rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
-        usual = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3)
-        self.camera_sigma = usual.to(device)
-        priors = _pose_priors(first, names, usual)  # [P, I, 6]
-        self.prior_sigma = priors.to(device)
-        self.rates = {
-            "poses": (rates * (priors / usual).clamp(1, MAX_SPEEDUP)).to(device),
-            "joints": per_rad * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
-            "cameras": (rates * config.camera_rate).to(device),
-            "latency": torch.tensor(config.latency_rate, device=device),
-        }
-        usual = per_rad * torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
-        self.joint_sigma = usual.repeat(len(self.neighbours), 1)  # [instants, R] rad or mm
-        for frame, instant in zip(frames, self.instants, strict=True):
-            for column, ((name, reading), slide) in enumerate(zip(self.readings, slides, strict=True)):
-                stated = frame.state.instruments[name].uncertainty
-                if stated is not None and reading in stated.joints_deg:
-                    deviation = stated.joints_deg[reading]
-                    own = deviation if slide else math.radians(deviation)
-                    self.joint_sigma[instant, column] = max(own, MIN_DEVIATION)
+        self._set_priors_and_rates(frames, first, device)
         self.moments = {
             f"{order}.{name}": torch.zeros_like(getattr(self, name))
             for order in ("first", "second")
@@ -128,10 +102,35 @@ class Refinement:
         self.frame_steps = torch.zeros(len(frames))  # on the CPU: read in every step
         self._leaves: dict[str, Tensor] = {}
 
+    def _set_priors_and_rates(self, frames: tuple[Frame, ...], first: tuple[Frame, ...], device: torch.device) -> None:
+        """Set standard deviations and learning rates of all corrections; `first`: a frame of every pose."""
+        config, items = self.config, self.layout.instruments
+        usual_pose_sd = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3)
+        priors = _pose_priors(first, tuple(item.name for item in items), usual_pose_sd)  # [P, I, 6]
+        self.camera_sigma, self.prior_sigma = usual_pose_sd.to(device), priors.to(device)
+        slides = [slides for item in items for slides in item.slides]
+        per_rad = torch.tensor([MM_PER_RAD if each else 1.0 for each in slides], device=device)
+        usual_joint_sd = per_rad * torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
+        self.joint_sigma = usual_joint_sd.repeat(len(self.neighbours), 1)  # [instants, R] rad or mm
+        for frame, instant in zip(frames, self.instants, strict=True):
+            for column, ((name, reading), slide) in enumerate(zip(self.readings, slides, strict=True)):
+                stated = frame.state.instruments[name].uncertainty
+                if stated is not None and reading in stated.joints_deg:
+                    deviation = stated.joints_deg[reading]
+                    own = deviation if slide else math.radians(deviation)
+                    self.joint_sigma[instant, column] = max(own, MIN_DEVIATION)
+        rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
+        self.rates = {
+            "poses": (rates * (priors / usual_pose_sd).clamp(1, MAX_SPEEDUP)).to(device),
+            "joints": per_rad * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
+            "cameras": (rates * config.camera_rate).to(device),
+            "latency": torch.tensor(config.latency_rate, device=device),
+        }
+
     def apply(self, index: int, state: State, camera: Camera, iteration: int) -> tuple[State, Camera, Tensor | None]:
         """Return the corrected state and camera of frame `index`, and the prior's penalty; leaves wait for `step`."""
         self._leaves = {}
-        config, instruments = self.config, self.parameters.instruments
+        config, instruments = self.config, self.layout.instruments
         if iteration < config.start:
             return state, camera, None
         penalties, instant, row = [], self.instants[index], self.pose_rows[index]
@@ -143,13 +142,13 @@ class Refinement:
                 penalties.append(self._prior(leaf, self.prior_sigma[row]))
             if config.latency:
                 offset = offset + self.velocities[row] * self._leaf("latency", self.latency)
-            joints: Sequence[Sequence[Any]] = [()] * len(instruments)
+            joints: Sequence[Sequence[Any]] | None = None
             if config.frame_joints and self.readings:
                 leaf = self._leaf("joints", self.joints[instant])
                 expected = torch.where(self.unrecorded, self.joints[self.neighbours[instant]].mean(0), 0.0)
                 penalties.append(self._prior(leaf - expected, self.joint_sigma[instant]))
                 joints = [tuple(changes) for changes in leaf.split([len(item.joints) for item in instruments])]
-            state = self.parameters.corrected(state, list(offset), joints)
+            state = self.layout.moved_by_parts(state, list(offset), joints)
         if config.cameras:
             leaf = self._leaf("cameras", self.cameras[index])
             camera = moved_camera(camera, leaf)
@@ -174,7 +173,7 @@ class Refinement:
         decay = log_linear(1.0, 0.1, progress)
         pose, own = self.pose_rows[index], float(self.frame_steps[index])
         rows: dict[str, tuple[Any, float]] = {
-            "poses": (pose, float(self.frame_steps[self.posed[pose]].sum())),
+            "poses": (pose, float(self.frame_steps[self.frames_of_pose[pose]].sum())),
             "joints": (self.instants[index], own),
             "cameras": (index, own),
             "latency": (slice(None), float(self.frame_steps.sum())),  # shared by all frames
@@ -196,8 +195,8 @@ class Refinement:
         used = (self.frame_steps > 0).nonzero()[:, 0]
         if len(used):
             rows = torch.tensor(sorted({self.pose_rows[frame] for frame in used.tolist()}), device=self.poses.device)
-            for world in self.worlds:
-                own = rows[torch.isin(rows, world)]
+            for rows_of_tissue in self.pose_rows_of_tissue:
+                own = rows[torch.isin(rows, rows_of_tissue)]
                 self.poses[own] -= self.poses[own].mean(0)
             self.joints -= torch.where(self.unrecorded, 0.0, self.joints.mean(0))
             used = used.to(self.cameras.device)
@@ -256,10 +255,10 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
     return shown, near
 
 
-def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual: Tensor) -> Tensor:
+def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual_sd: Tensor) -> Tensor:
     """Return the standard deviations [F, I, 6] of corrections (rad, mm, in the instrument's own frame): the states' own
-    uncertainties, else `usual` [6]."""
-    priors = usual.repeat(len(frames), len(instruments), 1)
+    uncertainties, else `usual_sd` [6]."""
+    priors = usual_sd.repeat(len(frames), len(instruments), 1)
     for row, frame in enumerate(frames):
         for k, name in enumerate(instruments):
             state = frame.state.instruments[name]
@@ -284,6 +283,14 @@ def _numbered(keys: Sequence[Hashable]) -> list[int]:
     """Return the number of each key, equal for equal keys."""
     numbers: dict[Hashable, int] = {}
     return [numbers.setdefault(key, len(numbers)) for key in keys]
+
+
+def _members(numbers: Sequence[int]) -> list[list[int]]:
+    """Return the places in `numbers` of 0, of 1, and so on."""
+    members: list[list[int]] = [[] for _ in range(max(numbers, default=-1) + 1)]
+    for place, number in enumerate(numbers):
+        members[number].append(place)
+    return members
 
 
 def _velocities(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> Tensor:

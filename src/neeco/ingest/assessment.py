@@ -11,16 +11,16 @@ import numpy as np
 from neeco.capture.documents import Problem
 from neeco.capture.model import UNKNOWN_DEG, Capture
 from neeco.ingest.result import IngestResult
+from neeco.plausible import FEW_TRAIN_FRAMES
 
 # Limits above which there is a warning: conventions, not measurements.
 POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.015, 0.5
 SEVERE = 3.0  # times the limit
-MIN_TRAIN_FRAMES, MIN_POINTS = 20, 100
+MIN_POINTS = 100
 MIN_OVERLAP = 0.8  # of a base's outline with what moves: nine tenths are usual, half is another instrument or time
 MIN_PLAUSIBLE_OVERLAP = 0.6
 MAX_SHOWN = 5  # warnings listed by `lines`
 VERDICTS = {"good": "good", "careful": "usable", "bad": "doubtful"}
-USABLE = ("not among the", "next to an unseen frame")  # beginnings of reasons that are no fault of a frame
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,9 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
             sentence = f"The outline of {name} and what moves overlap by {base.overlap:.2f} only: is its clock right?"
             (severe if base.overlap < MIN_PLAUSIBLE_OVERLAP else mild).append(sentence)
     train = len(capture.split("train"))
-    if train < MIN_TRAIN_FRAMES:
+    if train < FEW_TRAIN_FRAMES:
         severe.append(f"Only {train} frames are left to train on.")
-    unusable = sum(not why.startswith(USABLE) for _, why in result.dropped)
+    unusable = sum(not reason.frame_usable for _, reason in result.dropped)
     if unusable > 0.5 * result.video_frames:
         mild.append(f"{unusable} of {result.video_frames} video frames were dropped as unusable.")
     if result.points < MIN_POINTS:

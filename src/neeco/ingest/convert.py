@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from neeco.capture.checks.frames import masks_fault, measure_hidden, sample_points
 from neeco.capture.documents import ProblemReport, condensed
 from neeco.capture.images import read_mask, write_image, write_labels
+from neeco.capture.masks import masks_fault, measure_hidden
 from neeco.capture.model import Capture, Frame, evenly_spaced
+from neeco.capture.points import measured_sample
 from neeco.capture.readers import capture_of, parse_capture
 from neeco.capture.readers.endonerf import MASKS, folder_images
 from neeco.capture.readers.parsed import Parsed
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
-from neeco.files import LOCK, TEMPORARY, new_folder, own_folder
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
+from neeco.ingest.staging import staged
 
 
 def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
@@ -83,7 +80,7 @@ def _inverted_masks(capture: Capture) -> list[str]:
         frame, mask = masked[index], masked[index].load_mask()
         points = {tissue.name: tissue.points for tissue in capture.tissues}.get(str(frame.state.tissue), capture.points)
         assert mask is not None
-        found.append(measure_hidden(frame.load_image(), mask, frame.camera, sample_points(points)))
+        found.append(measure_hidden(frame.load_image(), mask, frame.camera, measured_sample(points)))
     fault = masks_fault(found)
     return [] if fault is None else [f"Warning: {fault[0]} {fault[1]}."]
 
@@ -205,53 +202,3 @@ def _undistort(frame: Frame, folder: Path) -> Frame:
         write_labels(mask_path, torch.from_numpy(lens.undistort_mask(mask.numpy()).astype(np.uint8) * 255))
     camera = pinhole.camera(frame.camera.world_from_camera.numpy())
     return replace(frame, image_path=image, camera=camera, mask_path=mask_path)
-
-
-@contextmanager
-def staged(output: Path) -> Iterator[Path]:
-    """Yield a temporary folder on the disk of `output`, whose `capture` becomes `output` after the block.
-
-    It is removed whatever happens (after SIGKILL: when the same `output` is asked for again).
-
-    Raises NeecoError when something other than an empty folder is at `output`, when another process is making it, and
-    when the disk refuses.
-    """
-    place = Path(os.path.abspath(output))  # `.` has no name and no parent of its own
-    folder = place.parent / f"{TEMPORARY}{hashlib.sha256(os.fsencode(place.name)).hexdigest()[:12]}"
-    if os.path.lexists(output) and (output.is_symlink() or not output.is_dir() or any(output.iterdir())):
-        if folder.is_dir():  # of a process killed after its last step
-            with _emptied(folder, place):
-                pass
-        raise NeecoError(f"{output}: exists already; choose another --output or remove it")
-    with new_folder(place.parent), _emptied(folder, place):
-        yield folder
-        try:
-            if place.exists():
-                place.rmdir()
-            (folder / "capture").rename(place)
-        except OSError as error:
-            raise NeecoError(f"{place}: cannot write: {error.strerror or error}") from error
-
-
-@contextmanager
-def _emptied(folder: Path, place: Path) -> Iterator[None]:
-    """Hold an empty folder of this process's own, to make `place` in; remove it afterwards."""
-    try:
-        with own_folder(folder, place):
-            _clear(folder)
-            try:
-                yield
-            finally:
-                _clear(folder)
-    finally:
-        with suppress(OSError):  # another process's, or gone
-            folder.rmdir()
-
-
-def _clear(folder: Path) -> None:
-    """Remove what is in a folder, but not its lock."""
-    for entry in folder.iterdir():
-        if entry.is_dir():
-            shutil.rmtree(entry, ignore_errors=True)
-        elif entry.name != LOCK:
-            entry.unlink()

@@ -18,15 +18,15 @@ from neeco.ingest.frames.views import SfmResult, StageProgress, Views
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.clocks import find_instrument_clocks, register
-from neeco.ingest.registration.find_bases import check_frames, find_bases, require_no_base
+from neeco.ingest.registration.find_bases import check_reference_frames, find_bases, require_no_base
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.shaft.video_instruments import find_in_video, on_masks
 from neeco.ingest.timing.episodes import Episodes
 from neeco.ingest.world import (
     NAME_TISSUES,
     World,
-    check_motion,
     longest_lag,
+    note_motion_contradiction,
     residual_flow,
 )
 
@@ -36,7 +36,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
 
     folder: for temporary files. Raises NeecoError where too few images get a camera.
     """
-    check_frames(data, moving=True)
+    check_reference_frames(data, moving=True)
     settings = data.recording.settings
     lens = images.lens
     motion = StructureFromMotion(
@@ -74,7 +74,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         data = data.with_assumed_clocks()
         progress("finding the instrument", 0, 0)
         on_instruments, shapes, evidence = _carve_instruments(data, sfm, views, flow, registration)
-    if data.in_video is not None:
+    if data.video_instrument is not None:
         progress("finding what moves", 0, 0)
         masks = foreground(np.arange(len(sfm.indices)))
         on_instruments |= on_masks(masks, sfm, images.size)
@@ -85,19 +85,19 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     data, registration = register(data, views)  # first: it may find clocks
     distance, shaft = settings.scene_distance_mm, None
     placed, points = _in_mm(sfm, views, registration, distance)
-    if data.in_video is not None:
+    if data.video_instrument is not None:
         assert masks is not None
         masks = masks[np.isin(first, sfm.indices)]
         tissue = None if registration is not None else float(np.median(_distances(points, placed.world_from_camera)))
         progress("finding the shaft", 0, 0)
-        data, shaft = find_in_video(data, data.in_video, placed, masks, tissue)
+        data, shaft = find_in_video(data, data.video_instrument, placed, masks, tissue)
         placed, points = _in_mm(sfm, views, registration, shaft.axes.scale * distance)
     data = data.with_assumed_clocks()
     states, usable = data.states_at(views.times)
     return World(
         data=data, images=images, views=placed, states=states, usable=usable, tissue=_reliable(data, sfm, points),
         shapes=shapes, bases=bases, shaft=shaft, masks=masks, registration=registration,
-        reprojection_px=sfm.reprojection_px, search=motion.search, moving=evidence,
+        reprojection_px=sfm.reprojection_px, search=motion.search, moving=evidence, still=False,
     )  # fmt: skip
 
 
@@ -105,10 +105,10 @@ def _check_joined(data: Episodes, placed: np.ndarray) -> None:
     """Raise NeecoError for an episode that structure from motion did not join to the others. placed [M]: the frames
     that got a camera."""
     counts = np.bincount(data.episode_of(placed), minlength=len(data.parts))
-    for name, part, count in zip(data.notes.names, data.parts, counts, strict=True):
+    for part, count in zip(data.parts, counts, strict=True):
         if count < MIN_FRAMES and not data.single:
             raise NeecoError(
-                f"{part.recording.path}: {name} stands alone: {count} of its frames show enough of what the other "
+                f"{part.recording.path}: {part.name} stands alone: {count} of its frames show enough of what the other "
                 f"recordings show to find their cameras together (at least {MIN_FRAMES} are needed); where it "
                 f"shows another tissue, {NAME_TISSUES}, else leave it out"
             )
@@ -166,7 +166,9 @@ def _carve_instruments(
         camera_from_instrument, valid = before_cameras(0.0, np.arange(len(views.times)))
         usable = valid[rows]
         shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], flow.pinhole)
-        check_motion(data, name, shape is not None, best_lag(evidence, before_cameras, flow.pinhole, longest_lag(data)))
+        note_motion_contradiction(
+            data, name, shape is not None, best_lag(evidence, before_cameras, flow.pinhole, longest_lag(data))
+        )
         if shape is None:
             continue
         shapes[name] = shape

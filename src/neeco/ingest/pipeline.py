@@ -25,18 +25,18 @@ from neeco.capture.model import Capture, Frame, InstrumentState, State, Uncertai
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.cameras.still_scene import right_frames
-from neeco.ingest.convert import staged
-from neeco.ingest.frames.images import choose_images
+from neeco.ingest.frames.images import DropReason, choose_images
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.moving_scope import find_moving_world
 from neeco.ingest.posing.posed_capture import prepare
+from neeco.ingest.recording.compatibility import separate
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.registration.clocks import note_frame_rates
 from neeco.ingest.result import IngestResult
 from neeco.ingest.shaft.video_instruments import NOT_VISIBLE, instruments_of, uncertainties
 from neeco.ingest.splits import LEFT_OUT, split_frames
+from neeco.ingest.staging import staged
 from neeco.ingest.still_scope import find_still_world, is_still
-from neeco.ingest.timing.compatibility import separate
 from neeco.ingest.timing.episodes import Episodes, States
 from neeco.ingest.timing.reading import read_episodes
 from neeco.ingest.world import World
@@ -81,11 +81,19 @@ def finish(
 
     everywhere: the readings over all tissues, by instrument and joint, where there are several.
     """
-    data, images, views, registration = world.data, world.images, world.views, world.registration
+    data, views = world.data, world.views
     note_frame_rates(data)
     splits, rule = split_frames(data, views.frames, world.states, world.usable, everywhere)
     chosen = np.flatnonzero(world.usable & (splits != LEFT_OUT))
-    item, shaft = data.in_video, world.shaft
+    capture = _capture(world, splits, chosen)
+    dropped = {**world.images.dropped, **_left_out(world, splits)}
+    return capture, _result(world, output, capture, chosen, dropped, rule)
+
+
+def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
+    """Return the capture of the `chosen` rows of the views."""
+    data, images, views, shaft = world.data, world.images, world.views, world.shaft
+    item = data.video_instrument
     deviations = uncertainties(item, shaft) if item and shaft else None
     frames = tuple(
         Frame(
@@ -100,14 +108,22 @@ def finish(
     if world.right is not None:  # one camera more to learn from; what is tested stays one
         frames += right_frames(world.right, frames, views.rows[chosen].tolist())
     assert images.lens is not None
-    registered = registration is not None or set(data.parts[0].poses) <= set(data.world_from_base)
+    registered = world.registration is not None or set(data.parts[0].poses) <= set(data.world_from_base)
     lens = replace(images.lens, size=images.size, border=images.border)
     instruments = instruments_of(data.recording, shaft)
-    capture = Capture(
+    return Capture(
         images.folder, frames, instruments, world.tissue, registered=registered, lens=lens, still=world.still
     )
+
+
+def _result(
+    world: World, output: Path, capture: Capture, chosen: np.ndarray, dropped: Mapping[int, DropReason], rule: str
+) -> IngestResult:
+    """Return the report on a capture of the `chosen` rows of the views, split by `rule`."""
+    data, images, views, registration = world.data, world.images, world.views, world.registration
     row_of = {row: index for index, row in enumerate(chosen.tolist())}
-    return capture, IngestResult(
+    item = data.video_instrument
+    return IngestResult(
         capture=output,
         recording=", ".join(dict.fromkeys(str(part.recording.path) for part in data.parts)),
         video_frames=len(data.times),
@@ -115,37 +131,40 @@ def finish(
         size=images.size,
         selected=views.frames[chosen],
         selected_times=views.times[chosen],
-        dropped=tuple(sorted({**images.dropped, **_left_out(world, splits)}.items())),
+        dropped=tuple(sorted(dropped.items())),
         clocks=data.reported_clocks,
         registration=registration,
         registered_frames=np.array([row_of.get(int(row), -1) for row in registration.used] if registration else []),
         reprojection_px=world.reprojection_px,
         points=len(world.tissue.positions),
         shapes=dict(world.shapes),
-        tissue=world.tissue_depth,
+        still=world.still,
+        depth_source=world.depth_source,
         split_rule=rule,
         notes=data.notes.sentences,
         search=world.search,
         unregistered=_unregistered(world, chosen) if registration is not None else {},
         moving=dict(world.moving),
-        registered=registered,
+        registered=capture.registered,
         bases=dict(world.bases),
         episodes=data.ranges,
         in_video=() if item is None else (item.name,),
-        episode_starts={name: part.start for name, part in zip(data.ranges, data.parts, strict=False)},
+        episode_starts={} if data.single else {part.name: part.start_s for part in data.parts},
         contradictions=data.notes.contradictions,
     )
 
 
-def _left_out(world: World, splits: np.ndarray) -> dict[int, str]:
+def _left_out(world: World, splits: np.ndarray) -> dict[int, DropReason]:
     """Return why chosen video frames are not in the capture, by frame."""
     views, shaft = world.views, world.shaft
     found = set(world.images.selected.tolist()) - set(views.frames.tolist())
-    why = dict.fromkeys(found, "no camera: too few of its features match other frames")
+    reasons = dict.fromkeys(found, DropReason("no camera: too few of its features match other frames"))
     for row in np.flatnonzero(~world.usable).tolist():
         unseen = shaft is not None and not shaft.known[row]
-        why[int(views.frames[row])] = NOT_VISIBLE if unseen else "no instrument state at its time (gap in a log)"
-    return why | dict.fromkeys(views.frames[world.usable & (splits == LEFT_OUT)].tolist(), "next to an unseen frame")
+        why = NOT_VISIBLE if unseen else "no instrument state at its time (gap in a log)"
+        reasons[int(views.frames[row])] = DropReason(why)
+    left_out = views.frames[world.usable & (splits == LEFT_OUT)].tolist()
+    return reasons | dict.fromkeys(left_out, DropReason("next to an unseen frame", frame_usable=True))
 
 
 def _unregistered(world: World, chosen: np.ndarray) -> dict[str, np.ndarray]:
@@ -169,7 +188,7 @@ def _state(states: States, row: int, time: float, uncertainty: Uncertainty | Non
 def _measure_roll(world: World, result: IngestResult, capture: Path, progress: StageProgress) -> None:
     """Measure roll and joints of an instrument found in the video in the written capture, for `neeco view --annotate`;
     not where the roll was logged, nor with a second camera, whose masks are not known."""
-    item = world.data.in_video
+    item = world.data.video_instrument
     if item is None or item.roll is not None or world.right is not None or world.masks is None:
         return
     progress("measuring roll and joints", 0, 0)

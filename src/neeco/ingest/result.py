@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from neeco.ingest.foreground.rough_shape import RoughShape
+from neeco.ingest.frames.images import DropReason
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.timing.clock_search import ClockOffset
@@ -26,14 +27,15 @@ class IngestResult:
     size: tuple[int, int]  # width, height px
     selected: np.ndarray  # [K] indices of the video frames in the capture
     selected_times: np.ndarray  # [K] s, video clock
-    dropped: tuple[tuple[int, str], ...]  # video frame, why
+    dropped: tuple[tuple[int, DropReason], ...]  # video frame, why
     clocks: dict[str, ClockOffset]  # by the clock's name: "em", or a joint's
     registration: Registration | None  # None: instrument poses stay in their tracker's frame
     registered_frames: np.ndarray  # [R] row of `selected` of each entry of `registration.used`; -1: not in the capture
     reprojection_px: float | None  # None: cameras were not found by SfM
     points: int
     shapes: dict[str, RoughShape] = field(default_factory=dict)  # rough shape of each instrument, its own frame
-    tissue: str | None = None  # how a still scope's tissue got its depth, after "the tissue's depth is"
+    still: bool = False  # the scope stood still: no cameras were searched
+    depth_source: str | None = None  # how a still scope's tissue got its depth, after "the tissue's depth is"
     split_rule: str = ""
     notes: tuple[str, ...] = ()  # losses and assumptions, one sentence each
     search: tuple[str, ...] = ()  # what was tried to find cameras and what was taken, one sentence each
@@ -49,11 +51,6 @@ class IngestResult:
     # s of the capture's time at which each of several recordings has its own 0
     episode_starts: dict[str, float] = field(default_factory=dict)
     contradictions: tuple[Contradiction, ...] = ()  # between parts of the recording
-
-    @property
-    def still(self) -> bool:
-        """The scope stood still: no cameras were searched."""
-        return self.tissue is not None
 
     def frame_words(self, frame: int) -> str:
         """Return a video frame's number, and of several recordings which is meant."""
@@ -100,7 +97,7 @@ class IngestResult:
             "capture": str(self.capture),
             "video_frames": self.video_frames,
             "kept": len(self.selected),
-            "dropped": [{"frame": frame, "why": why} for frame, why in self.dropped],
+            "dropped": [{"frame": frame, "why": reason.why} for frame, reason in self.dropped],
             "clocks": clocks,
             "registration": registration,
             "reprojection_px": self.reprojection_px,
@@ -109,7 +106,7 @@ class IngestResult:
             "registered": self.registered,
             "episodes": {name: {"first": first, "last": last} for name, (first, last) in self.episodes.items()},
             "bases": {name: base.as_json() for name, base in self.bases.items()},
-            "tissue_depth": self.tissue,
+            "tissue_depth": self.depth_source,
             "split_rule": self.split_rule,
             "notes": list(self.notes),
             "search": list(self.search),
@@ -123,7 +120,7 @@ class IngestResult:
             count = int(((self.selected >= first) & (self.selected <= last)).sum())
             shown.append(f"episode {name}: {count} of {last + 1 - first} frames kept")
         if self.still:
-            shown.append(f"still scope: the world is its camera's frame; the tissue's depth is {self.tissue}")
+            shown.append(f"still scope: the world is its camera's frame; the tissue's depth is {self.depth_source}")
         if not self.registered:
             shown.append("not registered: instrument poses stay in their tracker's frame")
         elif self.registration is not None:

@@ -36,7 +36,7 @@ def folder_to_convert(sources: Sequence[Path]) -> Path | None:
 
 def read_recordings(sources: Sequence[Path], frames: int | None = None) -> list[Recording]:
     """Read recording files. frames: how many to keep, instead of what they state. Raises NeecoError."""
-    check_frames(frames)
+    check_frame_count(frames)
     recordings = [read_recording(source) for source in sources]
     return [item if frames is None else replace(item, frames=frames) for item in recordings]
 
@@ -72,7 +72,7 @@ def recording_from_flags(
         raise NeecoError("--shaft-diameter: finds an instrument that was not tracked, and --instrument says it was")
     if shaft_diameter is not None and not 0 < shaft_diameter < MAX_SHAFT_MM:
         raise NeecoError(f"--shaft-diameter: {shaft_diameter:g} is no shaft's; give it in mm, as in 5")
-    check_frames(frames)
+    check_frame_count(frames)
     if fps is not None and not 0 < fps < 1e6:  # NaN compares false
         raise NeecoError(f"--fps: {fps:g} is no frame rate; give frames per second")
     if intrinsics is not None and not isinstance(intrinsics, str | Path) and len(intrinsics) != 4:
@@ -98,7 +98,7 @@ def recording_from_flags(
         return replace(read_section(RecordingSection, node_of(document, where)).recording(where), path=video)
 
 
-def check_frames(frames: int | None) -> None:
+def check_frame_count(frames: int | None) -> None:
     """Raise NeecoError when the option asks for too few frames."""
     if frames is not None and frames < MIN_FRAMES:
         raise NeecoError(f"--frames: {frames} is too few; give {MIN_FRAMES} or more")

@@ -26,14 +26,14 @@ from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.recording.model import STILL
 from neeco.ingest.registration.clocks import find_instrument_clocks
-from neeco.ingest.registration.find_bases import check_frames, find_bases
+from neeco.ingest.registration.find_bases import check_reference_frames, find_bases
 from neeco.ingest.shaft.video_instruments import find_in_video
 from neeco.ingest.timing.episodes import Episodes
 from neeco.ingest.world import (
     NAME_TISSUES,
     World,
-    check_motion,
     longest_lag,
+    note_motion_contradiction,
     residual_flow,
 )
 
@@ -66,7 +66,7 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
         )
     if data.parts[0].scope is not None:
         data.notes.add("the scope stands still: the laparoscope's log adds nothing to its images, and is ignored")
-    check_frames(data, moving=False)
+    check_reference_frames(data, moving=False)
     _check_one_place(data, images, progress)
     right = _right_camera(data, images, folder, progress)
     count = len(images.selected)
@@ -86,25 +86,26 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
             "or camera_from_base): they stay in their own frame (unregistered)"
         )
     shaft = masks = None
-    if data.in_video is not None:
+    if data.video_instrument is not None:
         progress("finding what moves", 0, 0)
         masks = moving(cameras.indices)
         progress("finding the shaft", 0, 0)
-        data, shaft = find_in_video(data, data.in_video, views, masks, None)
+        data, shaft = find_in_video(data, data.video_instrument, views, masks, None)
     data = data.with_assumed_clocks()
-    names = (*data.world_from_base, *data.found)
+    names = (*data.world_from_base, *data.video_poses)
     tracked = {name: partial(data.instrument_poses, name, views.times) for name in names}
     progress("finding the tissue behind the instrument", 0, 0)
     behind = look_behind(views, tracked, longest_lag(data), data.recording.settings, right)
     for note in behind.notes:
         data.notes.add(note)
     for name, lag in behind.lags.items():
-        check_motion(data, name, name in behind.shapes, lag)
+        note_motion_contradiction(data, name, name in behind.shapes, lag)
     states, usable = data.states_at(views.times)
     return World(
         data=data, images=images, views=views, states=states, usable=usable,
         tissue=PointCloud(behind.points.astype(np.float32), (behind.colors / 255).astype(np.float32)),
-        shapes=behind.shapes, bases=bases, shaft=shaft, masks=masks, tissue_depth=behind.how, right=right,
+        shapes=behind.shapes, bases=bases, shaft=shaft, masks=masks, still=True, depth_source=behind.how,
+        right=right,
     )  # fmt: skip
 
 
@@ -127,7 +128,7 @@ def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgre
     first, *others = backgrounds
     for episode in others:
         share = same_place(backgrounds[first], backgrounds[episode])
-        name, before = data.notes.names[episode], data.notes.names[first]
+        name, before = data.parts[episode].name, data.parts[first].name
         if share is not None and share < SAME_PLACE:
             raise NeecoError(
                 f"{data.parts[episode].recording.path}: {name} shows another place than {before}: {share:.0%} of "
@@ -149,7 +150,7 @@ def _right_camera(data: Episodes, images: ChosenImages, folder: Path, progress: 
     for episode, rows in _rows_by_episode(data, images).items():
         part = data.parts[episode]
         assert part.recording.stereo is not None
-        own, stems = images.selected[rows] - part.first, [names[row] for row in rows]
+        own, stems = images.selected[rows] - part.first_frame, [names[row] for row in rows]
         found = read_right_camera(part.recording.stereo, own, part.times, stems, folder / "right", progress)
         cameras.append(replace(found, names={int(rows[row]): name for row, name in found.names.items()}))
     return replace(cameras[0], names={row: name for camera in cameras for row, name in camera.names.items()})

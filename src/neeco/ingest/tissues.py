@@ -11,12 +11,12 @@ import numpy as np
 from neeco.capture.model import Capture, PointCloud, Tissue
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
-from neeco.ingest.convert import staged
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.pipeline import find_world, finish
+from neeco.ingest.recording.compatibility import check_shared_settings, episode_names, file_name, separate
 from neeco.ingest.recording.model import EACH, Recording, Splits
 from neeco.ingest.result import IngestResult
-from neeco.ingest.timing.compatibility import check_shared_settings, episode_names, file_name, separate
+from neeco.ingest.staging import staged
 from neeco.ingest.timing.reading import check_episodes, read_episodes
 from neeco.ingest.world import World
 

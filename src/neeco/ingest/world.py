@@ -33,6 +33,7 @@ class World:
     tissue: PointCloud
     shapes: Mapping[str, RoughShape]  # by instrument
     bases: Mapping[str, BaseRegistration]  # by instrument, of those found from what moves
+    still: bool  # the scope stood still
     shaft: FoundShaft | None = None  # the instrument found in the video
     masks: np.ndarray | None = None  # bool [M, h, w], what moves, where an instrument was found in the video
     # of a scope that moves
@@ -41,12 +42,8 @@ class World:
     search: tuple[str, ...] = ()  # what was tried to find cameras, one sentence each
     moving: Mapping[int, np.ndarray] = field(default_factory=dict)  # video frame -> [h, w] how often pixels moved
     # of a scope that stands still
-    tissue_depth: str | None = None  # how it was found, in words
+    depth_source: str | None = None  # how the tissue's depth was found, after "the tissue's depth is"
     right: RightCamera | None = None
-
-    @property
-    def still(self) -> bool:
-        return self.tissue_depth is not None
 
 
 def residual_flow(sfm: SfmResult, views: Views) -> ResidualFlow:
@@ -59,7 +56,7 @@ def longest_lag(data: Episodes) -> float:
     return float(max(np.ptp(part.times) for part in data.parts)) / 2
 
 
-def check_motion(data: Episodes, name: str, moves: bool, lag: float) -> None:
+def note_motion_contradiction(data: Episodes, name: str, moves: bool, lag: float) -> None:
     """Note an instrument with whose poses nothing in the images moves, or something moves at another time."""
     logs = data.parts[0].poses
     clock, sentence = logs[name].clock if name in logs else "", ""

@@ -170,8 +170,8 @@ def _coverage(capture: Capture, axes: dict[str, figures.MainAxis]) -> dict[str, 
 def _dropped(result: IngestResult) -> list[list[str]]:
     """Return rows of reason, count and frames; reasons that differ in a number only are one."""
     groups: dict[str, list[tuple[int, str]]] = {}
-    for frame, why in result.dropped:
-        groups.setdefault(_NUMBER.sub("…", why), []).append((frame, why))
+    for frame, reason in result.dropped:
+        groups.setdefault(_NUMBER.sub("…", reason.why), []).append((frame, reason.why))
     rows = []
     for pattern, members in sorted(groups.items(), key=lambda group: -len(group[1])):
         reasons = {why for _, why in members}

@@ -16,9 +16,9 @@ from neeco.files import finite
 from neeco.ingest.assessment import VERDICTS, Assessment, assess_ingest
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.pipeline import ingest
+from neeco.ingest.recording.compatibility import file_name
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.result import IngestResult
-from neeco.ingest.timing.compatibility import file_name
 from neeco.ingest.tissues import ingest_tissues
 from neeco.report.ingest_page import write_ingest_page
 from neeco.report.rerun_log import require_rerun, write_rrd

@@ -12,8 +12,8 @@ import torch
 
 from neeco.capture.model import Frame, State
 from neeco.errors import NeecoError
-from neeco.fitting.fitter import StateFit, loose_prior
-from neeco.fitting.layers import FrameView
+from neeco.fitting.crop_rendering import FrameView
+from neeco.fitting.state_fitter import StateFit, loose_prior
 from neeco.tracking.motion import MAX_GAP_S, MotionModel, MotionState
 from neeco.tracking.parameters import TrackingFitter
 from neeco.tracking.search import Search

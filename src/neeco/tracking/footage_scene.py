@@ -19,8 +19,8 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from neeco.capture.model import Frame, evenly_spaced
-from neeco.fitting.fitter import StateFit, loose_prior
-from neeco.fitting.layers import working_size
+from neeco.fitting.crop_rendering import working_size
+from neeco.fitting.state_fitter import StateFit, loose_prior
 from neeco.methods.kinematic.lamp_search import find_shadow
 from neeco.raster.reference import SH_C0
 from neeco.scene import CanonicalGaussians, GaussianScene

@@ -21,7 +21,7 @@ from torch import Tensor
 from neeco.capture.images import area_averaged, write_labels
 from neeco.capture.model import REFERENCE_PIXELS, Capture, Frame, State, evenly_spaced
 from neeco.errors import NeecoError
-from neeco.fitting.layers import TissueRenderer
+from neeco.fitting.crop_rendering import TissueRenderer
 from neeco.scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 from neeco.settings import with_fields

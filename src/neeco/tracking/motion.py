@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import State
-from neeco.fitting.fitter import StateFit
+from neeco.fitting.state_fitter import StateFit
 from neeco.tracking.parameters import TrackedParameters
 
 MIN_DIFFERENCES = 8  # second differences from which accelerations are estimated
@@ -56,12 +56,12 @@ class MotionModel:
         steps: list[Tensor | None] = []
         for before, after in pairwise(ordered):
             consecutive = abs(after.time - before.time - interval) < interval / 2
-            steps.append(parameters.between(before, after) if consecutive else None)
+            steps.append(parameters.increments_between(before, after) if consecutive else None)
         known = [step for step in steps if step is not None]
         differences = [b - a for a, b in pairwise(steps) if a is not None and b is not None]
         if len(differences) < MIN_DIFFERENCES:
             differences = known
-        deviation, place = parameters.each(*MIN_DIFFERENCE), parameters.each(*INITIAL_SD)
+        deviation, place = parameters.vector_from_degrees(*MIN_DIFFERENCE), parameters.vector_from_degrees(*INITIAL_SD)
         if differences:
             deviation = torch.maximum(deviation, MAD_TO_SD * torch.stack(differences).abs().median(0).values)
         velocities = torch.diag((deviation if differences else place) / interval) ** 2
@@ -75,9 +75,11 @@ class MotionModel:
 
         information [P, P]: of the image on the state, little on jaws outside of it; None: as much as is usual.
         """
-        place = torch.diag(self.parameters.each(*INITIAL_SD) ** 2)
+        place = torch.diag(self.parameters.vector_from_degrees(*INITIAL_SD) ** 2)
         if information is not None:
-            place = place + torch.linalg.inv(information + torch.diag(self.parameters.each(*UNKNOWN_SD) ** -2))
+            place = place + torch.linalg.inv(
+                information + torch.diag(self.parameters.vector_from_degrees(*UNKNOWN_SD) ** -2)
+            )
         return MotionState(state, torch.zeros_like(place[0]), torch.block_diag(place, self.velocities))
 
     def predict(self, before: MotionState, seconds: float) -> MotionState:
@@ -102,7 +104,7 @@ class MotionModel:
     def update(self, predicted: MotionState, fit: StateFit) -> MotionState:
         """Return the estimate after a frame to which the predicted state was fitted."""
         size = self.parameters.size
-        moved = self.parameters.between(predicted.state, fit.state)
+        moved = self.parameters.increments_between(predicted.state, fit.state)
         own, cross = predicted.covariance[:size, :size], predicted.covariance[size:, :size]
         velocity = predicted.velocity + cross @ torch.linalg.solve(own, moved)
         measured = torch.linalg.inv(fit.information + 1e-9 * torch.eye(size, dtype=torch.float64))
@@ -113,7 +115,10 @@ class MotionModel:
     def probability_within(self, estimate: MotionState, degrees: float) -> float:
         """Return the probability that rotation and every joint err by less than `degrees` (prismatic ones by 0.25 mm
         per degree). A joint is taken to be evenly distributed between its bounds where nothing determines it."""
-        variance, limits = estimate.covariance.diagonal(), self.parameters.each(degrees, math.inf, degrees, degrees / 4)
+        variance, limits = (
+            estimate.covariance.diagonal(),
+            self.parameters.vector_from_degrees(degrees, math.inf, degrees, degrees / 4),
+        )
         probability = 1.0
         for item, (pose, rows) in zip(self.parameters.instruments, self.parameters.rows, strict=True):
             rotation = torch.linalg.eigvalsh(estimate.covariance[pose, pose][:3, :3])[-1:].clamp_min(0)
@@ -126,6 +131,6 @@ class MotionModel:
 
     def released(self, predicted: MotionState) -> MotionState:
         """Return a prediction without its prior, to be updated by a fit that the motion did not foresee."""
-        place = torch.diag(self.parameters.each(*UNKNOWN_SD) ** 2)
+        place = torch.diag(self.parameters.vector_from_degrees(*UNKNOWN_SD) ** 2)
         covariance = predicted.covariance + torch.block_diag(place, self.velocities)
         return MotionState(predicted.state, predicted.velocity, covariance)

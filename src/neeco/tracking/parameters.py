@@ -10,9 +10,9 @@ from torch import Tensor
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
-from neeco.fitting.fitter import Fitter
-from neeco.fitting.layers import InstrumentRenderer, TissueRenderer
+from neeco.fitting.crop_rendering import InstrumentRenderer, TissueRenderer
 from neeco.fitting.parameters import InstrumentParameters, StateParameters
+from neeco.fitting.state_fitter import Fitter
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.scene import GaussianScene
 

@@ -20,7 +20,7 @@ from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_begun, read_bytes, read_json, require_same, write_json
-from neeco.fitting.fitter import loose_prior
+from neeco.fitting.state_fitter import loose_prior
 from neeco.scene import GaussianScene
 from neeco.scene.gaussian_scene import one_tissue
 from neeco.settings import with_fields

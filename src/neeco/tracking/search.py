@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import torch
 
 from neeco.capture.model import InstrumentState, State, evenly_spaced
-from neeco.fitting.fitter import MARGIN_PX, StateFit, loose_prior
-from neeco.fitting.layers import FrameView
+from neeco.fitting.crop_rendering import FrameView
 from neeco.fitting.parameters import DEG
+from neeco.fitting.state_fitter import MARGIN_PX, StateFit, loose_prior
 from neeco.geometry.camera import Camera
 from neeco.scene import Recorded
 from neeco.tracking.motion import MotionModel, MotionState
@@ -69,8 +69,8 @@ class Search:
         tried += [parameters.moved(predicted.state, increments) for increments in normal @ root.T]
         precision = self.motion.precision(predicted) / PRIOR_SCALE**2
         best: StateFit | None = None
-        about = self.fitter.about(view, predicted.state, 2 * MARGIN_PX)
-        for start in self.fitter.ranked(view if about is None else about, tried, 0.25)[:N_FITTED_NEAR]:
+        crop = self.fitter.crop_around(view, predicted.state, 2 * MARGIN_PX)
+        for start in self.fitter.ranked(view if crop is None else crop, tried, 0.25)[:N_FITTED_NEAR]:
             fit = self.fitter.fit(view, predicted.state, precision, start, levels=(0.25, 0.5), steps=(4, 4))
             if fit is not None and (best is None or fit.gain > best.gain):
                 best = fit
@@ -151,7 +151,7 @@ def differ(
     millimetres: float = math.inf,
 ) -> bool:
     """Return whether two states differ by more than `degrees` of rotation, `millimetres`, or `joint_degrees`."""
-    apart = parameters.between(one, other)
+    apart = parameters.increments_between(one, other)
     for item, (pose, rows) in zip(parameters.instruments, parameters.rows, strict=True):
         units = torch.tensor([MM_PER_DEG if slides else DEG for slides in item.slides], dtype=torch.float64)
         turned, shifted = float(apart[pose][:3].norm()) / DEG, float(apart[pose][3:].norm())

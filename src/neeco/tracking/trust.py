@@ -27,9 +27,9 @@ from torch import Tensor
 from neeco.capture.model import Frame, State, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import NEIGHBOURHOOD, TypicalErrors, estimate_trust, typical_errors_of
-from neeco.fitting.fitter import StateFit, loose_prior
-from neeco.fitting.layers import over
+from neeco.fitting.crop_rendering import composite
 from neeco.fitting.parameters import DEG
+from neeco.fitting.state_fitter import StateFit, loose_prior
 from neeco.geometry.camera import Camera
 from neeco.labels.labellers import CompositedLabels, composited_labels
 from neeco.raster import rasterize
@@ -121,7 +121,7 @@ class LabelRenderer:
         assert rendering.channels is not None
         parts, _ = composited_labels(replace(rendering, channels=rendering.channels[..., :-1]), self.threshold)
         color, alpha = rendering.color.cpu(), rendering.alpha.cpu()
-        image = over(color, alpha, view.tissue).clamp(0, 1)
+        image = composite(color, alpha, view.tissue).clamp(0, 1)
         return LabelledView(image, parts.cpu(), view.tissue, alpha, rendering.channels[..., -1].cpu())
 
 

@@ -16,8 +16,9 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neeco.capture.checks._cameras import CameraArrays
-from neeco.capture.checks._mistakes import camera_mistakes, gain_certainty
+from neeco.capture.checks.cameras import CameraArrays
+from neeco.capture.checks.mistakes import camera_mistakes
+from neeco.capture.checks.motion_evidence import gain_certainty
 from neeco.capture.images import exif_orientation
 from neeco.capture.model import evenly_spaced
 from neeco.capture.readers.parsed import Parsed
@@ -53,7 +54,7 @@ Pixels = tuple[np.ndarray, np.ndarray]  # columns and rows, px
 
 
 @dataclass(frozen=True)
-class _Hypothesis:
+class _CameraHypothesis:
     """A mistake, what to do about it, and what cameras and pixels are without it."""
 
     message: str = ""
@@ -64,7 +65,7 @@ class _Hypothesis:
     offset: int = 0  # frames by which the images are late
 
 
-AS_GIVEN = _Hypothesis()
+AS_GIVEN = _CameraHypothesis()
 
 
 class _Colors:
@@ -89,7 +90,7 @@ class _Colors:
         width, height = self.cameras.sizes[row].astype(int).tolist()
         return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
 
-    def project(self, hypothesis: _Hypothesis, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def project(self, hypothesis: _CameraHypothesis, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Columns and rows [F, P] px of the points in the images of cameras `rows`, and where they are inside."""
         cameras = (hypothesis.cameras or self.cameras)[rows]
         u, v, depth = cameras.project(self.points[None])
@@ -103,7 +104,7 @@ class _Colors:
         inside = cameras.inside(u, v, depth)
         return np.where(inside, u, 0).astype(np.float32), np.where(inside, v, 0).astype(np.float32), inside
 
-    def agreement(self, hypothesis: _Hypothesis = AS_GIVEN, every: int = 1, coarse: bool = False) -> np.ndarray:
+    def agreement(self, hypothesis: _CameraHypothesis = AS_GIVEN, every: int = 1, coarse: bool = False) -> np.ndarray:
         """[F] correlation of the points' brightness with the images', relative to their neighbours: 0 where too few are
         visible, NaN where there is no such camera. Every so many of the images."""
         rows = self.rows[::every] - hypothesis.offset
@@ -170,7 +171,7 @@ def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.remap(image, u - 0.5, v - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def check_images(parsed: Parsed) -> bool:
+def check_colors(parsed: Parsed) -> bool:
     """Report images that contradict the cameras, or whose red and blue are swapped, by the sparse points.
 
     Says nothing without measured points that have colours. Returns False where images and cameras contradict each
@@ -181,9 +182,9 @@ def check_images(parsed: Parsed) -> bool:
     colors, frames = _Colors(parsed), parsed.header("frames")
     given = colors.agreement()
     fits = given.mean() >= GOOD_CORRELATION
-    found = _likeliest(colors, given, list(_offsets() if fits else _hypotheses(parsed, colors)))
+    found = _best_hypothesis(colors, given, list(_offsets() if fits else _hypotheses(parsed, colors)))
     if found is None and not fits:
-        found = _order(parsed, colors, given)
+        found = _order_fault(parsed, colors, given)
     if found is not None:
         frames.warning(found.message, found.remedy, contradicted=True)
         return False
@@ -212,7 +213,7 @@ def agreements(parsed: Parsed, poses: Sequence[np.ndarray]) -> list[float] | Non
     colors = _Colors(parsed) if _has_colors(parsed) else None
     if colors is None:
         return None
-    return [_quick(colors, _Hypothesis(cameras=replace(colors.cameras, poses=one))) for one in poses]
+    return [_quick(colors, _CameraHypothesis(cameras=replace(colors.cameras, poses=one))) for one in poses]
 
 
 def _has_colors(parsed: Parsed) -> bool:
@@ -224,69 +225,75 @@ def _has_colors(parsed: Parsed) -> bool:
     return bool((points.colors * 255 @ LUMA).std() > MIN_BRIGHTNESS_SD)
 
 
-def _hypotheses(parsed: Parsed, colors: _Colors) -> Iterator[_Hypothesis]:
+def _hypotheses(parsed: Parsed, colors: _Colors) -> Iterator[_CameraHypothesis]:
     """All hypotheses that are tried, of similar ones the simpler first."""
     cameras = colors.cameras
     orientation = exif_orientation(parsed.frames[colors.rows[0]].image_path)
     turned = "turn the pixels, not only their EXIF orientation" if orientation > 1 else "turn them back"
-    yield _Hypothesis("the images are mirrored left to right", "mirror them back", pixels=lambda u, v, w, h: (w - u, v))
-    yield _Hypothesis("the images are upside down (flipped)", "flip them back", pixels=lambda u, v, w, h: (u, h - v))
+    yield _CameraHypothesis(
+        "the images are mirrored left to right", "mirror them back", pixels=lambda u, v, w, h: (w - u, v)
+    )
+    yield _CameraHypothesis(
+        "the images are upside down (flipped)", "flip them back", pixels=lambda u, v, w, h: (u, h - v)
+    )
     reason = f"EXIF orientation {orientation}" if orientation > 1 else "or the cameras: x left, y up in the ECM's axes"
     message = f"the images are turned by 180 degrees against their cameras ({reason})"
-    yield _Hypothesis(message, turned, pixels=lambda u, v, w, h: (w - u, h - v))
+    yield _CameraHypothesis(message, turned, pixels=lambda u, v, w, h: (w - u, h - v))
     if (cameras.sizes[:, 0] == cameras.sizes[:, 1]).all():
         for turn, pixels in (("left", lambda u, v, w, h: (v, h - u)), ("right", lambda u, v, w, h: (w - v, u))):
-            yield _Hypothesis(f"the images are turned by 90 degrees to the {turn}", turned, pixels=pixels)
+            yield _CameraHypothesis(f"the images are turned by 90 degrees to the {turn}", turned, pixels=pixels)
     for names, order in {"cx and cy": [0, 1, 3, 2], "fl_x and fl_y": [1, 0, 2, 3], "x and y": [1, 0, 3, 2]}.items():
         swapped = replace(cameras, intrinsics=cameras.intrinsics[:, order])
         message = f"{names} of the intrinsics are swapped"
-        yield _Hypothesis(message, "swap them: cx counts columns, cy rows", cameras=swapped)
+        yield _CameraHypothesis(message, "swap them: cx counts columns, cy rows", cameras=swapped)
     for size in SIZES:
         message = f"the intrinsics are those of images {1 / size:.3g} times as large"
         scaled = replace(cameras, intrinsics=cameras.intrinsics * size)
-        yield _Hypothesis(message, f"multiply fl_x, fl_y, cx and cy by {size:.3g}", cameras=scaled)
+        yield _CameraHypothesis(message, f"multiply fl_x, fl_y, cx and cy by {size:.3g}", cameras=scaled)
     yield from _offsets()
 
     def with_focal(factor: float) -> CameraArrays:
         return replace(cameras, intrinsics=cameras.intrinsics * [factor, factor, 1.0, 1.0])
 
-    focal = max(FOCAL_FACTORS, key=lambda f: _quick(colors, _Hypothesis(cameras=with_focal(f))))
+    focal = max(FOCAL_FACTORS, key=lambda f: _quick(colors, _CameraHypothesis(cameras=with_focal(f))))
     near = focal * np.arange(0.97, 1.031, 0.01)
-    focal = max(near, key=lambda f: _quick(colors, _Hypothesis(cameras=with_focal(f))))
+    focal = max(near, key=lambda f: _quick(colors, _CameraHypothesis(cameras=with_focal(f))))
     first = parsed.frames[0].camera
     message = f"the images fit a focal length of about {focal * first.fx:.3g} px, not {first.fx:.3g}"
-    yield _Hypothesis(message, "give fl_x and fl_y of these images, in px", cameras=with_focal(focal))
+    yield _CameraHypothesis(message, "give fl_x and fl_y of these images, in px", cameras=with_focal(focal))
     across, down = colors.shift()
     cx, cy = first.cx + across * first.width, first.cy + down * first.height
     message = f"the images fit a principal point of about ({cx:.0f}, {cy:.0f}) px, not ({first.cx:.0f}, {first.cy:.0f})"
     moved = cameras.intrinsics + np.pad(cameras.sizes * [across, down], ((0, 0), (2, 0)))
-    yield _Hypothesis(message, "correct cx and cy (cropped images?)", cameras=replace(cameras, intrinsics=moved))
+    yield _CameraHypothesis(message, "correct cx and cy (cropped images?)", cameras=replace(cameras, intrinsics=moved))
     for amount in DISTORTIONS:
         message = f"the images are distorted by their lens (k1 about {amount:g})"
-        yield _Hypothesis(message, "undistort them: a capture's cameras are pinholes", distortion=amount)
+        yield _CameraHypothesis(message, "undistort them: a capture's cameras are pinholes", distortion=amount)
     for mistake in camera_mistakes(cameras.poses):
         posed = replace(cameras, poses=mistake.poses)
-        yield _Hypothesis(mistake.what.format(of="of the cameras"), mistake.remedy, cameras=posed)
+        yield _CameraHypothesis(mistake.what.format(of="of the cameras"), mistake.remedy, cameras=posed)
 
 
-def _offsets() -> Iterator[_Hypothesis]:
+def _offsets() -> Iterator[_CameraHypothesis]:
     for count in range(1, MAX_OFFSET + 1):
         frames = f"{count} frame{'s' * (count > 1)}"
         for offset, direction in ((count, "earlier"), (-count, "later")):
-            yield _Hypothesis(
+            yield _CameraHypothesis(
                 f"the images fit the cameras of {frames} {direction}",
                 f"list each with the frame that is {frames} {direction} (frames dropped, or counted from another one?)",
                 offset=offset,
             )
 
 
-def _quick(colors: _Colors, hypothesis: _Hypothesis) -> float:
+def _quick(colors: _Colors, hypothesis: _CameraHypothesis) -> float:
     """Mean agreement with a hypothesis over few of the images."""
     values = colors.agreement(hypothesis, every=max(1, len(colors.rows) // QUICK_IMAGES))
     return float(np.nanmean(values)) if np.isfinite(values).sum() >= MIN_IMAGES else 0.0
 
 
-def _likeliest(colors: _Colors, given: np.ndarray, hypotheses: list[_Hypothesis]) -> _Hypothesis | None:
+def _best_hypothesis(
+    colors: _Colors, given: np.ndarray, hypotheses: list[_CameraHypothesis]
+) -> _CameraHypothesis | None:
     """The hypothesis with which images and points agree clearly, and most; of similar ones that listed first."""
     quick = np.array([_quick(colors, hypothesis) for hypothesis in hypotheses])
     clear = {}
@@ -303,7 +310,7 @@ def _likeliest(colors: _Colors, given: np.ndarray, hypotheses: list[_Hypothesis]
     return hypotheses[good[0]] if good else None
 
 
-def _order(parsed: Parsed, colors: _Colors, given: np.ndarray) -> _Hypothesis | None:
+def _order_fault(parsed: Parsed, colors: _Colors, given: np.ndarray) -> _CameraHypothesis | None:
     """Find images that belong to other cameras than those they are listed with: by one offset, or mixed."""
     cameras = np.array(evenly_spaced(len(parsed.frames), ORDERED_CAMERAS))
     u, v, inside = colors.project(AS_GIVEN, cameras)
@@ -316,9 +323,9 @@ def _order(parsed: Parsed, colors: _Colors, given: np.ndarray) -> _Hypothesis | 
     offset = int(np.median(rows - fitting))
     if np.mean(np.abs(rows - fitting - offset) <= 1) > MIN_SAME_OFFSET and abs(offset) > MAX_OFFSET:
         direction = f"{abs(offset)} frames {'earlier' if offset > 0 else 'later'}"
-        return _Hypothesis(
+        return _CameraHypothesis(
             f"the images fit the cameras of {direction}", f"list each with the frame that is {direction}"
         )
     names = [parsed.frames[row].image_path.name for row in (rows[0], fitting[0])]
     message = f"the images are in another order than the cameras: {names[0]} fits the camera of {names[1]}"
-    return _Hypothesis(message, "list each image with its own camera (sorted as text, or shuffled?)")
+    return _CameraHypothesis(message, "list each image with its own camera (sorted as text, or shuffled?)")

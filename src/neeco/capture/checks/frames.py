@@ -12,26 +12,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from neeco.capture.documents import Node, printable
-from neeco.capture.images import is_repeated
+from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, is_repeated
+from neeco.capture.masks import Hidden, masks_fault, measure_hidden
 from neeco.capture.model import Frame
-from neeco.capture.points import PointCloud
+from neeco.capture.points import measured_sample
 from neeco.capture.readers.parsed import Parsed
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
-from neeco.geometry.projection import project_world
-from neeco.plausible import Fault, mask_fault
+from neeco.plausible import FEW_TRAIN_FRAMES
 
 MIN_TRAIN_FRAMES = 4  # fewer: nothing can be learned
-FEW_TRAIN_FRAMES = 20  # fewer: expect little
 MAX_STILL_CAMERAS = 2  # of a scope that stands still: one, or the two of a stereo scope
 COMPARED_WIDTH = 320  # px of the reduced images that are compared
-VISIBLE_MM, VISIBLE_ROTATION = 1.0, 0.03  # changes that an image shows: of a position; of rotations' entries, or rad
-LIT = 0.12  # brightness in [0, 1] of a pixel's brightest channel: a round field of view's dark border has less
-MIN_LIT = 0.02  # share of an image: with fewer lit pixels it is not counted
-MAX_SAMPLED_POINTS = 500
 
 
 def check_frames(parsed: Parsed) -> None:
@@ -104,46 +98,6 @@ def _same_view(one: Camera, other: Camera) -> bool:
 
 
 @dataclass(frozen=True)
-class Hidden:
-    """What one loss mask hides."""
-
-    pixels: float | None  # share of the lit pixels; None: too few are lit
-    points: int  # projected sparse points
-    points_in_view: int
-
-
-def measure_hidden(image: Tensor, mask: Tensor, camera: Camera | None, points: np.ndarray) -> Hidden:
-    """Count what a loss mask bool [H, W], False where ignored, hides of an image [H, W, 3] in [0, 1], and of points
-    [P, 3] mm in its camera (None: not known)."""
-    lit, ignored = (image.amax(-1) > LIT).numpy(), ~mask.numpy()
-    pixels = float(ignored[lit].mean()) if lit.mean() > MIN_LIT else None
-    if camera is None or not len(points):
-        return Hidden(pixels, 0, 0)
-    with np.errstate(all="ignore"):  # points on the camera's plane
-        places, depths = project_world(points, camera)
-    inside = (depths > camera.near) & (places >= 0).all(-1) & (places < [camera.width, camera.height]).all(-1)
-    column, row = places[inside].astype(int).T
-    return Hidden(pixels, int(ignored[row, column].sum()), int(inside.sum()))
-
-
-def sample_points(cloud: PointCloud | None) -> np.ndarray:
-    """[P, 3] float64 mm, some of the measured points; none where there are none."""
-    if cloud is None or not cloud.measured:
-        return np.zeros((0, 3))
-    return cloud.positions[:: max(1, len(cloud.positions) // MAX_SAMPLED_POINTS)].astype(np.float64)
-
-
-def masks_fault(found: Sequence[Hidden]) -> Fault | None:
-    """Return what is wrong with loss masks that hide what was found, and what to do."""
-    shares = [one.pixels for one in found if one.pixels is not None]
-    if not shares:
-        return None
-    in_view = sum(one.points_in_view for one in found)
-    points = sum(one.points for one in found) / in_view if in_view else None
-    return mask_fault(float(np.median(shares)), points)
-
-
-@dataclass(frozen=True)
 class _Decoded:
     """What decoding one frame's files found."""
 
@@ -155,10 +109,10 @@ class _Decoded:
     hidden: Hidden | None  # by the mask; None: there is no usable one
 
 
-def check_files(parsed: Parsed) -> None:
+def check_image_files(parsed: Parsed) -> None:
     """Decode every image and mask and report those damaged, of the wrong size, empty, or with the same pixels."""
-    clouds = {tissue.name: sample_points(tissue.points) for tissue in parsed.tissues}
-    shared = sample_points(parsed.points)
+    clouds = {tissue.name: measured_sample(tissue.points) for tissue in parsed.tissues}
+    shared = measured_sample(parsed.points)
     points = [clouds.get(str(frame.state.tissue), shared) for frame in parsed.frames]
     cameras = [None if row in parsed.without_camera else frame.camera for row, frame in enumerate(parsed.frames)]
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
@@ -230,12 +184,12 @@ def _moved(one: Frame, two: Frame) -> bool:
     shared = one.state.instruments.keys() & two.state.instruments.keys()
     joints = [(one.state.instruments[name].joints, two.state.instruments[name].joints) for name in shared]
     readings = [(value, second.get(name, value)) for first, second in joints for name, value in first.items()]
-    if any(abs(after - before) > VISIBLE_ROTATION for before, after in readings):
+    if any(abs(after - before) > VISIBLE_RAD for before, after in readings):
         return True
     pairs = [(one.camera.world_from_camera, two.camera.world_from_camera)]
     pairs += [(one.state.instruments[name].pose, two.state.instruments[name].pose) for name in shared]
     changes = [(second - first).abs() for first, second in pairs]
-    return any(bool(change[:3, 3].norm() > VISIBLE_MM or change[:3, :3].max() > VISIBLE_ROTATION) for change in changes)
+    return any(bool(change[:3, 3].norm() > VISIBLE_MM or change[:3, :3].max() > VISIBLE_RAD) for change in changes)
 
 
 def _report_duplicate(parsed: Parsed, first: int, second: int) -> None:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.checks._mistakes import placement_mistakes, rotation_mistakes
+from neeco.capture.checks.mistakes import placement_mistakes, rotation_mistakes
 from neeco.capture.checks.motion_evidence import MotionEvidence, TimeSteps
 from neeco.capture.documents import printable
 from neeco.capture.model import Instrument, InstrumentState
@@ -48,23 +48,28 @@ class _Threshold(NamedTuple):
     factor: float  # on the mean evidence
     certainty: float  # standard errors over blocks of frames
     evidence: float
+    min_frames: int = 0  # that have these poses
+
+    def exceeded_by(self, factor: float, certainty: float, evidence: float) -> bool:
+        return factor > self.factor and certainty > self.certainty and evidence > self.evidence
 
 
 # A shift changes much at once; transposed rotations only as much as the instrument turns; where all else is wrong,
 # nearly nothing is explained. Of many hypotheses one may fit by chance.
-TURNED, SHIFTED, ELSEWHERE = _Threshold(1.1, 3.0, 0.15), _Threshold(1.15, 5.0, 0.2), _Threshold(1.5, 5.0, 0.2)
+TURNED, SHIFTED = _Threshold(1.1, 3.0, 0.15), _Threshold(1.15, 5.0, 0.2)
+ELSEWHERE = _Threshold(1.5, 5.0, 0.2, MIN_FRAMES_ELSEWHERE)
 
 
 @dataclass(frozen=True)
-class _Hypothesis:
+class _PoseHypothesis:
     """Poses [F, 4, 4] without a mistake, and which frames have them, [F]."""
 
     message: str
     remedy: str
     poses: np.ndarray
-    inside: np.ndarray
+    available: np.ndarray
     threshold: _Threshold
-    kind: str
+    kind: Literal["poses", "positions", "rotations", "shift", "rate", "backwards"]
     _: KW_ONLY
     steps: int = 0  # by which states are shifted
     in_time: bool = False  # by so many median steps of time, not by rows
@@ -152,14 +157,14 @@ def root_poses(instrument: Instrument, poses: np.ndarray, states: Sequence[Instr
     return np.stack([tree.world_from_root(pose, state.joints) for pose, state in zip(poses, states, strict=True)])
 
 
-def evidence_by_chance(motion: MotionEvidence, poses: np.ndarray, inside: np.ndarray | None = None) -> float:
+def evidence_by_chance(motion: MotionEvidence, poses: np.ndarray, available: np.ndarray | None = None) -> float:
     """Mean evidence of poses [F, 4, 4] in random order: the instrument where it usually is, at other times."""
-    rows = np.arange(len(poses)) if inside is None else np.flatnonzero(inside)
+    rows = np.arange(len(poses)) if available is None else np.flatnonzero(available)
     generator, shuffled = np.random.default_rng(0), poses.copy()
     found = []
     for _ in range(N_SHUFFLES):
         shuffled[rows] = poses[generator.permutation(rows)]
-        found.append(motion.mean(shuffled, inside))
+        found.append(motion.mean(shuffled, available))
     return float(np.mean(found))
 
 
@@ -190,23 +195,23 @@ def _fault(judged: _Judged, given: float) -> MotionFault | None:
     return MotionFault(POSES, message, remedy)
 
 
-def _likeliest_mistake(judged: _Judged) -> _Hypothesis | None:
+def _likeliest_mistake(judged: _Judged) -> _PoseHypothesis | None:
     """The mistake without which the poses of an instrument explain clearly, and most, more of what moves."""
     motion = judged.motion
     given, few = motion.evidence(judged.given), motion.thinned()
     shifts = _Shifts(judged)
-    tried = [*_turned(judged), *_likeliest(_placed(judged), few), *shifts.likeliest(few)]
+    tried = [*_turned(judged), *_likeliest_few(_placed(judged), few), *shifts.likeliest(few)]
     clear, others = [], []
     for one in tried:
-        if one.threshold == ELSEWHERE and one.inside.sum() < MIN_FRAMES_ELSEWHERE:
+        if one.available.sum() < one.threshold.min_frames:
             continue
-        found = motion.compare(given, one.poses, one.inside)
+        found = motion.compare(given, one.poses, one.available)
         if found[0] > ELSEWHERE.factor:
             others.append((found[2], one))
-        enough = all(value > least for value, least in zip(found, one.threshold, strict=True))
+        enough = one.threshold.exceeded_by(*found)
         if enough and one.kind == "rotations":
             enough = _clearly_turned(motion, given, one)
-        if enough and found[2] > MIN_FACTOR_BY_CHANCE * evidence_by_chance(few, one.poses, one.inside):
+        if enough and found[2] > MIN_FACTOR_BY_CHANCE * evidence_by_chance(few, one.poses, one.available):
             clear.append((found[2], one))
     if not clear:
         return None
@@ -219,17 +224,17 @@ def _likeliest_mistake(judged: _Judged) -> _Hypothesis | None:
     return None if abs(best.steps) >= shifts.longest > 0 else best
 
 
-def _same(one: _Hypothesis, other: _Hypothesis) -> bool:
+def _same(one: _PoseHypothesis, other: _PoseHypothesis) -> bool:
     """Return True if two hypotheses are one mistake, at most of another amount."""
     near = abs(one.steps - other.steps) <= 2 * SHIFT_RADIUS
     return one.kind == other.kind and near and (one.kind != "poses" or np.allclose(one.poses, other.poses, atol=0.1))
 
 
-def _likeliest(tried: Iterable[_Hypothesis], few: MotionEvidence) -> list[_Hypothesis]:
-    return sorted(tried, key=lambda one: few.mean(one.poses, one.inside), reverse=True)[:MAX_HYPOTHESES]
+def _likeliest_few(tried: Iterable[_PoseHypothesis], few: MotionEvidence) -> list[_PoseHypothesis]:
+    return sorted(tried, key=lambda one: few.mean(one.poses, one.available), reverse=True)[:MAX_HYPOTHESES]
 
 
-def _turned(judged: _Judged) -> Iterator[_Hypothesis]:
+def _turned(judged: _Judged) -> Iterator[_PoseHypothesis]:
     """Other rotations than those recorded, of an instrument whose poses turn enough to compare them."""
     turns = Rotation.from_matrix(judged.given[:, :3, :3])
     turning = np.degrees(np.sqrt(((turns.mean().inv() * turns).magnitude() ** 2).mean()))
@@ -239,24 +244,23 @@ def _turned(judged: _Judged) -> Iterator[_Hypothesis]:
     for mistake in rotation_mistakes(np.stack([state.pose.numpy() for state in states])):
         message = f"{mistake.what.format(of=judged.of)}: turned back, they fit what moves in the images better"
         poses = root_poses(judged.instrument, mistake.poses, states)
-        yield _Hypothesis(message, mistake.remedy, poses, judged.everywhere, TURNED, "rotations")
+        yield _PoseHypothesis(message, mistake.remedy, poses, judged.everywhere, TURNED, mistake.kind)
 
 
-def _clearly_turned(motion: MotionEvidence, given: np.ndarray, other: _Hypothesis) -> bool:
+def _clearly_turned(motion: MotionEvidence, given: np.ndarray, other: _PoseHypothesis) -> bool:
     """Return True if other rotations explain more where they change the evidence `given` most: on the shaft of a thin
     instrument any rotation explains nearly as much."""
-    factor, certainty, _ = motion.compare(given, other.poses, other.inside, most_changed=True)
+    factor, certainty, _ = motion.compare(given, other.poses, other.available, most_changed=True)
     return factor > MIN_FACTOR_CHANGED and certainty > TURNED.certainty
 
 
-def _placed(judged: _Judged) -> Iterator[_Hypothesis]:
+def _placed(judged: _Judged) -> Iterator[_PoseHypothesis]:
     """Poses of other frames, axes and units."""
     frames = [judged.parsed.frames[row] for row in judged.rows]
     cameras = np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames])
     for mistake in placement_mistakes(judged.given, cameras):
         message = f"{mistake.what.format(of=judged.of)}: corrected, they lie on what moves in the images"
-        kind = mistake.what.split()[0]
-        yield _Hypothesis(message, mistake.remedy, mistake.poses, judged.everywhere, ELSEWHERE, kind)
+        yield _PoseHypothesis(message, mistake.remedy, mistake.poses, judged.everywhere, ELSEWHERE, mistake.kind)
 
 
 class _Shifts:
@@ -267,45 +271,45 @@ class _Shifts:
         self.timeline = TimeSteps(np.array([frame.state.time for frame in judged.parsed.frames]))
         self.longest = int(self.timeline.longest * MAX_SHIFT)
 
-    def likeliest(self, few: MotionEvidence) -> list[_Hypothesis]:
+    def likeliest(self, few: MotionEvidence) -> list[_PoseHypothesis]:
         """The likeliest few of all shifts, in steps and, where uneven, in time; and of all rates of a clock."""
         every = max(1, 2 * self.longest // MAX_SHIFTS)
         steps = [step for step in range(-self.longest, self.longest + 1, every) if step]
-        found = _likeliest((self._by_steps(step) for step in steps), few)
+        found = _likeliest_few((self._by_steps(step) for step in steps), few)
         if not self.timeline.is_even:  # frames were left out: then a wrong clock is another shift than wrong rows
-            near = _likeliest((self._by_time(step, nearest=True) for step in steps), few)
+            near = _likeliest_few((self._by_time(step, nearest=True) for step in steps), few)
             found += [self._by_time(one.steps) for one in near]
-        found += _likeliest((self._by_rate(rate) for rate in RATES), few)
+        found += _likeliest_few((self._by_rate(rate) for rate in RATES), few)
         message = f"states {self.judged.of} are in reverse order: turned round, they fit the images"
         remedy, backwards = "list them in the images' order", self.timeline.backwards(self.poses, self.rows)
-        return [*found, _Hypothesis(message, remedy, *backwards, ELSEWHERE, "backwards")]
+        return [*found, _PoseHypothesis(message, remedy, *backwards, ELSEWHERE, "backwards")]
 
-    def refined(self, found: _Hypothesis) -> _Hypothesis:
+    def refined(self, found: _PoseHypothesis) -> _PoseHypothesis:
         """The best of the shifts near to one, on the frames for which all of them have poses."""
         build = self._by_time if found.in_time else self._by_steps
         near = [build(step) for step in range(found.steps - SHIFT_RADIUS, found.steps + SHIFT_RADIUS + 1) if step]
-        common = np.all([one.inside for one in near], axis=0)
+        common = np.all([one.available for one in near], axis=0)
         means = [self.judged.motion.mean(one.poses, common) for one in near]
         return near[int(np.argmax(means))] if max(means) > 0 else found
 
-    def _by_steps(self, steps: int) -> _Hypothesis:
+    def _by_steps(self, steps: int) -> _PoseHypothesis:
         amount = f"{abs(steps)} frame{'s' * (abs(steps) > 1)}"
         return self._shift(steps, amount, *self.timeline.by_steps(self.poses, self.rows, steps))
 
-    def _by_time(self, steps: int, nearest: bool = False) -> _Hypothesis:
+    def _by_time(self, steps: int, nearest: bool = False) -> _PoseHypothesis:
         delay = steps * self.timeline.gap
         moved = self.timeline.by_time(self.poses, self.rows, delay, nearest=nearest)
         return replace(self._shift(steps, f"{abs(delay):.2g} s", *moved), in_time=True)
 
-    def _shift(self, steps: int, amount: str, poses: np.ndarray, inside: np.ndarray) -> _Hypothesis:
+    def _shift(self, steps: int, amount: str, poses: np.ndarray, available: np.ndarray) -> _PoseHypothesis:
         direction = "earlier" if steps > 0 else "later"  # than the images they are listed with
         small = abs(steps) <= min(SMALL_SHIFT, self.timeline.longest // 5)
         message = f"states {self.judged.of} fit the images better {amount} {direction}"
         remedy = f"move them {amount} {direction} (a clock's offset, frames dropped or counted from another one?)"
-        return _Hypothesis(message, remedy, poses, inside, SHIFTED if small else ELSEWHERE, "shift", steps=steps)
+        return _PoseHypothesis(message, remedy, poses, available, SHIFTED if small else ELSEWHERE, "shift", steps=steps)
 
-    def _by_rate(self, rate: float) -> _Hypothesis:
+    def _by_rate(self, rate: float) -> _PoseHypothesis:
         found = self.timeline.by_time(self.poses, self.rows, rate=rate, nearest=True)
         message = f"states {self.judged.of} fit the images better on a clock that runs {rate:.3g} times as fast"
         remedy = "correct their times, or the images' (24, 25 or 30 frames a second?)"
-        return _Hypothesis(message, remedy, *found, SHIFTED, "rate")
+        return _PoseHypothesis(message, remedy, *found, SHIFTED, "rate")

@@ -15,8 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from neeco.capture.checks._cameras import MIN_DEPTH, CameraArrays
-from neeco.capture.checks._mistakes import gain_certainty
+from neeco.capture.checks.cameras import MIN_DEPTH, CameraArrays
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.projection import project
@@ -33,6 +32,7 @@ QUICK_RAYS, QUICK_DEPTHS = 4, 2  # every so many of the rays and their depths, f
 DEPTHS = np.linspace(0.35, 1.0, 12)  # at which rays may be, of the tissue's
 COMPARED_RAYS = 0.4  # share of the rays: those which some poses explain best
 MIN_EVIDENCE = 0.1  # of a ray that some poses explain
+N_BLOCKS = 12  # of frames that follow each other, whose gains count as independent
 
 
 class TimeSteps:
@@ -54,15 +54,15 @@ class TimeSteps:
         """The poses, of [N, 4, 4], so many steps after frames `rows` [F], and where the recording has one, [F]."""
         wanted = self.step[rows] + steps
         found = self.frame_at[wanted.clip(0, len(self.frame_at) - 1)]
-        inside = (wanted >= 0) & (wanted < len(self.frame_at)) & (self.recording[found] == self.recording[rows])
-        return poses[found], inside
+        available = (wanted >= 0) & (wanted < len(self.frame_at)) & (self.recording[found] == self.recording[rows])
+        return poses[found], available
 
     def by_time(
         self, poses: np.ndarray, rows: np.ndarray, delay: float = 0.0, rate: float = 1.0, *, nearest: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
         """Poses as `by_steps`, those so many seconds after the frames, of a clock that runs so many times as fast from
         the start of each recording: interpolated, or the nearest recorded."""
-        moved, inside = poses[rows].copy(), np.zeros(len(rows), dtype=bool)
+        moved, available = poses[rows].copy(), np.zeros(len(rows), dtype=bool)
         for recording in np.unique(self.recording):
             frames = self.frame_at[self.recording[self.frame_at] == recording]
             times = self.times[self.step[frames]]
@@ -77,8 +77,8 @@ class TimeSteps:
                 moved[mine, :3, :3] = turns.as_matrix()
                 for axis in range(3):
                     moved[mine, axis, 3] = np.interp(wanted[mine], times, poses[frames, axis, 3])
-            inside |= mine
-        return moved, inside
+            available |= mine
+        return moved, available
 
     def backwards(self, poses: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses as `by_steps`, those of the same recording in reverse order."""
@@ -180,7 +180,7 @@ class MotionEvidence:
             return None
         views = _Views(parsed.frames, rows, points.positions.astype(np.float64))
         rays = cls(views) if len(views.rows) >= MIN_FRAMES else None
-        return rays if rays is not None and len(np.unique(rays.frames)) >= MIN_FRAMES else None
+        return rays if rays is not None and len(np.unique(rays.ray_views)) >= MIN_FRAMES else None
 
     def __init__(self, views: _Views) -> None:
         self.views = views
@@ -192,20 +192,20 @@ class MotionEvidence:
             if len(moving) >= each:
                 frames += [index] * each
                 places += generator.choice(moving, each, replace=False).tolist()
-        self.frames = np.array(frames, int)  # [R] index into `views`
+        self.ray_views = np.array(frames, int)  # [R] index into `views` of each ray's frame
         row, column = np.divmod(np.array(places, int), views.width)
-        fx, fy, cx, cy = views.cameras.intrinsics[self.frames].T
+        fx, fy, cx, cy = views.cameras.intrinsics[self.ray_views].T
         slopes = np.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones(len(row))], -1)  # [R, 3]
-        depths = views.depths[self.frames, row, column][:, None] * DEPTHS
+        depths = views.depths[self.ray_views, row, column][:, None] * DEPTHS
         self.points = slopes[:, None] * depths[..., None]  # [R, D, 3] mm, in the camera's frame
         # what moves everywhere or always is no evidence
         self._evidence = (views.moving - views.moving.mean(0)).astype(np.float32).ravel()
-        self._others = self.frames[:, None] != np.arange(len(views.rows))  # [R, F]
+        self._others = self.ray_views[:, None] != np.arange(len(views.rows))  # [R, F]
 
     def thinned(self) -> MotionEvidence:
         """Fewer of the rays, at fewer depths, for a first comparison of many poses."""
         few = copy.copy(self)
-        few.frames, few._others = self.frames[::QUICK_RAYS], self._others[::QUICK_RAYS]
+        few.ray_views, few._others = self.ray_views[::QUICK_RAYS], self._others[::QUICK_RAYS]
         few.points = self.points[::QUICK_RAYS, ::QUICK_DEPTHS]
         return few
 
@@ -214,7 +214,7 @@ class MotionEvidence:
         where they are out of view."""
         views, count = self.views, len(self.views.rows)
         camera_from_instrument = np.linalg.inv(views.cameras.poses) @ poses
-        back = np.linalg.inv(camera_from_instrument)[self.frames]
+        back = np.linalg.inv(camera_from_instrument)[self.ray_views]
         points = np.einsum("rij,rdj->rdi", back[:, :3, :3], self.points) + back[:, None, :3, 3]
         fixed = points.reshape(-1, 3).astype(np.float32)
         turns, moves = (
@@ -235,45 +235,51 @@ class MotionEvidence:
         means = np.einsum("rdf,rf->rd", evidence, weights) / weights.sum(-1).clip(1)[:, None]
         return np.asarray(means.max(1))
 
-    def mean(self, poses: np.ndarray, inside: np.ndarray | None = None) -> float:
+    def mean(self, poses: np.ndarray, available: np.ndarray | None = None) -> float:
         """Mean evidence of poses [F, 4, 4], over the rays that they explain best and the frames they are of [F]."""
-        inside = np.ones(len(poses), dtype=bool) if inside is None else inside
-        counts = inside[self.frames]
-        if len(np.unique(self.frames[counts])) < MIN_FRAMES:
+        available = np.ones(len(poses), dtype=bool) if available is None else available
+        counts = available[self.ray_views]
+        if len(np.unique(self.ray_views[counts])) < MIN_FRAMES:
             return 0.0
-        explained = np.sort(self.explained(self.evidence(poses), inside)[counts])
+        explained = np.sort(self.explained(self.evidence(poses), available)[counts])
         return float(explained[int((1 - COMPARED_RAYS) * len(explained)) :].mean())
 
     def travel(self, poses: np.ndarray) -> float:
         """Median over the rays of the standard deviation, of the image's width, by which their points move over all
         frames, as one camera would see them."""
         views = self.views
-        back = np.linalg.inv(np.linalg.inv(views.cameras.poses) @ poses)[self.frames]
+        back = np.linalg.inv(np.linalg.inv(views.cameras.poses) @ poses)[self.ray_views]
         best = self.evidence(poses).mean(-1).argmax(1)
         points = np.einsum("rij,rj->ri", back[:, :3, :3], self.points[np.arange(len(best)), best]) + back[:, :3, 3]
         world = np.einsum("fij,rj->rfi", poses[:, :3, :3], points) + poses[:, :3, 3]
-        other_pose = views.cameras.poses[self.frames]
+        other_pose = views.cameras.poses[self.ray_views]
         local = np.einsum("rfi,rij->rfj", world - other_pose[:, None, :3, 3], other_pose[:, :3, :3])
-        fx, fy, cx, cy = views.cameras.intrinsics[self.frames].T[..., None]
+        fx, fy, cx, cy = views.cameras.intrinsics[self.ray_views].T[..., None]
         u, v = project(local, fx, fy, cx, cy, nearest=1.0)
         return float(np.median(np.hypot(u.std(1), v.std(1)))) / views.width
 
     def compare(
-        self, given: np.ndarray, poses: np.ndarray, inside: np.ndarray, *, most_changed: bool = False
+        self, given: np.ndarray, poses: np.ndarray, available: np.ndarray, *, most_changed: bool = False
     ) -> tuple[float, float, float]:
         """Factor by which poses [F, 4, 4], which there are for some frames [F], explain more than those whose
         `evidence` is given; its certainty in standard errors over blocks; their mean evidence. Over the rays that
         some poses explain best; or, of those explained at all, the half that they explain most differently."""
-        counts = inside[self.frames]
-        if len(np.unique(self.frames[counts])) < MIN_FRAMES:
+        counts = available[self.ray_views]
+        if len(np.unique(self.ray_views[counts])) < MIN_FRAMES:
             return 0.0, 0.0, 0.0
-        other = self.explained(self.evidence(poses), inside)[counts]
-        own = self.explained(given, inside)[counts]
+        other = self.explained(self.evidence(poses), available)[counts]
+        own = self.explained(given, available)[counts]
         best = np.maximum(other, own)
         compared = best >= np.quantile(best, 1 - COMPARED_RAYS)
         if most_changed and (best > MIN_EVIDENCE).any():
             change = np.abs(other - own)
             compared = (best > MIN_EVIDENCE) & (change >= np.median(change[best > MIN_EVIDENCE]))
-        other, own, frames = other[compared], own[compared], self.frames[counts][compared]
+        other, own, frames = other[compared], own[compared], self.ray_views[counts][compared]
         gains = np.array([(other - own)[frames == frame].mean() for frame in np.unique(frames)])
         return float(other.mean() / max(own.mean(), 1e-9)), gain_certainty(gains), float(other.mean())
+
+
+def gain_certainty(gains: np.ndarray) -> float:
+    """Mean of gains [F] of frames in order, in standard errors over blocks of them."""
+    blocks = np.array([block.mean() for block in np.array_split(gains, min(N_BLOCKS, len(gains)))])
+    return float(blocks.mean() / max(blocks.std(ddof=1) / np.sqrt(len(blocks)), 1e-9))

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import torch
 
-from neeco.capture.images import is_repeated, open_image, write_image, write_labels
+from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, is_repeated, open_image, write_image, write_labels
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Border, Lens
@@ -27,11 +27,18 @@ N_NEIGHBOURS = 7  # frames on each side, whose sharpness a frame is compared wit
 NOISE = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
 NOISE_PLACE = 0.06  # the same at one place of a thumbnail
 NOISE_MM, NOISE_RAD = 0.3, 0.005  # and of the state, within the tracker's noise
-FROZEN_MM, FROZEN_RAD = 1.0, 0.03  # by which a state changes visibly while the picture does not
 MAX_RANGES = 3  # of frames, named in a note
 THUMBNAIL_PX = 64  # px, width
 MIN_REPEATED = 5  # frames with the picture before them that are worth a note where no state contradicts it
 ASPECT_TOLERANCE = 0.02  # of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
+
+
+@dataclass(frozen=True)
+class DropReason:
+    """Why a video frame is not in the capture."""
+
+    why: str
+    frame_usable: bool = False  # it could have been in it as well
 
 
 @dataclass(frozen=True)
@@ -63,7 +70,7 @@ def frozen_frames(features: FrameFeatures, usable: np.ndarray, states: np.ndarra
     """Return the frames whose picture repeats an earlier one, though the state changed since; see `choose_frames`."""
     source = np.maximum.accumulate(np.where(features.repeats, 0, np.arange(len(states))))
     change = states - states[source]
-    moved = (np.linalg.norm(change[:, :3], axis=1) > FROZEN_MM) | (np.linalg.norm(change[:, 3:], axis=1) > FROZEN_RAD)
+    moved = (np.linalg.norm(change[:, :3], axis=1) > VISIBLE_MM) | (np.linalg.norm(change[:, 3:], axis=1) > VISIBLE_RAD)
     return np.flatnonzero(moved & usable & usable[source])
 
 
@@ -75,33 +82,33 @@ def describe_ranges(frames: np.ndarray) -> str:
 
 
 def choose_frames(
-    features: FrameFeatures, usable: np.ndarray, states: np.ndarray, count: int | None, min_sharpness: float = 0.5
-) -> tuple[np.ndarray, dict[int, str]]:
+    features: FrameFeatures, usable: np.ndarray, states: np.ndarray, count: int, min_sharpness: float
+) -> tuple[np.ndarray, dict[int, DropReason]]:
     """Choose at most `count` sharp frames that differ, spread over states and views; return them, and why not others.
 
     usable [N] bool: frames with a known state (the others are dropped); states [N, 6+J]: position mm, rotation vector
     rad, joints rad of the instrument; min_sharpness: of the neighbours' median.
     """
-    dropped = {int(i): "no instrument state at its time" for i in np.flatnonzero(~usable)}
-    dropped |= dict.fromkeys(
-        frozen_frames(features, usable, states).tolist(), "frozen: the state changed, not the picture"
-    )
+    dropped = {int(i): DropReason("no instrument state at its time") for i in np.flatnonzero(~usable)}
+    frozen = DropReason("frozen: the state changed, not the picture")
+    dropped |= dict.fromkeys(frozen_frames(features, usable, states).tolist(), frozen)
     for i in np.flatnonzero(usable).tolist():
         around = features.sharpness[max(0, i - N_NEIGHBOURS) : i + N_NEIGHBOURS + 1]
         if features.sharpness[i] < min_sharpness * np.median(around):
-            dropped[i] = f"blurred: {features.sharpness[i] / np.median(around):.0%} of its neighbours' sharpness"
+            share = features.sharpness[i] / np.median(around)
+            dropped[i] = DropReason(f"blurred: {share:.0%} of its neighbours' sharpness")
     last: int | None = None
     for i in range(len(usable)):
         if i in dropped:
             continue
         if last is not None and _same(features, states, last, i):
-            dropped[i] = f"the same as frame {last}: neither picture nor state changed"
+            dropped[i] = DropReason(f"the same as frame {last}: neither picture nor state changed")
         else:
             last = i
     selected = np.array([i for i in range(len(usable)) if i not in dropped], dtype=int)
-    if count is not None and len(selected) > count:
+    if len(selected) > count:
         chosen = selected[_farthest_points(_embedding(features, states)[selected], count)]
-        reason = f"not among the {count} that cover states and views best"
+        reason = DropReason(f"not among the {count} that cover states and views best", frame_usable=True)
         dropped |= dict.fromkeys((int(i) for i in set(selected) - set(chosen)), reason)
         selected = np.sort(chosen)
     return selected, dropped
@@ -144,7 +151,7 @@ class ChosenImages:
     size: tuple[int, int]  # width, height px
     lens: Lens | None  # None: not known yet
     selected: np.ndarray  # [K] video frames
-    dropped: Mapping[int, str]  # of other video frames, why
+    dropped: Mapping[int, DropReason]  # of other video frames, why
     border: Border | None  # the endoscope's, in the frames as recorded
 
     @property
@@ -272,7 +279,7 @@ def _check_pixels(video: VideoSource, lens: Lens | None, where: str, data: Episo
             )
 
 
-def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[int, str]]:
+def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[int, DropReason]]:
     """Return the video frames to keep, and why others are not."""
     count, recording = len(data.times), data.recording
     settings = recording.settings
@@ -297,7 +304,7 @@ def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[i
     if recording.frames is None and count > limit:
         data.notes.add(f"{limit} of {count} frames are kept; ask for more with --frames")
     if len(selected) < MIN_FRAMES:
-        reasons = Counter(why.split(":")[0] for why in dropped.values())
+        reasons = Counter(reason.why.split(":")[0] for reason in dropped.values())
         why = reasons.most_common(1)[0][0] if reasons else "the video is short"
         raise NeecoError(
             f"{data.video.path}: only {len(selected)} of {count} frames are usable (at least {MIN_FRAMES} are "

@@ -11,6 +11,7 @@ import numpy as np
 from neeco.capture.model import REFERENCE_PIXELS
 from neeco.geometry.lens import Lens
 
+MIN_POINT_IMAGES, MAX_POINT_ERROR_PX = 4, 1.2  # of points that are tissue: images that observe them, and misfit
 StageProgress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
 
 
@@ -28,9 +29,9 @@ class SfmResult:
     lens: Lens | None  # estimated; None where it was given
     reprojection_px: float
 
-    def reliable_points(self, length: int = 4, error: float = 1.2) -> np.ndarray:
+    def reliable_points(self) -> np.ndarray:
         """Return [P] bool: observed by enough images and well fitted."""
-        return (self.lengths >= length) & (self.errors < error)
+        return (self.lengths >= MIN_POINT_IMAGES) & (self.errors < MAX_POINT_ERROR_PX)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -34,7 +34,7 @@ def register(data: Episodes, views: Views) -> tuple[Episodes, Registration | Non
     """
     settings = data.recording.settings
     if data.parts[0].scope is None:
-        if data.in_video is None:  # else a note on the instrument in the video states how the scale is found
+        if data.video_instrument is None:  # else a note on the instrument in the video states how the scale is found
             data.notes.add(
                 "the laparoscope was not tracked: "
                 + ("instrument poses stay in the tracker's frame (unregistered), and " if data.parts[0].poses else "")
@@ -44,7 +44,7 @@ def register(data: Episodes, views: Views) -> tuple[Episodes, Registration | Non
     found = None
     for episode, part in enumerate(data.parts):
         rows = np.flatnonzero(views.episodes == episode)
-        data, found = _register_episode(data, episode, views.world_from_camera[rows], views.times[rows] - part.start)
+        data, found = _register_episode(data, episode, views.world_from_camera[rows], views.times[rows] - part.start_s)
         if found is None and _scope(data.parts[episode]).clock not in data.parts[episode].clocks:
             return data, None
     if data.single:
@@ -155,7 +155,7 @@ def find_instrument_clocks(data: Episodes, flow: ResidualFlow, views: Views, pro
     moved = flow.fastest_motion()
     for episode, part in enumerate(data.parts):
         rows = np.flatnonzero(views.episodes == episode)
-        own = views.times[rows] - part.start
+        own = views.times[rows] - part.start_s
         for clock, log in {log.clock: log for log in part.poses.values() if _is_open(part, log)}.items():
             stated, found = clock in data.parts[episode].clocks, None
             try:

@@ -29,7 +29,7 @@ MIN_TRAVEL_MM = 2.0  # root mean square, from which an arm counts as moving
 KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
 
 
-def check_frames(data: Episodes, *, moving: bool) -> None:
+def check_reference_frames(data: Episodes, *, moving: bool) -> None:
     """Raise NeecoError for poses, or bases, that are stated to what does not stand still. moving: whether the scope
     does."""
     path = data.recording.path

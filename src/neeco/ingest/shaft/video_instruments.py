@@ -54,7 +54,7 @@ def find_in_video(
             "pose frames by hand (`neeco view CAPTURE --annotate`)"
         )
     poses = views.times[found.known], found.poses[found.known]
-    return replace(data, found={**data.found, item.name: poses}), found
+    return replace(data, video_poses={**data.video_poses, item.name: poses}), found
 
 
 def _in_words(name: str, found: FoundShaft) -> str:

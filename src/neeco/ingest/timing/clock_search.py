@@ -80,8 +80,8 @@ def clock_from_turning(world_from_camera: np.ndarray, times: np.ndarray, log: Po
     log_grid = np.arange(log.times[0] + STRIDE_S, log.times[-1] - STRIDE_S, STEP_S)
     if len(video_grid) < 50 or len(log_grid) < 50:
         raise NeecoError(f"{log.path}: video or log is shorter than a second; give its clock offset in `sync`")
-    video = turning_speed(video_grid, times, Rotation.from_matrix(world_from_camera[:, :3, :3]))
-    sensor = turning_speed(log_grid, log.times, Rotation.from_quat(log.quats, scalar_first=True))
+    video = _turning_speed(video_grid, times, Rotation.from_matrix(world_from_camera[:, :3, :3]))
+    sensor = _turning_speed(log_grid, log.times, Rotation.from_quat(log.quats, scalar_first=True))
     rate, lags, scores = best_rate(video, sensor)
     seconds = log_grid[0] + _peak(lags, scores, rate, log) * STEP_S - rate * video_grid[0]
     return ClockOffset(float(seconds), float("nan"), SCOPE_MOTION, rate)
@@ -91,7 +91,7 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
     """Estimate a clock from the speeds of the instrument in the image and of its tracker.
 
     motion [M-1] px between frames at video `times` [M] s, beyond a still scene's. The standard deviation is that of the
-    estimates from halves of the video. Raises NeecoError when the two never fit, or fit at several offsets.
+    estimates from three halves of the video. Raises NeecoError when the two never fit, or fit at several offsets.
     """
     _check_span(log)
     steps = np.diff(times)
@@ -109,22 +109,25 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
         rate = _finer_rate(observed, tracked, rate)
         lags, scores = correlate(_stretched(observed, rate), tracked)
     best, length = _peak(lags, scores, rate, log), grid[-1] - grid[0]
-    sd = _spread_of_halves(_stretched(observed, rate), tracked, best)
+    sd = _spread_of_parts(_stretched(observed, rate), tracked, best)
     rate_sd = np.sqrt(12) * sd / length if rate != 1 else 0.0  # of a line through offsets spread over the video
     seconds = log_grid[0] + _vertex(lags, scores) * STEP_S - rate * grid[0]
     return ClockOffset(float(seconds), sd, INSTRUMENT_MOTION, rate, float(rate_sd))
 
 
-def _spread_of_halves(observed: np.ndarray, tracked: np.ndarray, best: int) -> float:
-    """Return the standard deviation, s, of the offsets of the video's halves about the lag `best` of all of it."""
+def _spread_of_parts(observed: np.ndarray, tracked: np.ndarray, best: int) -> float:
+    """Return the standard deviation, s, of the offsets of the video's first, middle and last half.
+
+    Each is searched near `best`, the lag of the whole video.
+    """
     quarter = len(observed) // 4
-    halves = []
+    found = []
     for part in (slice(0, 2 * quarter), slice(quarter, 3 * quarter), slice(2 * quarter, 4 * quarter)):
         near, fit = correlate(observed[part], tracked)
         around = np.abs((near - part.start - best) * STEP_S) < LOBE_S
         if around.any():
-            halves.append(_vertex(near[around] - part.start, fit[around]))
-    return max(float(np.std(halves)) * STEP_S if len(halves) > 1 else LOBE_S, STEP_S / 4)
+            found.append(_vertex(near[around] - part.start, fit[around]))
+    return max(float(np.std(found)) * STEP_S if len(found) > 1 else LOBE_S, STEP_S / 4)
 
 
 def _check_span(log: PoseLog) -> None:
@@ -203,7 +206,7 @@ def _vertex(lags: np.ndarray, scores: np.ndarray) -> float:
     return float(lags[best] + (0.5 * (left - right) / bend if bend < 0 else 0.0))
 
 
-def turning_speed(grid: np.ndarray, times: np.ndarray, turns: Rotation) -> np.ndarray:
+def _turning_speed(grid: np.ndarray, times: np.ndarray, turns: Rotation) -> np.ndarray:
     """Return angular speeds [G] rad/s at the grid's times s, from interpolated rotations STRIDE_S apart."""
     along = Slerp(times, turns)
     before, after = (along(np.clip(grid + side * STRIDE_S / 2, times[0], times[-1])) for side in (-1, 1))

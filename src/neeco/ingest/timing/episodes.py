@@ -19,9 +19,9 @@ from neeco.errors import NeecoError
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import PoseLog, ReadingLog
+from neeco.ingest.recording.compatibility import file_name
 from neeco.ingest.recording.model import InstrumentLogs, Recording
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, ClockOffset
-from neeco.ingest.timing.compatibility import file_name
 
 PAUSE_S = 2.0  # longer than any smoothing over time reaches
 SAME_INSTANT = 1e-6  # s
@@ -43,21 +43,21 @@ class Notes:
     """The one value of an ingest that grows: every stage adds to it. names: of the episodes."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        self.names = tuple(names)
+        self._names = tuple(names)
         self._sentences: dict[tuple[str, int | None], None] = {}  # in order; one without an episode holds for all
         self._contradictions: dict[tuple[str, int | None], Contradiction] = {}
 
     def add(self, sentence: str, episode: int | None = None) -> None:
         """Add a sentence, once: about one episode, or about all."""
-        self._sentences[sentence, 0 if len(self.names) == 1 else episode] = None
+        self._sentences[sentence, 0 if len(self._names) == 1 else episode] = None
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """Sentences on losses and assumptions; one about one of several episodes begins with its name."""
         found = []
-        for episode, name in enumerate(self.names):
+        for episode, name in enumerate(self._names):
             for sentence in [sentence for sentence, of in self._sentences if of == episode]:
-                everywhere = all((sentence, other) in self._sentences for other in range(len(self.names)))
+                everywhere = all((sentence, other) in self._sentences for other in range(len(self._names)))
                 found.append(sentence if everywhere else f"{name}: {sentence}")
         return tuple(dict.fromkeys([*found, *(sentence for sentence, of in self._sentences if of is None)]))
 
@@ -67,7 +67,7 @@ class Notes:
         if not sentence:
             self._contradictions.pop((subject, episode), None)
             return
-        named = sentence if len(self.names) == 1 or episode is None else f"{self.names[episode]}: {sentence}"
+        named = sentence if len(self._names) == 1 or episode is None else f"{self._names[episode]}: {sentence}"
         self._contradictions[subject, episode] = Contradiction(named, severe)
 
     def is_contradicted(self, subject: str) -> bool:
@@ -82,6 +82,7 @@ class Notes:
 class Episode:
     """One recording in memory, on its own timeline: that of its video."""
 
+    name: str  # of its images and in messages; distinct
     recording: Recording
     video: VideoSource
     poses: Mapping[str, PoseLog]  # by instrument, of those that were tracked
@@ -89,8 +90,8 @@ class Episode:
     rolls: Mapping[str, ReadingLog]
     scope: PoseLog | None
     clocks: Mapping[str, ClockOffset]  # of the logs, as far as they are known
-    start: float = 0.0  # s of the joint timeline at its own 0
-    first: int = 0  # frames before it
+    start_s: float = 0.0  # of the joint timeline at its own 0
+    first_frame: int = 0  # of the joint numbering
 
     @property
     def times(self) -> np.ndarray:
@@ -115,8 +116,8 @@ class Episodes:
     notes: Notes
     tissue: str | None = None
     world_from_base: Mapping[str, np.ndarray] = field(default_factory=dict)  # [4, 4] mm of logs in another frame
-    found: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
-    # instruments found in the video: times [N] s of the joint timeline, poses [N, 4, 4]
+    # by instrument found in the video: times [N] s of the joint timeline, poses [N, 4, 4]
+    video_poses: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     @property
     def recording(self) -> Recording:
@@ -128,7 +129,7 @@ class Episodes:
         return len(self.parts) == 1
 
     @property
-    def in_video(self) -> InstrumentLogs | None:
+    def video_instrument(self) -> InstrumentLogs | None:
         """The instrument that is to be found in the video, if any."""
         return next((item for item in self.recording.instruments if item.from_video is not None), None)
 
@@ -141,23 +142,22 @@ class Episodes:
 
     def episode_of(self, frames: np.ndarray) -> np.ndarray:
         """Return the episode [N] of every frame [N]."""
-        return np.searchsorted([part.first for part in self.parts], frames, side="right") - 1
+        return np.searchsorted([part.first_frame for part in self.parts], frames, side="right") - 1
 
     @property
     def ranges(self) -> dict[str, tuple[int, int]]:
         """The frames (first, last) of each of several episodes, by its name."""
         if self.single:
             return {}
-        named = zip(self.notes.names, self.parts, strict=True)
-        return {name: (part.first, part.first + len(part.times) - 1) for name, part in named}
+        return {part.name: (part.first_frame, part.first_frame + len(part.times) - 1) for part in self.parts}
 
     def frame_name(self, frame: int) -> str:
         """Return the name of a frame's image in the capture; of several episodes, it begins with the episode's."""
         of = "" if self.tissue is None else file_name(self.tissue) + "_"
         if self.single:
             return f"{of}{frame:06d}"
-        episode = int(self.episode_of(np.array([frame]))[0])
-        return f"{of}{self.notes.names[episode]}_{frame - self.parts[episode].first:06d}"
+        part = self.parts[int(self.episode_of(np.array([frame]))[0])]
+        return f"{of}{part.name}_{frame - part.first_frame:06d}"
 
     def with_base(self, name: str, world_from_base: np.ndarray) -> Episodes:
         """Return the episodes with the base [4, 4] mm of an instrument's log."""
@@ -189,7 +189,7 @@ class Episodes:
         data = self
         for episode, part in enumerate(self.parts):
             logs: list[PoseLog | ReadingLog] = []
-            for name in (*part.poses, *self.found):
+            for name in (*part.poses, *self.video_poses):
                 logs += [log for log in (part.poses.get(name), part.rolls.get(name)) if log is not None]
                 logs += part.joints[name].values()
             for log in logs:
@@ -206,8 +206,7 @@ class Episodes:
         """The clocks of all episodes, by their names in a report."""
         if self.single:
             return dict(self.parts[0].clocks)
-        named = zip(self.notes.names, self.parts, strict=True)
-        return {f"{clock} of {name}": offset for name, part in named for clock, offset in part.clocks.items()}
+        return {f"{clock} of {part.name}": offset for part in self.parts for clock, offset in part.clocks.items()}
 
     def clock(self, name: str) -> ClockOffset | None:
         """Return a clock of the joint logs: of several episodes, known once it is known in each."""
@@ -228,11 +227,11 @@ class Episodes:
         inner, times, rows = [], [], []
         for part, log in zip(self.parts, logs, strict=True):
             known = part.clocks.get(log.clock, ClockOffset(0.0, 0.0, GIVEN))
-            own = part.times + part.start
-            moved = known.video_times(log.times) + part.start
+            own = part.times + part.start_s
+            moved = known.video_times(log.times) + part.start_s
             rows.append((moved > own[0] - PAUSE_S / 2) & (moved < own[-1] + PAUSE_S / 2))
             times.append(moved[rows[-1]])
-            inner += [tuple(known.video_times(np.array(gap)) + part.start) for gap in log.gaps]
+            inner += [tuple(known.video_times(np.array(gap)) + part.start_s) for gap in log.gaps]
         joint = np.concatenate(times)
         gaps = {(before, after) for before, after in inner if before >= joint[0] and after <= joint[-1]}
         gaps |= {(float(before[-1]), float(after[0])) for before, after in pairwise(times)}
@@ -258,14 +257,14 @@ class Episodes:
 
         They are in the world's frame as far as that is known, else in the tracker's.
         """
-        if name in self.found:
+        if name in self.video_poses:
             return self._found_poses(name, times)
         poses, known = self._gathered(times, lambda part, own: part.logged_poses(part.poses[name], own + lag), (4, 4))
         return (self.world_from_base[name] @ poses if name in self.world_from_base else poses), known
 
     def _found_poses(self, name: str, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`instrument_poses` of one found in the video, with its roll where that is logged."""
-        held, poses = self.found[name]
+        held, poses = self.video_poses[name]
         if not len(held):
             return np.full((len(times), 4, 4), np.nan), np.zeros(len(times), dtype=bool)
         row = np.abs(times[:, None] - held).argmin(1)
@@ -284,7 +283,7 @@ class Episodes:
         states: States = {}
         usable = np.ones(len(times), dtype=bool)
         limits = {item.name: {j: log.limits for j, log in item.joints.items()} for item in self.recording.instruments}
-        for name in (*self.parts[0].poses, *self.found):
+        for name in (*self.parts[0].poses, *self.video_poses):
             poses, known = self.instrument_poses(name, times)
             usable &= known
             readings = {}
@@ -315,11 +314,11 @@ class Episodes:
 
     def _each(self, times: np.ndarray) -> Iterator[tuple[Episode, np.ndarray, np.ndarray]]:
         """Yield every episode that times [N] fall into, their rows, and their seconds on its own timeline."""
-        ends = np.array([part.start + part.times[-1] + PAUSE_S / 2 for part in self.parts[:-1]])
+        ends = np.array([part.start_s + part.times[-1] + PAUSE_S / 2 for part in self.parts[:-1]])
         of = np.searchsorted(ends, times)
         for episode in np.unique(of):
             rows = np.flatnonzero(of == episode)
-            yield self.parts[episode], rows, times[rows] - self.parts[episode].start
+            yield self.parts[episode], rows, times[rows] - self.parts[episode].start_s
 
     def _gathered(
         self,

@@ -11,9 +11,9 @@ from neeco.errors import NeecoError
 from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_lengths
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
+from neeco.ingest.recording.compatibility import check_recordings, episode_names, refusal
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.timing.clock_search import GIVEN, MAX_LENGTH_S, ClockOffset
-from neeco.ingest.timing.compatibility import check_recordings, episode_names, refusal
 from neeco.ingest.timing.episodes import PAUSE_S, Episode, Episodes, Notes, assumed_clock
 
 MIN_FPS, MAX_FPS = 0.01, 10_000.0
@@ -25,17 +25,18 @@ def read_episodes(recordings: Sequence[Recording], tissue: str | None = None) ->
 
     Raises NeecoError for recordings that cannot be used, or that one capture cannot hold.
     """
-    notes = Notes(episode_names(recordings))
+    names = episode_names(recordings)
+    notes = Notes(names)
     parts: list[Episode] = []
     for episode, recording in enumerate(recordings):
-        part = _read(recording, notes, episode)
+        part = _read(recording, names[episode], notes, episode)
         if parts:
             before = parts[-1]
-            start = before.start + before.times[-1] + PAUSE_S - part.times[0]
-            part = replace(part, start=start, first=before.first + len(before.times))
+            start = before.start_s + before.times[-1] + PAUSE_S - part.times[0]
+            part = replace(part, start_s=start, first_frame=before.first_frame + len(before.times))
         parts.append(part)
     check_episodes(parts)
-    _check_split_names(recordings[0], notes.names)
+    _check_split_names(recordings[0], names)
     return Episodes(tuple(parts), parts[0].video if len(parts) == 1 else _joined_video(parts), notes, tissue)
 
 
@@ -53,7 +54,7 @@ def check_episodes(parts: Sequence[Episode], *, tissues: bool = False) -> None:
                 raise refusal(part.recording, f"instruments: {name}: poses are in another frame than", first.recording)
 
 
-def _read(recording: Recording, notes: Notes, episode: int) -> Episode:
+def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episode:
     """Read one recording. Raises NeecoError for logs and videos that cannot be used."""
     # logs are quick to read: wrong ones are found before the video is touched
     items = recording.instruments
@@ -91,7 +92,7 @@ def _read(recording: Recording, notes: Notes, episode: int) -> Episode:
                 episode,
             )
     return Episode(
-        recording=recording, video=video, poses=poses, joints=joints, rolls=rolls, scope=scope, clocks=clocks
+        name=name, recording=recording, video=video, poses=poses, joints=joints, rolls=rolls, scope=scope, clocks=clocks
     )
 
 
@@ -174,6 +175,6 @@ class _JoinedVideo(VideoSource):
 
 
 def _joined_video(parts: Sequence[Episode]) -> VideoSource:
-    videos, first = tuple(part.video for part in parts), tuple(part.first for part in parts)
-    times = np.concatenate([part.times + part.start for part in parts])
+    videos, first = tuple(part.video for part in parts), tuple(part.first_frame for part in parts)
+    times = np.concatenate([part.times + part.start_s for part in parts])
     return _JoinedVideo(videos[0].path, videos[0].size, (), times, videos, (*first, len(times)))

@@ -11,19 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neeco.capture.checks._cameras import CameraArrays
-from neeco.capture.checks._mistakes import camera_axes_mistakes, unit_mistakes
+from neeco.capture.checks.cameras import CameraArrays
 from neeco.capture.checks.colors import agreements
+from neeco.capture.checks.mistakes import camera_axes_mistakes, frame_mistakes, unit_mistakes
 from neeco.capture.checks.motion import POSES, MotionVerdict, judge_motion
 from neeco.capture.checks.motion_evidence import MotionEvidence
 from neeco.capture.documents import Node, errors_only, printable
 from neeco.capture.model import Instrument
+from neeco.capture.points import sampled
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.lines import across_projectors
 from neeco.plausible import Fault
 
 FEW_POINTS = 100
-MAX_SAMPLED_POINTS = 500
 MAX_DISTANCE = 10.0  # sizes of the scene
 MIN_VISIBLE = 0.1  # share of the points, or of the frames, below which a mistake is looked for
 MIN_EXPLAINED = 0.3  # share in view that a mistake must restore to be named
@@ -49,7 +49,7 @@ class _Extent:
         cameras = CameraArrays.of([frame.camera for frame in parsed.frames])
         center = np.median(points, axis=0)
         distance = float(np.median(np.linalg.norm(cameras.centers - center, axis=1)))
-        return cls(cameras, points[:: max(1, len(points) // MAX_SAMPLED_POINTS)], center, _radius(points), distance)
+        return cls(cameras, sampled(points), center, _radius(points), distance)
 
     @property
     def size(self) -> float:
@@ -141,10 +141,10 @@ def _camera_fault(parsed: Parsed, extent: _Extent, given: float) -> Fault | None
         best = int(np.argmax(colors))
         return faults[best] if colors[best] > MIN_COLOR_CORRELATION else None
     views = [CameraArrays(mistake.poses, cameras.intrinsics, cameras.sizes).sees(points) for mistake in mistakes]
-    return _likeliest(faults, views, given)
+    return _most_visible(faults, views, given)
 
 
-def _likeliest(faults: Sequence[Fault], visible: Sequence[np.ndarray], given: float) -> Fault | None:
+def _most_visible(faults: Sequence[Fault], visible: Sequence[np.ndarray], given: float) -> Fault | None:
     """The mistake without which the greatest share is in view, if that is much more than the share given."""
     shares = [float(seen.mean()) for seen in visible]
     best = int(np.argmax(shares))
@@ -276,20 +276,20 @@ def _instrument_fault(cameras: CameraArrays, poses: np.ndarray, given: float) ->
     if _visible_body_point(cameras, poses)[1] > MIN_BODY_VISIBLE:
         return None
     origins = poses[:, :3, 3]
-    in_camera = np.einsum("fij,fj->fi", cameras.poses[:, :3, :3], origins) + cameras.centers
-    flipped = np.einsum("fij,fj->fi", cameras.poses[:, :3, :3], origins * [1, -1, -1]) + cameras.centers
     in_world = "turn the poses into the cameras' world frame"
-    tried = {
-        ("poses are instrument-from-world", "invert them: world_from_instrument is expected"): (
-            np.linalg.inv(poses)[:, :3, 3]
-        ),
-        ("its world has y and z flipped (OpenGL axes)", in_world): origins * [1, -1, -1],
-        ("its world has y and z swapped (y up)", in_world): origins[:, [0, 2, 1]] * [1, -1, 1],
-        ("its world has z and y swapped (z up)", in_world): origins[:, [0, 2, 1]] * [1, 1, -1],
-        ("poses are in the camera's frame", "multiply by world_from_camera"): in_camera,
-        ("poses are in the camera's frame with OpenGL axes", "multiply by transform_matrix"): flipped,
-    }
+    inverted, *in_camera = (
+        (mistake.what.replace(" {of}", ""), mistake.remedy, mistake.poses[:, :3, 3])
+        for mistake in frame_mistakes(poses, cameras.poses)
+    )
+    tried = [
+        inverted,
+        ("its world has y and z flipped (OpenGL axes)", in_world, origins * [1, -1, -1]),
+        ("its world has y and z swapped (y up)", in_world, origins[:, [0, 2, 1]] * [1, -1, 1]),
+        ("its world has z and y swapped (z up)", in_world, origins[:, [0, 2, 1]] * [1, 1, -1]),
+        *in_camera,
+    ]
     # shrinking puts everything at the world's origin, in view or not: a unit slip must also be far out to begin with
     if np.median(np.linalg.norm(origins, axis=1)) > 30 * np.linalg.norm(cameras.centers, axis=1).max():
-        tried["cameras and points are in metres, its positions in mm", ALL_IN_MM] = origins / 1000.0
-    return _likeliest(list(tried), [cameras.sees(moved[:, None]) for moved in tried.values()], given)
+        tried.append(("cameras and points are in metres, its positions in mm", ALL_IN_MM, origins / 1000.0))
+    faults = [(what, remedy) for what, remedy, _ in tried]
+    return _most_visible(faults, [cameras.sees(moved[:, None]) for _, _, moved in tried], given)

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from neeco.capture.checks._placement import check_placement
-from neeco.capture.checks._states import check_states
-from neeco.capture.checks.colors import check_images
-from neeco.capture.checks.frames import check_files, check_frames
+from neeco.capture.checks.colors import check_colors
+from neeco.capture.checks.frames import check_frames, check_image_files
 from neeco.capture.checks.motion import check_motion
+from neeco.capture.checks.placement import check_placement
+from neeco.capture.checks.states import check_states
 from neeco.capture.documents import Problem, ProblemReport, condensed, errors_only, key_name
 from neeco.capture.model import Capture
 from neeco.capture.readers import capture_of, parse_capture
@@ -81,13 +81,13 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
     capture = None if errors_only(report.problems) else capture_of(parsed)
     if parsed.frames:
         check_frames(parsed)
-        check_files(parsed)
+        check_image_files(parsed)
         check_states(parsed)
         parts = parsed.by_tissue()
         verdicts = [check_placement(part) for part in parts]
         if motion and not errors_only(report.problems):
             for part, known in zip(parts, verdicts, strict=True):
-                if check_images(part):  # else motion in them proves nothing
+                if check_colors(part):  # else motion in them proves nothing
                     check_motion(part, known)
     return Checked(condensed(report.problems), _summary(parsed), capture)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import permutations, product
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from neeco.geometry.conventions import DVRK_ECM, OPENGL
 
 UNITS_MM = {"centimetres": 10.0, "inches": 25.4, "metres": 1000.0}
-N_BLOCKS = 12  # of frames that follow each other, whose gains count as independent
 SCALES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 2.0)
 
 
@@ -23,6 +23,7 @@ class Mistake:
     what: str  # with "{of}" where the message says whose poses they are
     remedy: str
     poses: np.ndarray
+    kind: Literal["poses", "positions", "rotations"] = "poses"  # what of the poses is wrong
 
 
 def rotation_mistakes(poses: np.ndarray) -> Iterator[Mistake]:
@@ -32,6 +33,7 @@ def rotation_mistakes(poses: np.ndarray) -> Iterator[Mistake]:
         "rotations {of} are transposed",
         "transpose them: their columns are the axes in the world",
         with_rotations(poses, rotations.transpose(0, 2, 1)),
+        "rotations",
     )
     quaternions = Rotation.from_matrix(rotations).as_quat()  # x y z w
     for step, written, read in ((-1, "w x y z", "x y z w"), (1, "x y z w", "w x y z")):
@@ -39,20 +41,29 @@ def rotation_mistakes(poses: np.ndarray) -> Iterator[Mistake]:
             f"quaternions {{of}} were written {written} and read as {read}",
             f"read them as {written}",
             with_rotations(poses, Rotation.from_quat(np.roll(quaternions, step, axis=1)).as_matrix()),
+            "rotations",
         )
+
+
+def frame_mistakes(poses: np.ndarray, world_from_camera: np.ndarray) -> Iterator[Mistake]:
+    """Instrument poses [N, 4, 4] that were inverted, or are in the frame of the cameras [N, 4, 4] (OpenCV axes)."""
+    in_camera = "poses {of} are in the camera's frame"
+    invert = "invert them: world_from_instrument is expected"
+    yield Mistake("poses {of} are instrument-from-world", invert, np.linalg.inv(poses))
+    yield Mistake(in_camera, "multiply by world_from_camera", world_from_camera @ poses)
+    in_opengl = world_from_camera @ OPENGL.poses_to_opencv(poses)
+    yield Mistake(f"{in_camera} with OpenGL axes", "multiply by transform_matrix", in_opengl)
 
 
 def placement_mistakes(poses: np.ndarray, world_from_camera: np.ndarray) -> Iterator[Mistake]:
     """Mistakes of frames, axes and units of instrument poses [N, 4, 4]; cameras [N, 4, 4] have OpenCV axes."""
-    invert = "invert them: world_from_instrument is expected"
-    yield Mistake("poses {of} are instrument-from-world", invert, np.linalg.inv(poses))
-    in_camera = "poses {of} are in the camera's frame"
-    in_opengl, in_ecm = OPENGL.poses_to_opencv(poses), DVRK_ECM.poses_to_opencv(poses)
+    yield from frame_mistakes(poses, world_from_camera)
     ecm = "the axes of the dVRK's ECM (x left, y up)"
-    half_turn = "turn them by diag(-1, -1, 1) first (`frame: ecm` in recording.yaml)"
-    yield Mistake(in_camera, "multiply by world_from_camera", world_from_camera @ poses)
-    yield Mistake(f"{in_camera} with OpenGL axes", "multiply by transform_matrix", world_from_camera @ in_opengl)
-    yield Mistake(f"{in_camera} with {ecm}", half_turn, world_from_camera @ in_ecm)
+    yield Mistake(
+        f"poses {{of}} are in the camera's frame with {ecm}",
+        "turn them by diag(-1, -1, 1) first (`frame: ecm` in recording.yaml)",
+        world_from_camera @ DVRK_ECM.poses_to_opencv(poses),
+    )
     yield Mistake(
         "poses {of} are camera-from-instrument, inverted",
         "invert them and multiply by world_from_camera",
@@ -85,6 +96,7 @@ def placement_mistakes(poses: np.ndarray, world_from_camera: np.ndarray) -> Iter
             f"positions {{of}} are about {1 / scale:.2g} times as large as in the cameras' world",
             "give both in mm: structure from motion alone does not tell the scale",
             with_positions(poses, scale),
+            "positions",
         )
 
 
@@ -113,9 +125,9 @@ def unit_mistakes(poses: np.ndarray, units: Mapping[str, float] = UNITS_MM) -> I
     """Positions of poses [N, 4, 4] in another unit than mm, or all else in it."""
     for unit, length in units.items():
         remedy = "give all lengths in mm"
-        yield Mistake(f"positions {{of}} are in {unit}", remedy, with_positions(poses, length))
+        yield Mistake(f"positions {{of}} are in {unit}", remedy, with_positions(poses, length), "positions")
         what = f"positions {{of}} are in mm, the others in {unit}"
-        yield Mistake(what, remedy, with_positions(poses, 1 / length))
+        yield Mistake(what, remedy, with_positions(poses, 1 / length), "positions")
 
 
 def turned_axes() -> Iterator[tuple[str, str, np.ndarray]]:
@@ -149,9 +161,3 @@ def with_positions(poses: np.ndarray, scale: float) -> np.ndarray:
     changed = poses.copy()
     changed[:, :3, 3] *= scale
     return changed
-
-
-def gain_certainty(gains: np.ndarray) -> float:
-    """Mean of gains [F] of frames in order, in standard errors over blocks of them."""
-    blocks = np.array([block.mean() for block in np.array_split(gains, min(N_BLOCKS, len(gains)))])
-    return float(blocks.mean() / max(blocks.std(ddof=1) / np.sqrt(len(blocks)), 1e-9))

@@ -89,7 +89,7 @@ def color_matched(image: Tensor, tissue: Tensor, weight: Tensor) -> Tensor:
     These are a linear map of each channel's light, fitted robustly to the tissue. The image itself is returned where
     its colours agree, or no map explains them.
     """
-    small = (reduced(each, 1 / BLOCK_PX).flatten(0, 1) for each in (image, tissue, weight[..., None]))
+    small = (downsampled(each, 1 / BLOCK_PX).flatten(0, 1) for each in (image, tissue, weight[..., None]))
     observed, rendered, counted = (each.clamp(0, 1) ** GAMMA for each in small)
     used = counted[:, 0] > 0.99
     for _ in range(N_TRIMMINGS):
@@ -107,12 +107,12 @@ def color_matched(image: Tensor, tissue: Tensor, weight: Tensor) -> Tensor:
     return ((image**GAMMA - offset) / gain).clamp_min(0) ** (1 / GAMMA)
 
 
-def over(color: Tensor, alpha: Tensor, tissue: Tensor) -> Tensor:
+def composite(color: Tensor, alpha: Tensor, tissue: Tensor) -> Tensor:
     """Composite a colour [h, w, 3] rendered over black, with its alpha [h, w], over tissue [h, w, 3]."""
     return color + (1 - alpha[..., None]) * tissue
 
 
-def reduced(image: Tensor, size: float) -> Tensor:
+def downsampled(image: Tensor, size: float) -> Tensor:
     """Return an image [h, w, C] at `size` times its size.
 
     Renderings are made at full size and then reduced, too: rendered small, every Gaussian is widened by as many of the
@@ -145,7 +145,7 @@ class InstrumentRenderer:
 
     def composed(self, posed: Gaussians, view: FrameView) -> Tensor:
         """Return posed instruments over a view's tissue, [h, w, 3]."""
-        return over(*self._rendered(posed, view.camera), view.tissue)
+        return composite(*self._rendered(posed, view.camera), view.tissue)
 
     def moved(self, posed: Gaussians, state: State, other: State, view: FrameView) -> Tensor:
         """Return `composed` of `other`, which differs from the `state` of `posed` by the pose of the only instrument:

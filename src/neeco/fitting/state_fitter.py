@@ -14,7 +14,15 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Frame, State
-from neeco.fitting.layers import FrameView, InstrumentRenderer, TissueRenderer, over, reduced, view_of, working_size
+from neeco.fitting.crop_rendering import (
+    FrameView,
+    InstrumentRenderer,
+    TissueRenderer,
+    composite,
+    downsampled,
+    view_of,
+    working_size,
+)
 from neeco.fitting.minimise import ImageResidual, minimise
 from neeco.fitting.parameters import StateParameters, precision_of
 from neeco.raster.types import Gaussians
@@ -41,7 +49,8 @@ class StateFit:
     state: State
     cost: float  # of pixels and prior, -log probability
     gain: float  # by how much pixels cost less than with the tissue alone; comparable between crops
-    misfit: float  # mean squared error in HUBERs per pixel of instrument, on it and close by, without foreground
+    # Huber error on and close by the instrument, without foreground, per pixel of instrument; 1: of residuals of HUBER
+    misfit: float
     information: Tensor  # [P, P] of the pixels on the parameters
     view: FrameView  # the crop about the instruments, with the shadow of `state`
 
@@ -59,19 +68,19 @@ class _CropProblem:
 
     def render(self, at: Tensor) -> tuple[Gaussians, Tensor]:
         posed = self.fitter.instruments.pose(self.fitter.parameters.moved(self.expected, at))
-        return posed, reduced(self.fitter.instruments.composed(posed, self.view), self.size)
+        return posed, downsampled(self.fitter.instruments.composed(posed, self.view), self.size)
 
     def differences(self, at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
         parameters = self.fitter.parameters
         state = parameters.moved(self.expected, at)
         # the pose of a single instrument moves all Gaussians as one
         n_rigid = 6 if len(parameters.instruments) == 1 else 0
-        for index, step in enumerate((parameters.each(*STEPS) / self.size).tolist()):
-            moved, change = at.clone(), step * parameters.inwards(state, index, step)
+        for index, step in enumerate((parameters.vector_from_degrees(*STEPS) / self.size).tolist()):
+            moved, change = at.clone(), step * parameters.step_sign(state, index, step)
             moved[index] += change
             if index < n_rigid:
                 other = parameters.moved(self.expected, moved)
-                yield reduced(self.fitter.instruments.moved(posed, state, other, self.view), self.size), change
+                yield downsampled(self.fitter.instruments.moved(posed, state, other, self.view), self.size), change
             else:
                 yield self.render(moved)[1], change
 
@@ -106,11 +115,11 @@ class Fitter(Generic[P]):
         parameters = self.parameters
         increments = torch.zeros(parameters.size, dtype=torch.float64)
         if start is not None:
-            increments = parameters.between(expected, start)
-        small = parameters.each(*SMALL_STEP)
+            increments = parameters.increments_between(expected, start)
+        small = parameters.vector_from_degrees(*SMALL_STEP)
         cost, information = math.inf, torch.zeros_like(precision)
         for level, count in zip(levels, steps, strict=True):
-            crop = self.about(view, parameters.moved(expected, increments))
+            crop = self.crop_around(view, parameters.moved(expected, increments))
             if crop is None:
                 return None
             residual = residual_of(crop, level)
@@ -124,7 +133,7 @@ class Fitter(Generic[P]):
                 if found.settled:
                     break
         state = parameters.moved(expected, increments)
-        crop = self.about(view, state)
+        crop = self.crop_around(view, state)
         if crop is None:
             return None
         crop = self.with_shadow(crop, state)
@@ -135,12 +144,12 @@ class Fitter(Generic[P]):
         """Return states, the best first, by how well they explain a view reduced to `size`."""
         residual, renderer = residual_of(view, size), self.instruments
         scored = [
-            (float(residual.errors(reduced(renderer.composed(renderer.pose(state), view), size)).sum()), k, state)
+            (float(residual.errors(downsampled(renderer.composed(renderer.pose(state), view), size)).sum()), k, state)
             for k, state in enumerate(states)
         ]
         return [state for _, _, state in sorted(scored, key=lambda item: item[:2])]
 
-    def about(self, view: FrameView, state: State, margin: float = MARGIN_PX) -> FrameView | None:
+    def crop_around(self, view: FrameView, state: State, margin: float = MARGIN_PX) -> FrameView | None:
         """Return the crop of a view about the instruments in `state`; None where they are outside."""
         box = self.instruments.box(state, view.camera, margin)
         return None if box is None else view.crop(box)
@@ -151,8 +160,8 @@ class Fitter(Generic[P]):
         if not self.tissue.shaded:
             return view
         if view.shadow_of is not None:
-            changed = self.parameters.between(view.shadow_of, state).abs()
-            if bool((changed < 2 * self.parameters.each(*STEPS)).all()):
+            changed = self.parameters.increments_between(view.shadow_of, state).abs()
+            if bool((changed < 2 * self.parameters.vector_from_degrees(*STEPS)).all()):
                 return view
         return replace(view, tissue=self.tissue.render(view.camera, state), shadow_of=state)
 
@@ -160,16 +169,18 @@ class Fitter(Generic[P]):
         """Return `gain` and `misfit` (see `StateFit`) of a state before a view that holds all of the instruments."""
         color, alpha = self.instruments.render(state, view.camera)
         residual = residual_of(view, 1.0)
-        with_it, without = (residual.errors(image).sum(2) for image in (over(color, alpha, view.tissue), view.tissue))
+        with_it, without = (
+            residual.errors(image).sum(2) for image in (composite(color, alpha, view.tissue), view.tissue)
+        )
         gain = residual.scale * float((without - with_it).sum(dtype=torch.float64))
         unexplained = (with_it > FOREGROUND_ERROR) & (without > FOREGROUND_ERROR)
         hidden = wide_areas(unexplained, round(FOREGROUND_WIDTH * view.diagonal))
         opaque = alpha * view.weight
         if float(opaque[hidden].sum()) > MAX_HIDDEN * float(opaque.sum()):
             hidden = torch.zeros_like(hidden)
-        about = widened(alpha > 0.5, round(NEIGHBOURHOOD * view.diagonal)) & ~hidden
+        near = widened(alpha > 0.5, round(NEIGHBOURHOOD * view.diagonal)) & ~hidden
         pixels = float(opaque[~hidden].sum())
-        return gain, float(with_it[about].sum()) / (0.5 * HUBER**2 * 3 * max(pixels, 1.0))
+        return gain, float(with_it[near].sum()) / (0.5 * HUBER**2 * 3 * max(pixels, 1.0))
 
 
 def wide_areas(mask: Tensor, pixels: int) -> Tensor:
@@ -188,10 +199,10 @@ def widened(mask: Tensor, pixels: int) -> Tensor:
 def residual_of(view: FrameView, size: float) -> ImageResidual:
     """Return the residual of a view reduced to `size` times its size, of the same weight at any size."""
     scale = size**-2 / (HUBER**2 * CORRELATION_PX * 3)
-    weight = torch.where(reduced(view.weight[..., None], size)[..., 0] > 0.99, 1.0, 0.0)
-    return ImageResidual(reduced(view.image, size), weight, HUBER, scale)
+    weight = torch.where(downsampled(view.weight[..., None], size)[..., 0] > 0.99, 1.0, 0.0)
+    return ImageResidual(downsampled(view.image, size), weight, HUBER, scale)
 
 
 def loose_prior(parameters: StateParameters, degrees: float, millimetres: float, joint_degrees: float) -> Tensor:
     """Return the precision [P, P] of a prior with such standard deviations; of prismatic joints 0.25 mm per degree."""
-    return precision_of(parameters.each(degrees, millimetres, joint_degrees, joint_degrees / 4))
+    return precision_of(parameters.vector_from_degrees(degrees, millimetres, joint_degrees, joint_degrees / 4))
