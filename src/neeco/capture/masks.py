@@ -18,7 +18,7 @@ MIN_LIT = 0.02  # share of an image: with fewer lit pixels it is not counted
 
 @dataclass(frozen=True)
 class Hidden:
-    """What one loss mask hides."""
+    """Content hidden by one loss mask."""
 
     pixels: float | None  # share of the lit pixels; None: too few are lit
     points: int  # projected sparse points
