@@ -8,7 +8,8 @@ import pytest
 from rich.console import Console
 
 from neeco.cli.ablate import print_tables
-from neeco.studies.ablation_study import AblationResult, AblationRow, AblationTable
+from neeco.studies.ablation_study import AblationResult
+from neeco.studies.ablation_tables import AblationRow, AblationTable
 
 MEASURES = ["psnr.test", "psnr.unseen", "mask_iou.test", "mask_iou.unseen"]
 

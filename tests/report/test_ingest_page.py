@@ -299,7 +299,7 @@ def test_without_registration_and_joints_the_page_says_so(tmp_path):
     text = (tmp_path / "page.html").read_text()
     for piece in (
         "do not meet",
-        "nothing can be drawn over",
+        "nothing can be overlaid",
         "No joint was read",
         "left out: its poses",
         "proportions only",

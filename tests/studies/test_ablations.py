@@ -18,19 +18,15 @@ from neeco.report.study_pages import write_ablation_report
 from neeco.settings import plain
 from neeco.studies import ablation_study, training_job
 from neeco.studies.ablation_study import (
-    ablation_csv,
-    agreement,
     chosen_ablations,
     direction,
     distinct_variants,
-    grid,
-    markdown,
     phase_1_psnr,
     psnr_at,
     run_ablations,
     table_of,
-    write_tables,
 )
+from neeco.studies.ablation_tables import ablation_csv, agreement, grid, markdown, write_tables
 from neeco.studies.ablations import CHECKPOINTS, AblationPlan, Derived, Variant, all_ablations
 from neeco.studies.derived import derive_capture
 from neeco.studies.tables import latex_table

@@ -30,7 +30,7 @@ def run(plan: AblationPlan) -> int:
 
 def print_tables(console: Console, ablation: AblationResult) -> None:
     """Print how many of the paper's directions hold, our tables in full, then the notes."""
-    from neeco.studies.ablation_study import agreement, grid
+    from neeco.studies.ablation_tables import agreement, grid
 
     for table in ablation.tables:
         if table.judged:

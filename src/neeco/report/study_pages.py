@@ -20,15 +20,8 @@ from neeco.files import write_text
 from neeco.labels.drawing import draw
 from neeco.report.charts import Series, binned, legend, line_chart
 from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
-from neeco.studies.ablation_study import (
-    EVEN_DB,
-    AblationResult,
-    AblationTable,
-    ablation_csv,
-    agreement,
-    grid,
-    primary_split,
-)
+from neeco.studies.ablation_study import EVEN_DB, AblationResult, primary_split
+from neeco.studies.ablation_tables import AblationTable, ablation_csv, agreement, grid
 from neeco.studies.ablations import PHASE_1_SHARE, PUBLISHED_STEPS, all_ablations
 from neeco.studies.comparison import (
     MASK_METRICS,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.method_registry import method_settings
 from neeco.settings import plain
+from neeco.studies.ablation_tables import AblationRow, AblationTable, Values, write_tables
 from neeco.studies.ablations import (
     CHECKPOINTS,
     PHASE_1_SHARE,
@@ -36,17 +36,6 @@ from neeco.studies.derived import derive_capture
 from neeco.studies.machine import machine
 from neeco.studies.masks import LabelScores, score_label_ways
 from neeco.studies.study import JobEvent, Result, check_workers, run_jobs
-from neeco.studies.tables import (
-    UNKNOWN,
-    Cell,
-    Column,
-    ResultTable,
-    Row,
-    csv_text,
-    latex_table,
-    markdown_table,
-    write_files,
-)
 from neeco.studies.training_job import (
     CURVE_FILE,
     Budget,
@@ -67,43 +56,6 @@ INITIAL_SHARE = 0.25  # of the tissue's budget: density control can only differ 
 MIN_KINEMATIC_STEPS = 1_000  # steps: the shaft starts to spin and joints to learn after 600
 EVEN_DB = 0.1  # smaller differences do not count as a direction
 FINAL_SCORES = ("psnr", "psnr_instrument", "mask_iou")
-HEADINGS = {
-    "phase_1_psnr": "phase-1 training PSNR",
-    "psnr": "PSNR",
-    "psnr_instrument": "instrument PSNR",
-    "mask_iou": "mask IoU",
-}
-
-Values = dict[str, float | None]  # by measure; empty where the run failed
-
-
-@dataclass(frozen=True, kw_only=True)
-class AblationRow:
-    """One setting of a table: its numbers by measure, the paper's, and how both differ from the reference's."""
-
-    comparison: str
-    label: str
-    reference: bool  # what the others of its comparison are measured against
-    run: str
-    values: Values
-    paper: dict[str, float]
-    paper_direction: str  # "worse" where the paper shows it in a figure without numbers
-    difference: Values
-    agrees: dict[str, str | None]  # of each judged measure: do ours and the paper's differ in the same direction
-
-
-@dataclass(frozen=True, kw_only=True)
-class AblationTable:
-    """A table with its numbers. `judged`, `measures`: those compared with the paper, and all that are shown."""
-
-    name: str
-    group: str
-    title: str
-    question: str
-    judged: list[str]
-    measures: list[str]
-    rows: list[AblationRow]
-    curves: list[dict[str, Any]]  # held-out PSNR over the run: {comparison, label, iteration, progress, psnr}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -420,93 +372,3 @@ def psnr_at(curve: Sequence[Mapping[str, Any]], split: str, share: float) -> flo
     """Held-out PSNR (dB) when `share` of the run was done; None where the curve has no row so near as 5 % of it."""
     rows = [row for row in curve if row["split"] == split and abs(row["progress"] - share) < 0.05]
     return min(rows, key=lambda row: abs(row["progress"] - share))["psnr"] if rows else None
-
-
-def write_tables(output: Path, tables: Sequence[AblationTable]) -> None:
-    """Write DIR/tables/NAME.csv, .md and .tex for every table."""
-    for table in tables:
-        texts = {"csv": ablation_csv(table), "md": markdown(table), "tex": latex_table(grid(table), table.title)}
-        write_files(output / "tables", table.name, texts)
-
-
-def heading(measure: str) -> str:
-    """A measure in words, e.g. `test PSNR at 40 %`."""
-    score, _, split = measure.partition(".")
-    if score.startswith("psnr_at_"):
-        return f"{split} PSNR at {score.removeprefix('psnr_at_')} %"
-    return f"{split} {HEADINGS[score]}".strip()
-
-
-def formatted(measure: str, value: float | None, *, signed: bool = False) -> str:
-    """A number as the tables show it: dB with two digits, IoU with three; `-` when not known."""
-    if value is None:
-        return UNKNOWN
-    digits = 3 if measure.startswith("mask_iou") else 2
-    return f"{value:{'+' if signed else ''}.{digits}f}"
-
-
-def grid(table: AblationTable) -> ResultTable:
-    """A table for reading: per judged measure the paper's number, ours and whether they agree; the rest as ours alone.
-
-    What is compared has a column of its own where it is not the same in all rows.
-    """
-    several = len({row.comparison for row in table.rows}) > 1
-    columns = []
-    for measure in table.measures:
-        titles = [f"{heading(measure)}: paper", "ours", "agrees"] if measure in table.judged else [heading(measure)]
-        columns += [Column(measure, title) for title in titles]
-    rows = []
-    for row in table.rows:
-        cells = [text for measure in table.measures for text in _cells(row, measure, measure in table.judged)]
-        keys = (row.comparison, row.label) if several else (row.label,)
-        rows.append(Row(keys, tuple(map(Cell, cells)), reference=row.reference))
-    return ResultTable(table.title, ("", "setting") if several else ("setting",), tuple(columns), tuple(rows))
-
-
-def _cells(row: AblationRow, measure: str, judged: bool) -> list[str]:
-    """Our number with its difference from the reference; where judged, after the paper's and before the verdict."""
-    ours = formatted(measure, row.values.get(measure))
-    if (difference := row.difference.get(measure)) is not None:
-        ours += f" ({formatted(measure, difference, signed=True)})"
-    if not judged:
-        return [ours]
-    paper = formatted(measure, row.paper.get(measure))
-    agrees = "" if row.reference else row.agrees.get(measure) or UNKNOWN
-    return [row.paper_direction if paper == UNKNOWN and row.paper_direction else paper, ours, agrees]
-
-
-def agreement(table: AblationTable) -> str:
-    """Return how many of the paper's directions ours shows, in words; "" for a table that judges nothing."""
-    counts = Counter(agrees for row in table.rows for agrees in row.agrees.values())
-    if not counts:
-        return ""
-    words = {"even": "even", "no": "the other way", None: "not known"}
-    others = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
-    return ", ".join([f"{counts['yes']} of {counts.total()} as in the paper", *others])
-
-
-def ablation_csv(table: AblationTable) -> str:
-    """One line per setting and measure: every number in full."""
-    rows = [
-        {
-            "table": table.name,
-            "comparison": row.comparison,
-            "setting": row.label,
-            "run": row.run,
-            "measure": measure,
-            "paper": row.paper.get(measure),
-            "ours": row.values.get(measure),
-            "difference": row.difference.get(measure),
-            "agrees": row.agrees.get(measure),
-        }
-        for row in table.rows
-        for measure in dict.fromkeys([*table.measures, *row.values])
-    ]
-    return csv_text(list(rows[0]), rows)
-
-
-def markdown(table: AblationTable) -> str:
-    """A Markdown table under its title."""
-    title, empty, *lines = markdown_table(grid(table))
-    directions = ["", f"Directions: {agreement(table)}."] if table.judged else []
-    return "\n".join([title, empty, table.question, "", *lines, *directions]) + "\n"
