@@ -27,7 +27,7 @@ from neeco.files import read_json, require_like, write_json
 from neeco.geometry.camera import Camera
 from neeco.labels.labellers import (
     DELTAS,
-    THRESHOLD_STATES,
+    N_THRESHOLD_STATES,
     DeltaThresholds,
     ThresholdLabels,
     delta_magnitudes,
@@ -82,7 +82,7 @@ def mean_iou(views: Sequence[View], origin: str, thresholds: DeltaThresholds) ->
 def mean_deltas(scene: GaussianScene) -> Deltas:
     """Each Gaussian's mean change from canonical over recorded states."""
     states = scene.recorded.states
-    found = [scene.deltas(states[k]) for k in evenly_spaced(len(states), THRESHOLD_STATES, floor=True)]
+    found = [scene.deltas(states[k]) for k in evenly_spaced(len(states), N_THRESHOLD_STATES, floor=True)]
     return Deltas(*(torch.stack([getattr(deltas, kind) for deltas in found]).mean(0) for kind in DELTAS))
 
 

@@ -21,21 +21,22 @@ from typing import Any
 import torch
 
 from neeco.capture.checks import read_checked
-from neeco.raster import losses, native, posing, shadow
+from neeco.raster import articulated, cpu_backend, losses, shadow
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.raster.optimizer import Adam
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 from neeco.training import session as steps
 from neeco.training.initial import begin_session
 from neeco.training.run import read_checkpoint, read_config, restore_session, stored_config
 
 PARTS: list[tuple[Any, str, str]] = [
-    (steps.Scene, "at", "Scene.at beside posing"),
-    (native._Rasterize, "forward", "drawing, shadow maps too"),
-    (native._Rasterize, "backward", "drawing, backward"),
+    (GaussianScene, "at", "GaussianScene.at without posing"),
+    (cpu_backend._Rasterize, "forward", "rasterizing, shadow maps too"),
+    (cpu_backend._Rasterize, "backward", "rasterizing, backward"),
     (shadow, "blocked", "shadows"),
     (shadow._Blocked, "backward", "shadows, backward"),
-    (posing._Pose, "backward", "posing, backward"),
+    (articulated._Pose, "backward", "posing, backward"),
     (losses._Photometric, "forward", "loss with its gradient"),
     (torch.Tensor, "backward", "autograd"),
     (steps.GaussianSession, "_regularisation", "regularisation"),

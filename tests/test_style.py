@@ -16,6 +16,7 @@ MAX_POSITIONAL = 6  # arguments of a call, fields of a dataclass
 POSITIONAL_ONLY = ("native().", "_Pose.apply", "struct.pack")
 TRITON = "neeco.raster.triton"  # kernels, whose arguments are addresses and strides
 
+FRAGMENTS = {"What", "How", "Where", "Which", "Of", "As", "By", "From", "With", "In"}
 PUBLIC_LONG = {"neeco.geometry.camera.Camera"}  # dataclasses that users call by position
 PRIVATE_IN_TESTS = {  # at most ten
     "_bagfile",
@@ -147,6 +148,25 @@ def test_tests_use_only_the_private_names_listed() -> None:
 def test_a_private_import_is_found(source: str, found: list[str]) -> None:
     known = {"neeco.capture._motion", "neeco.ingest._steps", "neeco.scene.gaussian_scene"}
     assert list(private_imports(ast.parse(source), "neeco.ingest.pipeline", known)) == found
+
+
+def fragments(tree: ast.Module) -> Iterator[str]:
+    """Docstrings whose first word begins no sentence and names no thing, `line: first line`."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            continue
+        text = ast.get_docstring(node) or "Nothing"
+        if text.split()[0] in FRAGMENTS:
+            yield f"{getattr(node, 'lineno', 1)}: {text.splitlines()[0]}"
+
+
+def test_a_docstring_begins_with_a_verb_or_names_its_result() -> None:
+    assert [f"{name}:{item}" for name, tree in TREES.items() for item in fragments(tree)] == []
+
+
+def test_a_fragment_is_found() -> None:
+    source = 'def f():\n    """What f finds."""\ndef g():\n    """Return what g finds."""'
+    assert list(fragments(ast.parse(source))) == ["1: What f finds."]
 
 
 def test_long_calls_and_dataclasses_are_found() -> None:

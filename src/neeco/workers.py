@@ -213,7 +213,7 @@ def _visible_gpu(slot: int) -> str:
 
 
 def _serve(function: TaskFunction, shared: Any, threads: int, connection: Connection, gpu: str | None) -> None:
-    """In a worker: do the tasks until the connection is closed.
+    """Do the tasks in a worker until the connection is closed.
 
     Ctrl-C reaches the whole group of processes: the one that was started decides, and interrupts by SIGTERM.
     """
@@ -233,7 +233,7 @@ def _serve(function: TaskFunction, shared: Any, threads: int, connection: Connec
 
 
 def _exit_with_parent() -> None:
-    """In a worker: exit at once when the parent was killed, so as not to write while its successor does."""
+    """Exit a worker at once when its parent was killed, so that it does not write while its successor does."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -293,7 +293,7 @@ class RayTasks:
 
 
 def work_on_node(function: TaskFunction, shared: Any, task: Any, threads: int, folder: str) -> Any:
-    """In a cluster's worker: do the task, whose paths may be relative to `folder`, with the GPU that Ray gave it."""
+    """Do the task in a cluster's worker, its paths relative to `folder`, with the GPU that Ray assigned."""
     import ray
 
     if own := ray.get_runtime_context().get_accelerator_ids().get("GPU"):

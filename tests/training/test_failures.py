@@ -18,10 +18,10 @@ from safetensors.torch import save_file
 
 import neeco.files
 import neeco.training.session
-from neeco.capture.checks import inspection as check
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY
+from neeco.training import train as training
 from neeco.training.config import training_config
 from neeco.training.run import checkpoint_path, load_run, read_checkpoint
 from neeco.training.train import ProgressRow, train
@@ -155,14 +155,14 @@ def test_a_run_is_read_from_its_own_folder_alone(capture: Path, tmp_path: Path) 
 def test_a_frame_that_becomes_unreadable_after_the_check_is_named(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    real = check.inspect_capture
+    real = training.read_checked
 
     def check_then_break(*args: object, **options: object):
-        problems = real(*args, **options)
+        read = real(*args, **options)
         (capture / "images/000003.png").write_bytes(b"a disk gone bad")
-        return problems
+        return read
 
-    monkeypatch.setattr(check, "inspect_capture", check_then_break)
+    monkeypatch.setattr(training, "read_checked", check_then_break)
     assert (
         main(["train", str(capture), "--output", str(tmp_path / "run"), "--method", "3dgs", "--iterations", "60"]) == 1
     )

@@ -1,4 +1,4 @@
-"""From a recording (video and logs) to a capture; `pipeline.py` states the stages.
+"""Captures made from recordings (video and logs); `pipeline.py` states the stages.
 
 Folders, from the last stage back to the first; each imports only from those after it: posing, registration, shaft,
 cameras, foreground, frames, timing, recording, readers, calibration.

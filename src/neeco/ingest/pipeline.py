@@ -1,4 +1,4 @@
-"""From a recording to a capture, in stages that take and return frozen values:
+"""A recording becomes a capture, in stages that take and return frozen values:
 
     read            recordings  -> Episodes       logs and video on one timeline, with the clocks that are given
     choose frames   Episodes    -> ChosenImages   sharp frames that differ, undistorted, without a dark border

@@ -1,4 +1,4 @@
-"""What goes into `rasterize` and what comes out."""
+"""Inputs and outputs of `rasterize`."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ PAGE = "ingest.html"
 
 @dataclass(frozen=True)
 class Ingested:
-    """What `ingest` made: the capture in folder `output`, and how far it can be trusted.
+    """Result of `ingest`: the capture in folder `output`, and its verdict.
 
     The report and the verdict on every tissue are by its name, "" where recordings name none; a folder converted from
     another format has none, but `notes` on what it lacks."""

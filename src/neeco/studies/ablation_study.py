@@ -198,7 +198,7 @@ def _paper_settings(iterations: int) -> tuple[str, ...]:
 
 
 def _with_room_to_grow(config: TrainConfig) -> TrainConfig:
-    """With INITIAL_SHARE of the tissue's budget: were it full of sparse points, density control could do nothing."""
+    """Start with INITIAL_SHARE of the tissue's budget: density control cannot change a tissue full of sparse points."""
     if config.initial_points is not None:
         return config
     return replace(

@@ -264,7 +264,7 @@ def _run_in_workers(jobs: Sequence[Job], workers: int, report: Callable[[JobEven
 
 
 def _run_in_worker(_: None, job: Job, threads: int) -> Result:
-    """In a worker: run the job with so many threads."""
+    """Run the job in a worker with so many threads."""
     set_threads(threads)
     torch.set_num_threads(threads)
     keep_freed_memory()

@@ -65,7 +65,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """What the row is of (as many keys as the table has), its cells, or why there are none."""
+    """The row's keys (as many as the table has), its cells, or the reason for their absence."""
 
     keys: tuple[str, ...]
     cells: tuple[Cell, ...]
@@ -85,7 +85,7 @@ class ResultTable:
 
 @dataclass(frozen=True)
 class SummaryRow:
-    """What a row is of, its numbers by column key as `study.spread` gives them, and why there are none."""
+    """A row's keys, its numbers by column key as `study.spread` gives them, and the reason for their absence."""
 
     keys: tuple[str, ...]
     numbers: Mapping[str, Any]

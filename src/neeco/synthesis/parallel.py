@@ -103,7 +103,7 @@ def _write_bytes(content: bytes, path: Path) -> None:
 def _draw(
     shared: tuple[GeneratorSpec | PackedSpec, Path | None], indices: tuple[int, ...], threads: int
 ) -> list[tuple[Record, dict[str, bytes]]]:
-    """In a worker: render these images; returns their records, and their files unless it wrote them to the output."""
+    """Render these images in a worker; return their records, and their files unless it wrote them to the output."""
     spec, output = shared
     with readable_failures():
         generator = _opened(spec, threads)

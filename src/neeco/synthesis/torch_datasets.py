@@ -67,7 +67,7 @@ Transform = Callable[[Sample], Sample]
 
 
 class HasLearned(Protocol):
-    """What `neeco.Scene` is here."""
+    """The part of `neeco.Scene` that data sets need."""
 
     @property
     def learned(self) -> DrawableScene:
@@ -75,7 +75,7 @@ class HasLearned(Protocol):
 
 
 class HasTrained(Protocol):
-    """What `neeco.Run` is here."""
+    """The part of `neeco.Run` that data sets need."""
 
     @property
     def trained(self) -> TrainedRun:

@@ -51,11 +51,11 @@ class CameraArrays:
             return *project(local, fx, fy, cx, cy, nearest=MIN_DEPTH), local[..., 2]
 
     def inside(self, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """Which of the projected points are in the images, bool [F, P]."""
+        """Return which projected points are in the images, bool [F, P]."""
         width, height = self.sizes.T[..., None]
         with np.errstate(invalid="ignore"):
             return (depth > MIN_DEPTH) & (u > 0) & (u < width) & (v > 0) & (v < height)
 
     def sees(self, points: np.ndarray) -> np.ndarray:
-        """Which camera has which of points [F, P, 3] or [1, P, 3] in its image, bool [F, P]."""
+        """Return which of points [F, P, 3] or [1, P, 3] each camera has in its image, bool [F, P]."""
         return self.inside(*self.project(points))

@@ -99,7 +99,7 @@ def _same_view(one: Camera, other: Camera) -> bool:
 
 @dataclass(frozen=True)
 class _Decoded:
-    """What decoding one frame's files found."""
+    """Result of decoding one frame's files."""
 
     digest: bytes | None  # of the pixels; None when not readable
     grey: np.ndarray | None  # uint8 [h, w], every few pixels

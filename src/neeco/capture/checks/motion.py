@@ -43,7 +43,7 @@ MIN_TRAVEL = 0.055  # of the image's width: the poses of any frame explain an in
 
 
 class _Threshold(NamedTuple):
-    """By how much poses without a mistake must explain more than those given."""
+    """Margin by which poses without a mistake must explain more than the given ones."""
 
     factor: float  # on the mean evidence
     certainty: float  # standard errors over blocks of frames
@@ -77,7 +77,7 @@ class _PoseHypothesis:
 
 @dataclass(frozen=True)
 class MotionFault:
-    """How the images contradict an instrument's states, the field of these, and what to do."""
+    """Contradiction between the images and an instrument's states: the field of these, and the remedy."""
 
     field: str
     message: str
@@ -87,7 +87,7 @@ class MotionFault:
 
 @dataclass(frozen=True)
 class MotionVerdict:
-    """What the images say of an instrument's states: a fault, or support; neither where too little moves."""
+    """Evidence of the images on an instrument's states: a fault, or support; neither where too little moves."""
 
     fault: MotionFault | None
     supported: bool
@@ -169,7 +169,7 @@ def evidence_by_chance(motion: MotionEvidence, poses: np.ndarray, available: np.
 
 
 def _fault(judged: _Judged, given: float) -> MotionFault | None:
-    """How the images contradict an instrument's states, of mean evidence `given`; None where they do not."""
+    """Return how the images contradict an instrument's states of mean evidence `given`; None where they do not."""
     name, motion = printable(judged.instrument.name), judged.motion
     found = _likeliest_mistake(judged)
     if found is not None:

@@ -36,7 +36,7 @@ ALL_IN_MM = "give all lengths in mm"
 
 @dataclass(frozen=True)
 class _Extent:
-    """Where the points are and how far the cameras are from them, robust against outliers."""
+    """Position of the points and the cameras' distance from them, robust against outliers."""
 
     cameras: CameraArrays
     points: np.ndarray  # [P, 3], a sample

@@ -255,7 +255,7 @@ def _points_of(node: Node, folder: Path, root: Path) -> tuple[PointCloud | None,
 
 
 class _Splits:
-    """Which split each frame belongs to: its own word, else nerfstudio's lists, else every 8th is test."""
+    """Return the split of each frame: its own, else by nerfstudio's lists, else every 8th is test."""
 
     def __init__(self, document: Node, split: str | None) -> None:
         self.fixed = split

@@ -193,7 +193,7 @@ def parallax(model: pycolmap.Reconstruction) -> float:
 
 
 def save_matches(job: dict[str, Any], database: Path, path: Path) -> None:
-    """Where features of pairs of images that were matched lie in both: rows of pair, x, y, x', y' px."""
+    """Matched features of pairs of images: rows of pair, x, y, x', y' px."""
     opened = pycolmap.Database.open(str(database))
     number = {image.name: image.image_id for image in opened.read_all_images()}
     rows = []

@@ -1,1 +1,1 @@
-"""What a recording consists of: recording.yaml and the files it names."""
+"""Recordings: recording.yaml and the files it names."""

@@ -1,4 +1,4 @@
-"""Which recordings make one capture, and what each is called in it."""
+"""Selection of the recordings that make one capture, and their names in it."""
 
 from __future__ import annotations
 

@@ -214,7 +214,7 @@ def _links(node: Node) -> KinematicTree | None:
 
 @dataclass(frozen=True, kw_only=True)
 class BasesSection:
-    """Where a base stands to a still camera, or to the tracker of a scope that moves; one of the two."""
+    """Pose of a base relative to a still camera, or to the tracker of a scope that moves; one of the two."""
 
     camera_from_base: Annotated[StatedBase, parse_base] | None = None
     world_from_base: Annotated[StatedBase, parse_world_base] | None = None

@@ -149,7 +149,7 @@ class StereoPartner:
 
 @dataclass(frozen=True)
 class Recording:
-    """What was recorded. path: the file that states it (for messages); source: the frames; intrinsics: a calibration
+    """A recording. path: the file that states it (for messages); source: the frames; intrinsics: a calibration
     file, (fl_x, fl_y, cx, cy) px or None (the file's own, else estimated); sync: t_log = t_video + offset s of each
     clock that is known; frames: how many to keep; camera: STILL, MOVING or None (to be detected); episodes: by number,
     those of its data set that are meant instead of the one that its streams name; episode: what this one of several is

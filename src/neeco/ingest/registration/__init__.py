@@ -1,1 +1,1 @@
-"""Where trackers, robots' bases and clocks stand to the cameras."""
+"""Registration of trackers, robots' bases and clocks to the cameras."""

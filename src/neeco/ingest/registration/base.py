@@ -301,7 +301,7 @@ def _unmoved(name: str) -> str:
 
 
 def _moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, float]:
-    """How far a base is from a given one, at the instrument's mean position [3] mm in its frame."""
+    """Distance between a base and a given one, at the instrument's mean position [3] mm in its frame."""
     shift = (base[:3, :3] - given[:3, :3]) @ middle + base[:3, 3] - given[:3, 3]
     turn = Rotation.from_matrix(base[:3, :3] @ given[:3, :3].T).magnitude()
     return {"moved_mm": float(np.linalg.norm(shift)), "turned_deg": float(np.degrees(turn))}

@@ -169,7 +169,7 @@ def sides(problem: SilhouetteProblem, fit: SilhouetteFit) -> Sides:
 
 
 def reach(problem: SilhouetteProblem, fit: SilhouetteFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How far the instrument reaches along its line in the images [F] px; these directions [F, 2]; and the derivatives
+    """Extent of the instrument along its line in the images [F] px; these directions [F, 2]; and the derivatives
     [F, E] px/mm by `ends`.
 
     The tip's surroundings reach along a direction as far as their support function says, which depends on the angle

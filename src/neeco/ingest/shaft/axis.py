@@ -122,7 +122,7 @@ def edge_distances(axes: ShaftAxes, edges: ShaftEdges, radius: float, intrinsics
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShaftVideo:
-    """What all frames share: world_from_camera [F, 4, 4], in units of which one is `ShaftAxes.scale` mm; times [F] s;
+    """Data of all frames: world_from_camera [F, 4, 4], in units of which one is `ShaftAxes.scale` mm; times [F] s;
     episodes [F]: motion is smooth within each; radius mm; trocar: is there a fixed one; scaled: is that unit mm, so
     that the scale is 1."""
 

@@ -154,6 +154,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return hinge_joints(instrument, joints, frames, report) if settings.kinematics else joints
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
+        """Pose every instrument as an articulated body: its readings become joint values, these move its links."""
         roll = perturbation.shaft_roll if isinstance(perturbation, Spin) else 0.0
         bodies: list[ArticulatedBody | None] = [None]  # tissue is no articulated body
         for instrument, articulation in zip(self.instruments, self.articulations, strict=True):

@@ -222,7 +222,7 @@ class Template(nn.Module):
         return nn.functional.softplus(density - 1), torch.sigmoid(color)
 
     def condition(self, directions: Tensor, appearance: Tensor) -> Tensor:
-        """What is the same for all samples of a ray [R, V]."""
+        """Inputs [R, V] that all samples of a ray share."""
         unit = nn.functional.normalize(directions, dim=-1)
         return torch.cat([encode_by_octave(unit, self.view_frequencies), appearance], -1)
 
@@ -244,7 +244,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class Composite:
-    """What R rays of S samples look like."""
+    """Appearance of R rays with S samples each."""
 
     color: Tensor  # [R, 3]
     alpha: Tensor  # [R], without the sample at infinity

@@ -99,7 +99,7 @@ def geman_mcclure(squared: Tensor, scale: float = 0.03) -> Tensor:
 
 
 def elastic_loss(jacobians: Tensor, scale: float = 0.03) -> Tensor:
-    """How far the warp's Jacobians [M, 3, 3] are from rotations [M]: robust sum of squared log singular values
+    """Deviation [M] of the warp's Jacobians [M, 3, 3] from rotations: robust sum of squared log singular values
     (Nerfies eq. 11-13)."""
     values = torch.linalg.svdvals(jacobians).clamp_min(1e-6)
     return geman_mcclure(values.log().square().sum(-1), scale)

@@ -385,7 +385,7 @@ def pose_sums_kernel(sums, numbers, to_numbers, programs, WIDTH: tl.constexpr, P
 
 @triton.jit
 def entry_terms(place, row, column: tl.constexpr, to_entry):
-    """Where, with which sign, a gradient of an entry of Shepperd's matrix goes in the pose (rows of four)."""
+    """Row, column and sign with which a gradient of an entry of Shepperd's matrix goes in the pose (rows of four)."""
     low, high = tl.minimum(row, column), tl.maximum(row, column)
     i, j = place // 4, place % 4
     turns = (i < 3) & (j < 3)

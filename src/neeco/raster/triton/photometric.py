@@ -36,7 +36,7 @@ def place_of(numbers, width, BLOCK: tl.constexpr):
 
 @triton.jit
 def weight_of(k: tl.constexpr):
-    """Of the window's tap k."""
+    """Weight of the window's tap k."""
     return E ** (0.0 - (k - REACH) * (k - REACH) / SPREAD) / NORM
 
 
@@ -185,7 +185,7 @@ def factor(table, k: tl.constexpr, tensor, SLOTS: tl.constexpr):
 
 @triton.jit
 def numbers_at(address):
-    """What an address points to."""
+    """Return the value at an address."""
     return address.to(tl.pointer_type(tl.float32))
 
 
@@ -232,7 +232,7 @@ def step_together(
 def _table(
     tensors: Sequence[Tensors], rates: Sequence[tuple[float, int]], betas: tuple[float, float]
 ) -> tuple[Tensor, int]:
-    """What the kernel reads, [FIELDS, SLOTS] int64, and the number of programs. Slots left over begin behind the
+    """Return the kernel's table [FIELDS, SLOTS] int64 and the number of programs. Slots left over begin behind the
     last."""
     first, rows, factors = 0, [], []
     for four, (rate, step) in zip(tensors, rates, strict=True):

@@ -26,7 +26,7 @@ def interpreted() -> bool:
 
 
 def missing(device: torch.device) -> str | None:
-    """Return what Triton lacks to render on `device`, as far as is known without trying, with the remedy, or None."""
+    """Return what Triton lacks on `device`, as far as is known without trying, and the remedy; None: nothing."""
     if not installed():
         return "package triton is missing; on Linux pip install 'neeco[triton]', or draw on the CPU"
     if interpreted():
