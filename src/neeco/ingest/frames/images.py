@@ -21,7 +21,7 @@ from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visibl
 from neeco.ingest.frames.views import StageProgress, Views
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import MIN_FRAMES
-from neeco.ingest.timing.episodes import CoverageStates, Episodes
+from neeco.ingest.timing.episodes import Episodes
 
 N_NEIGHBOURS = 7  # frames on each side, whose sharpness a frame is compared with
 NOISE = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
@@ -66,13 +66,12 @@ def frame_features(images: Iterable[np.ndarray]) -> FrameFeatures:
     return FrameFeatures(np.array(sharpness), np.array(thumbnails), np.array(repeats))
 
 
-def frozen_frames(features: FrameFeatures, usable: np.ndarray, states: CoverageStates) -> np.ndarray:
+def frozen_frames(features: FrameFeatures, usable: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Return the frames whose picture repeats an earlier one, though the state changed since; see `choose_frames`."""
-    rows = np.arange(len(usable))
-    source = np.maximum.accumulate(np.where(features.repeats, 0, rows))
-    moved_mm, turned_rad = states.changes(rows, source)
-    changed = (moved_mm > VISIBLE_MM) | (turned_rad > VISIBLE_RAD)
-    return np.flatnonzero(changed & usable & usable[source])
+    source = np.maximum.accumulate(np.where(features.repeats, 0, np.arange(len(states))))
+    change = states - states[source]
+    moved = (np.linalg.norm(change[:, :3], axis=1) > VISIBLE_MM) | (np.linalg.norm(change[:, 3:], axis=1) > VISIBLE_RAD)
+    return np.flatnonzero(moved & usable & usable[source])
 
 
 def describe_ranges(frames: np.ndarray) -> str:
@@ -83,11 +82,12 @@ def describe_ranges(frames: np.ndarray) -> str:
 
 
 def choose_frames(
-    features: FrameFeatures, usable: np.ndarray, states: CoverageStates, count: int, min_sharpness: float
+    features: FrameFeatures, usable: np.ndarray, states: np.ndarray, count: int, min_sharpness: float
 ) -> tuple[np.ndarray, dict[int, DropReason]]:
     """Choose at most `count` sharp frames that differ, spread over states and views; return them, and why not others.
 
-    usable [N] bool: frames with a known state (the others are dropped); min_sharpness: of the neighbours' median.
+    usable [N] bool: frames with a known state (the others are dropped); states [N, 6+J]: position mm, rotation vector
+    rad, joints rad of the instrument; min_sharpness: of the neighbours' median.
     """
     dropped = {int(i): DropReason("no instrument state at its time") for i in np.flatnonzero(~usable)}
     frozen = DropReason("frozen: the state changed, not the picture")
@@ -114,29 +114,20 @@ def choose_frames(
     return selected, dropped
 
 
-def _same(features: FrameFeatures, states: CoverageStates, a: int, b: int) -> bool:
-    (moved,), (turned,) = states.changes(np.array([a]), np.array([b]))
+def _same(features: FrameFeatures, states: np.ndarray, a: int, b: int) -> bool:
+    moved, turned = np.linalg.norm(states[a, :3] - states[b, :3]), np.linalg.norm(states[a, 3:] - states[b, 3:])
     changes = np.abs(features.thumbnails[a] - features.thumbnails[b])
-    if not states.known and changes.max() > NOISE_PLACE:  # no state is known yet, and something small moved
+    if not states.any() and changes.max() > NOISE_PLACE:  # no state is known yet, and something small moved
         return False
     return bool(changes.mean() < NOISE and moved < NOISE_MM and turned < NOISE_RAD)
 
 
-def _embedding(features: FrameFeatures, states: CoverageStates) -> np.ndarray:
-    """Return state, main components of the view, and time (SfM needs neighbours) [N, D].
-
-    Each column has unit spread, but the nine of a rotation count as three.
-    """
-    pictures = features.thumbnails.reshape(len(features.thumbnails), -1)
+def _embedding(features: FrameFeatures, states: np.ndarray) -> np.ndarray:
+    """Return state, main components of the view, and time (SfM needs neighbours) [N, D], each of unit spread."""
+    pictures = features.thumbnails.reshape(len(states), -1)
     pictures = pictures - pictures.mean(0)
     basis = np.linalg.svd(pictures[:: max(1, len(pictures) // 400)], full_matrices=False)[2][:3]
-    time = np.arange(len(pictures))[:, None]
-    others = np.concatenate([states.positions_mm, states.joints, pictures @ basis.T, time], 1)
-    return np.concatenate([_unit_spread(others), _unit_spread(states.rotations) / np.sqrt(3)], 1)
-
-
-def _unit_spread(columns: np.ndarray) -> np.ndarray:
-    """Return the columns [N, D] that vary, each with standard deviation 1."""
+    columns = np.concatenate([states, pictures @ basis.T, np.arange(len(states))[:, None]], 1)
     spread = columns.std(0)
     return columns[:, spread > 1e-9] / spread[spread > 1e-9]
 
@@ -300,7 +291,7 @@ def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[i
 
     features = frame_features(images())
     states, usable = data.coverage_states()
-    known = states.known  # else the clocks are found later, by frames that are not frozen
+    known = states.any()  # else the clocks are found later, by frames that are not frozen
     frozen = frozen_frames(features, usable, states) if known else np.flatnonzero(features.repeats)
     if len(frozen) >= (1 if known else MIN_REPEATED):
         why = (

@@ -108,42 +108,6 @@ class Episode:
 
 
 @dataclass(frozen=True, eq=False)
-class CoverageStates:
-    """States of V frames to choose them by, of the instruments and joints whose clocks are known. 0 where a log has a
-    gap."""
-
-    positions_mm: np.ndarray  # [V, 3 I]
-    rotations: np.ndarray  # [V, 9 I] entries of the rotation matrices
-    joints: np.ndarray  # [V, J] rad (mm of prismatic ones)
-
-    @classmethod
-    def concatenated(cls, parts: Sequence[CoverageStates]) -> CoverageStates:
-        """Return the states of all parts in order; none where a clock is known in some of the parts only."""
-        widths = {(part.positions_mm.shape[1], part.joints.shape[1]) for part in parts}
-        if len(widths) > 1:
-            count = sum(len(part.joints) for part in parts)
-            return cls(*(np.zeros((count, 0)) for _ in range(3)))
-        return cls(
-            np.concatenate([part.positions_mm for part in parts]),
-            np.concatenate([part.rotations for part in parts]),
-            np.concatenate([part.joints for part in parts]),
-        )
-
-    @property
-    def known(self) -> bool:
-        """Whether they tell frames apart."""
-        return bool(self.positions_mm.any() or self.rotations.any() or self.joints.any())
-
-    def changes(self, rows: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return by how much the states of frames [F] differ from those of others [F]: mm, and rad of turns and joints
-        together."""
-        moved = self.positions_mm[rows] - self.positions_mm[others]
-        turned = (self.rotations[rows] - self.rotations[others]) / np.sqrt(2)  # matrices: sqrt(2) times a small angle
-        bent = self.joints[rows] - self.joints[others]
-        return np.linalg.norm(moved, axis=1), np.linalg.norm(np.concatenate([turned, bent], 1), axis=1)
-
-
-@dataclass(frozen=True, eq=False)
 class Episodes:
     """All recordings of one world on the joint timeline. video: the frames of all; tissue: the world's, of several."""
 
@@ -340,11 +304,13 @@ class Episodes:
                 )
         return states, usable
 
-    def coverage_states(self) -> tuple[CoverageStates, np.ndarray]:
-        """Return states [V] to choose frames by, and where they are known. Raises NeecoError when a log has no sample
-        for any video frame."""
+    def coverage_states(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return states [V, 6 * instruments + joints] to choose frames by, and where they are known; zeros while a
+        clock is unknown. Raises NeecoError when a log has no sample for any video frame."""
         states, usable = zip(*(_coverage(part) for part in self.parts), strict=True)
-        return CoverageStates.concatenated(states), np.concatenate(usable)
+        if len({columns.shape[1] for columns in states}) > 1:  # a clock is known in some of them
+            return np.zeros((len(self.times), 6)), np.concatenate(usable)
+        return np.concatenate(states), np.concatenate(usable)
 
     def _each(self, times: np.ndarray) -> Iterator[tuple[Episode, np.ndarray, np.ndarray]]:
         """Yield every episode that times [N] fall into, their rows, and their seconds on its own timeline."""
@@ -395,26 +361,24 @@ def with_roll(poses: np.ndarray, roll: np.ndarray) -> np.ndarray:
     return np.asarray(poses @ turned)
 
 
-def _coverage(part: Episode) -> tuple[CoverageStates, np.ndarray]:
+def _coverage(part: Episode) -> tuple[np.ndarray, np.ndarray]:
     """`Episodes.coverage_states` of one episode, [V] its frames."""
-    count = len(part.times)
-    positions, rotations, joints = [np.zeros((count, 0))], [np.zeros((count, 0))], [np.zeros((count, 0))]
-    usable = np.ones(count, dtype=bool)
+    columns, usable = [], np.ones(len(part.times), dtype=bool)
     for log in part.poses.values():
         if log.clock in part.clocks:
             poses, valid = part.logged_poses(log, part.times)
             usable &= valid
-            positions.append(np.where(valid[:, None], poses[:, :3, 3], 0.0))
-            rotations.append(np.where(valid[:, None], poses[:, :3, :3].reshape(-1, 9), 0.0))
+            columns.append(np.where(valid[:, None], poses[:, :3, 3], 0.0))
+            columns.append(np.where(valid[:, None], poses[:, :3, :3].reshape(-1, 9)[:, :3], 0.0))
             _check_overlap(part, log, valid)
     placed = [item.name for item in part.recording.instruments if item.placed]
     for reading in (log for name in placed for log in part.joints[name].values()):
         if reading.clock in part.clocks:
             values, valid = part.logged_readings(reading, part.times)
             usable &= valid
-            joints.append(np.where(valid, values, 0.0)[:, None])
+            columns.append(np.where(valid, values, 0.0)[:, None])
             _check_overlap(part, reading, valid)
-    return CoverageStates(*(np.concatenate(columns, 1) for columns in (positions, rotations, joints))), usable
+    return np.concatenate(columns or [np.zeros((len(part.times), 6))], 1), usable
 
 
 def _check_overlap(part: Episode, log: PoseLog | ReadingLog, valid: np.ndarray) -> None:
