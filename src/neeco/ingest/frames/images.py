@@ -87,7 +87,8 @@ def choose_frames(
     """Choose at most `count` sharp frames that differ, spread over states and views; return them, and why not others.
 
     usable [N] bool: frames with a known state (the others are dropped); states [N, 6+J]: position mm, first row of the
-    rotation matrix (a turn about the frame's x axis leaves it), joints rad of the instrument; min_sharpness: of the neighbours' median.
+    rotation matrix (a turn about the frame's x axis leaves it), joints rad of the instrument; min_sharpness: of the
+    neighbours' median.
     """
     dropped = {int(i): DropReason("no instrument state at its time") for i in np.flatnonzero(~usable)}
     frozen = DropReason("frozen: the state changed, not the picture")
