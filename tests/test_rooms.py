@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import itertools
 from pathlib import Path
 
@@ -142,6 +143,7 @@ def test_a_room_imports_only_from_rooms_below() -> None:
 def reduced(edges: Graph) -> Graph:
     """The edges that follow from no others (the transitive reduction of a graph without circles)."""
 
+    @functools.cache
     def reached(start: str) -> set[str]:
         return edges[start].union(*(reached(other) for other in edges[start]))
 

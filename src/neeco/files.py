@@ -391,6 +391,20 @@ def require_same(place: str, pairs: Iterable[tuple[str, Any, Any]], remedy: str 
             raise NeecoError(f"{place}: {name}: begun with {begun!r}, now {now!r}; {remedy}")
 
 
+def read_json_lines(path: Path, like: Any, expected: str, remedy: str) -> list[Any]:
+    """Return the values of a file that neeco itself wrote, one per line, each as `require_like` asks. Raises NeecoError
+    naming the line."""
+    values = []
+    for number, line in enumerate(read_text(path, expected).splitlines(), 1):
+        place = f"{path}: line {number}"
+        try:
+            value = json.loads(line)
+        except (ValueError, RecursionError):
+            raise NeecoError(f"{place}: not valid JSON; {remedy}") from None
+        values.append(require_like(value, like, place, remedy))
+    return values
+
+
 def require_like(value: Any, like: Any, place: str, remedy: str) -> Any:
     """`value`, read from a file that neeco itself wrote, when it is built like `like`; else raises NeecoError naming
     the field below `place`.

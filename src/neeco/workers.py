@@ -27,7 +27,7 @@ from typing import Any, Literal
 
 from neeco.errors import NeecoError
 
-RETRIES = 3  # of a task whose worker died
+MAX_RETRIES = 3  # of a task whose worker died
 CONNECT_S = 5.0  # that a cluster's head gets to answer
 PROBE_S = 60.0  # that a cluster's nodes get to start a worker and look at a folder
 POLL_S = 1.0  # between two looks at running tasks
@@ -44,7 +44,7 @@ Stage = Literal["started", "done", "failed", "died", "abandoned"]
 class TaskEvent:
     """Progress of one task: `value` is its result once it is done, or the reason why it failed or its worker died.
 
-    A task whose worker died is begun again, RETRIES times at most; then it is abandoned.
+    A task whose worker died is begun again, MAX_RETRIES times at most; then it is abandoned.
     """
 
     index: int
@@ -123,7 +123,7 @@ def run_tasks(
                     yield TaskEvent(index, "started")
                 for index, outcome, value in pool.finished():
                     deaths[index] += outcome == "died"
-                    given_up = deaths[index] > RETRIES
+                    given_up = deaths[index] > MAX_RETRIES
                     if outcome == "died" and not given_up:
                         waiting.insert(0, index)
                     yield TaskEvent(index, "abandoned" if given_up else outcome, value)

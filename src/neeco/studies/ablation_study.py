@@ -41,7 +41,7 @@ from neeco.studies.training_job import (
     Budget,
     TrainingJob,
     check_settings,
-    read_json_lines,
+    read_rows,
     settings_for,
 )
 from neeco.training.config import TISSUE_GAUSSIANS, TrainConfig, training_config
@@ -274,7 +274,7 @@ def table_of(
             folder = folders.get(entry.variant.name)
             if table.group == "paper" and folder is not None:
                 names = {"comparison": comparison.title, "label": entry.label}
-                points = [row for row in read_json_lines(folder / CURVE_FILE) if row["split"] == primary]
+                points = [row for row in read_rows(folder / CURVE_FILE) if row["split"] == primary]
                 curves += [names | {key: row[key] for key in ("iteration", "progress", "psnr")} for row in points]
     final = ("psnr",) if table.group == "paper" else FINAL_SCORES
     known = dict.fromkeys(key for row in rows for key, value in row.values.items() if value is not None)
@@ -351,7 +351,7 @@ def _values(
     values: Values = {}
     if entry.variant.method == "neeco":  # trained in phases: how good it was in the first and on the way
         values["phase_1_psnr"] = phase_1_psnr(folder, int(result["iterations"]))
-        curve, split = read_json_lines(folder / CURVE_FILE), primary_split(splits)
+        curve, split = read_rows(folder / CURVE_FILE), primary_split(splits)
         for percent in CHECKPOINTS:
             values[f"psnr_at_{percent}.{split}"] = psnr_at(curve, split, percent / 100)
     return values | {f"{score}.{split}": result["splits"][split][score] for score in FINAL_SCORES for split in splits}
@@ -363,7 +363,7 @@ def phase_1_psnr(folder: Path, iterations: int) -> float | None:
     A row averages 50 steps; None when phase 1, or the whole run, was shorter than that.
     """
     end = PHASE_1_SHARE * iterations
-    rows = [row for row in read_json_lines(folder / "metrics.jsonl") if row["iteration"] <= end]
+    rows = [row for row in read_rows(folder / "metrics.jsonl") if row["iteration"] <= end]
     late = [row["psnr"] for row in rows if row["iteration"] > 0.75 * end or row is rows[-1]]
     return round(sum(late) / len(late), 4) if late else None
 

@@ -43,8 +43,8 @@ from neeco.studies.training_job import (
     Budget,
     TrainingJob,
     check_settings,
-    read_json_lines,
     read_result,
+    read_rows,
     settings_for,
 )
 from neeco.training.config import TrainConfig, training_config
@@ -305,7 +305,7 @@ def _frame_rows(plan: ComparisonPlan, done: Sequence[Result]) -> tuple[list[dict
     for job in done:
         folder = job_folder(plan.spec.output, job["name"], job["seed"])
         names = {key: job[key] for key in ("name", "seed")}
-        for row in read_json_lines(folder / CURVE_FILE):
+        for row in read_rows(folder / CURVE_FILE):
             seconds = {"seconds": row[SECONDS_ON[plan.spec.budget.clock]]}
             curves.append(names | seconds | {key: row[key] for key in ("iteration", "split", "psnr")})
         file = folder / EVALUATION_FILE

@@ -22,7 +22,7 @@ from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.image_metrics import find_lpips, psnr
-from neeco.files import finite, read_json, read_text, require_like, require_same, write_json, write_text
+from neeco.files import finite, read_json, read_json_lines, require_like, require_same, write_json, write_text
 from neeco.labels.drawing import draw
 from neeco.raster.devices import device_of
 from neeco.scene.method_registry import method_class
@@ -207,21 +207,13 @@ def read_result(file: Path) -> Result:
     return dict(require_like(read_json(file), RESULT, str(file), ANEW))
 
 
-def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The rows of a run's JSON-lines file (curve.jsonl, metrics.jsonl); none where it ended before it wrote the first.
-    Raises NeecoError for a file that is damaged."""
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a run's curve.jsonl or metrics.jsonl; none where it ended before it wrote the first. Raises
+    NeecoError for a file that is damaged."""
     if not path.exists():
         return []
     like = CURVE_ROW | {"psnr": (float, None)} if path.name == CURVE_FILE else {"iteration": int}
-    rows = []
-    for number, line in enumerate(read_text(path, "one JSON object per line").splitlines(), 1):
-        place = f"{path}: line {number}"
-        try:
-            row = json.loads(line)
-        except (ValueError, RecursionError):
-            raise NeecoError(f"{place}: not valid JSON; {ANEW}") from None
-        rows.append(require_like(row, like, place, ANEW))
-    return rows
+    return read_json_lines(path, like, "one JSON object per line", ANEW)
 
 
 def check_settings(assignments: Sequence[str], methods: Collection[str], seed_option: str) -> None:
@@ -273,7 +265,7 @@ def _train(
         if recorder.started:
             recorder.save()
     if not recorder.started:
-        recorder.rows = read_json_lines(job.folder / CURVE_FILE)
+        recorder.rows = read_rows(job.folder / CURVE_FILE)
     if not recorder.rows or recorder.rows[-1]["progress"] < 1:  # stopped between its last step and its finish
         with open_run(job.folder, device) as run:
             totals = recorder.totals
@@ -355,7 +347,7 @@ class TrainingRecorder:
     def _resume_curve(self, iteration: int) -> None:
         """Keep the rows before `iteration`: those after it belong to steps that are done again."""
         self.started = True
-        rows = read_json_lines(self.folder / CURVE_FILE)
+        rows = read_rows(self.folder / CURVE_FILE)
         self.rows = [row for row in rows if row["iteration"] < iteration]
         reached = max((row["progress"] for row in self.rows), default=0.0)
         self.due = [share for share in self.held_out.shares if share > reached]

@@ -20,7 +20,7 @@ import torch
 from neeco.capture.images import write_image, write_labels, write_png
 from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.errors import NeecoError
-from neeco.files import read_text, require_like, write_atomically, write_text
+from neeco.files import read_json_lines, read_text, write_atomically, write_text
 from neeco.geometry.lens import Lens
 from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import LayeredDrawing, to_numpy
@@ -169,16 +169,8 @@ def write_states(root: Path, records: list[Record]) -> None:
 
 
 def read_public_records(root: Path) -> list[Record]:
-    """The lines of states.jsonl. Raises NeecoError naming the line that is not as `write_states` writes it."""
-    path, records = root / "states.jsonl", []
-    for number, line in enumerate(read_text(path, "one JSON object per image").splitlines(), 1):
-        place = f"{path}: line {number}"
-        try:
-            value = json.loads(line)
-        except (ValueError, RecursionError):
-            raise NeecoError(f"{place}: not valid JSON; write the data set anew") from None
-        records.append(require_like(value, PUBLIC, place, "write the data set anew"))
-    return records
+    """Return the lines of states.jsonl. Raises NeecoError naming the line that is not as `write_states` writes it."""
+    return read_json_lines(root / "states.jsonl", PUBLIC, "one JSON object per image", "write the data set anew")
 
 
 def public_record(record: Record) -> dict[str, Any]:
