@@ -181,7 +181,7 @@ CASES: dict[str, Case] = {
             "1",
             "--folds",
             "1",
-            "--real",
+            "--num-real",
             "0",
             "--size",
             "32",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -94,9 +95,12 @@ def test_a_scene_and_its_gradients_are_the_same_there(method: str, device: torch
         assert close(there[name], expected), name
 
 
-def test_a_field_is_the_same_there(device: torch.device) -> None:
+def test_a_field_is_the_same_there(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neeco.methods.nerfies.field.tf32_products", lambda device: nullcontext())
+
     def traced(where: torch.device) -> list[Tensor]:
-        scene = make_nerf(fine_samples=0).requires_grad_(True).to(where)
+        # few octaves: with ten of them the gradients of a random field change wholly where a ray is nudged by 3e-6 mm
+        scene = make_nerf(fine_samples=0, frequencies=3, warp_frequencies=2).requires_grad_(True).to(where)
         directions = torch.nn.functional.normalize(torch.ones(7, 3), dim=-1).to(where)
         times = torch.zeros(7, dtype=torch.float64, device=where)
         drawn = scene.render_rays(Rays(torch.zeros(7, 3, device=where), directions, times))

@@ -123,7 +123,20 @@ def test_ablate(verb: Call, capture: str) -> None:
 def test_downstream(verb: Call, capture: str, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("monai")
     monkeypatch.setattr("neeco.studies.downstream.models.unet.UNet.channels", (4, 4, 8, 8, 8))
-    small = ["--steps", "2", "--batch", "2", "--size", "48", "--folds", "1", "--real", "all", "--conditions", "real"]
+    small = [
+        "--steps",
+        "2",
+        "--batch",
+        "2",
+        "--size",
+        "48",
+        "--folds",
+        "1",
+        "--num-real",
+        "all",
+        "--conditions",
+        "real",
+    ]
     verb("downstream", capture, *small, "--output", "out")
     assert "error" not in json.loads(Path("out/downstream.json").read_text())["jobs"][0]
 

@@ -102,6 +102,17 @@ def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch
     assert "| off | worse | - | - |" in markdown(ablation.tables[1])
 
 
+def test_runs_that_all_fail_leave_empty_tables(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_, **__):
+        raise NeecoError("the loss became nan")
+
+    monkeypatch.setattr(training_job, "train", fails)
+    own = replace(plan, settings=(), tables=("joints",))  # no number of the paper's either
+    ablation = run_ablations(own)
+    assert {failure["error"] for failure in ablation.failures} == {"the loss became nan"}
+    assert ablation_csv(ablation.tables[0]).splitlines()[0].startswith("table,comparison,setting")
+
+
 def test_runs_too_short_for_a_row_of_metrics_leave_the_first_phase_unknown(
     plan: AblationPlan,
 ) -> None:

@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeGuard
 
 import torch
@@ -75,13 +76,16 @@ class GaussianScene(nn.Module):
         self.background = 0.0
         self.label_threshold: float | None = None
         self.diagnostics: dict[str, Any] = {}
-        self.register_buffer("center", center.float())  # [3] mm, middle of the tissue; [T, 3] of several
-        self.registration = nn.Parameter(torch.zeros(*center.shape[:-1], 7))
-        self.falloff = nn.Parameter(torch.zeros(2))
-        self.vignette = nn.Parameter(torch.zeros(2))
-        self.shadow_offsets = nn.Parameter(torch.zeros(MAX_LAMPS, 3))
-        self.shadow_strengths = nn.Parameter(torch.zeros(MAX_LAMPS))
-        self.shadow_width = nn.Parameter(torch.full((), INITIAL_SHADOW_WIDTH))
+        self.register_buffer(
+            "center", center.float().to(canonical.means.device)
+        )  # [3] mm, middle of the tissue; [T, 3] of several
+        zeros = partial(torch.zeros, device=canonical.means.device)
+        self.registration = nn.Parameter(zeros(*center.shape[:-1], 7))
+        self.falloff = nn.Parameter(zeros(2))
+        self.vignette = nn.Parameter(zeros(2))
+        self.shadow_offsets = nn.Parameter(zeros(MAX_LAMPS, 3))
+        self.shadow_strengths = nn.Parameter(zeros(MAX_LAMPS))
+        self.shadow_width = nn.Parameter(zeros(()) + INITIAL_SHADOW_WIDTH)
         self._shines = CachedPredicate(lambda strengths: (strengths > 0).any())
         self._corrects = CachedPredicate(lambda registration: registration.any())
 

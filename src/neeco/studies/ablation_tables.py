@@ -27,6 +27,8 @@ HEADINGS = {
     "mask_iou": "mask IoU",
 }
 
+CSV_COLUMNS = ("table", "comparison", "setting", "run", "measure", "paper", "ours", "difference", "agrees")
+
 Values = dict[str, float | None]  # by measure; empty where the run failed
 
 
@@ -139,7 +141,7 @@ def ablation_csv(table: AblationTable) -> str:
         for row in table.rows
         for measure in dict.fromkeys([*table.measures, *row.values])
     ]
-    return csv_text(list(rows[0]), rows)
+    return csv_text(CSV_COLUMNS, rows)
 
 
 def markdown(table: AblationTable) -> str:
