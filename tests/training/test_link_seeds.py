@@ -16,8 +16,9 @@ from wristed_world import shifted
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.fitting.refinement import RefineConfig, Refinement
-from neeco.geometry.rotations import rotate_about
-from neeco.methods.kinematic.link_search import align_to_links, check_readings, readings_of, start_links
+from neeco.geometry.rotations import rigid_from_vector, rotate_about
+from neeco.methods.kinematic.link_registration import correct_poses
+from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve
 from neeco.scene.drawable import Recorded
@@ -79,7 +80,11 @@ def session(evidence: Evidence, unrecorded: tuple[str, ...] = ()) -> Any:
             report=said.append,
             said=said,
             scene=SimpleNamespace(
-                instruments=(instrument,), recorded=Recorded.of(frames, (instrument,)), diagnostics={}
+                instruments=(instrument,),
+                recorded=Recorded.of(frames, (instrument,)),
+                diagnostics={},
+                base_corrections=torch.zeros(1, 6),
+                center=torch.tensor([0.0, 0.0, 130.0]),
             ),
             refinement=Refinement(RefineConfig(frame_joints=True), frames, (instrument,), torch.device("cpu")),
             full_views=SimpleNamespace(frames=frames),
@@ -197,7 +202,68 @@ def test_readings_that_drive_other_joints_than_they_say_are_doubted(
 ) -> None:
     asked = session(carved[0])
     readings = [change(given) for given in readings_of(asked, carved[0], "tool")]
-    check_readings(asked, started(carved), carved[0], asked.scene.instruments[0], readings)
+    assert not correct_poses(asked, started(carved), *carved_for(asked, carved), readings)
     assert set(asked.scene.diagnostics.get("doubted_readings", {})) == doubted
     assert all(words in line for line in asked.said)
     assert len(asked.said) == bool(doubted)
+
+
+def carved_for(asked: Any, carved: tuple[Evidence, CarvedShape]) -> tuple[Evidence, Instrument, CarvedShape]:
+    return carved[0], asked.scene.instruments[0], carved[1]
+
+
+def moved(carved: tuple[Evidence, CarvedShape], base: Tensor, frame: Tensor) -> tuple[Evidence, CarvedShape]:
+    """The evidence with all poses moved by `base` [4, 4] in the world and by `frame` [4, 4] in the instrument."""
+    evidence, shape = carved
+    frames = []
+    for one in evidence.frames:
+        given = one.state.instruments["tool"]
+        frames.append(
+            replace(
+                one, state=State({"tool": InstrumentState(base @ given.pose @ frame, given.joints)}, one.state.time)
+            )
+        )
+    back = torch.linalg.inv(frame).float()
+    return replace(evidence, frames=tuple(frames)), replace(
+        shape, instrument_from_shaft=back @ shape.instrument_from_shaft
+    )
+
+
+def pivots_off_mm(asked: Any, links: StatedLinks, evidence: Evidence, true: Evidence) -> float:
+    """Rms distance of the last pivot from where it is, with what was learned of bases and links."""
+    correction = rigid_from_vector(asked.scene.base_corrections[0]).double()
+    center, off = asked.scene.center.double(), []
+    rest = StatedLinks(driver_tree()).requires_grad_(False)
+    for one, other in zip(evidence.frames, true.frames, strict=True):
+        given, right = one.state.instruments["tool"], other.state.instruments["tool"]
+        found, wanted = (item.place(item.axes()[0][:1], 1, right.joints)[0].double() for item in (links, rest))
+        here = given.pose[:3, :3] @ found + given.pose[:3, 3] - center
+        here = correction[:3, :3] @ here + center + correction[:3, 3]
+        off.append(here - right.pose[:3, :3] @ wanted - right.pose[:3, 3])
+    return float(torch.stack(off).square().sum(1).mean().sqrt())
+
+
+@pytest.mark.parametrize("along_mm", [-5.0, 8.0])
+def test_a_frame_that_is_off_along_the_shaft_is_found_and_no_joint_is_called_reversed(
+    carved: tuple[Evidence, CarvedShape], along_mm: float
+) -> None:
+    true = torch.eye(4, dtype=torch.float64)
+    off = moved(carved, true, torch.from_numpy(shifted(0, 0, along_mm)))
+    asked, links = session(off[0]), started(off)
+    assert correct_poses(asked, links, *carved_for(asked, off), readings_of(asked, off[0], "tool"))
+    assert len(asked.said) == 1
+    assert "the pose's frame is off along the shaft" in asked.said[0]
+    found = asked.scene.diagnostics["registration_of_links"]["tool"]
+    assert abs(found["frame_off_along_shaft_mm"] - along_mm) < 1.5
+    assert not asked.scene.diagnostics.get("doubted_readings")
+    assert pivots_off_mm(asked, links, off[0], carved[0]) < 2.0
+
+
+def test_a_base_that_is_off_is_corrected(carved: tuple[Evidence, CarvedShape]) -> None:
+    true = torch.eye(4, dtype=torch.float64)
+    base = rigid_from_vector(torch.tensor([0.02, -0.03, 0.02, 5.0, -4.0, 3.0], dtype=torch.float64))
+    off = moved(carved, base, true)
+    asked, links = session(off[0]), started(off)
+    before = pivots_off_mm(asked, links, off[0], carved[0])
+    assert correct_poses(asked, links, *carved_for(asked, off), readings_of(asked, off[0], "tool"))
+    assert pivots_off_mm(asked, links, off[0], carved[0]) < 0.4 * before

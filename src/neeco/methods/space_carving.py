@@ -31,6 +31,7 @@ SOLID_LEVELS = (0.85, 0.75, 0.65)  # mean evidence of a solid point: the stricte
 MIN_SOLID_POINTS = 8  # with fewer, nothing is carved
 MIN_COARSE_POINTS = 24  # solid points on the coarse grid; with fewer, the finer one is tried
 SEED_SPREAD = 0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame
+DARKEST_SHADOW = 0.66  # of the tissue's sRGB values: 40 % of its light
 MIN_LEVEL = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
 
 
@@ -73,6 +74,7 @@ class Evidence:
     camera_from_world: Tensor  # [F, 4, 4]
     intrinsics: Tensor  # [F, 4] fx, fy, cx, cy
     frames: tuple[Frame, ...]
+    unshaded: Tensor | None = None  # [F, H, W] as `hits`, without what a shadow on the tissue explains
 
     @cached_property
     def distance(self) -> float:
@@ -103,9 +105,8 @@ class Evidence:
         """Return the evidence of the frames `index` [M]."""
         index = index.to(self.device)
         frames = tuple(self.frames[i] for i in index.tolist())
-        return Evidence(
-            self.hits[index], self.depths[index], self.camera_from_world[index], self.intrinsics[index], frames
-        )
+        tensors = (self.hits[index], self.depths[index], self.camera_from_world[index], self.intrinsics[index])
+        return Evidence(*tensors, frames, None if self.unshaded is None else self.unshaded[index])
 
     def look_up_camera(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the evidence at camera-frame points [F, Q, 3], and which of them are in the image and in front of the
@@ -128,16 +129,18 @@ def gather_evidence(scene: GaussianScene, views: TrainingViews, settings: Carvin
     device. Pixels outside a mask have no evidence."""
     frames = views.frames
     picked = list(range(0, len(frames), max(1, -(-len(frames) // settings.evidence_frames))))
-    hits, depths = [], []
+    hits, unshaded, depths = [], [], []
     for index in picked:
         frame = frames[index]
         rendering = rasterize(scene.at(frame.state), frame.camera)
-        residual = (rendering.color - views.target(index)).abs().mean(-1)
-        mask = views.mask(index)
-        if mask is not None:
-            residual = residual * mask
-        smooth = avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]
-        hits.append(((smooth - settings.evidence_floor) / settings.evidence_range).clamp(0, 1))
+        tissue, image, mask = rendering.color, views.target(index), views.mask(index)
+        dimmed = (image * tissue).sum(-1, keepdim=True) / tissue.square().sum(-1, keepdim=True).clamp_min(1e-6)
+        for found, expected in ((hits, tissue), (unshaded, tissue * dimmed.clamp(DARKEST_SHADOW, 1.0))):
+            residual = (expected - image).abs().mean(-1)
+            if mask is not None:
+                residual = residual * mask
+            smooth = avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]
+            found.append(((smooth - settings.evidence_floor) / settings.evidence_range).clamp(0, 1))
         depths.append(torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)))
     cameras, device = [frames[i].camera for i in picked], views.device
     return Evidence(
@@ -146,6 +149,7 @@ def gather_evidence(scene: GaussianScene, views: TrainingViews, settings: Carvin
         torch.stack([torch.linalg.inv(camera.world_from_camera.double()).float() for camera in cameras]).to(device),
         torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras], device=device),
         tuple(frames[i] for i in picked),
+        _pad_and_stack(unshaded, 0.0),
     )
 
 

@@ -46,6 +46,8 @@ class GaussianScene(nn.Module):
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
     in mm, log scale about `center`), applied to every instrument pose; zero unless refined. Several tissues have one
     each, [T, 7], always refined: an instrument's shape absorbs the constant error of one world, but not of several.
+    `base_corrections` [I, 6] correct each instrument's poses before that (rotation vector in rad about `center`,
+    translation in mm): the error of its robot's base, zero unless found from the images.
     `falloff` (tissue, instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`,
     `shadow_strengths` (0: no such lamp) and `shadow_width` the instruments' shadows on the tissue (see `Shadow`).
     `background` in [0, 1] is the grey behind everything. `label_threshold` in (0, 1) is the share of a pixel from which
@@ -81,6 +83,7 @@ class GaussianScene(nn.Module):
         )  # [3] mm, middle of the tissue; [T, 3] of several
         zeros = partial(torch.zeros, device=canonical.means.device)
         self.registration = nn.Parameter(zeros(*center.shape[:-1], 7))
+        self.base_corrections = nn.Parameter(zeros(len(instruments), 6))
         self.falloff = nn.Parameter(zeros(2))
         self.vignette = nn.Parameter(zeros(2))
         self.shadow_offsets = nn.Parameter(zeros(MAX_LAMPS, 3))
@@ -88,6 +91,7 @@ class GaussianScene(nn.Module):
         self.shadow_width = nn.Parameter(zeros(()) + INITIAL_SHADOW_WIDTH)
         self._shines = CachedPredicate(lambda strengths: (strengths > 0).any())
         self._corrects = CachedPredicate(lambda registration: registration.any())
+        self._corrects_bases = CachedPredicate(lambda corrections: corrections.any())
 
     @property
     def settings(self) -> Any:
@@ -215,7 +219,7 @@ class GaussianScene(nn.Module):
         return Shadow(self.canonical.of_instruments, self.shadow_offsets, strengths, self.shadow_width)
 
     def registered(self, state: State) -> State:
-        """Return `state` with the learned tracker-to-world correction applied to its poses.
+        """Return `state` with the learned corrections of bases and of tracker to world applied to its poses.
 
         Raises NeecoError for poses that are not rigid and joints far beyond their limits (see `State.check`).
         """
@@ -223,20 +227,21 @@ class GaussianScene(nn.Module):
         registration = self.registration
         # a tensor on the device "meta" has no values to test
         corrects = registration.requires_grad or registration.is_meta or self._corrects(registration)
-        if not state.instruments or not corrects:
+        bases = dict(zip((item.name for item in self.instruments), self.base_corrections, strict=True))
+        if self.base_corrections.is_meta or not self._corrects_bases(self.base_corrections):
+            bases = {}
+        if not state.instruments or not (corrects or bases):
             return state
-        index, center, moved = self._tissue_index(state), self.center, {}
+        index, center, moved = self._tissue_index(state), self.center, dict(state.instruments)
         if index is not None:
             registration, center = registration[index], center[index]
-        correction = rigid_from_vector(registration[:6])
-        scale = registration[6].exp()
         for name, given in state.instruments.items():
-            pose = given.pose.to(correction)
-            arm = (pose[:3, 3] - center) * scale
-            rotation = correction[:3, :3] @ pose[:3, :3]
-            translation = correction[:3, :3] @ arm + center + correction[:3, 3]
-            top = torch.cat([rotation, translation[:, None]], 1)
-            moved[name] = InstrumentState(torch.cat([top, pose[3:]]), given.joints)
+            pose = given.pose.to(center)
+            if name in bases:
+                pose = _moved_about(center, pose, bases[name])
+            if corrects:
+                pose = _moved_about(center, pose, registration[:6], registration[6].exp())
+            moved[name] = InstrumentState(pose, given.joints)
         return dataclasses.replace(state, instruments=moved)
 
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
@@ -278,6 +283,17 @@ class GaussianScene(nn.Module):
     def skeleton(self) -> Skeleton:
         """Return the pairs of keypoint names that a line joins."""
         return self.deformation.skeleton()
+
+
+def _moved_about(center: Tensor, pose: Tensor, vector: Tensor, scale: Tensor | None = None) -> Tensor:
+    """Return a pose [4, 4] moved by `vector` [6] (rotation vector in rad about `center` [3], translation in mm), after
+    its distance from there was multiplied by `scale`."""
+    correction = rigid_from_vector(vector)
+    arm = pose[:3, 3] - center
+    arm = arm if scale is None else arm * scale
+    translation = correction[:3, :3] @ arm + center + correction[:3, 3]
+    top = torch.cat([correction[:3, :3] @ pose[:3, :3], translation[:, None]], 1)
+    return torch.cat([top, pose[3:]])
 
 
 def is_gaussian(scene: DrawableScene) -> TypeGuard[GaussianScene]:

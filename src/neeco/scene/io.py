@@ -33,6 +33,7 @@ OLD_SCHEMA = "neeco-scene/1"  # read as scenes without shadows, with readings re
 INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height", "near")  # of a recorded camera, in the order of the file
 # tensors of modules that OLD_SCHEMA lacks
 ADDED = {"shadow_offsets", "shadow_strengths", "shadow_width", "middle", "closed", "radius", "tips"}
+ADDED_SINCE = {"base_corrections"}  # that files of SCHEMA may lack: zero
 MAX_REASON = 200  # characters of an error's message
 MAX_PIXELS = 2**26  # of a recorded image
 MAX_NUMBER = 1e9  # mm, rad, s or px: larger numbers are damage
@@ -158,8 +159,8 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Drawable
     )
     scene.diagnostics = header["diagnostics"]
     module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}
-    if header.get("schema") == OLD_SCHEMA:
-        module = {n: t for n, t in scene.state_dict().items() if n.rsplit(".", 1)[-1] in ADDED} | module
+    may_lack = ADDED_SINCE | (ADDED if header.get("schema") == OLD_SCHEMA else set())
+    module = {n: t for n, t in scene.state_dict().items() if n.rsplit(".", 1)[-1] in may_lack} | module
     scene.load_state_dict(module)
     for name, parameter in scene.named_parameters():  # buffers may be infinite: not every shaft has a known end
         if not torch.isfinite(parameter).all():

@@ -94,6 +94,7 @@ class GaussianSession(GaussianTraining):
         scene.requires_grad_(True)
         several = scene.registration.dim() > 1 and bool(scene.instruments)
         scene.registration.requires_grad_(self.config.refine.registration or several)
+        scene.base_corrections.requires_grad_(False)  # found before the first step: gradients hardly move them
         self.watch_gradients()
 
     def watch_gradients(self) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
 from neeco.methods.kinematic.hinge_search import start_hinges
 from neeco.methods.kinematic.hinges import Hinges
-from neeco.methods.kinematic.link_search import align_to_links, check_readings, readings_of, start_links
+from neeco.methods.kinematic.link_registration import correct_poses
+from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import carved_shape
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
@@ -31,7 +34,7 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
     tissue = fit_tissue(scene, session.views, session.config)
     if isinstance(articulated, BreathingTissue) and articulated.may_breathe and session.timed:
         tissue = _learn_breathing(session, articulated, tissue)
-    evidence = tissue_evidence(scene, session.views, session.config, tissue)
+    recorded = evidence = tissue_evidence(scene, session.views, session.config, tissue)
     generator = torch.Generator().manual_seed(session.config.seed)
     bodies = [scene.canonical]
     for index, instrument in enumerate(scene.instruments):
@@ -39,6 +42,13 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
         articulation = articulated.articulations[index]
         if isinstance(articulation, StatedLinks):
             shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
+            articulation.radius.fill_(shape.radius)
+            readings = readings_of(session, evidence, instrument.name)
+            if correct_poses(session, articulation, evidence, instrument, shape, readings):
+                corrected = (replace(frame, state=scene.registered(frame.state)) for frame in recorded.frames)
+                evidence = replace(recorded, frames=tuple(corrected))
+                shape = carved_shape(session, evidence, instrument.name, generator)
+                shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
         articulation.base.copy_(shape.instrument_from_shaft)
         articulation.extent.copy_(torch.tensor([shape.near, shape.tip]))
         articulation.radius.fill_(shape.radius)
@@ -47,7 +57,6 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
             seeds, logits = start_links(
                 session, articulation, evidence, instrument.name, shape, columns=columns, generator=generator
             )
-            check_readings(session, articulation, evidence, instrument, readings_of(session, evidence, instrument.name))
         else:
             assert isinstance(articulation, Hinges)
             seeds, logits = start_hinges(

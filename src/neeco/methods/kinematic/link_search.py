@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 
@@ -245,38 +245,48 @@ CHECK_MIN_VISIBLE_SHARE = 0.1  # of the frames, that must observe a point
 Readings = dict[str, float]
 
 
+@dataclass(frozen=True)
+class DoubtedReadings:
+    """Readings with which the links fit the images less well than with others."""
+
+    names: tuple[str, ...]
+    ratio: float  # of the volume on evidence with other readings to that with the given ones
+    words: str  # what is other
+    change: Callable[[Readings], Readings]
+
+
 @torch.no_grad()
-def check_readings(
+def doubted_readings(
     session: GaussianSession, links: StatedLinks, evidence: Evidence, instrument: Instrument, readings: list[Readings]
-) -> None:
-    """Warn, and note in `scene.diagnostics["doubted_readings"]`, where the links keep more of their volume on evidence
-    with two readings exchanged or one's sign reversed. `readings`: those of every frame of the evidence.
+) -> DoubtedReadings | None:
+    """Return what to doubt where the links keep more of their volume on evidence with two readings exchanged or one's
+    sign reversed. `readings`: those of every frame of the evidence.
 
     Swapped logs and reversed signs pass every check of numbers, but not the images."""
     volumes = _Volumes(links, evidence, instrument.name, readings, session.config.seed)
     named = volumes.with_readings(dict)
     recorded = [name for name in links.reading_names if name not in instrument.unrecorded]
-    better: dict[float, tuple[tuple[str, ...], str]] = {}
+    changes: list[tuple[tuple[str, ...], str, Callable[[Readings], Readings]]] = []
     for one, other in combinations(recorded, 2):
         if instrument.slides(one) == instrument.slides(other):
-            better[volumes.with_readings(partial(_exchanged, one, other))] = (
-                (one, other),
-                f"with the readings of {one} and {other} exchanged: which log is which?",
-            )
+            words = f"with the readings of {one} and {other} exchanged: which log is which?"
+            changes.append(((one, other), words, partial(_exchanged, one, other)))
     for name in recorded:
-        better[volumes.with_readings(partial(_reversed, name))] = (
-            (name,),
-            f"with the sign of {name} reversed: is its axis, or its gain, the wrong way round?",
-        )
-    most = max(better, default=0.0)
+        words = f"with the sign of {name} reversed: is its axis, or its gain, the wrong way round?"
+        changes.append(((name,), words, partial(_reversed, name)))
+    kept = [volumes.with_readings(change) for _, _, change in changes]
+    most = max(kept, default=0.0)
     if most <= MIN_VOLUME_RATIO * named:
-        return
-    names, words = better[most]
-    session.report(
-        f"warning: {instrument.name}: its links fit the images {most / max(named, 1):.1f} times as well {words}"
-    )
+        return None
+    names, words, change = changes[len(kept) - 1 - kept[::-1].index(most)]
+    return DoubtedReadings(names, most / max(named, 1), words, change)
+
+
+def note_doubt(session: GaussianSession, name: str, doubt: DoubtedReadings) -> None:
+    """Warn of an instrument's doubted readings, and note them in `scene.diagnostics["doubted_readings"]`."""
+    session.report(f"warning: {name}: its links fit the images {doubt.ratio:.1f} times as well {doubt.words}")
     warnings = session.scene.diagnostics.setdefault("doubted_readings", {})
-    warnings |= {f"{instrument.name}.{name}": f"the links fit the images better {words}" for name in names}
+    warnings |= {f"{name}.{reading}": f"the links fit the images better {doubt.words}" for reading in doubt.names}
 
 
 def _exchanged(one: str, other: str, given: Readings) -> Readings:

@@ -94,7 +94,7 @@ class StatedLinks(Articulation):
         carries = [any(bool(gains[j, :, r].any()) for j in moving if j >= 0) for r in range(len(tree.readings))]
         self.register_buffer("observable", torch.tensor(carries, dtype=torch.float32), persistent=False)
         turns = torch.tensor([not slides for slides in self.slides], dtype=torch.float32)[:, None]
-        moved = torch.stack([self._moves(j) for j in range(len(first))]) if first else torch.zeros(0, len(links) - 1)
+        moved = torch.stack([self.moves(j) for j in range(len(first))]) if first else torch.zeros(0, len(links) - 1)
         carrier = torch.tensor([self.link_of(parent) for parent in parents], dtype=torch.long)
         self.register_buffer("outer", turns * nn.functional.pad(moved.float(), (1, 0)), persistent=False)
         self.register_buffer("inner", turns * nn.functional.one_hot(carrier, len(links)), persistent=False)
@@ -151,7 +151,7 @@ class StatedLinks(Articulation):
     @property
     def _following(self) -> int:
         """Index of the link after the shaft."""
-        return next(k for k in range(1, self.link_count) if bool(self._moves(len(self.points) - 1)[k - 1]))
+        return next(k for k in range(1, self.link_count) if bool(self.moves(len(self.points) - 1)[k - 1]))
 
     @property
     def slides(self) -> tuple[bool, ...]:
@@ -186,7 +186,7 @@ class StatedLinks(Articulation):
         """Return cubes at rest that contain a link: centres [K, 3] mm, half sizes [K] mm. They reach `reach` from its
         pivot where no link follows, else to the pivots beyond plus `margin`."""
         pivots, _ = self.axes()
-        own = next(j for j in range(len(pivots)) if bool(self._moves(j)[link - 1]))
+        own = next(j for j in range(len(pivots)) if bool(self.moves(j)[link - 1]))
         beyond = [j for j, group in enumerate(self.joint_groups) if self.link_of(group[0].parent) == link]
         if not beyond:
             return pivots[own][None], pivots.new_tensor([reach])
@@ -276,7 +276,7 @@ class StatedLinks(Articulation):
         self.tips.fill_(torch.nan)
         pivots, _ = self.axes()
         for link in self._ends:
-            joint = next(j for j in range(len(pivots)) if bool(self._moves(j)[link - 1]))
+            joint = next(j for j in range(len(pivots)) if bool(self.moves(j)[link - 1]))
             tip = farthest(points[weights[:, link] > MIN_PART_SHARE], pivots[joint])
             if tip is not None:
                 self.tips[link] = tip
@@ -311,7 +311,7 @@ class StatedLinks(Articulation):
             + (self.reading_gains / GAIN_SD).square().sum()
         )
 
-    def _moves(self, joint: int) -> Tensor:
+    def moves(self, joint: int) -> Tensor:
         """Return which links a joint moves, [L - 1] bool."""
         return (self.gains[joint].abs().amax(1) > 0) | (self.constants[joint] != 0)
 

@@ -1,0 +1,330 @@
+"""Registration of an instrument with stated links: a constant correction of its poses, fitted to the evidence before
+any Gaussian exists.
+
+Gradients through rendering hardly move an instrument that is off by a shaft's radius or more along its shaft: Gaussians
+form where the evidence is, whatever link they belong to. The silhouette of capsules along the links, driven by the
+readings, bends where the joints are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d
+
+from neeco.capture.model import Instrument, evenly_spaced
+from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
+from neeco.geometry.projection import project
+from neeco.geometry.rotations import rigid_from_vector, rotation_from_vector
+from neeco.methods.kinematic.link_search import doubted_readings, note_doubt
+from neeco.methods.kinematic.stated_links import OFFSET_SD, StatedLinks
+from neeco.methods.space_carving import CarvedShape, Evidence, camera_from_instrument
+from neeco.training.session import GaussianSession
+
+MAX_FRAMES = 30
+WIDTHS = (20, 40)  # cells across the images compared, coarse to fine
+MAX_STEPS = 8  # at each
+CELLS_PER_OBSERVATION = 10.0  # of the finer images, whose errors are correlated
+EVIDENCE_SD = 0.3  # of a cell; beyond it, the cost is linear
+MIN_WEIGHT = 0.1  # of a residual; less where most frames have evidence, since the tissue's fit absorbed the instrument
+EDGE_CELLS = 0.6  # width over which a silhouette fades
+SHAFT_LENGTH_MM, NEAREST_MM = 150.0, 5.0  # of the shaft from its end; depth from which it is compared
+# standard deviations: of the base's error, and of the frame's about and along the shaft
+BASE_SD_RAD, BASE_SD_MM = 0.035, 3.0
+FRAME_SD = (0.035, 2.0)  # rad, mm
+# of the shape: tilts (rad) and shifts (mm) of the carved shaft, log radii, heading (rad) and log length of end links
+SHAFT_SD, LOG_RADIUS_SD, END_SD = (0.1, 0.1, 2.0, 2.0), 0.4, (0.15, 0.4)
+LINK_RADIUS, END_RADIUS, END_LENGTH = 0.8, 0.4, 3.0  # in carved radii
+STEP = 0.05  # finite differences, in standard deviations
+MODEL_ERROR = 2.0  # of a standard deviation by the evidence: errors of the model are common to all frames
+MIN_GAIN = 10.0  # of -log likelihood, from which a correction is made
+SHAPE = ("shaft", "radii", "ends")  # parameters that are no correction
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LinkRegistration:
+    """A correction of an instrument's poses, and of its links in the tracked frame."""
+
+    base: Tensor  # [6] rotation vector (rad) about `center`, translation (mm), world frame
+    center: Tensor  # [3] mm, world frame
+    turn: Tensor  # [3] rad, rotation vector of the links about `pivot`, tracked frame
+    pivot: Tensor  # [3] mm, tracked frame
+    shift: Tensor  # [3] mm, of the links, tracked frame
+    offsets: Tensor  # [R] rad or mm, of the readings
+    cost: float  # -log likelihood and prior
+    gain: float  # by which they are less than without a correction
+    along_mm: float  # by which the first pivot moves along the shaft, mean over the frames
+    along_sd_mm: float
+
+    def about(self, center: Tensor) -> Tensor:
+        """Return `base` [6] with the rotation about another point [3] mm."""
+        arm = self.center - center
+        moved = self.base[3:] + arm - rotation_from_vector(self.base[:3]) @ arm
+        return torch.cat([self.base[:3], moved])
+
+
+@torch.no_grad()
+def register_links(
+    links: StatedLinks, evidence: Evidence, name: str, shape: CarvedShape, readings: list[dict[str, float]]
+) -> LinkRegistration | None:
+    """Return the correction of instrument `name` with which its links explain the evidence best; None where no two
+    joints follow each other. `readings`: of every frame of the evidence.
+
+    A base's error moves all poses by one rigid motion of the world, the frame's error moves the links along and about
+    the shaft (across it, the learned shape absorbs it). About a trocar both move the links alike along the shaft; then
+    the priors decide, and the sum is what the images show.
+    """
+    line = links.rest_line()
+    if line is None:
+        return None
+    problem = _SilhouetteProblem(links, evidence, name, shape, line, readings)
+    values = []
+    for names in (SHAPE, tuple(problem.layout)):
+        problem.fit_only(names)
+        found = np.zeros(problem.size)
+        for width in WIDTHS:
+            problem.compare_at(width)
+            found = levenberg_marquardt(
+                found, problem.linearise, np.add, max_steps=MAX_STEPS, damping=1e-2, tolerance=1e-3
+            )
+        fitted = problem.linearise(found)
+        values.append(fitted.value)
+    parts, along = problem.parts(found), problem.along_shaft(found)
+    slope = np.array([problem.along_shaft(found + step) - along for step in STEP * np.eye(problem.size)]) / STEP
+    return LinkRegistration(
+        base=parts["base"],
+        center=problem.center,
+        turn=problem.axis * parts["frame"][0],
+        pivot=problem.pivot,
+        shift=problem.axis * parts["frame"][1],
+        offsets=parts["offsets"],
+        cost=values[1],
+        gain=values[0] - values[1],
+        along_mm=along,
+        along_sd_mm=MODEL_ERROR * float(np.sqrt(slope @ np.linalg.solve(np.asarray(fitted.information), slope))),
+    )
+
+
+def correct_poses(
+    session: GaussianSession,
+    links: StatedLinks,
+    evidence: Evidence,
+    instrument: Instrument,
+    shape: CarvedShape,
+    readings: list[dict[str, float]],
+) -> bool:
+    """Correct the base and the links of an instrument where that explains the evidence better; return whether.
+
+    Warns of its readings where others explain the evidence better than any correction: a frame that is off along the
+    shaft makes a joint seem reversed. `readings`: those of every frame of the evidence.
+    """
+    scene, name = session.scene, instrument.name
+    doubt = doubted_readings(session, links, evidence, instrument, readings)
+    found = register_links(links, evidence, name, shape, readings)
+    if doubt is not None and found is not None:
+        other = register_links(links, evidence, name, shape, [doubt.change(given) for given in readings])
+        doubt = doubt if other is not None and other.cost < found.cost else None
+    if doubt is not None:
+        note_doubt(session, name, doubt)
+    if doubt is not None or found is None or found.gain < MIN_GAIN or len(scene.recorded.tissues) > 1:
+        return False
+    base = found.about(scene.center)
+    with torch.no_grad():
+        scene.base_corrections[scene.instruments.index(instrument)] = base
+        arms = links.points + links.axis_shifts - found.pivot
+        links.axis_shifts += found.shift + torch.linalg.cross(found.turn.expand_as(arms), arms)
+        links.axis_turns += found.turn
+        links.reading_offsets += found.offsets
+    off, sd, degrees = -found.along_mm, found.along_sd_mm, float(torch.rad2deg(found.base[:3].norm()))
+    session.report(
+        f"{name}: the pose's frame is off along the shaft by {off:.1f} mm (standard deviation {sd:.1f} mm; positive: "
+        f"towards the jaws), its base by {float(found.base[3:].norm()):.1f} mm and {degrees:.1f} degrees; corrected"
+    )
+    scene.diagnostics.setdefault("registration_of_links", {})[name] = {
+        "frame_off_along_shaft_mm": round(off, 3),
+        "frame_off_along_shaft_sd_mm": round(sd, 3),
+        "base_correction": [round(value, 5) for value in base.tolist()],
+        "links_turned_deg": round(float(torch.rad2deg(found.turn.norm())), 3),
+        "links_shifted_mm": round(float(found.shift.norm()), 3),
+    }
+    return True
+
+
+class _SilhouetteProblem:
+    """Silhouettes of capsules along an instrument's links, against the evidence of F frames.
+
+    `layout` has the standard deviations of all parameters, in which vectors of those that are fitted are counted."""
+
+    layout: dict[str, Tensor]
+
+    def __init__(
+        self,
+        links: StatedLinks,
+        evidence: Evidence,
+        name: str,
+        shape: CarvedShape,
+        line: tuple[Tensor, Tensor],
+        readings: list[dict[str, float]],
+    ) -> None:
+        chosen = evenly_spaced(len(evidence.frames), MAX_FRAMES)
+        self.links, self.shape = links, shape
+        self.evidence = evidence.subset(torch.tensor(chosen))
+        self.pivot, self.axis = line[0], nn.functional.normalize(line[1], dim=0)
+        self.readings = torch.tensor([[readings[i][r] for r in links.reading_names] for i in chosen]).to(self.axis)
+        to_camera = self.evidence.camera_from_world
+        self.poses = torch.linalg.solve(to_camera, camera_from_instrument(self.evidence, name))
+        self.center = self.poses[:, :3, 3].mean(0)
+        joints = range(len(links.points))
+        # of every link but the shaft: the joint that carries it, and the joints that it carries
+        self.own = [next(j for j in joints if bool(links.moves(j)[k])) for k in range(links.link_count - 1)]
+        carriers = [links.link_of(group[0].parent) for group in links.joint_groups]
+        self.carried = [[j for j in joints if carriers[j] == k] for k in range(1, links.link_count)]
+        slides = [any(links.slides[j] and bool(links.gains[j, :, r].any()) for j in joints)
+                  for r in range(len(links.reading_names))]  # fmt: skip
+        spreads = {
+            "base": [BASE_SD_RAD] * 3 + [BASE_SD_MM] * 3,
+            "frame": FRAME_SD,
+            "offsets": [OFFSET_SD[slide] * float(seen) for slide, seen in zip(slides, links.observable, strict=True)],
+            "shaft": SHAFT_SD,
+            "radii": [LOG_RADIUS_SD] * links.link_count,
+            "ends": [*END_SD] * sum(not carried for carried in self.carried),
+        }
+        self.layout = {key: torch.tensor(spread).to(self.axis) for key, spread in spreads.items()}
+
+    def fit_only(self, names: tuple[str, ...]) -> None:
+        """Fit the parameters of these names; others, and those without deviation, stay 0."""
+        spread = torch.cat([spread * float(key in names) for key, spread in self.layout.items()])
+        self.columns = torch.nonzero(spread)[:, 0]
+        self.spread, self.size = spread, len(self.columns)
+
+    def parts(self, at: np.ndarray) -> dict[str, Tensor]:
+        """Return the parameters by name, in their own units."""
+        full = torch.zeros_like(self.spread)
+        full[self.columns] = torch.from_numpy(at).to(full) * self.spread[self.columns]
+        return dict(zip(self.layout, full.split([len(spread) for spread in self.layout.values()]), strict=True))
+
+    def compare_at(self, width: int) -> None:
+        """Compare images about `width` cells wide from now on."""
+        evidence = self.evidence
+        hits = evidence.hits if evidence.unshaded is None else evidence.unshaded
+        self.cell_px = max(1, round(hits.shape[2] / width))
+        self.target = avg_pool2d(hits[:, None], self.cell_px)[:, 0]
+        rows, columns = (torch.arange(size, device=hits.device) + 0.5 for size in self.target.shape[1:])
+        y, x = torch.meshgrid(rows, columns, indexing="ij")
+        self.cells = torch.stack([x, y], -1).view(-1, 2) * self.cell_px  # [C, 2] px
+        correlated = CELLS_PER_OBSERVATION * (width / WIDTHS[-1]) ** 2
+        usual = (1 - self.target.mean(0)).clamp_min(MIN_WEIGHT)
+        self.weight = usual / (EVIDENCE_SD * correlated**0.5)
+
+    def linearise(self, at: np.ndarray) -> Linearisation[np.ndarray]:
+        residual = self._residual(at)
+        steps = STEP * np.eye(self.size)
+        slopes = torch.stack([(self._residual(at + step) - residual) / STEP for step in steps], 1)
+        robust = self._limit / residual.abs().clamp_min(1e-9)
+        weighed = slopes * robust.clamp_max(1.0)[:, None]
+        return Linearisation(
+            (weighed.T @ slopes).double().cpu().numpy() + np.eye(self.size),
+            (weighed.T @ residual).double().cpu().numpy() + at,
+            self._cost(at, residual),
+            lambda other: self._cost(other, self._residual(other)),
+        )
+
+    def _cost(self, at: np.ndarray, residual: Tensor) -> float:
+        size = residual.abs()
+        huber = torch.where(size < self._limit, 0.5 * size.square(), self._limit * (size - 0.5 * self._limit))
+        return float(huber.sum(dtype=torch.float64)) + 0.5 * float(at @ at)
+
+    @property
+    def _limit(self) -> Tensor:
+        """Residuals [F * C] from which on the cost is linear."""
+        return (EVIDENCE_SD * self.weight).flatten().repeat(len(self.target))
+
+    def _residual(self, at: np.ndarray) -> Tensor:
+        """Return weighed differences [F * C] of silhouette and evidence."""
+        inside = self._inside_px(*self._capsules(self.parts(at)))
+        silhouette = torch.sigmoid(inside / (EDGE_CELLS * self.cell_px))
+        return ((silhouette - self.target.flatten(1)) * self.weight.flatten()).flatten()
+
+    def _axes(self, parts: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return (pivots [J, 3] mm, axes [J, 3]) of the joints at rest, with the frame's correction."""
+        turn, shift = rotation_from_vector(self.axis * parts["frame"][0]), self.axis * parts["frame"][1]
+        pivots, axes = self.links.axes()
+        return (pivots - self.pivot) @ turn.T + self.pivot + shift, axes @ turn.T
+
+    def _corrected(self, parts: dict[str, Tensor]) -> Tensor:
+        """Return the poses [F, 4, 4] with the base's correction."""
+        correction, poses = rigid_from_vector(parts["base"]), self.poses.clone()
+        poses[:, :3, :3] = correction[:3, :3] @ self.poses[:, :3, :3]
+        poses[:, :3, 3] = (self.poses[:, :3, 3] - self.center) @ correction[:3, :3].T + self.center + correction[:3, 3]
+        return poses
+
+    def along_shaft(self, at: np.ndarray) -> float:
+        """Return by how many mm the correction moves the first pivot along the shaft, mean over the frames."""
+        parts, zero = self.parts(at), self.parts(np.zeros(self.size))
+        moved, still = self._corrected(parts), self._corrected(zero)
+        shift = moved[:, :3, :3] @ self._axes(parts)[0][-1] + moved[:, :3, 3] - still[:, :3, 3]
+        shift = shift - still[:, :3, :3] @ self._axes(zero)[0][-1]
+        return float((shift * (still[:, :3, :3] @ self.axis)).sum(1).mean())
+
+    def _capsules(self, parts: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the ends [F, S, 2, 3] mm of the links' capsules in the cameras' frames, and their radii [S] mm."""
+        links, shape, ends = self.links, self.shape, parts["ends"].view(-1, 2)
+        pivots, axes = self._axes(parts)
+        tilts, shifts = parts["shaft"].split(2)
+        base = shape.instrument_from_shaft.to(axes)
+        shaft = nn.functional.normalize(base[:3, :3] @ torch.cat([tilts, tilts.new_ones(1)]), dim=0)
+        origin = base[:3, :3] @ torch.cat([shifts, shifts.new_zeros(1)]) + base[:3, 3]
+        front = origin + ((pivots[-1] - origin) @ shaft) * shaft
+        segments = [(0, torch.stack([front - SHAFT_LENGTH_MM * shaft, front]), 1.0)]
+        for link, (own, carried) in enumerate(zip(self.own, self.carried, strict=True), 1):
+            segments += [(link, pivots[[own, joint]], LINK_RADIUS) for joint in carried]
+            if carried:
+                continue
+            (heading, length), ends = ends[0], ends[1:]
+            ahead = self.axis - (self.axis @ axes[own]) * axes[own]
+            ahead = nn.functional.normalize(ahead, dim=0)
+            ahead = heading.cos() * ahead + heading.sin() * torch.linalg.cross(axes[own], ahead)
+            tip = pivots[own] + END_LENGTH * shape.radius * length.exp() * ahead
+            segments.append((link, torch.stack([pivots[own], tip]), END_RADIUS))
+        to_camera = self.evidence.camera_from_world @ self._corrected(parts)
+        values = links.constants + torch.einsum("jlr,fr->fjl", links.gains, self.readings - parts["offsets"])
+        placed = []
+        for link, points, _ in segments:
+            moved = points.expand(len(values), -1, -1)
+            for joint in range(len(pivots)) if link else ():
+                amount = values[:, joint, link - 1]
+                if links.slides[joint]:
+                    moved = moved + amount[:, None, None] * axes[joint]
+                else:
+                    turns = rotation_from_vector(amount[:, None] * axes[joint])
+                    moved = (moved - pivots[joint]) @ turns.transpose(1, 2) + pivots[joint]
+            placed.append(moved @ to_camera[:, :3, :3].transpose(1, 2) + to_camera[:, None, :3, 3])
+        radii = [shape.radius * size * parts["radii"][link].exp() for link, _, size in segments]
+        return torch.stack(placed, 1), torch.stack(radii)
+
+    def _inside_px(self, ends: Tensor, radii: Tensor) -> Tensor:
+        """Return how far [F, C] px every cell's middle lies inside the nearest capsule's outline."""
+        far, near = ends.unbind(2)  # [F, S, 3]
+        depth = near[..., 2] - far[..., 2]
+        share = (NEAREST_MM - far[..., 2]) / torch.where(depth.abs() > 1e-6, depth, 1e-6)
+        share = torch.where(far[..., 2] < NEAREST_MM, share.clamp(0, 1), 0.0)
+        far = far + share[..., None] * (near - far)
+        intrinsics = [column[:, None] for column in self.evidence.intrinsics.unbind(1)]
+        (far_px, far_radius), (near_px, near_radius) = (
+            (torch.stack(project(end, *intrinsics, nearest=1.0), -1), intrinsics[0] * radii / end[..., 2].clamp_min(1))
+            for end in (far, near)
+        )
+        x, y = self.cells.unbind(1)  # [C]: coordinates apart, twice as fast as vectors
+        best = x.new_full((len(ends), len(x)), -torch.inf)
+        for k in range(len(radii)):
+            (step_x, step_y), (far_x, far_y) = ((part[:, k, None].unbind(-1)) for part in (near_px - far_px, far_px))
+            arm_x, arm_y = x - far_x, y - far_y  # [F, C]
+            place = (arm_x * step_x + arm_y * step_y) / (step_x.square() + step_y.square()).clamp_min(1e-6)
+            place = place.clamp(0, 1)
+            distance = torch.hypot(arm_x - place * step_x, arm_y - place * step_y)
+            radius = far_radius[:, k, None] + place * (near_radius - far_radius)[:, k, None]
+            best = torch.maximum(best, radius - distance)
+        return best
