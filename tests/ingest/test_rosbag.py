@@ -419,7 +419,8 @@ def test_another_recordings_bag_gives_its_only_pair_of_cameras(tmp_path: Path) -
     assert known is not None
     of_these = known.stereo(path, "/stereo/left/image_raw", "/stereo/right/image_raw")
     of_others = known.stereo(path, "/endoscope/l/image_raw", "/endoscope/r/image_raw")
-    assert of_these is not None and of_others is not None
+    assert of_these is not None
+    assert of_others is not None
     np.testing.assert_array_equal(of_these[2], of_others[2])
 
 

@@ -26,6 +26,7 @@ from neeco.ingest.foreground.masks import moving_masks
 from neeco.ingest.foreground.residual_flow import STEP_PX
 from neeco.ingest.foreground.rough_shape import PosesAt, RoughShape, best_lag, carve_shape, project_mask
 from neeco.ingest.frames.views import SfmResult, StageProgress, Views, reduced
+from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import IngestSettings, Recording, VideoFile
 
 N_FRAMES = 24  # spread over the recording, that are compared with each other
@@ -52,6 +53,12 @@ def stands_still(load: Callable[[int], np.ndarray], count: int) -> bool:
         stay += [_share_in_place(first, second) for first, second in zip(grey, grey[step:], strict=False)]
     shares = np.array([share for share in stay if share is not None])
     return len(shares) > 0 and float(np.mean(shares > STILL_SHARE)) > STILL_PAIRS
+
+
+def video_stands_still(video: VideoSource) -> bool:
+    """Return the same of a video. Raises NeecoError where it cannot be read."""
+    images = [image for _, image in video.read(evenly_spaced(len(video.times), N_FRAMES))]
+    return stands_still(images.__getitem__, len(images))
 
 
 def same_place(first: np.ndarray, second: np.ndarray) -> float | None:
