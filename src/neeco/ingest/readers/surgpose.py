@@ -107,6 +107,8 @@ class SurgPose(RecordingFormat):
         return None if found is None else found[:2]["right" in Path(name).name]
 
     def stereo(self, path: Path, left: str | None, right: str | None) -> tuple[Lens, Lens, np.ndarray] | None:
+        if left and right and right != left.replace("left", "right"):
+            return None  # of another light, or a left camera, too
         calibrations = visible_entries(path, "*.ini")
         return read_stereo(calibrations[0]) if len(calibrations) == 1 else None
 

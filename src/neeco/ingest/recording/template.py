@@ -393,7 +393,7 @@ def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value:
         lines.append("# calibration: table.csv   # of counts and angle_rad, where the values are counts")
     lines += _unit_lines(when, {} if tables else {"angle": (value,)})
     span = found.spans.get((log.stream.name, value)) if log.stream is not None else None
-    if span is None:
+    if span is None or span[0] == span[1]:
         return [*lines, "# limits: [0, 1.5]   # rad, of the joint"]
     low, high = math.floor(10 * span[0]) / 10, math.ceil(10 * span[1]) / 10
     return [
