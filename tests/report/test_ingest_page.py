@@ -74,7 +74,7 @@ def made(folder: Path, **changes) -> IngestResult:
 def based(overlap: float) -> BaseRegistration:
     """A base found from outlines that overlap with what moves by so much."""
     return BaseRegistration(
-        world_from_base=np.eye(4), clock_s=0.0, clock_sd_s=0.0, sd_mm=np.ones(3), sd_deg=np.ones(3), open_directions=(),
+        world_from_base=np.eye(4), clock_s=0.0, clock_sd_s=0.0, covariance=np.eye(6), open_directions=(),
         moved_mm=0.0, turned_deg=0.0, overlap=overlap, overlap_before=0.5, residual_px=1.0, frames=100, from_masks=True,
     )  # fmt: skip
 
