@@ -39,7 +39,7 @@ class Assessment:
 
     @property
     def conclusion(self) -> str:
-        """What to do, and the facts behind it."""
+        """Advice on training, and the facts behind it."""
         return f"{ADVICE[self.level]}: {'; '.join(self.facts)}"
 
     @property
@@ -64,7 +64,7 @@ class Assessment:
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What speaks for a capture or against it: a fact, and a sentence that warns where it is unusual.
+    """Evidence on a capture: a fact, and a sentence that warns where it is unusual.
 
     level: 0 where it is usual, 1 for a warning, 2 where the capture is not to be trained on.
     """
