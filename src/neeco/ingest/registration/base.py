@@ -322,7 +322,6 @@ def _result(
     problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit, information: FitInformation, size_sd: float
 ) -> BaseRegistration:
     covariance, open_directions, clock_sd = _covariance(problem, known, fit, information, size_sd)
-    view = problem.camera_from_world[0, :3, :3]
     moved: dict[str, float] = {}
     if known.sd_mm is not None:
         moved = _moved_from(known.world_from_base, fit.world_from_base, problem.middle)
