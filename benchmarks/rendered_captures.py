@@ -70,7 +70,8 @@ scene is one more entry in `scenes.SCENES`.
     bowel-wristed, stomach-wristed
               8 mm black shaft whose wrist pitches and, 9 mm further, yaws two unequal jaws; readings wrist_pitch and
               wrist_yaw with the encoders' offsets, play and noise; `kinematics` states every axis 5 degrees
-              and every pivot 2 mm off; truth/kinematics.json instead of hinge.json
+              and every pivot 2 mm off; truth/kinematics.json instead of hinge.json. With --video, recording/ states
+              these links, and recording/exact-links.yaml the true ones (encoders without their offsets)
     bowel-wristed-swapped
               the same with the names of wrist_pitch and wrist_yaw swapped: what a mistake in the logs looks like
     bowel-sliding
@@ -90,6 +91,7 @@ from rendered.frames import Settings
 from rendered.motion import THINNINGS
 from rendered.render import Lens
 from rendered.scenes import SCENES, SceneSpec
+from rendered.wristed import SlidingDesign
 from rendered.writing import without_sign, write_recording
 
 from neeco.errors import NeecoError
@@ -137,8 +139,10 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
     spec = SCENES[arguments.scene]
     arguments.video |= arguments.bag or arguments.plus or arguments.lerobot or arguments.stereo
     arguments.video |= arguments.base_error is not None
-    if arguments.video and spec.encoders is not None:
-        parser.error(f"--video: the logs of a wrist are not written; {arguments.scene} is a capture only")
+    if arguments.video and isinstance(spec.design, SlidingDesign):
+        parser.error(f"--video: the log of what slides is not written; {arguments.scene} is a capture only")
+    if spec.encoders is not None and (arguments.bag or arguments.plus or arguments.lerobot):
+        parser.error("--video: bags, PLUS and LeRobot files hold no wrist; leave them out, or take another scene")
     if arguments.stereo and arguments.lens:
         parser.error("--stereo: both cameras are pinholes; leave out --lens")
     if arguments.frames and (arguments.video or arguments.every > 1):

@@ -150,18 +150,20 @@ class BagWriter:
         distortion: Sequence[float] = (),
         model: str = "plumb_bob",
         binning: int = 0,
+        rectification: np.ndarray | None = None,
+        baseline: float = 0.0,
     ) -> None:
         """sensor_msgs/CameraInfo, whose rectified camera has 0.9 of the focal length. intrinsics: fl_x, fl_y, cx, cy
-        px, from the image's corner."""
+        px, from the image's corner; rectification [3, 3]; baseline m, of a right camera."""
         width, height = size
         fl_x, fl_y, cx, cy = np.array(intrinsics) - [0, 0, 0.5, 0.5]  # ROS counts from the first pixel's centre
         matrix = np.array([fl_x, 0, cx, 0, fl_y, cy, 0, 0, 1.0])
-        projection = np.array([0.9 * fl_x, 0, cx, 0, 0, 0.9 * fl_y, cy, 0, 0, 0, 1.0, 0])
+        projection = np.array([0.9 * fl_x, 0, cx, -0.9 * fl_x * baseline, 0, 0.9 * fl_y, cy, 0, 0, 0, 1.0, 0])
         region = self._make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
         coefficients, kind = np.array(distortion, np.float64), "sensor_msgs/msg/CameraInfo"
         info = self._make(
-            kind, self._header(time, "camera"), height, width, model, coefficients, matrix, np.eye(3).ravel(),
-            projection, binning, binning, region,
+            kind, self._header(time, "camera"), height, width, model, coefficients, matrix,
+            (np.eye(3) if rectification is None else rectification).ravel(), projection, binning, binning, region,
         )  # fmt: skip
         self.write(topic, "sensor_msgs/msg/CameraInfo", time, info)
 

@@ -43,16 +43,19 @@ def true_kinematics(spec: SceneSpec) -> KinematicTree:
     return KinematicTree(tuple(links))
 
 
-def stated_kinematics(spec: SceneSpec) -> KinematicTree:
+def stated_kinematics(spec: SceneSpec, *, exact: bool = False) -> KinematicTree:
     """The links as a drawing of the instrument and a ruler on its sensor give them: axes turned by AXIS_ERROR and
-    pivots shifted by PIVOT_ERROR mm, each some way of its own, and encoders thought to be without an offset."""
+    pivots shifted by PIVOT_ERROR mm, each some way of its own, unless `exact`, and encoders thought to be without an
+    offset."""
     assert spec.encoders is not None
     without = replace(spec.encoders, offsets=(0.0,) * len(spec.encoders.offsets))
-    exact = true_kinematics(replace(spec, encoders=without))
+    right = true_kinematics(replace(spec, encoders=without))
+    if exact:
+        return right
     generator = np.random.default_rng((spec.seed, 4))
     errors: dict[str, tuple[Array, Array]] = {}  # by parent: the links that it carries share an axis
     links = []
-    for link in exact.links:
+    for link in right.links:
         if link.parent is None:
             links.append(link)
             continue

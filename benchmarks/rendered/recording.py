@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -16,11 +17,14 @@ from neeco.files import write_atomically, write_json, write_text
 from rendered import errors
 from rendered.base import BASE_FROM_CAMERA, rough_base
 from rendered.frames import RIGHT_FROM_LEFT, Settings, Shot, image_name, right_name
+from rendered.kinematics import stated_kinematics
 from rendered.motion import FRAME_RATE, Array, Trajectory, rigid
 from rendered.optics import Optics
 from rendered.plus import write_plus
 from rendered.render import Lens
+from rendered.scenes import SceneSpec
 from rendered.truth import JOINT, World
+from rendered.wristed import Encoders
 
 EM_HZ, JAW_HZ = 40.0, 50.0
 EM_CLOCK_S, JAW_CLOCK_S, SYNC_S = 0.038, -0.0097, 0.003  # t_log = t_video + offset; how well a sync pulse shows it
@@ -56,6 +60,8 @@ def write_raw_recording(
     angles = np.linspace(*readings.limits, TABLE)
     table = [(int(c), f"{a:.5f}") for c, a in zip(np.rint(_counts(angles, readings.limits)), angles, strict=True)]
     _write_csv(folder / "logs" / "jaw_calibration.csv", "hall_raw,angle_rad", table)
+    if spec.encoders is not None:
+        _write_wrist(folder / "logs" / "wrist.csv", world, trajectory, spec.encoders)
     for name in ("instrument",) if settings.still else ("instrument", "camera"):
         times = _sensor_times(world, EM_HZ, generator)
         moments = [trajectory.at(float(time)) for time in times]
@@ -75,7 +81,12 @@ def write_raw_recording(
             path / "truth" / "base.json",
             {"camera_from_base": np.linalg.inv(BASE_FROM_CAMERA).tolist(), "clock_s": EM_CLOCK_S},
         )
-    write_text(folder / "recording.yaml", yaml.safe_dump(_document(world, settings, sync), sort_keys=False))
+    document = _document(world, settings, sync)
+    if spec.encoders is not None:
+        _state_links(document, spec, exact=True)
+        write_text(folder / "exact-links.yaml", yaml.safe_dump(document, sort_keys=False))
+        _state_links(document, spec, exact=False)
+    write_text(folder / "recording.yaml", yaml.safe_dump(document, sort_keys=False))
     if settings.bags:
         from rendered.bags import write_bags  # needs rosbags
 
@@ -100,13 +111,34 @@ def write_raw_recording(
 _CLOCKS = {"em": EM_CLOCK_S, JOINT: JAW_CLOCK_S}
 
 
-def _document(world: World, settings: Settings, sync: dict[str, float]) -> dict[str, object]:
+def _write_wrist(path: Path, world: World, trajectory: Trajectory, encoders: Encoders) -> None:
+    """What the encoders of a wrist log, on the clock of the poses."""
+    generator = np.random.default_rng((world.spec.seed, 5))  # its own: the other logs are those without a wrist
+    times = _sensor_times(world, EM_HZ, generator)
+    readings = encoders.readings(np.array([trajectory.at(float(time)).wrist for time in times]), generator)
+    rows = [
+        (f"{time + EM_CLOCK_S:.5f}", *(f"{value:.5f}" for value in row))
+        for time, row in zip(times, readings, strict=True)
+    ]
+    _write_csv(path, ",".join(["t_s", *(f"{name}_rad" for name in world.spec.reading_names)]), rows)
+
+
+def _state_links(document: dict[str, Any], spec: SceneSpec, *, exact: bool) -> None:
+    """State the links of recording.yaml's instrument, and the logs of its wrist."""
+    (instrument,) = document["instruments"]
+    instrument["kinematics"] = stated_kinematics(spec, exact=exact).to_json()
+    for name in spec.reading_names:
+        columns = {"time": "t_s", "value": f"{name}_rad"}
+        instrument["joints"][name] = {"file": "logs/wrist.csv", "clock": "em", "columns": columns}
+
+
+def _document(world: World, settings: Settings, sync: dict[str, float]) -> dict[str, Any]:
     """recording.yaml, with the capture's splits."""
     spec, lens = world.spec, settings.lens
     joint: dict[str, object] = {"file": "logs/jaw.csv", "columns": {"time": "t_s", "value": "hall_raw"}}
     joint |= {"calibration": "logs/jaw_calibration.csv", "limits": list(spec.joint.limits)}
     of = {split: [k for k, shot in enumerate(world.shots) if shot.split == split] for split in ("test", "unseen")}
-    document: dict[str, object] = {"video": "video.mp4"}
+    document: dict[str, Any] = {"video": "video.mp4"}
     poses: object = "logs/instrument.csv"
     if settings.still:
         document |= {"camera": "still"}

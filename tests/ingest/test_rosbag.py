@@ -374,3 +374,78 @@ def test_the_lens_is_the_cameras_beside_the_images(tmp_path: Path, kind: str) ->
     assert not straight.distorted
     assert known.lens(bag.path, "/other/image_raw") is None
     assert known.lens(bag.path, "/fresh/image_raw") is None  # never calibrated
+
+
+def write_stereo(folder: Path, kind: str = "recording.bag", baseline: float = 0.0055) -> Path:
+    """A bag of a stereo camera, turned for rectification by 2 degrees to the left and 1 degree to the right."""
+    with BagWriter(folder, kind) as bag:
+        for side, degrees, offset in (("left", 2.0, 0.0), ("right", -1.0, baseline)):
+            for name in ("image_raw", "image_rect_color"):
+                for time in TICKS[:4]:
+                    bag.image(f"/stereo/{side}/{name}", time, picture(0), "rgb8")
+            turn = Rotation.from_rotvec([0, degrees, 0], degrees=True).as_matrix()
+            lens = np.add(FOCAL, [2 * offset, 0, 0, 0])
+            bag.camera_info(
+                f"/stereo/{side}/camera_info", 0.0, SIZE, lens, [0.1, 0, 0, 0], rectification=turn, baseline=offset
+            )
+    return bag.path
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_the_right_cameras_camera_info_gives_its_pose_to_the_left_one(
+    tmp_path: Path, kind: str, rectified: bool
+) -> None:
+    path, name = write_stereo(tmp_path, kind), "image_rect_color" if rectified else "image_raw"
+    known = format_of(path)
+    assert known is not None
+    found = known.stereo(path, f"/stereo/left/{name}", f"/stereo/right/{name}")
+    assert found is not None
+    left, right, right_from_left = found
+    assert left == known.lens(path, f"/stereo/left/{name}")
+    assert right.intrinsics == pytest.approx((0.9 * 30.011, 27.9, 12.5, 8.0) if rectified else (30.011, *FOCAL[1:]))
+    # a point of the left camera's frame has the same x and depth in both rectified frames, but for the baseline
+    of_left, of_right = (
+        np.eye(3) if rectified else Rotation.from_rotvec([0, degrees, 0], degrees=True).as_matrix()
+        for degrees in (2.0, -1.0)
+    )
+    point = np.array([3.0, -4.0, 80.0])
+    seen = of_right @ (right_from_left[:3, :3] @ point + right_from_left[:3, 3])
+    np.testing.assert_allclose(seen, of_left @ point - [5.5, 0, 0], atol=1e-9)
+
+
+def test_another_recordings_bag_gives_its_only_pair_of_cameras(tmp_path: Path) -> None:
+    path = write_stereo(tmp_path)
+    known = format_of(path)
+    assert known is not None
+    of_these = known.stereo(path, "/stereo/left/image_raw", "/stereo/right/image_raw")
+    of_others = known.stereo(path, "/endoscope/l/image_raw", "/endoscope/r/image_raw")
+    assert of_these is not None
+    assert of_others is not None
+    np.testing.assert_array_equal(of_these[2], of_others[2])
+
+
+@pytest.mark.parametrize(
+    ("baseline", "left", "right", "words"),
+    [
+        (0.0, "left", "right", "/stereo/right/camera_info: projection_matrix: has no baseline (its 4th number is 0)"),
+        (0.0055, "right", "left", "/stereo/right/camera_info: projection_matrix: has a baseline, so it is the right"),
+        (0.5, "left", "right", "/stereo/right/camera_info: T: 0.5 long, which is no stereo scope's"),
+    ],
+)
+def test_a_calibration_of_no_stereo_scope_is_refused(
+    tmp_path: Path, baseline: float, left: str, right: str, words: str
+) -> None:
+    path = write_stereo(tmp_path, baseline=baseline)
+    known = format_of(path)
+    assert known is not None
+    with pytest.raises(NeecoError) as caught:
+        known.stereo(path, f"/stereo/{left}/image_raw", f"/stereo/{right}/image_raw")
+    assert words in str(caught.value)
+
+
+def test_a_bag_without_the_right_cameras_camera_info_says_what_to_give(tmp_path: Path) -> None:
+    path = whole(tmp_path)
+    known = format_of(path)
+    assert known is not None
+    with pytest.raises(NeecoError, match="holds no /stereo/right/camera_info; give a calibration of both cameras"):
+        known.stereo(path, LEFT, "/stereo/right/image_raw")

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.cli import main
 from neeco.errors import NeecoError
+from neeco.ingest.cameras.still_scene import read_right_camera
 from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
@@ -403,3 +404,27 @@ def _copy(path: Path, folder: Path) -> Path:
 
 def _messages(path: Path) -> Path:
     return path if path.is_file() else next(file for file in path.iterdir() if file.suffix != ".yaml")
+
+
+def test_two_cameras_of_a_bag_are_paired_by_their_stamps(tmp_path: Path) -> None:
+    """As many images of each, but the right camera begins and ends later, and lost one on the way."""
+    taken = {LEFT: [*range(20)], RIGHT: [*range(3, 9), *range(10, 24)]}
+    with BagWriter(tmp_path, "recording.bag") as bag:
+        for topic, numbers in taken.items():
+            for number in numbers:
+                bag.image(topic, number / 25, np.full((*SIZE[::-1], 3), 10 * number, np.uint8), "rgb8")
+        for side, baseline in (("left", 0.0), ("right", 0.005)):
+            bag.camera_info(f"/stereo/{side}/camera_info", 0.0, SIZE, FOCAL, baseline=baseline)
+    path = tmp_path / "recording.yaml"
+    document = {"video": {"file": "recording.bag", "stream": LEFT}, "camera": "still"}
+    path.write_text(yaml.safe_dump(document | {"stereo": {"video": {"file": "recording.bag", "stream": RIGHT}}}))
+    recording = read_recording(path)
+    times = recording.source.open().times
+    assert recording.stereo is not None
+    assert len(recording.stereo.source.open().times) == len(times) == 20
+    selected = np.arange(0, 20, 3)
+    stems = [f"{number:02d}" for number in selected.tolist()]
+    found = read_right_camera(recording, selected, times, stems, tmp_path / "right", lambda *_: None)
+    shown = {stems[row]: int(found.load(row)[0, 0, 0]) // 10 for row in found.names}
+    assert shown == {stem: int(stem) for stem in stems if stem not in ("00", "09")}
+    np.testing.assert_allclose(found.world_from_camera[:3, 3], [5, 0, 0], atol=1e-9)

@@ -58,6 +58,17 @@ def test_the_lens_is_the_camera_s(trajectory):
     assert right.fl_x == RIGHT[0, 0]
 
 
+def test_the_right_video_is_the_second_camera_of_a_scope_that_stands_still(world, trajectory):
+    for stands_still in (lambda video: True, lambda video: False):
+        text = write_template(trajectory, stands_still=stands_still)
+        recording = read_recording(world.text(text, "recording.yaml"))
+        assert (recording.stereo is not None) is stands_still(None)
+        if recording.stereo is not None:
+            assert recording.stereo.source.stream == "regular/right_video.mp4"
+            assert recording.read_stereo()[1].fl_x == RIGHT[0, 0]
+    assert format_of(trajectory).stereo(trajectory, "regular/left_video.mp4", "green/left_video.mp4") is None
+
+
 def test_a_template_of_the_folder_is_complete(world, trajectory):
     recording = read_recording(world.text(write_template(trajectory), "recording.yaml"))
     assert (recording.video, recording.stream) == (trajectory, "regular/left_video.mp4")

@@ -71,10 +71,11 @@ def made(folder: Path, **changes) -> IngestResult:
     return replace(result, **changes)
 
 
-def based(overlap: float) -> BaseRegistration:
-    """A base found from outlines that overlap with what moves by so much."""
+def based(overlap: float, sd_mm: float = 1.0) -> BaseRegistration:
+    """A base found from outlines that overlap with what moves by so much, and its greatest standard deviation."""
     return BaseRegistration(
-        world_from_base=np.eye(4), clock_s=0.0, clock_sd_s=0.0, sd_mm=np.ones(3), sd_deg=np.ones(3), open_directions=(),
+        world_from_base=np.eye(4), clock_s=0.0, clock_sd_s=0.0, open_directions=(),
+        covariance=np.diag([*[np.radians(0.2) ** 2] * 3, 0.04, sd_mm**2, 0.04]),
         moved_mm=0.0, turned_deg=0.0, overlap=overlap, overlap_before=0.5, residual_px=1.0, frames=100, from_masks=True,
     )  # fmt: skip
 
@@ -242,7 +243,9 @@ def test_the_side_view_has_the_tissue_ahead_of_the_camera():
         ({"dropped": tuple((i, DropReason("blurred")) for i in range(60))}, "careful", "60 of 106"),
         ({"contradictions": (Contradiction("nothing moves with the tool", True),)}, "bad", "Doubtful: nothing moves"),
         ({"contradictions": (Contradiction("the video is fast", False),)}, "careful", "with care: the video is"),
+        ({"bases": {"psm1": based(0.58)}}, "bad", "overlap by 0.58"),
         ({"bases": {"psm1": based(0.68)}}, "careful", "overlap by 0.68"),
+        ({"bases": {"psm1": based(0.92, sd_mm=4.0)}}, "careful", "psm1 is known to ±4.0 mm only"),
         ({"bases": {"psm1": based(0.92)}}, "good", "Ready"),
         ({"dropped": tuple((i, DropReason("not best", frame_usable=True)) for i in range(60))}, "good", "Ready"),
     ],
@@ -251,6 +254,26 @@ def test_the_verdict_names_what_is_doubtful(changes, level, piece):
     verdict = assess_ingest(made(SAMPLE, **changes), read_capture(SAMPLE))
     assert verdict.level == level
     assert piece in " ".join([verdict.headline, *verdict.warnings])
+
+
+@pytest.mark.parametrize(
+    ("overlap", "conclusion"),
+    [
+        (0.58, "do not train: the outline of psm1 and what moves overlap by 0.58 (usual: 0.8 or more); "),
+        (0.68, "usable: the outline of psm1 and what moves overlap by 0.68 (usual: 0.8 or more); "),
+        (0.93, "good: the outline of psm1 and what moves overlap by 0.93 (usual: 0.8 or more); "),
+    ],
+)
+def test_the_conclusion_names_the_two_facts_behind_it(tmp_path, overlap, conclusion):
+    result = made(SAMPLE, bases={"psm1": based(overlap)})
+    verdict = assess_ingest(result, read_capture(SAMPLE))
+    base_known = "the base of psm1 is known to ±1.0 mm (usual: 2 or less)"
+    assert verdict.conclusion == conclusion + base_known
+    assert verdict.as_json()["advice"] == conclusion.partition(":")[0]
+    assert len(verdict.as_json()["facts"]) == 2
+    write_ingest_page(result, tmp_path / "page.html")
+    sentence = f"{conclusion[0].upper()}{conclusion[1:]}{base_known}."
+    assert f"{sentence}</p>" in (tmp_path / "page.html").read_text()
 
 
 def test_what_check_finds_is_in_the_verdict():

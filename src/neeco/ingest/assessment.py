@@ -10,39 +10,78 @@ import numpy as np
 
 from neeco.capture.documents import Problem
 from neeco.capture.model import UNKNOWN_DEG, Capture
+from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.result import IngestResult
 from neeco.plausible import FEW_TRAIN_FRAMES
 
 # Limits above which there is a warning: conventions, not measurements.
 POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.015, 0.5
+BASE_MM, BASE_DEG = 2.0, 1.5  # standard deviations of a base
 SEVERE = 3.0  # times the limit
 MIN_POINTS = 100
-MIN_OVERLAP = 0.8  # of a base's outline with what moves: nine tenths are usual, half is another instrument or time
+MIN_OVERLAP = 0.8  # of a base's outline with what moves
 MIN_PLAUSIBLE_OVERLAP = 0.6
 MAX_SHOWN = 5  # warnings listed by `lines`
+N_FACTS = 2
 VERDICTS = {"good": "good", "careful": "usable", "bad": "doubtful"}
+ADVICE = {"good": "good", "careful": "usable", "bad": "do not train"}
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """headline: one sentence; warnings: why it is not better, one sentence each, the worst first."""
+    """headline: one sentence; warnings: why it is not better, one sentence each, the worst first; facts: the measured
+    values that decide, with what is usual."""
 
     level: Literal["good", "careful", "bad"]
     headline: str
     warnings: tuple[str, ...]
+    facts: tuple[str, ...] = ()
+
+    @property
+    def conclusion(self) -> str:
+        """Advice on training, and the facts behind it."""
+        return f"{ADVICE[self.level]}: {'; '.join(self.facts)}"
+
+    @property
+    def others(self) -> list[str]:
+        """The warnings that the headline does not state."""
+        return [warning for warning in self.warnings if not self.headline.endswith(_lower(warning))]
 
     def lines(self) -> list[str]:
         """Return the verdict for a terminal: headline (in capitals if doubtful) and the first MAX_SHOWN warnings."""
         verdict, _, rest = self.headline.partition(":")
+        others = self.others
         words = {"good": f"good. {self.headline}", "careful": self.headline, "bad": f"{verdict.upper()}:{rest}"}
         shown = [words[self.level]]
-        others = [warning for warning in self.warnings if not self.headline.endswith(_lower(warning))]
         shown += [f"  - {warning}" for warning in others[:MAX_SHOWN]]
         return shown + ([f"  - and {len(others) - MAX_SHOWN} more warnings"] if len(others) > MAX_SHOWN else [])
 
     def as_json(self) -> dict[str, Any]:
         """Return the verdict for scripts (`--json`)."""
-        return {"verdict": VERDICTS[self.level], "headline": self.headline, "doubts": list(self.warnings)}
+        found = {"verdict": VERDICTS[self.level], "headline": self.headline, "doubts": list(self.warnings)}
+        return found | {"advice": ADVICE[self.level], "facts": list(self.facts)}
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """Evidence on a capture: a fact, and a sentence that warns where it is unusual.
+
+    level: 0 where it is usual, 1 for a warning, 2 where the capture is not to be trained on.
+    """
+
+    fact: str
+    level: int
+    warning: str = ""
+
+    @classmethod
+    def of(cls, sentence: str, *, severe: bool) -> _Evidence:
+        """Evidence without a measured value."""
+        return cls(_lower(sentence).rstrip("."), 2 if severe else 1, sentence)
+
+    @classmethod
+    def measured(cls, fact: str, value: float, limit: float, warning: str) -> _Evidence:
+        """A measured value that should stay below a limit."""
+        return cls(fact, 0 if value <= limit else 1 if value <= SEVERE * limit else 2, warning)
 
 
 def rms(values: np.ndarray) -> float:
@@ -53,48 +92,49 @@ def rms(values: np.ndarray) -> float:
 def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Problem] = ()) -> Assessment:
     """Judge a finished ingest by its own numbers, by contradictions in its recording, and by the problems that `check`
     found in its capture; nothing here knows the truth."""
-    severe = [_sentence(item.sentence) for item in result.contradictions if item.severe]
     grave = [problem for problem in problems if problem.severity == "error" or problem.contradicted]
-    severe += [_sentence(str(problem)) for problem in grave]
-    mild = [_sentence(item.sentence) for item in result.contradictions if not item.severe]
-    for value, limit, sentence in _measured(result, capture):
-        if value > limit:
-            (severe if value > SEVERE * limit else mild).append(sentence)
-    for name, base in result.bases.items():
-        if base.overlap < MIN_OVERLAP:
-            sentence = f"The outline of {name} and what moves overlap by {base.overlap:.2f} only: is its clock right?"
-            (severe if base.overlap < MIN_PLAUSIBLE_OVERLAP else mild).append(sentence)
-    train = len(capture.split("train"))
-    if train < FEW_TRAIN_FRAMES:
-        severe.append(f"Only {train} frames are left to train on.")
+    evidence = [_Evidence.of(_sentence(item.sentence), severe=item.severe) for item in result.contradictions]
+    evidence += [_Evidence.of(_sentence(str(problem)), severe=True) for problem in grave]
+    evidence += _measured(result, capture)
     unusable = sum(not reason.frame_usable for _, reason in result.dropped)
     if unusable > 0.5 * result.video_frames:
-        mild.append(f"{unusable} of {result.video_frames} video frames were dropped as unusable.")
+        words = f"{unusable} of {result.video_frames} video frames were dropped as unusable."
+        evidence.append(_Evidence.of(words, severe=False))
     if result.points < MIN_POINTS:
-        mild.append(f"Only {result.points} tissue points were found.")
-    mild += [
-        f"Clock {name} was neither given nor found: {clock.source}."
+        evidence.append(_Evidence.of(f"Only {result.points} tissue points were found.", severe=False))
+    evidence += [
+        _Evidence.of(f"Clock {name} was neither given nor found: {clock.source}.", severe=False)
         for name, clock in result.clocks.items()
         if not np.isfinite(clock.sd)
     ]
     if result.in_video and not _rolls_known(capture):
-        mild.append("The instrument's roll is not known: log it, or pose frames by hand, before training.")
-    mild += [_sentence(str(problem)) for problem in problems if problem not in grave]
+        words = "The instrument's roll is not known: log it, or pose frames by hand, before training."
+        evidence.append(_Evidence.of(words, severe=False))
+    others = [problem for problem in problems if problem not in grave]
+    evidence += [_Evidence.of(_sentence(str(problem)), severe=False) for problem in others]
     if not capture.instruments:
-        mild.append("No instrument was tracked: only methods without states, such as 3dgs, can be trained.")
-        if not severe:
-            return Assessment("careful", "Cameras only: there is no instrument to pose.", tuple(mild))
+        words = "No instrument was tracked: only methods without states, such as 3dgs, can be trained."
+        evidence.append(_Evidence.of(words, severe=False))
     elif not capture.registered:
-        severe.append(
-            "Cameras and instrument do not meet: instrument poses are in a frame of their own, so that it cannot be "
-            "rendered where it was."
-        )
-    if severe:
-        return Assessment("bad", "Doubtful: " + _lower(severe[0]), (*severe, *mild))
-    if mild:
-        return Assessment("careful", "Usable, with care: " + _lower(mild[0]), tuple(mild))
+        words = "Cameras and instrument do not meet: instrument poses are in a frame of their own, so that it cannot "
+        evidence.append(_Evidence.of(words + "be rendered where it was.", severe=True))
+    return _judged(evidence, result, capture)
+
+
+def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -> Assessment:
+    """Return the assessment that all evidence gives, the worst first."""
+    ordered = sorted(evidence, key=lambda item: -item.level)
+    facts = tuple(item.fact for item in ordered[:N_FACTS])
+    warnings = tuple(item.warning for item in ordered if item.level)
+    worst = ordered[0].level if ordered else 0
+    if worst == 2:
+        return Assessment("bad", "Doubtful: " + _lower(warnings[0]), warnings, facts)
+    if not capture.instruments:
+        return Assessment("careful", "Cameras only: there is no instrument to pose.", warnings, facts)
+    if worst == 1:
+        return Assessment("careful", "Usable, with care: " + _lower(warnings[0]), warnings, facts)
     fit = "no measurement contradicts it" if result.registration is None else "cameras and instrument fit together"
-    return Assessment("good", f"Ready to train: {fit}.", ())
+    return Assessment("good", f"Ready to train: {fit}.", (), facts)
 
 
 def _sentence(text: str) -> str:
@@ -111,28 +151,56 @@ def _lower(sentence: str) -> str:
     return sentence[0].lower() + sentence[1:]
 
 
-def _measured(result: IngestResult, capture: Capture) -> list[tuple[float, float, str]]:
-    """Return (value, limit, sentence for a value above the limit)."""
-    measured = []
-    if (pixels := result.reprojection_px) is not None:
-        sentence = f"Tissue points are off by {pixels:.2f} px on average in the images they were found in."
-        measured.append((pixels, REPROJECTION_PX, sentence))
+def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
+    """Return what was measured, the most telling first."""
+    found = [item for name, base in result.bases.items() for item in _of_base(name, base)]
     registration = result.registration
     if registration is not None:
         position = rms(registration.position_residual)
+        says = f"cameras and laparoscope tracker agree to {position:.2f} mm rms (usual: {POSITION_MM:g} or less)"
+        warning = f"Cameras and laparoscope tracker disagree by {position:.2f} mm rms."
+        found.append(_Evidence.measured(says, position, POSITION_MM, warning))
+    if (pixels := result.reprojection_px) is not None:
+        says = f"tissue points are reprojected to {pixels:.2f} px (usual: {REPROJECTION_PX:g} or less)"
+        warning = f"Tissue points are off by {pixels:.2f} px on average in the images they were found in."
+        found.append(_Evidence.measured(says, pixels, REPROJECTION_PX, warning))
+    if registration is not None:
         rotation = float(np.degrees(rms(registration.rotation_residual)))
-        scale = registration.scale_sd
-        measured += [
-            (position, POSITION_MM, f"Cameras and laparoscope tracker disagree by {position:.2f} mm rms."),
-            (rotation, ROTATION_DEG, f"Cameras and laparoscope tracker disagree by {rotation:.2f}° rms."),
-            (scale, SCALE, f"Lengths are known to {scale:.1%} only: the scope travelled too little."),
-        ]
+        says = f"cameras and laparoscope tracker agree to {rotation:.2f}° rms (usual: {ROTATION_DEG:g} or less)"
+        warning = f"Cameras and laparoscope tracker disagree by {rotation:.2f}° rms."
+        found.append(_Evidence.measured(says, rotation, ROTATION_DEG, warning))
+        says = f"lengths are known to {registration.scale_sd:.1%} (usual: {SCALE:.1%} or less)"
+        warning = f"Lengths are known to {registration.scale_sd:.1%} only: the scope travelled too little."
+        found.append(_Evidence.measured(says, registration.scale_sd, SCALE, warning))
     for name, clock in result.clocks.items():
         moved = clock_cost_mm(name, clock.sd, capture)
         if moved is not None:
-            sentence = f"Clock {name} is known to ±{clock.sd * 1000:.0f} ms, up to {moved:.1f} mm of instrument motion."
-            measured.append((moved, CLOCK_MM, sentence))
-    return measured
+            known = f"Clock {name} is known to ±{clock.sd * 1000:.0f} ms, up to {moved:.1f} mm of instrument motion."
+            fact = f"{_lower(known).rstrip('.')} (usual: {CLOCK_MM:g} or less)"
+            found.append(_Evidence.measured(fact, moved, CLOCK_MM, known))
+    train = len(capture.split("train"))
+    fact = f"{train} frames to train on (usual: {FEW_TRAIN_FRAMES} or more)"
+    few = train < FEW_TRAIN_FRAMES
+    found.append(_Evidence(fact, 2 if few else 0, f"Only {train} frames are left to train on."))
+    found.append(_Evidence(f"{result.points:,} tissue points (usual: {MIN_POINTS} or more)", 0))
+    return found
+
+
+def _of_base(name: str, base: BaseRegistration) -> list[_Evidence]:
+    """Return what the images say of a robot's base."""
+    found = []
+    if np.isfinite(overlap := base.overlap):
+        level = 0 if overlap >= MIN_OVERLAP else 1 if overlap >= MIN_PLAUSIBLE_OVERLAP else 2
+        says = f"the outline of {name} and what moves overlap by {overlap:.2f}"
+        warning = f"{says[0].upper()}{says[1:]} only: is its clock right?"
+        found.append(_Evidence(f"{says} (usual: {MIN_OVERLAP:g} or more)", level, warning))
+    for unit, limit, sds in (("mm", BASE_MM, base.sd_mm), ("deg", BASE_DEG, base.sd_deg)):
+        worst = float(np.max(sds))
+        known = f"±{worst:.1f} {unit}" if np.isfinite(worst) else "no direction's certainty"
+        fact = f"the base of {name} is known to {known} (usual: {limit:g} or less)"
+        warning = f"The base of {name} is known to {known} only."
+        found.append(_Evidence(fact, 1 if not worst <= limit else 0, warning))
+    return found
 
 
 def clock_cost_mm(name: str, sd: float, capture: Capture) -> float | None:

@@ -24,7 +24,7 @@ from neeco.ingest.foreground.masks import moving_masks
 from neeco.ingest.frames.images import ChosenImages
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.readers.columns import CAMERA
-from neeco.ingest.recording.model import STILL
+from neeco.ingest.recording.model import MOVING, STILL
 from neeco.ingest.registration.clocks import find_instrument_clocks
 from neeco.ingest.registration.find_bases import check_reference_frames, find_bases
 from neeco.ingest.shaft.video_instruments import find_in_video
@@ -43,15 +43,19 @@ MOSTLY_SIMILAR = 0.7  # less is worth a note
 
 def is_still(data: Episodes, images: ChosenImages, progress: StageProgress) -> bool:
     """Return whether the scope stands still: as the recording states, else as its images show."""
-    if data.recording.camera is not None:
-        return data.recording.camera == STILL
-    if data.recording.stereo is not None:
-        return True
+    stated, stereo = data.recording.camera, data.recording.stereo is not None
+    if stereo and stated == MOVING:
+        data.notes.add("stereo: the second camera of a scope that moves is not used")
+    if stated is not None:
+        return stated == STILL
     progress("looking whether the scope moves", 0, 0)
     still = all(stands_still(images.loader(rows), len(rows)) for rows in _rows_by_episode(data, images).values())
     if still:
         data.notes.add("the scope stands still: nothing but the foreground moves in the images")
-    return still
+    elif stereo:
+        sentence = "its second camera is for a scope that stands still, and the background moves: state `camera`"
+        data.notes.contradict("scope", sentence, severe=False)
+    return still or stereo
 
 
 def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progress: StageProgress) -> World:
@@ -149,8 +153,7 @@ def _right_camera(data: Episodes, images: ChosenImages, folder: Path, progress: 
     cameras = []
     for episode, rows in _rows_by_episode(data, images).items():
         part = data.parts[episode]
-        assert part.recording.stereo is not None
         own, stems = images.selected[rows] - part.first_frame, [names[row] for row in rows]
-        found = read_right_camera(part.recording.stereo, own, part.times, stems, folder / "right", progress)
+        found = read_right_camera(part.recording, own, part.times, stems, folder / "right", progress)
         cameras.append(replace(found, names={int(rows[row]): name for row, name in found.names.items()}))
     return replace(cameras[0], names={row: name for camera in cameras for row, name in camera.names.items()})

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.files import write_atomically, write_text
+from neeco.ingest.cameras.still_scene import video_stands_still
 from neeco.ingest.readers import IMAGES, VideoSource, format_of
 from neeco.ingest.readers.choices import AXES, OpenPoses, Reading, axis_directions, largest_step, open_poses, shaft_of
 from neeco.ingest.readers.columns import BASE
@@ -39,7 +40,7 @@ def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
     path = (source.parent if holds_streams(source) else source) / RECORDING
     if path.exists():
         raise NeecoError(f"{path}: already exists; edit it, or move it away first")
-    write_text(path, write_template(source, lambda problem: report(f"left out: {problem}")))
+    write_text(path, write_template(source, lambda problem: report(f"left out: {problem}"), video_stands_still))
     lines, picture = [], path.with_name(CHOICES)
     try:
         if holds_streams(source) and write_choice_picture(source, picture):

@@ -72,7 +72,8 @@ class Ingested:
         shown += [f"to scrub through: rerun {self.rrd}"] if self.rrd is not None else []
         for tissue, verdict in self.verdicts.items():
             first, *others = verdict.lines()
-            shown += [f"verdict: {f'{tissue}: ' if tissue else ''}{first}", *others]
+            of = f"{tissue}: " if tissue else ""
+            shown += [f"verdict: {of}{first}", *others, f"{of}{verdict.conclusion}"]
         return shown
 
 

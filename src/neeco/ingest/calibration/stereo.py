@@ -7,7 +7,7 @@ from __future__ import annotations
 import configparser
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
     path = Path(path)
     if path.is_dir():
         left, right = _pair_of_files(path)
-        return _rectified((left, _one_camera(left)), (right, _one_camera(right)))
+        return from_projections(_one_camera(left), _one_camera(right))
     require_file(path, EXPECTED)
     document = _of_ini(path) if path.suffix.lower() == ".ini" else read_calibration(path)
     if not isinstance(document, dict):
@@ -69,9 +69,63 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
     if len(cameras) == 2:
         return _two_cameras(path, document, *cameras)
     if cameras and first_of(cameras[0].keys, _PROJECTION) is not None:
-        right = _right_beside(path)
-        return _rectified((path, cameras[0]), (right, _one_camera(right)))
+        return from_projections(RosCamera(path, cameras[0]), _one_camera(_right_beside(path)))
     raise NeecoError(f"{path}: camera matrices: not there for two cameras; expected {EXPECTED}")
+
+
+@dataclass(frozen=True)
+class RosCamera:
+    """A camera_info. where: begins messages; camera: with its rectification and projection among its keys; rectified:
+    are its images rectified already?"""
+
+    where: Path | str
+    camera: CameraNumbers
+    rectified: bool = False
+
+    def lens(self) -> Lens:
+        """Return the lens of the images, of rectified ones the pinhole of the projection. Raises NeecoError."""
+        if not self.rectified:
+            return lens_of(self.where, self.camera)
+        projection = self.projection()
+        pinhole = (projection[0, 0], projection[1, 1], projection[0, 2], projection[1, 2])
+        return lens_of(self.where, replace(self.camera, intrinsics=pinhole, distortion=(), fisheye=False))
+
+    def rectification(self) -> np.ndarray:
+        """Return rectified_from_camera [3, 3]. Raises NeecoError."""
+        turn = _numbers(self.where, self.camera.keys, _RECTIFICATION, 9).reshape(3, 3)
+        if rotation_error(turn) > ROTATION_TOLERANCE:
+            raise NeecoError(
+                f"{self.where}: rectification_matrix: is no rotation; calibrate the two cameras as one stereo rig"
+            )
+        return turn
+
+    def projection(self) -> np.ndarray:
+        """Return the projection matrix [3, 4]. Raises NeecoError."""
+        return _numbers(self.where, self.camera.keys, _PROJECTION, 12).reshape(3, 4)
+
+
+def from_projections(left: RosCamera, right: RosCamera) -> tuple[Lens, Lens, np.ndarray]:
+    """Return lenses and pose as `read_stereo` does, from the rectification and projection of two cameras as ROS's
+    camera_info and ORB-SLAM's settings have them: the right projection's fourth column is -focal length x baseline.
+    Raises NeecoError."""
+    of_left, of_right = left.projection(), right.projection()
+    focal_x, focal_y = of_right[0, 0], of_right[1, 1]
+    if min(focal_x, focal_y) <= 0:
+        raise NeecoError(
+            f"{right.where}: projection_matrix: has no focal length; calibrate the cameras as one stereo rig"
+        )
+    if np.abs(of_left[:2, 3]).max() > 0:
+        raise NeecoError(
+            f"{left.where}: projection_matrix: has a baseline, so it is the right camera's; exchange left and right"
+        )
+    shift = np.array([of_right[0, 3] / focal_x, of_right[1, 3] / focal_y, 0.0])
+    if not shift.any():
+        raise NeecoError(
+            f"{right.where}: projection_matrix: has no baseline (its 4th number is 0), so the cameras were calibrated "
+            "one by one; calibrate them as one stereo rig and give that file as stereo.calibration"
+        )
+    turns = [np.eye(3) if camera.rectified else camera.rectification() for camera in (left, right)]
+    return left.lens(), right.lens(), _pose(right.where, turns[1].T @ turns[0], turns[1].T @ shift)
 
 
 def _two_cameras(
@@ -88,7 +142,7 @@ def _two_cameras(
             return *lenses, _pose(path, matrix[:3, :3].ravel(), matrix[:3, 3])
     source, turn, shift = path, first_of(keys, _TURNS), first_of(keys, _SHIFTS)
     if turn is None and first_of(right.keys, _PROJECTION) is not None:
-        return _rectified((path, left), (path, right))
+        return from_projections(RosCamera(path, left), RosCamera(path, right))
     if turn is None and path.stem.lower().startswith("intrinsics"):
         source = path.with_name("ex" + path.name[2:])
         if not source.is_file():
@@ -171,41 +225,11 @@ def _number(path: Path, field: str, text: str) -> float:
         raise NeecoError(f"{path}: {field}: {printable(text)} is not a number; save the calibration again") from None
 
 
-def _one_camera(path: Path) -> CameraNumbers:
+def _one_camera(path: Path) -> RosCamera:
     cameras = cameras_in(path, read_calibration(path))
     if not cameras:
         raise NeecoError(f"{path}: camera_matrix: missing; expected the camera_info of one camera, as ROS saves it")
-    return cameras[0]
-
-
-def _rectified(
-    of_left: tuple[Path, CameraNumbers], of_right: tuple[Path, CameraNumbers]
-) -> tuple[Lens, Lens, np.ndarray]:
-    """Return lenses and pose from the rectification and projection of two cameras, each with the file that states it,
-    as ROS's camera_info and ORB-SLAM's settings have them: the right projection's fourth column is -focal length x
-    baseline."""
-    left, right = of_left[0], of_right[0]
-    lenses, turns, projections = [], [], []
-    for path, camera in (of_left, of_right):
-        lenses.append(lens_of(path, camera))
-        turns.append(_numbers(path, camera.keys, _RECTIFICATION, 9).reshape(3, 3))
-        projections.append(_numbers(path, camera.keys, _PROJECTION, 12).reshape(3, 4))
-        if rotation_error(turns[-1]) > ROTATION_TOLERANCE:
-            raise NeecoError(
-                f"{path}: rectification_matrix: is no rotation; calibrate the two cameras as one stereo rig"
-            )
-    focal_x, focal_y = projections[1][0, 0], projections[1][1, 1]
-    if min(focal_x, focal_y) <= 0:
-        raise NeecoError(f"{right}: projection_matrix: has no focal length; calibrate the cameras as one stereo rig")
-    if np.abs(projections[0][:2, 3]).max() > 0:
-        raise NeecoError(
-            f"{left}: projection_matrix: has a baseline, so it is the right camera's; exchange the two files"
-        )
-    shift = np.array([projections[1][0, 3] / focal_x, projections[1][1, 3] / focal_y, 0.0])
-    if not shift.any():
-        raise NeecoError(f"{right}: projection_matrix: has no baseline; calibrate the two cameras as one stereo rig")
-    pose = _pose(right, turns[1].T @ turns[0], turns[1].T @ shift)
-    return lenses[0], lenses[1], pose
+    return RosCamera(path, cameras[0])
 
 
 def _pair_of_files(folder: Path) -> tuple[Path, Path]:
@@ -224,7 +248,7 @@ def _right_beside(path: Path) -> Path:
     raise NeecoError(f"{path}: is one camera's; put the right camera's next to it, as left.yaml and right.yaml")
 
 
-def _numbers(path: Path, document: Mapping[str, Any], names: tuple[str, ...], count: int) -> np.ndarray:
+def _numbers(path: Path | str, document: Mapping[str, Any], names: tuple[str, ...], count: int) -> np.ndarray:
     found = matrix_numbers(path, first_of(document, names), names[0])
     if len(found) != count:
         raise NeecoError(f"{path}: {names[0]}: needs {count} numbers, has {len(found)}; write it as ROS does")
@@ -238,7 +262,7 @@ def _lens(path: Path, camera: CameraNumbers) -> Lens:
     return lens_of(path, replace(camera, distortion=camera.distortion + missing))
 
 
-def _pose(path: Path, turn: Sequence[float] | np.ndarray, shift: Sequence[float] | np.ndarray) -> np.ndarray:
+def _pose(path: Path | str, turn: Sequence[float] | np.ndarray, shift: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return right_from_left [4, 4] mm of a rotation (9 numbers by rows, or a rotation vector of 3) and a
     translation."""
     angles, vector = np.asarray(turn, np.float64).ravel(), np.asarray(shift, np.float64).ravel()

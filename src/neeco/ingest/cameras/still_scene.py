@@ -20,14 +20,14 @@ from neeco.capture.model import Frame, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
-from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.cameras.tissue_surface import TissueSurface, surface_behind, surface_from_stereo
 from neeco.ingest.foreground.background import Background, find_background
 from neeco.ingest.foreground.masks import moving_masks
 from neeco.ingest.foreground.residual_flow import STEP_PX
 from neeco.ingest.foreground.rough_shape import PosesAt, RoughShape, best_lag, carve_shape, project_mask
 from neeco.ingest.frames.views import SfmResult, StageProgress, Views, reduced
-from neeco.ingest.recording.model import IngestSettings, StereoPartner
+from neeco.ingest.readers import VideoSource
+from neeco.ingest.recording.model import IngestSettings, Recording, VideoFile
 
 N_FRAMES = 24  # spread over the recording, that are compared with each other
 N_CELLS = 20  # across an image, with a feature each
@@ -53,6 +53,12 @@ def stands_still(load: Callable[[int], np.ndarray], count: int) -> bool:
         stay += [_share_in_place(first, second) for first, second in zip(grey, grey[step:], strict=False)]
     shares = np.array([share for share in stay if share is not None])
     return len(shares) > 0 and float(np.mean(shares > STILL_SHARE)) > STILL_PAIRS
+
+
+def video_stands_still(video: VideoSource) -> bool:
+    """Return the same of a video. Raises NeecoError where it cannot be read."""
+    images = [image for _, image in video.read(evenly_spaced(len(video.times), N_FRAMES))]
+    return stands_still(images.__getitem__, len(images))
 
 
 def same_place(first: np.ndarray, second: np.ndarray) -> float | None:
@@ -122,7 +128,7 @@ class RightCamera:
 
 
 def read_right_camera(
-    partner: StereoPartner,
+    recording: Recording,
     selected: np.ndarray,
     times: np.ndarray,
     stems: Sequence[str],
@@ -130,17 +136,21 @@ def read_right_camera(
     progress: StageProgress,
 ) -> RightCamera:
     """Write the right camera's images at the `selected` [K] video frames, called as `stems`, undistorted, into
-    `folder`. times [V] s: of the left video's frames. The two videos begin together. Raises NeecoError."""
-    _, lens, right_from_left = read_stereo(partner.calibration)
-    video = partner.source.open()
-    lens.check_size(video.size, partner.calibration)
-    rows = {_nearest(video.times, times, int(frame), len(times)): row for row, frame in enumerate(selected)}
-    rows.pop(-1, None)
-    if 2 * len(rows) < len(selected):
+    `folder`. times [V] s: of the left video's frames. Two streams of one file share a clock; two videos begin together.
+    Raises NeecoError."""
+    assert recording.stereo is not None
+    source = recording.stereo.source
+    _, lens, right_from_left, calibration = recording.read_stereo()
+    video = source.open()
+    lens.check_size(video.size, calibration)
+    one_clock = isinstance(source, VideoFile) and source.file == recording.video
+    pairs = _pairs(video.times, times, selected, one_clock)
+    if 2 * len(pairs) < len(selected):
         raise NeecoError(
-            f"{video.path}: {len(video.times)} frames, the left video has {len(times)}: they show {len(rows)} of the "
+            f"{video.path}: {len(video.times)} frames, the left video has {len(times)}: they show {len(pairs)} of the "
             f"{len(selected)} chosen moments together; give the videos of one recording"
         )
+    rows = {right: row for row, right in pairs.items()}
     folder.mkdir(exist_ok=True)
     sample = sorted(rows)
     border = find_border(
@@ -169,13 +179,23 @@ def right_frames(right: RightCamera, frames: tuple[Frame, ...], rows: list[int])
     )
 
 
-def _nearest(right: np.ndarray, left: np.ndarray, frame: int, count: int) -> int:
-    """Return the right video's frame that was taken with a frame of the left, whose times are given; -1: none."""
-    if len(right) == count:
-        return frame
-    found = int(np.abs(right - left[frame]).argmin())
+def _pairs(right: np.ndarray, left: np.ndarray, selected: np.ndarray, one_clock: bool) -> dict[int, int]:
+    """Return the right camera's frame, by row of the `selected` frames of the left one, that was taken with it.
+
+    right [R], left [V] s: times of all frames, on one clock or, of videos that begin together, each on its own; these
+    are paired by number where there are equally many. A right frame that two rows are nearest to is of the nearer one.
+    """
+    if not one_clock and len(right) == len(left):
+        return dict(enumerate(selected.tolist()))
+    moments = left[selected]
+    nearest = np.abs(right - moments[:, None]).argmin(axis=1)
+    off = np.abs(right[nearest] - moments)
     step = float(np.median(np.diff(left)))
-    return found if abs(right[found] - left[frame]) < step / 2 else -1
+    found: dict[int, int] = {}
+    for row in np.argsort(off, kind="stable").tolist():
+        if off[row] < step / 2 and int(nearest[row]) not in found.values():
+            found[row] = int(nearest[row])
+    return found
 
 
 def still_cameras(count: int) -> SfmResult:

@@ -185,6 +185,11 @@ class RecordingFormat(ABC):
         """Return the lens of the images of `stream`; None where the file does not state it."""
         return None
 
+    def stereo(self, path: Path, left: str | None, right: str | None) -> tuple[Lens, Lens, np.ndarray] | None:
+        """Return the lenses of two streams of images, of this file or another one, and right_from_left [4, 4] mm
+        (OpenCV axes); None where the format does not state them."""
+        return None
+
 
 POSES, READINGS, IMAGES, OTHER = "poses", "readings", "images", "other"  # kinds of streams
 

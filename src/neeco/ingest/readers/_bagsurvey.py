@@ -17,7 +17,7 @@ from neeco.errors import NeecoError
 from neeco.geometry.rotations import rigid
 from neeco.ingest.readers import OTHER, Stream, Table
 from neeco.ingest.readers._bagfile import Bag, open_bag, plain
-from neeco.ingest.readers._rosimages import ImageLog
+from neeco.ingest.readers._rosimages import ImageLog, matrix_of
 from neeco.ingest.readers.columns import BASE, PoseColumns
 from neeco.ingest.readers.frame_names import meaning_of, of_dvrk
 from neeco.ingest.readers.interpolate import poses_at
@@ -122,7 +122,7 @@ class Survey:
         if kind in IMAGE:
             self.images[topic].add(received, message)
         elif kind == CAMERA_INFO:
-            if message is not None and (topic not in self.lenses or not _calibrated(self.lenses[topic])):
+            if message is not None and (topic not in self.lenses or not matrix_of(self.lenses[topic], "K")[0]):
                 self.lenses[topic] = message
         elif kind in TRANSFORMS:
             for item in [] if message is None else message.transforms:
@@ -167,10 +167,6 @@ def _fill(survey: Survey, bag: Bag) -> None:
     logs = logs or [log for log in [*survey.poses.values(), *survey.joints.values()] if log.stamps]
     firsts = [min(log.stamps) or min(log.received) for log in logs]
     survey.origin = min(firsts, default=0)
-
-
-def _calibrated(info: Any) -> bool:
-    return bool((info.K if hasattr(info, "K") else info.k)[0])
 
 
 def chained(survey: Survey, stream: str, images: set[str]) -> Table:

@@ -16,8 +16,8 @@ from PIL import Image
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
-from neeco.geometry.lens import Lens
-from neeco.ingest.calibration.lens import opencv_lens
+from neeco.ingest.calibration.camera_fields import cameras_in
+from neeco.ingest.calibration.stereo import RosCamera
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.readers._bagfile import open_bag, plain
 
@@ -191,23 +191,27 @@ def open_topic(path: Path, topic: str, log: ImageLog, seconds: np.ndarray, notes
     )
 
 
-def lens_of(where: str, info: Any, rectified: bool) -> Lens | None:
-    """Return the lens of a CameraInfo; of a rectified image, its pinhole camera. None where the camera was not
-    calibrated. Raises NeecoError."""
-    # ROS 1 has capitals
-    matrix, projection, distortion = (getattr(info, key if hasattr(info, key) else key.lower()) for key in "KPD")
+def matrix_of(info: Any, name: str) -> list[float]:
+    """Return the numbers K, D, R or P of a CameraInfo, whose fields have capitals in ROS 1."""
+    return [float(value) for value in getattr(info, name if hasattr(info, name) else name.lower())]
+
+
+def camera_of(where: str, info: Any, rectified: bool) -> RosCamera | None:
+    """Return the camera of a CameraInfo; None where it was not calibrated. Raises NeecoError."""
+    numbers = {name: matrix_of(info, name) for name in "KDRP"}
     region = info.roi
     cut = region.height not in (0, info.height) or region.width not in (0, info.width)
     if max(info.binning_x, info.binning_y) > 1 or cut:
         raise NeecoError(f"{where}: states binning or a part of the image; give the images' own `intrinsics`")
-    camera = [*projection[0:3], *projection[4:7], *projection[8:11]] if rectified else [*matrix]
-    if not camera[0]:
+    if not numbers["P" if rectified else "K"][0]:
         return None
     document = {
-        "camera_matrix": [float(value) for value in camera],
-        "distortion_coefficients": [] if rectified else [float(value) for value in distortion],
+        "camera_matrix": numbers["K"],
+        "distortion_coefficients": [] if rectified else numbers["D"],
+        "rectification_matrix": numbers["R"],
+        "projection_matrix": numbers["P"],
         "image_width": int(info.width),
         "image_height": int(info.height),
-        "distortion_model": "" if rectified else info.distortion_model,
+        "distortion_model": "" if rectified else plain(info.distortion_model),
     }
-    return opencv_lens(where, document)
+    return RosCamera(where, cameras_in(where, document)[0], rectified)

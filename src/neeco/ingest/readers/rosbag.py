@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
+from neeco.ingest.calibration.stereo import RosCamera, from_projections
 from neeco.ingest.readers import (
     IMAGES,
     OTHER,
@@ -113,16 +114,21 @@ class RosBag(RecordingFormat):
         return open_topic(path, chosen, log, seconds, notes)
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
-        from neeco.ingest.readers._rosimages import lens_of
-
         survey = self._survey(path)
-        chosen = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
-        plain = chosen.removesuffix("/compressed")
-        topic = f"{plain.rpartition('/')[0]}/camera_info"
-        if topic not in survey.lenses:
-            return None
-        rectified = plain.rpartition("/")[2].startswith("image_rect")
-        return lens_of(f"{path}: {topic}", survey.lenses[topic], rectified)
+        chosen = stream if stream else choose_stream(path, self.streams(path), None, (IMAGES,)).name
+        camera = _camera(survey, _info_topic(survey, chosen, of_right=False), chosen)
+        return None if camera is None else camera.lens()
+
+    def stereo(self, path: Path, left: str | None, right: str | None) -> tuple[Lens, Lens, np.ndarray] | None:
+        survey, cameras = self._survey(path), []
+        for stream, of_right in ((left, False), (right, True)):
+            topic = _info_topic(survey, stream, of_right)
+            camera = _camera(survey, topic, stream or "")
+            if camera is None:
+                what = f"{topic}: is not calibrated" if topic in survey.lenses else f"holds no {topic or 'camera_info'}"
+                raise NeecoError(f"{path}: {what}; give a calibration of both cameras as stereo.calibration")
+            cameras.append(camera)
+        return from_projections(*cameras)
 
     def origin_s(self, path: Path) -> float:
         """Return the time from which all streams' times count, s of the recorder's clock."""
@@ -253,6 +259,29 @@ def _camera_from_stated(survey: Survey, name: str) -> np.ndarray | None:
     own = next(iter(images))
     certain = meaning_of(frame, images, dvrk=of_dvrk(name)).frame is not None
     return None if certain or meaning_of(own, images).frame is None else fixed_transform(survey, frame, own)
+
+
+def _info_topic(survey: Survey, stream: str | None, of_right: bool) -> str | None:
+    """Return the topic of the camera_info of a stream of images, which is in their namespace; of another bag's stream,
+    whose topic is not in this one, that of its only right camera (with a baseline) or left one."""
+    from neeco.ingest.readers._rosimages import matrix_of
+
+    plain = (stream or "").removesuffix("/compressed")
+    topic = f"{plain.rpartition('/')[0]}/camera_info" if stream else None
+    if topic in survey.lenses or stream in survey.images:
+        return topic
+    sided = [name for name, info in survey.lenses.items() if bool(matrix_of(info, "P")[3]) == of_right]
+    return sided[0] if len(sided) == 1 else topic
+
+
+def _camera(survey: Survey, topic: str | None, stream: str) -> RosCamera | None:
+    """Return the camera that a topic states, as it takes the images of a stream; None where it is not calibrated."""
+    from neeco.ingest.readers._rosimages import camera_of
+
+    if topic not in survey.lenses:
+        return None
+    rectified = stream.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
+    return camera_of(f"{survey.path}: {topic}", survey.lenses[topic], rectified)
 
 
 def _camera_order(topic: str) -> tuple[bool, bool, bool, str]:

@@ -103,11 +103,14 @@ class SurgPose(RecordingFormat):
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
         name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        found = self.stereo(path, None, None)
+        return None if found is None else found[:2]["right" in Path(name).name]
+
+    def stereo(self, path: Path, left: str | None, right: str | None) -> tuple[Lens, Lens, np.ndarray] | None:
+        if left and right and right != left.replace("left", "right"):
+            return None  # of another light, or a left camera, too
         calibrations = visible_entries(path, "*.ini")
-        if len(calibrations) != 1:
-            return None
-        left, right, _ = read_stereo(calibrations[0])
-        return right if "right" in Path(name).name else left
+        return read_stereo(calibrations[0]) if len(calibrations) == 1 else None
 
 
 def _videos(path: Path) -> list[str]:

@@ -289,11 +289,31 @@ class FramesSection:
         return found
 
 
+@dataclass(frozen=True)
+class CalibrationSection:
+    """A calibration of two cameras, or a recording that holds one. stream: whose camera is the right one."""
+
+    shorthand: ClassVar[str] = "file"
+    file: Path
+    stream: str | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class StereoSection(FramesSection):
     """The right camera of a stereo scope."""
 
-    calibration: Path
+    calibration: CalibrationSection | None = None
+
+    def partner(self, left: VideoFile | ImageFolder) -> StereoPartner:
+        """Return it as the partner of the camera that took `left`."""
+        held = left.file if isinstance(left, VideoFile) and format_of(left.file) is not None else None
+        if self.source == left:
+            raise Fault("stereo.video", "these are the left camera's images; name the right camera's")
+        if self.calibration is not None:
+            return StereoPartner(self.source, self.calibration.file, self.calibration.stream)
+        if held is None or not isinstance(self.source, VideoFile) or self.source.file != held:
+            raise Fault("stereo.calibration", "missing; give the file of a stereo calibration, or a bag that holds it")
+        return StereoPartner(self.source)
 
 
 def _intrinsics(node: Node) -> Path | tuple[float, ...]:
@@ -354,7 +374,7 @@ class RecordingSection(FramesSection, BasesSection):
         instruments = tuple(item.logs(video, self.base, shared) for item in self.instruments)
         scope = None if self.laparoscope is None else self.laparoscope.log(video)
         sync, notes = _sync(node_of(self.sync, path, "sync"), instruments, scope)
-        stereo = None if self.stereo is None else StereoPartner(self.stereo.calibration, self.stereo.source)
+        stereo = None if self.stereo is None else self.stereo.partner(self.source)
         found = Recording(
             path, self.source, intrinsics=self.intrinsics, instruments=instruments, laparoscope=scope, sync=sync,
             frames=self.frames, splits=self.splits, notes=notes, settings=self.settings, camera=self.camera,

@@ -7,13 +7,15 @@ from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
 
+import numpy as np
+
 from neeco.capture.documents import Node
 from neeco.capture.kinematics import KinematicTree
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.calibration.stereo import read_stereo
-from neeco.ingest.readers import VideoSource, format_of
+from neeco.ingest.readers import DELIMITED, RecordingFormat, VideoSource, format_of
 from neeco.ingest.readers.columns import JointColumns, PoseColumns
 from neeco.ingest.readers.video import open_images, open_video
 from neeco.ingest.recording.base import StatedBase
@@ -141,10 +143,12 @@ class IngestSettings:
 
 @dataclass(frozen=True)
 class StereoPartner:
-    """The right camera of a stereo scope: the file that states its pose to the left one, and its frames."""
+    """The right camera of a stereo scope: its frames; the file that states its pose to the left one (None: that of the
+    frames); and, of several in that file, the stream whose camera it is."""
 
-    calibration: Path
     source: VideoFile | ImageFolder
+    calibration: Path | None = None
+    stream: str | None = None
 
 
 @dataclass(frozen=True)
@@ -192,13 +196,33 @@ class Recording:
         """Names of the clocks of all logs, each once."""
         return tuple(dict.fromkeys(log.clock for log in self.logs))
 
+    def read_stereo(self) -> tuple[Lens, Lens, np.ndarray, Path]:
+        """Return the lenses of the two cameras, right_from_left [4, 4] mm, and the file that states them. Raises
+        NeecoError."""
+        assert self.stereo is not None
+        source = self.stereo.source
+        right = source if isinstance(source, VideoFile) else VideoFile(Path())
+        file = self.stereo.calibration or right.file
+        known = _streams_of(file)
+        if known is None:
+            return *read_stereo(file), file
+        found = known.stereo(file, self.stream, self.stereo.stream or right.stream)
+        if found is None:
+            raise NeecoError(f"{file}: {known.format}: states no stereo calibration; give one as stereo.calibration")
+        return *found, file
+
     def read_lens(self) -> tuple[Lens | None, str]:
         """Return the lens given, else that which the images' file states (None: to be estimated), and its source.
         Raises NeecoError."""
         if self.intrinsics is None and self.stereo is not None:
-            return read_stereo(self.stereo.calibration)[0], str(self.stereo.calibration)
+            left, _, _, file = self.read_stereo()
+            return left, str(file)
         if self.intrinsics is None and self.video is not None and (known := format_of(self.video)) is not None:
             return known.lens(self.video, self.stream), str(self.video)
+        if isinstance(self.intrinsics, Path) and (known := _streams_of(self.intrinsics)) is not None:
+            if (lens := known.lens(self.intrinsics, self.stream)) is None:
+                raise NeecoError(f"{self.intrinsics}: states no lens of these images; give a calibration")
+            return lens, str(self.intrinsics)
         if isinstance(self.intrinsics, Path) and self.intrinsics.suffix.lower() == ".ini":  # which two cameras share
             return read_stereo(self.intrinsics)[0], str(self.intrinsics)
         where = str(self.intrinsics) if isinstance(self.intrinsics, Path) else f"{self.path}: intrinsics"
@@ -207,6 +231,15 @@ class Recording:
         except NeecoError as error:
             # numbers know nothing of where they came from
             raise NeecoError(f"{where}: {str(error).removeprefix('intrinsics: ')}") from error
+
+
+def _streams_of(file: Path) -> RecordingFormat | None:
+    """Return the format of a recording that a calibration is taken from; None for a calibration's own file."""
+    known = format_of(file)
+    if known is None or known.suffixes == DELIMITED:
+        return None
+    known.require_package(file)
+    return known
 
 
 def logs_of(

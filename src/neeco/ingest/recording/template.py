@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -11,15 +12,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from neeco.errors import NeecoError
 from neeco.files import placeholder, read_json, require_content
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers import IMAGES as IMAGE_STREAMS
-from neeco.ingest.readers import POSES, READINGS, Stream, format_of, read_table
+from neeco.ingest.readers import POSES, READINGS, Stream, format_of, numbers, read_table
 from neeco.ingest.readers.columns import (
+    BASE,
     MATRIX,
+    UNITS,
     PoseColumns,
     RecognisedColumns,
     recognise_pose,
@@ -30,7 +34,9 @@ from neeco.ingest.readers.columns import (
 from neeco.ingest.readers.frame_names import NamedFrame, without_frame
 from neeco.ingest.readers.logs import with_named_frame
 from neeco.ingest.readers.ndi import tool_columns, tool_names
+from neeco.ingest.readers.rosbag import DVRK_WRIST
 from neeco.ingest.readers.video import IMAGES
+from neeco.ingest.recording.drafted_scope import FoundFrames, StandsStill, draft_scope
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts", ".wmv", ".mxf")
 MAX_FILES = 400  # looked at; a folder with more is not one recording
@@ -50,6 +56,7 @@ class _Log:
     stream: Stream | None = None
     tool: str | None = None
     meaning: NamedFrame | None = None
+    in_base: bool = False  # are its poses stated in a base's frame?
 
     @property
     def hints(self) -> tuple[str, ...]:
@@ -84,12 +91,15 @@ class _Log:
 class _FolderFiles:
     """The files of a folder by their likely kind, as paths relative to it. others: those not used, in words."""
 
+    folder: Path
     videos: list[_Log] = field(default_factory=list)
     images: list[str] = field(default_factory=list)
     lenses: list[str] = field(default_factory=list)
     syncs: list[str] = field(default_factory=list)
     poses: list[tuple[_Log, RecognisedColumns]] = field(default_factory=list)
     joints: list[tuple[_Log, RecognisedColumns, str, str | None]] = field(default_factory=list)
+    spans: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)  # of readings, by stream and column
+    travels: dict[str, float] = field(default_factory=dict)  # mm, between the extremes of poses, by stream
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)  # of others, those that cannot be read
@@ -105,10 +115,12 @@ class _FolderFiles:
         self.image_problems += [line] if why and images else []
 
 
-def write_template(source: Path, report: Callable[[str], None] = lambda problem: None) -> str:
+def write_template(
+    source: Path, report: Callable[[str], None] = lambda problem: None, stands_still: StandsStill | None = None
+) -> str:
     """The text of a recording.yaml for the files in a folder and its subfolders, or for one file or folder that holds
     several streams, to stand next to it; `read_recording` accepts it. report: called with each
-    file that cannot be read, which is left out.
+    file that cannot be read, which is left out; stands_still: looks at images for `camera: still`.
 
     Raises NeecoError when there are no images.
     """
@@ -130,12 +142,21 @@ def write_template(source: Path, report: Callable[[str], None] = lambda problem:
         raise NeecoError(f"{source}: holds no video and no folder of images; put the recording's video there")
     for problem in found.problems:
         report(problem)
-    frames = [_frames_line(log) for log in found.videos]
-    frames += [f"images: {{folder: {_scalar(folder)}, fps: 25}}" for folder in found.images]
-    if not found.videos:
-        frames[0] += "   # the rate is a guess: correct it"
+    frames = [
+        FoundFrames(
+            _frames_line(log), log.file, found.folder / log.file, None if log.stream is None else log.stream.name
+        )
+        for log in found.videos
+    ]
+    frames += [
+        FoundFrames(f"images: {{folder: {_scalar(folder)}, fps: 25}}", folder, found.folder / folder)
+        for folder in found.images
+    ]
     poses = [(log, columns) for log, columns in found.poses if not _SCOPE.search(log.stem)]
     scopes = [(log, columns) for log, columns in found.poses if _SCOPE.search(log.stem)]
+    own = scopes[0][0].stream if scopes else None
+    scope = draft_scope(frames, found.lenses, None if own is None else found.travels.get(own.name), stands_still)
+    guess = "" if found.videos else "   # the rate is a guess: correct it"
     environment = Environment(
         loader=PackageLoader("neeco.ingest.recording", ""),
         undefined=StrictUndefined,
@@ -145,16 +166,16 @@ def write_template(source: Path, report: Callable[[str], None] = lambda problem:
     )
     environment.filters["scalar"] = _scalar
     return environment.get_template("recording.yaml.j2").render(
-        frames=frames,
+        frames=[f"{frames[0].line}{guess}", *(item.line for item in frames[1:] if item.line != scope.right)],
+        camera=scope,
         lenses=found.lenses,
-        instruments=_instruments(found, poses),
+        instruments=_instruments(found, poses, scope.still or not scopes),
         scope=_pose_lines(*scopes[0]) if scopes else None,
         scope_hints=scopes[0][0].hints if scopes else (),
         other_scopes=[", ".join(log.lines()) for log, _ in scopes[1:]],
         sync=next(iter(found.syncs), None),
         others=found.others[:MAX_OTHERS],
         episodes=found.episodes,
-        partner=next((line for line in frames[1:] if line.startswith(("video:", "images:"))), "video: right.mp4"),
     )
 
 
@@ -164,7 +185,7 @@ def holds_streams(source: Path) -> bool:
 
 
 def _find_files(source: Path) -> _FolderFiles:
-    found = _FolderFiles()
+    found = _FolderFiles(folder=source if source.is_dir() and format_of(source) is None else source.parent)
     if _add_streams(found, source, source.name):
         return found
     folder = source
@@ -232,11 +253,22 @@ def _classify_stream(found: _FolderFiles, log: _Log, stream: Stream, path: Path)
     when = recognise_time(table.header)
     if stream.kind == POSES:
         header = table.header if stream.columns is None else (*(when.time or ()), *stream.columns)
-        found.poses.append((log, recognise_pose(header)))
+        pose = recognise_pose(header)
+        unit = split_unit(pose.position[0], "length")[1] if pose.position else None
+        if pose.position and unit:
+            places = numbers(table, pose.position)[0]
+            places = places[np.isfinite(places).all(axis=1)]
+            if len(places):
+                found.travels[stream.name] = UNITS["length"][unit] * float(np.linalg.norm(np.ptp(places, axis=0)))
+        found.poses.append((replace(log, in_base=table.frame in (None, BASE) and not stream.asks), pose))
         found.joints += [(log, when, column, joint) for joint, column in stream.joints or ()]
         return
     angles = [column for column in table.header if split_unit(column, "angle")[1]]  # every angle is a joint
     named = [(None, column) for column in angles] if stream.joints is None else stream.joints
+    for _, column in named:
+        values = numbers(table, [column])[0]
+        if np.isfinite(values).any():
+            found.spans[stream.name, column] = float(np.nanmin(values)), float(np.nanmax(values))
     found.joints += [(log, when, column, joint) for joint, column in named]
 
 
@@ -293,8 +325,11 @@ def _is_lens(file: Path) -> bool:
     return False
 
 
-def _instruments(found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColumns]]) -> list[dict[str, Any]]:
-    """Name, lines of the pose log and (name, lines) of the joints of every instrument."""
+def _instruments(
+    found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColumns]], to_camera: bool
+) -> list[dict[str, Any]]:
+    """Name, lines of the pose log and (name, lines) of the joints of every instrument. to_camera: do the poses of a
+    base have to be related to a still camera?"""
     if not poses and not found.joints:
         return []
     names = _unique([log.stem for log, _ in poses]) or ["instrument"]
@@ -307,6 +342,9 @@ def _instruments(found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColu
     instruments = []
     for index, name in enumerate(names):
         logs = [log for log in found.joints if owners[log[0]] == name]
+        chain = [joint for *_, joint in logs]
+        if all(joint in DVRK_WRIST for joint in chain):
+            logs.sort(key=lambda log: DVRK_WRIST.index(str(log[3])))
         joints = _unique([joint or _joint_name(log, value) for log, _, value, joint in logs])
         instruments.append(
             {
@@ -314,6 +352,8 @@ def _instruments(found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColu
                 "poses": _pose_lines(*poses[index]) if poses else None,
                 "joints": [(joint, _joint_lines(found, *log[:3])) for joint, log in zip(joints, logs, strict=True)],
                 "hints": poses[index][0].hints if poses else (),
+                "in_base": to_camera and bool(poses) and poses[index][0].in_base,
+                "wristed": set(DVRK_WRIST) <= set(joints),
             }
         )
     return instruments
@@ -352,7 +392,14 @@ def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value:
     elif log.stream is None:
         lines.append("# calibration: table.csv   # of counts and angle_rad, where the values are counts")
     lines += _unit_lines(when, {} if tables else {"angle": (value,)})
-    return [*lines, "# limits: [0, 1.5]   # rad, of the joint"]
+    span = found.spans.get((log.stream.name, value)) if log.stream is not None else None
+    if span is None or span[0] == span[1]:
+        return [*lines, "# limits: [0, 1.5]   # rad, of the joint"]
+    low, high = math.floor(10 * span[0]) / 10, math.ceil(10 * span[1]) / 10
+    return [
+        *lines,
+        f"# limits: [{low:g}, {high:g}]   # how far it goes; its readings are {span[0]:.2f} to {span[1]:.2f}",
+    ]
 
 
 def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | None]) -> list[str]:
