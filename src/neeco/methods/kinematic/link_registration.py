@@ -8,6 +8,7 @@ readings, bends where the joints are.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,13 +21,12 @@ from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, rotation_from_vector
 from neeco.methods.kinematic.link_search import doubted_readings, note_doubt
-from neeco.methods.kinematic.stated_links import OFFSET_SD, StatedLinks
+from neeco.methods.kinematic.stated_links import AXIS_SD, OFFSET_SD, PIVOT_SD, StatedLinks
 from neeco.methods.space_carving import CarvedShape, Evidence, camera_from_instrument
 from neeco.training.session import GaussianSession
 
 MAX_FRAMES = 30
-WIDTHS = (20, 40)  # cells across the images compared, coarse to fine
-MAX_STEPS = 8  # at each
+WIDTHS, MAX_STEPS = (20, 40), (8, 4)  # cells across the images compared, coarse to fine, and steps at each
 CELLS_PER_OBSERVATION = 10.0  # of the finer images, whose errors are correlated
 EVIDENCE_SD = 0.3  # of a cell; beyond it, the cost is linear
 MIN_WEIGHT = 0.1  # of a residual; less where most frames have evidence, since the tissue's fit absorbed the instrument
@@ -41,21 +41,21 @@ LINK_RADIUS, END_RADIUS, END_LENGTH = 0.8, 0.4, 3.0  # in carved radii
 STEP = 0.05  # finite differences, in standard deviations
 MODEL_ERROR = 2.0  # of a standard deviation by the evidence: errors of the model are common to all frames
 MIN_GAIN = 10.0  # of -log likelihood, from which a correction is made
-SHAPE = ("shaft", "radii", "ends")  # parameters that are no correction
+# parameters of models, each with those of the one before: of the shape alone, the links as stated; of the links; of all
+MODELS = (("shaft", "radii", "ends"), ("turns", "shifts", "offsets"), ("base", "frame"))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinkRegistration:
     """A correction of an instrument's poses, and of its links in the tracked frame."""
 
-    base: Tensor  # [6] rotation vector (rad) about `center`, translation (mm), world frame
+    base: Tensor  # [6] rotation vector (rad) about `center`, translation (mm), world frame; zero: the links suffice
     center: Tensor  # [3] mm, world frame
-    turn: Tensor  # [3] rad, rotation vector of the links about `pivot`, tracked frame
-    pivot: Tensor  # [3] mm, tracked frame
-    shift: Tensor  # [3] mm, of the links, tracked frame
+    pivots: Tensor  # [J, 3] mm, of the joints at rest, tracked frame
+    axes: Tensor  # [J, 3] unit
     offsets: Tensor  # [R] rad or mm, of the readings
-    cost: float  # -log likelihood and prior
-    gain: float  # by which they are less than without a correction
+    needed: bool  # whether the evidence is explained significantly better than by the links as stated
+    cost: float  # -log likelihood and prior, of the most general model
     along_mm: float  # by which the first pivot moves along the shaft, mean over the frames
     along_sd_mm: float
 
@@ -73,36 +73,40 @@ def register_links(
     """Return the correction of instrument `name` with which its links explain the evidence best; None where no two
     joints follow each other. `readings`: of every frame of the evidence.
 
-    A base's error moves all poses by one rigid motion of the world, the frame's error moves the links along and about
-    the shaft (across it, the learned shape absorbs it). About a trocar both move the links alike along the shaft; then
-    the priors decide, and the sum is what the images show.
+    The links as stated, corrected links, and a corrected base and frame as well are compared: the simplest model
+    counts that no other betters significantly. A base's error moves all poses by one rigid motion of the world, the
+    frame's error moves the links along and about the shaft (across it, the learned shape absorbs it). About a trocar
+    both move the links alike along the shaft; then the priors decide, and the sum is what the images show.
     """
     line = links.rest_line()
     if line is None:
         return None
     problem = _SilhouetteProblem(links, evidence, name, shape, line, readings)
-    values = []
-    for names in (SHAPE, tuple(problem.layout)):
+    fits: list[tuple[tuple[str, ...], np.ndarray, Linearisation[np.ndarray]]] = []
+    names: list[str] = []
+    for more in MODELS:
+        names += more
         problem.fit_only(names)
         found = np.zeros(problem.size)
-        for width in WIDTHS:
+        for width, steps in zip(WIDTHS, MAX_STEPS, strict=True):
             problem.compare_at(width)
-            found = levenberg_marquardt(
-                found, problem.linearise, np.add, max_steps=MAX_STEPS, damping=1e-2, tolerance=1e-3
-            )
-        fitted = problem.linearise(found)
-        values.append(fitted.value)
+            found = levenberg_marquardt(found, problem.linearise, np.add, max_steps=steps, damping=1e-3, tolerance=1e-3)
+        fits.append((tuple(names), found, problem.linearise(found)))
+    costs = [fitted.value for _, _, fitted in fits]
+    chosen = next(k for k in range(len(fits)) if costs[k] - min(costs[k:]) < MIN_GAIN)
+    fitted_names, found, fitted = fits[chosen]
+    problem.fit_only(fitted_names)
     parts, along = problem.parts(found), problem.along_shaft(found)
     slope = np.array([problem.along_shaft(found + step) - along for step in STEP * np.eye(problem.size)]) / STEP
+    pivots, axes = problem.corrected_axes(parts)
     return LinkRegistration(
         base=parts["base"],
         center=problem.center,
-        turn=problem.axis * parts["frame"][0],
-        pivot=problem.pivot,
-        shift=problem.axis * parts["frame"][1],
+        pivots=pivots,
+        axes=axes,
         offsets=parts["offsets"],
-        cost=values[1],
-        gain=values[0] - values[1],
+        needed=chosen > 0,
+        cost=costs[-1],
         along_mm=along,
         along_sd_mm=MODEL_ERROR * float(np.sqrt(slope @ np.linalg.solve(np.asarray(fitted.information), slope))),
     )
@@ -116,7 +120,8 @@ def correct_poses(
     shape: CarvedShape,
     readings: list[dict[str, float]],
 ) -> bool:
-    """Correct the base and the links of an instrument where that explains the evidence better; return whether.
+    """Correct the links of an instrument, or also its base, where that explains the evidence better; return whether
+    its poses moved.
 
     Warns of its readings where others explain the evidence better than any correction: a frame that is off along the
     shaft makes a joint seem reversed. `readings`: those of every frame of the evidence.
@@ -129,28 +134,27 @@ def correct_poses(
         doubt = doubt if other is not None and other.cost < found.cost else None
     if doubt is not None:
         note_doubt(session, name, doubt)
-    if doubt is not None or found is None or found.gain < MIN_GAIN or len(scene.recorded.tissues) > 1:
+    if doubt is not None or found is None or not found.needed or len(scene.recorded.tissues) > 1:
         return False
     base = found.about(scene.center)
     with torch.no_grad():
         scene.base_corrections[scene.instruments.index(instrument)] = base
-        arms = links.points + links.axis_shifts - found.pivot
-        links.axis_shifts += found.shift + torch.linalg.cross(found.turn.expand_as(arms), arms)
-        links.axis_turns += found.turn
-        links.reading_offsets += found.offsets
+        links.axis_shifts.copy_(found.pivots - links.points)
+        cosines = (links.directions * found.axes).sum(1, keepdim=True)
+        links.axis_turns.copy_(torch.linalg.cross(links.directions, found.axes) / cosines)
+        links.reading_offsets.copy_(found.offsets)
     off, sd, degrees = -found.along_mm, found.along_sd_mm, float(torch.rad2deg(found.base[:3].norm()))
+    its_base = f", its base by {float(found.base[3:].norm()):.1f} mm and {degrees:.1f} degrees" if base.any() else ""
     session.report(
         f"{name}: the pose's frame is off along the shaft by {off:.1f} mm (standard deviation {sd:.1f} mm; positive: "
-        f"towards the jaws), its base by {float(found.base[3:].norm()):.1f} mm and {degrees:.1f} degrees; corrected"
+        f"towards the jaws){its_base}; corrected"
     )
     scene.diagnostics.setdefault("registration_of_links", {})[name] = {
         "frame_off_along_shaft_mm": round(off, 3),
         "frame_off_along_shaft_sd_mm": round(sd, 3),
         "base_correction": [round(value, 5) for value in base.tolist()],
-        "links_turned_deg": round(float(torch.rad2deg(found.turn.norm())), 3),
-        "links_shifted_mm": round(float(found.shift.norm()), 3),
     }
-    return True
+    return bool(base.any())
 
 
 class _SilhouetteProblem:
@@ -187,6 +191,8 @@ class _SilhouetteProblem:
         spreads = {
             "base": [BASE_SD_RAD] * 3 + [BASE_SD_MM] * 3,
             "frame": FRAME_SD,
+            "turns": [AXIS_SD] * 3 * len(joints),
+            "shifts": [PIVOT_SD] * 3 * len(joints),
             "offsets": [OFFSET_SD[slide] * float(seen) for slide, seen in zip(slides, links.observable, strict=True)],
             "shaft": SHAFT_SD,
             "radii": [LOG_RADIUS_SD] * links.link_count,
@@ -194,7 +200,7 @@ class _SilhouetteProblem:
         }
         self.layout = {key: torch.tensor(spread).to(self.axis) for key, spread in spreads.items()}
 
-    def fit_only(self, names: tuple[str, ...]) -> None:
+    def fit_only(self, names: Sequence[str]) -> None:
         """Fit the parameters of these names; others, and those without deviation, stay 0."""
         spread = torch.cat([spread * float(key in names) for key, spread in self.layout.items()])
         self.columns = torch.nonzero(spread)[:, 0]
@@ -248,10 +254,12 @@ class _SilhouetteProblem:
         silhouette = torch.sigmoid(inside / (EDGE_CELLS * self.cell_px))
         return ((silhouette - self.target.flatten(1)) * self.weight.flatten()).flatten()
 
-    def _axes(self, parts: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return (pivots [J, 3] mm, axes [J, 3]) of the joints at rest, with the frame's correction."""
+    def corrected_axes(self, parts: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return (pivots [J, 3] mm, axes [J, 3]) of the joints at rest, with their own and the frame's correction."""
         turn, shift = rotation_from_vector(self.axis * parts["frame"][0]), self.axis * parts["frame"][1]
         pivots, axes = self.links.axes()
+        pivots = pivots + parts["shifts"].view(-1, 3)
+        axes = nn.functional.normalize(axes + torch.linalg.cross(parts["turns"].view(-1, 3), axes), dim=1)
         return (pivots - self.pivot) @ turn.T + self.pivot + shift, axes @ turn.T
 
     def _corrected(self, parts: dict[str, Tensor]) -> Tensor:
@@ -265,14 +273,14 @@ class _SilhouetteProblem:
         """Return by how many mm the correction moves the first pivot along the shaft, mean over the frames."""
         parts, zero = self.parts(at), self.parts(np.zeros(self.size))
         moved, still = self._corrected(parts), self._corrected(zero)
-        shift = moved[:, :3, :3] @ self._axes(parts)[0][-1] + moved[:, :3, 3] - still[:, :3, 3]
-        shift = shift - still[:, :3, :3] @ self._axes(zero)[0][-1]
+        shift = moved[:, :3, :3] @ self.corrected_axes(parts)[0][-1] + moved[:, :3, 3] - still[:, :3, 3]
+        shift = shift - still[:, :3, :3] @ self.corrected_axes(zero)[0][-1]
         return float((shift * (still[:, :3, :3] @ self.axis)).sum(1).mean())
 
     def _capsules(self, parts: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return the ends [F, S, 2, 3] mm of the links' capsules in the cameras' frames, and their radii [S] mm."""
         links, shape, ends = self.links, self.shape, parts["ends"].view(-1, 2)
-        pivots, axes = self._axes(parts)
+        pivots, axes = self.corrected_axes(parts)
         tilts, shifts = parts["shaft"].split(2)
         base = shape.instrument_from_shaft.to(axes)
         shaft = nn.functional.normalize(base[:3, :3] @ torch.cat([tilts, tilts.new_ones(1)]), dim=0)
@@ -312,9 +320,9 @@ class _SilhouetteProblem:
         share = (NEAREST_MM - far[..., 2]) / torch.where(depth.abs() > 1e-6, depth, 1e-6)
         share = torch.where(far[..., 2] < NEAREST_MM, share.clamp(0, 1), 0.0)
         far = far + share[..., None] * (near - far)
-        intrinsics = [column[:, None] for column in self.evidence.intrinsics.unbind(1)]
+        fx, fy, cx, cy = (column[:, None] for column in self.evidence.intrinsics.unbind(1))
         (far_px, far_radius), (near_px, near_radius) = (
-            (torch.stack(project(end, *intrinsics, nearest=1.0), -1), intrinsics[0] * radii / end[..., 2].clamp_min(1))
+            (torch.stack(project(end, fx, fy, cx, cy, 1.0), -1), fx * radii / end[..., 2].clamp_min(1))
             for end in (far, near)
         )
         x, y = self.cells.unbind(1)  # [C]: coordinates apart, twice as fast as vectors
