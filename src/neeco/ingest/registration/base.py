@@ -71,16 +71,15 @@ Prior = tuple[np.ndarray, float, float]  # world_from_base [4, 4], standard devi
 class BaseRegistration:
     """A base and its uncertainty.
 
-    Standard deviations are along the first camera's right, down and forward, at the instrument: mm for shifts and
-    degrees for turns; NaN where a direction is undetermined and has no prior. `open_directions`: what the motion leaves
-    undetermined, in words.
+    `covariance` is of turns (rad) and then shifts (mm) of the base about the instrument's mean position, along the
+    first camera's right, down and forward; NaN where a direction is undetermined and has no prior. `open_directions`:
+    what the motion leaves undetermined, in words.
     """
 
     world_from_base: np.ndarray  # [4, 4]
     clock_s: float  # by which the log is ahead of what was given
     clock_sd_s: float
-    sd_mm: np.ndarray  # [3]
-    sd_deg: np.ndarray  # [3]
+    covariance: np.ndarray  # [6, 6]
     open_directions: tuple[str, ...]
     moved_mm: float = np.nan  # from what was given; NaN where nothing was
     turned_deg: float = np.nan
@@ -90,6 +89,18 @@ class BaseRegistration:
     frames: int  # that it was found from
     from_masks: bool
     explained: float = np.nan  # without masks: the share of the change in the images that the shaft explains
+
+    @property
+    def sd_mm(self) -> np.ndarray:
+        """Standard deviations [3] mm of shifts right, down and forward."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.sqrt(np.diag(self.covariance)[3:]))
+
+    @property
+    def sd_deg(self) -> np.ndarray:
+        """Standard deviations [3] degrees of turns about right, down and forward."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.degrees(np.sqrt(np.diag(self.covariance)[:3])))
 
     def as_json(self) -> dict[str, Any]:
         """Numbers for scripts: mm, degrees, s; None where a direction is undetermined and has no prior."""
@@ -311,20 +322,15 @@ def _result(
     problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit, information: FitInformation, size_sd: float
 ) -> BaseRegistration:
     covariance, open_directions, clock_sd = _covariance(problem, known, fit, information, size_sd)
-    view = problem.camera_from_world[0, :3, :3]
-    turns, shifts = (view @ covariance[part, part] @ view.T for part in (slice(0, 3), slice(3, 6)))
     moved: dict[str, float] = {}
     if known.sd_mm is not None:
         moved = _moved_from(known.world_from_base, fit.world_from_base, problem.middle)
         moved["overlap_before"] = overlap(problem, replace(fit, world_from_base=known.world_from_base))
-    with np.errstate(invalid="ignore"):
-        sd_mm, sd_deg = np.sqrt(np.diag(shifts)), np.degrees(np.sqrt(np.diag(turns)))
     return BaseRegistration(
         world_from_base=fit.world_from_base,
         clock_s=fit.clock,
         clock_sd_s=clock_sd,
-        sd_mm=sd_mm,
-        sd_deg=sd_deg,
+        covariance=in_camera(covariance, problem.camera_from_world[0]),
         open_directions=open_directions,
         overlap=overlap(problem, fit),
         residual_px=fit.residual_px,
@@ -332,6 +338,12 @@ def _result(
         from_masks=True,
         **moved,
     )
+
+
+def in_camera(covariance: np.ndarray, camera_from_world: np.ndarray) -> np.ndarray:
+    """Covariance [6, 6] of turns and shifts along a camera's axes, from that along the world's; [4, 4]."""
+    view, blocks = camera_from_world[:3, :3], covariance.reshape(2, 3, 2, 3)  # blocks apart: some may be NaN
+    return np.einsum("ai,xiyj,bj->xayb", view, blocks, view).reshape(6, 6)
 
 
 def _covariance(
@@ -408,13 +420,11 @@ def base_from_layers(
         for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
         if value > OPEN_SHARE**2 / (np.square(vector) @ (1 / before))
     ]
-    sds = np.sqrt(np.diag(found.covariance))
     return BaseRegistration(
         world_from_base=base,
         clock_s=found.clock,
-        clock_sd_s=float(sds[6]),
-        sd_mm=sds[3:6],
-        sd_deg=np.degrees(sds[:3]),
+        clock_sd_s=float(np.sqrt(found.covariance[6, 6])),
+        covariance=found.covariance[:6, :6],
         open_directions=tuple(dict.fromkeys(words)),
         frames=found.frames,
         from_masks=False,
