@@ -201,9 +201,8 @@ def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Eviden
         warning = f"{says[0].upper()}{says[1:]} only: is its clock right?"
         found.append(_Evidence(f"{says} (usual: {MIN_OVERLAP:g} or more)", level, warning))
     known = [(f"the base of {name}", "mm", BASE_MM, base.sd_mm), (f"the base of {name}", "deg", BASE_DEG, base.sd_deg)]
-    if base.covariance is not None and base.shaft is not None and linked:
-        side = frame_about(base.shaft).T
-        sd_mm, sd_deg = base.deviations(side)
+    if base.shaft is not None and linked:
+        sd_mm, sd_deg = base.deviations(frame_about(base.shaft).T)
         known = [
             (f"the place of {name} along its shaft", "mm", BASE_MM, sd_mm[2:]),
             (f"the place of {name} across its shaft", "mm", BASE_MM, sd_mm[:2]),

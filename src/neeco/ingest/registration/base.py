@@ -72,19 +72,18 @@ Prior = tuple[np.ndarray, float, float]  # world_from_base [4, 4], standard devi
 class BaseRegistration:
     """A base and its uncertainty.
 
-    Standard deviations are of the base itself, along the first camera's right, down and forward, at the instrument: mm
-    for shifts and degrees for turns; NaN where a direction is undetermined and has no prior. They include errors that a
-    learned shape makes up for, such as a shift along a shaft that hardly tilts; `sd_motion_mm` does not: root mean
-    square over the recording, after the best constant offset in the instrument's frame. `covariance` (turns rad, shifts
-    mm) and `shaft`, its mean direction towards the tip, are in the world's directions. `open_directions`: what the
-    motion leaves undetermined, in words.
+    `covariance` is of turns (rad) and then shifts (mm) of the base about the instrument's mean position, along the
+    first camera's right, down and forward; NaN where a direction is undetermined and has no prior. It includes errors
+    that a learned shape makes up for, such as a shift along a shaft that hardly tilts; `sd_motion_mm` does not: root
+    mean square over the recording, after the best constant offset in the instrument's frame. `shaft`: its mean
+    direction towards the tip, in the first camera's axes. `open_directions`: what the motion leaves undetermined, in
+    words.
     """
 
     world_from_base: np.ndarray  # [4, 4]
     clock_s: float  # by which the log is ahead of what was given
     clock_sd_s: float
-    sd_mm: np.ndarray  # [3]
-    sd_deg: np.ndarray  # [3]
+    covariance: np.ndarray  # [6, 6]
     open_directions: tuple[str, ...]
     moved_mm: float = np.nan  # from what was given; NaN where nothing was
     turned_deg: float = np.nan
@@ -94,18 +93,29 @@ class BaseRegistration:
     frames: int  # that it was found from
     from_masks: bool
     explained: float = np.nan  # without masks: the share of the change in the images that the shaft explains
-    covariance: np.ndarray | None = None  # [6, 6]
     shaft: np.ndarray | None = None  # [3] unit
     sd_motion_mm: float = np.nan
 
     def deviations(self, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Standard deviations, mm [N] and degrees [N], of shifts along and turns about axes [N, 3], world."""
-        assert self.covariance is not None
-        turns, shifts = (
-            np.einsum("ni,ij,nj->n", axes, self.covariance[part, part], axes) for part in (slice(0, 3), slice(3, 6))
+        """Standard deviations, mm [N] and degrees [N], of shifts along and turns about axes [N, 3] of the first
+        camera's frame."""
+        turned, shifted = (
+            np.einsum("ni,ij,nj->n", axes, part, axes) for part in (self.covariance[:3, :3], self.covariance[3:, 3:])
         )
         with np.errstate(invalid="ignore"):
-            return np.sqrt(shifts), np.degrees(np.sqrt(turns))
+            return np.sqrt(shifted), np.degrees(np.sqrt(turned))
+
+    @property
+    def sd_mm(self) -> np.ndarray:
+        """Standard deviations [3] mm of shifts right, down and forward."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.sqrt(np.diag(self.covariance)[3:]))
+
+    @property
+    def sd_deg(self) -> np.ndarray:
+        """Standard deviations [3] degrees of turns about right, down and forward."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.degrees(np.sqrt(np.diag(self.covariance)[:3])))
 
     def as_json(self) -> dict[str, Any]:
         """Numbers for scripts: mm, degrees, s; None where a direction is undetermined and has no prior."""
@@ -345,33 +355,35 @@ def _moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict
 
 
 def _result(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> BaseRegistration:
-    shaft = (fit.world_from_base[:3, :3] @ instrument_in_base(problem, fit)[:, :3, :3] @ fit.axis).mean(0)
+    poses = fit.world_from_base @ instrument_in_base(problem, fit)
+    shaft = (poses[:, :3, :3] @ fit.axis).mean(0)
     shaft /= np.linalg.norm(shaft)
     covariance, open_directions, clock_sd = _covariance(problem, known, fit, shaft)
-    view = problem.camera_from_world[0, :3, :3]
     moved: dict[str, float] = {}
     if known.sd_mm is not None:
         moved = _moved_from(known.world_from_base, fit.world_from_base, problem.middle)
         given = replace(fit, world_from_base=known.world_from_base)
         moved["overlap_before"] = shaft_overlap(problem, given)
-    found = BaseRegistration(
+    return BaseRegistration(
         world_from_base=fit.world_from_base,
         clock_s=fit.clock,
         clock_sd_s=clock_sd,
-        sd_mm=np.zeros(3),
-        sd_deg=np.zeros(3),
+        covariance=in_camera(covariance, problem.camera_from_world[0]),
         open_directions=open_directions,
         overlap=shaft_overlap(problem, fit),
         residual_px=fit.residual_px,
         frames=len(problem.blocks),
         from_masks=True,
-        covariance=covariance,
-        shaft=shaft,
-        sd_motion_mm=_sd_motion(covariance, fit.world_from_base @ instrument_in_base(problem, fit)),
+        shaft=problem.camera_from_world[0, :3, :3] @ shaft,
+        sd_motion_mm=_sd_motion(covariance, poses),
         **moved,
     )
-    sd_mm, sd_deg = found.deviations(view)
-    return replace(found, sd_mm=sd_mm, sd_deg=sd_deg)
+
+
+def in_camera(covariance: np.ndarray, camera_from_world: np.ndarray) -> np.ndarray:
+    """Covariance [6, 6] of turns and shifts along a camera's axes, from that along the world's; [4, 4]."""
+    view, blocks = camera_from_world[:3, :3], covariance.reshape(2, 3, 2, 3)  # blocks apart: some may be NaN
+    return np.einsum("ai,xiyj,bj->xayb", view, blocks, view).reshape(6, 6)
 
 
 def _covariance(
@@ -453,20 +465,16 @@ def base_from_layers(
         for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
         if value > OPEN_SHARE**2 / (np.square(vector) @ (1 / before))
     ]
-    sds = np.sqrt(np.diag(found.covariance))
-    turned = np.kron(np.eye(2), world_from_camera[:3, :3])
     return BaseRegistration(
         world_from_base=base,
         clock_s=found.clock,
-        clock_sd_s=float(sds[6]),
-        sd_mm=sds[3:6],
-        sd_deg=np.degrees(sds[:3]),
+        clock_sd_s=float(np.sqrt(found.covariance[6, 6])),
+        covariance=found.covariance[:6, :6],
         open_directions=tuple(dict.fromkeys(words)),
         frames=found.frames,
         from_masks=False,
         explained=found.explained,
-        covariance=turned @ found.covariance[:6, :6] @ turned.T,
-        shaft=world_from_camera[:3, :3] @ shaft,
-        sd_motion_mm=_sd_motion(turned @ found.covariance[:6, :6] @ turned.T, base @ poses),
+        shaft=shaft,
+        sd_motion_mm=_sd_motion(found.covariance[:6, :6], found.camera_from_base @ poses),
         **_moved_from(prior[0], base, poses[:, :3, 3].mean(0)),
     )

@@ -41,7 +41,7 @@ MAX_STEPS, TOLERANCE = 12, 1e-5  # of Levenberg-Marquardt, at each width; share 
 DAMPING, SMOOTH_DAMPING = 1e-2, 1e-4  # at first
 MAX_TURN_RAD, MAX_SHIFT_MM = 0.15, 15.0  # of the base in one step
 # errors of a log's poses that last, rad and mm along each axis: trackers and robots drift by 0.2 to 0.4 mm
-POSE_SDS = np.array([0.002] * 3 + [0.4] * 3)
+POSE_SDS = np.array([0.0015] * 3 + [0.3] * 3)
 STEPS = np.array([0.012] * 3 + [0.8] * 3 + [0.02] + [0.012] * 2 + [0.8] * 2)  # of differences, by parameter
 
 
