@@ -127,6 +127,13 @@ def test_a_setting_that_was_added_later_has_its_default(kinematic: GaussianScene
     assert load_scene(path).settings.hinge_start == 600
 
 
+def test_a_scene_from_before_bases_were_corrected_has_none(kinematic: GaussianScene, tmp_path: Path) -> None:
+    tensors, header = pack_scene(kinematic)
+    del tensors["module.base_corrections"]
+    save_tensors(tensors, {"neeco": json.dumps(header)}, tmp_path / "scene.safetensors")
+    assert not load_scene(tmp_path / "scene.safetensors").base_corrections.any()
+
+
 def test_a_scene_from_before_shadows_casts_none(kinematic: GaussianScene, tmp_path: Path) -> None:
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)

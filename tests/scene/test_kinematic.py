@@ -13,7 +13,7 @@ from scene_worlds import SURE, TISSUE, grasper_state, pose_of
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.geometry.rotations import quat_to_matrix, rotate_about
+from neeco.geometry.rotations import quat_to_matrix, rigid_from_vector, rotate_about
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.kinematic.deformation import Kinematic, Spin
 from neeco.scene import GaussianScene
@@ -239,6 +239,18 @@ def test_a_registration_moves_all_instruments_and_no_tissue(kinematic: GaussianS
         after = kinematic.at(grasper_state(POSE)).means
     assert torch.equal(after[:TISSUE], before[:TISSUE])
     assert torch.allclose(after[TISSUE:] - before[TISSUE:], torch.tensor([1.0, -2.0, 3.0]), atol=1e-4)
+
+
+def test_a_base_is_corrected_about_the_middle_of_the_tissue(kinematic: GaussianScene) -> None:
+    before = kinematic.at(grasper_state(POSE)).means
+    correction = torch.tensor([0.0, 0.1, 0.0, 1.0, -2.0, 3.0])
+    with torch.no_grad():
+        kinematic.base_corrections[0] = correction
+        after = kinematic.at(grasper_state(POSE)).means
+    moved, center = rigid_from_vector(correction), kinematic.center
+    expected = (before[TISSUE:] - center) @ moved[:3, :3].T + center + moved[:3, 3]
+    assert torch.equal(after[:TISSUE], before[:TISSUE])
+    assert torch.allclose(after[TISSUE:], expected, atol=1e-4)
 
 
 @pytest.mark.parametrize(
