@@ -41,6 +41,7 @@ LINK_RADIUS, END_RADIUS, END_LENGTH = 0.8, 0.4, 3.0  # in carved radii
 STEP = 0.05  # finite differences, in standard deviations
 MODEL_ERROR = 2.0  # of a standard deviation by the evidence: errors of the model are common to all frames
 MIN_GAIN = 10.0  # of -log likelihood, from which a correction is made
+MIN_ALONG_MM = 3.0  # by which links alone are moved along the shaft, at least: training finds smaller errors by itself
 # parameters of models, each with those of the one before: of the shape alone, the links as stated; of the links; of all
 MODELS = (("shaft", "radii", "ends"), ("turns", "shifts", "offsets"), ("base", "frame"))
 
@@ -54,7 +55,7 @@ class LinkRegistration:
     pivots: Tensor  # [J, 3] mm, of the joints at rest, tracked frame
     axes: Tensor  # [J, 3] unit
     offsets: Tensor  # [R] rad or mm, of the readings
-    needed: bool  # whether the evidence is explained significantly better than by the links as stated
+    needed: bool  # whether the evidence is explained significantly better, and the correction is not small
     cost: float  # -log likelihood and prior, of the most general model
     along_mm: float  # by which the first pivot moves along the shaft, mean over the frames
     along_sd_mm: float
@@ -105,7 +106,7 @@ def register_links(
         pivots=pivots,
         axes=axes,
         offsets=parts["offsets"],
-        needed=chosen > 0,
+        needed=chosen == len(MODELS) - 1 or (chosen > 0 and abs(along) > MIN_ALONG_MM),
         cost=costs[-1],
         along_mm=along,
         along_sd_mm=MODEL_ERROR * float(np.sqrt(slope @ np.linalg.solve(np.asarray(fitted.information), slope))),
