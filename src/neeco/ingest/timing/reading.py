@@ -82,7 +82,7 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
         notes.add(note, episode)
     clocks = {name: ClockOffset(float(seconds), 0.0, GIVEN) for name, seconds in recording.sync.items()}
     if VIDEO_CLOCK in recording.clocks:
-        clocks[VIDEO_CLOCK] = ClockOffset(0.0, 0.0, "the images' own")
+        clocks.setdefault(VIDEO_CLOCK, ClockOffset(0.0, 0.0, "the images' own"))
     # joints' clocks that nothing gives are the video's: images determine them to some 20 ms at best; trackers' clocks,
     # and those of joints on one of them, are found later, from motion
     found_later = {log.clock for log in (*poses.values(), *([scope] if scope else []))}
