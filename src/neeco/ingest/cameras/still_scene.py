@@ -101,7 +101,7 @@ def _features(grey: np.ndarray) -> np.ndarray:
     return np.array(places, np.float32).reshape(-1, 1, 2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StillScene:
     """The tissue, the instruments and the remarks that a still scope's images give."""
 
@@ -244,7 +244,9 @@ def look_behind(
         small = views.reduced_pinhole
         surface = surface_behind(swept, small, max(deepest, default=None), settings.scene_distance_mm)
     points, colors = surface.points(background.colors, pinhole, visible)
-    return StillScene(points, colors, shapes, lags, surface.how, tuple(notes), doubt)
+    return StillScene(
+        points=points, colors=colors, shapes=shapes, lags=lags, how=surface.how, notes=tuple(notes), doubt=doubt
+    )
 
 
 def _by_stereo(
