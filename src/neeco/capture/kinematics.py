@@ -113,7 +113,7 @@ class KinematicTree:
         return {reading for link in chain for reading in link.value}
 
     def world_from_root(self, pose: Array, readings: Mapping[str, float]) -> Array:
-        """[4, 4] mm from the recorded pose of the link `pose_of`. Raises KeyError for a missing reading that moves it."""
+        """[4, 4] mm from the recorded pose of the link `pose_of`. Raises KeyError without a reading that moves it."""
         if self.pose_of is None:
             return pose
         own = {name: readings[name] for name in self.readings_of(self.pose_of)}
