@@ -88,6 +88,7 @@ class BaseRegistration:
     residual_px: float = np.nan  # median, of the silhouettes, in the masks' pixels
     frames: int  # that it was found from
     from_masks: bool
+    doubts: tuple[str, ...] = ()  # what contradicts the recording's statements, in sentences
     explained: float = np.nan  # without masks: the share of the change in the images that the shaft explains
 
     @property
@@ -111,7 +112,12 @@ class BaseRegistration:
 
         numbers = ("sd_mm", "sd_deg", "clock_s", "clock_sd_s", "moved_mm", "turned_deg", "overlap", "explained")
         found = {name: known(getattr(self, name)) for name in (*numbers, "overlap_before")}
-        return {"world_from_base": self.world_from_base.tolist(), **found, "open": list(self.open_directions)}
+        return {
+            "world_from_base": self.world_from_base.tolist(),
+            **found,
+            "open": list(self.open_directions),
+            "doubts": list(self.doubts),
+        }
 
 
 def find_base(
@@ -154,7 +160,7 @@ def find_base(
         known = BasePrior(prior[0], np.radians(prior[2]), prior[1], clock_sd)
     starts = _starts(few, known, _distance(problem, prior), generator)
     if not starts:
-        raise NeecoError(_unmoved(name))
+        raise NeecoError(unmoved(name))
     best = max((fit_silhouettes(few, known, start) for start in starts), key=lambda fit: overlap(few, fit))
     radius = float(np.median(best.shape[len(best.shape) // 2 :, 0, 0]))
     if not RADIUS_RANGE_MM[0] < radius < RADIUS_RANGE_MM[1]:
@@ -296,23 +302,24 @@ def overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
 def _require_moved(name: str, problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> None:
     """Raise NeecoError where poses of other moments, or none, explain the masks as well."""
     if not (fit.residual_px < MAX_RESIDUAL_PX * problem.px_scale and overlap(problem, fit) > MIN_OVERLAP):
-        raise NeecoError(_unmoved(name))
+        raise NeecoError(unmoved(name))
     for share in EXCHANGED_SHARES:
         exchanged = replace(problem, poses=np.roll(problem.poses, round(share * len(problem.blocks)), axis=1))
         other = refine(exchanged, replace(known, sd_clock=0.0), fit, 12)
         if other.cost < MIN_EXCHANGED_COST * fit.cost:
-            raise NeecoError(_unmoved(name))
+            raise NeecoError(unmoved(name))
 
 
-def _unmoved(name: str) -> str:
+def unmoved(name: str) -> str:
+    """Error where nothing in the images moves as an instrument's log says."""
     return (
         f"instrument {name!r}: camera_from_base: nothing in the images moves with its poses; check which arm and which "
         "clock its log is of, or give the exact transform"
     )
 
 
-def _moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, float]:
-    """Distance between a base and a given one, at the instrument's mean position [3] mm in its frame."""
+def moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, Any]:
+    """Distance mm and degrees between a base and a given one, at the instrument's mean position [3] mm in its frame."""
     shift = (base[:3, :3] - given[:3, :3]) @ middle + base[:3, 3] - given[:3, 3]
     turn = Rotation.from_matrix(base[:3, :3] @ given[:3, :3].T).magnitude()
     return {"moved_mm": float(np.linalg.norm(shift)), "turned_deg": float(np.degrees(turn))}
@@ -322,9 +329,9 @@ def _result(
     problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit, information: FitInformation, size_sd: float
 ) -> BaseRegistration:
     covariance, open_directions, clock_sd = _covariance(problem, known, fit, information, size_sd)
-    moved: dict[str, float] = {}
+    moved: dict[str, Any] = {}
     if known.sd_mm is not None:
-        moved = _moved_from(known.world_from_base, fit.world_from_base, problem.middle)
+        moved = moved_from(known.world_from_base, fit.world_from_base, problem.middle)
         moved["overlap_before"] = overlap(problem, replace(fit, world_from_base=known.world_from_base))
     return BaseRegistration(
         world_from_base=fit.world_from_base,
@@ -429,5 +436,5 @@ def base_from_layers(
         frames=found.frames,
         from_masks=False,
         explained=found.explained,
-        **_moved_from(prior[0], base, poses[:, :3, 3].mean(0)),
+        **moved_from(prior[0], base, poses[:, :3, 3].mean(0)),
     )
