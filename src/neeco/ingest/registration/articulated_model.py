@@ -224,7 +224,7 @@ class ArticulatedModel:
         angle = np.arctan2((normal * other).sum(-1), (normal * sideways).sum(-1))
         factor = np.exp(flat[:, 0] * np.cos(2 * angle) + flat[:, 1] * np.sin(2 * angle))
         factor = np.where((flat != 0).any(-1), factor, 1.0)
-        middles, widths = [], []
+        middles, chords = [], []
         for place, radius in ((a, radii[:, 0]), (b, radii[:, 1])):
             size = (radius * factor)[..., None]
             sine = np.clip(size / np.maximum(-(facing * place).sum(-1, keepdims=True), 1e-3), 0, 0.9)
@@ -233,8 +233,18 @@ class ArticulatedModel:
                 np.stack(project(p, *intrinsics, nearest=NEAREST_MM / 2), -1) for p in (near - out, near + out)
             )
             middles.append((left + right) / 2)
-            widths.append(np.linalg.norm(right - left, axis=-1) / 2)
-        return Outlines(np.stack(middles, 2), np.stack(widths, 2), valid)
+            chords.append((right - left) / 2)
+        images, chord = np.stack(middles, 2), np.stack(chords, 2)
+        ahead = images[:, :, 1] - images[:, :, 0]
+        ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-6)
+        # across the cone's image: far from the image's middle, chords are oblique to it
+        across = chord[..., 1] * ahead[:, :, None, 0] - chord[..., 0] * ahead[:, :, None, 1]
+        widths = np.where(
+            np.linalg.norm(images[:, :, 1] - images[:, :, 0], axis=-1)[..., None] > 1.0,
+            np.abs(across),
+            np.linalg.norm(chord, axis=-1),
+        )
+        return Outlines(images, widths, valid)
 
     def outline_points(self, found: Outlines) -> np.ndarray:
         """Points [F, N, 2] px of all cones' outlines, of the cone `owner` [N] each."""
