@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 import yaml
 from bag_world import KINDS, BagWriter
+from ingest.still_world import HEIGHT, RATE, WIDTH, Theatre
 from scipy.spatial.transform import Rotation
 
+from neeco.capture import read_capture
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.ingest.cameras.still_scene import read_right_camera
+from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
@@ -428,3 +431,30 @@ def test_two_cameras_of_a_bag_are_paired_by_their_stamps(tmp_path: Path) -> None
     shown = {stems[row]: int(found.load(row)[0, 0, 0]) // 10 for row in found.names}
     assert shown == {stem: int(stem) for stem in stems if stem not in ("00", "09")}
     np.testing.assert_allclose(found.world_from_camera[:3, 3], [5, 0, 0], atol=1e-9)
+
+
+def test_what_the_right_camera_took_later_shows_the_state_of_that_moment(tmp_path: Path) -> None:
+    theatre, late, path = Theatre(tmp_path), 0.012, tmp_path / "recording.yaml"
+    with BagWriter(tmp_path, "recording.bag") as bag:
+        for number in range(30):
+            for topic, offset in ((LEFT, 0.0), (RIGHT, late)):
+                bag.image(topic, number / RATE + offset, theatre.image(number, topic == RIGHT), "rgb8")
+        for time in np.arange(-0.1, 30 / RATE + 0.1, 0.01):
+            bag.pose("/bar", time, theatre.place(time) / 1000, [1, 0, 0, 0])
+        size, intrinsics = (WIDTH, HEIGHT), (150.0, 150.0, WIDTH / 2, HEIGHT / 2)
+        bag.camera_info("/stereo/left/camera_info", 0.0, size, intrinsics)
+        bag.camera_info("/stereo/right/camera_info", 0.0, size, intrinsics, baseline=0.008)
+    bar = {"name": "bar", "poses": {"file": "recording.bag", "stream": "/bar", "frame": "camera"}}
+    left, right = ({"file": "recording.bag", "stream": topic} for topic in (LEFT, RIGHT))
+    document = {"video": left, "stereo": {"video": right}, "camera": "still", "instruments": [bar]}
+    path.write_text(yaml.safe_dump(document))
+    result = ingest(read_recording(path), tmp_path / "capture", lambda what, done, total: None)
+    assert any("taken +12 ms after the left one's" in note for note in result.notes)
+    frames = {frame.name: frame.state for frame in read_capture(result.capture).frames}
+    pairs = [(state, frames[name.removesuffix("_right")]) for name, state in frames.items() if name.endswith("_right")]
+    assert len(pairs) > 10
+    for state, of_left in pairs:
+        assert state.time - of_left.time == pytest.approx(late, abs=1e-6)
+        for taken in (state, of_left):
+            place = taken.instruments["bar"].pose[:3, 3].numpy()
+            assert np.abs(place - theatre.place(taken.time)).max() < 0.05

@@ -24,7 +24,7 @@ import torch
 from neeco.capture.model import Capture, Frame, InstrumentState, State, Uncertainty
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
-from neeco.ingest.cameras.still_scene import right_frames
+from neeco.ingest.cameras.still_scene import RightCamera
 from neeco.ingest.frames.images import DropReason, choose_images
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.moving_scope import find_moving_world
@@ -106,7 +106,7 @@ def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
         for row in chosen.tolist()
     )
     if world.right is not None:  # one camera more to learn from; what is tested stays one
-        frames += right_frames(world.right, frames, views.rows[chosen].tolist())
+        frames += _right_frames(data, world.right, frames, views.rows[chosen].tolist())
     assert images.lens is not None
     registered = world.registration is not None or set(data.parts[0].poses) <= set(data.world_from_base)
     lens = replace(images.lens, size=images.size, border=images.border)
@@ -114,6 +114,38 @@ def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
     return Capture(
         images.folder, frames, instruments, world.tissue, registered=registered, lens=lens, still=world.still
     )
+
+
+def _right_frames(data: Episodes, right: RightCamera, frames: Sequence[Frame], rows: list[int]) -> tuple[Frame, ...]:
+    """Return the training frames among `frames`, rows of the chosen ones, as the right camera took them: with the
+    states of its own moments, where these are known."""
+    taken = [
+        (frame, row) for frame, row in zip(frames, rows, strict=True) if frame.split == "train" and row in right.names
+    ]
+    if not taken:
+        return ()
+    times = np.array([frame.state.time + right.delays[row] for frame, row in taken])
+    states, known = data.states_at(times)
+    camera, found = right.pinhole.camera(right.world_from_camera), []
+    for index, (frame, row) in enumerate(taken):
+        state = frame.state if right.delays[row] == 0 else _moved(frame.state, states, index, float(times[index]))
+        if known[index]:
+            path = right.folder / right.names[row]
+            found.append(replace(frame, image_path=path, camera=camera, state=state, mask_path=right.mask))
+    return tuple(found)
+
+
+def _moved(state: State, states: States, row: int, time: float) -> State:
+    """Return a state with the poses and readings of another time, a row of `states`."""
+    instruments = {
+        name: replace(
+            item,
+            pose=torch.from_numpy(states[name][0][row].copy()),
+            joints={joint: float(values[row]) for joint, values in states[name][1].items()},
+        )
+        for name, item in state.instruments.items()
+    }
+    return State(instruments, time)
 
 
 def _result(

@@ -38,6 +38,7 @@ from neeco.ingest.world import (
 )
 
 SAME_PLACE = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
+SAME_MOMENT_S = 1e-3  # between two cameras' images
 MOSTLY_SIMILAR = 0.7  # less is worth a note
 
 
@@ -155,5 +156,23 @@ def _right_camera(data: Episodes, images: ChosenImages, folder: Path, progress: 
         part = data.parts[episode]
         own, stems = images.selected[rows] - part.first_frame, [names[row] for row in rows]
         found = read_right_camera(part.recording, own, part.times, stems, folder / "right", progress)
-        cameras.append(replace(found, names={int(rows[row]): name for row, name in found.names.items()}))
-    return replace(cameras[0], names={row: name for camera in cameras for row, name in camera.names.items()})
+        moved = {row: int(rows[row]) for row in found.names}
+        late = np.array([*found.delays.values()])
+        if np.median(np.abs(late)) > SAME_MOMENT_S:
+            data.notes.add(
+                f"the right camera's images were taken {1000 * np.median(late):+.0f} ms after the left one's (median; "
+                f"{1000 * late.min():+.0f} to {1000 * late.max():+.0f} ms): theirs are the states of these moments",
+                episode,
+            )
+        cameras.append(
+            replace(
+                found,
+                names={moved[row]: name for row, name in found.names.items()},
+                delays={moved[row]: delay for row, delay in found.delays.items()},
+            )
+        )
+    return replace(
+        cameras[0],
+        names={row: name for camera in cameras for row, name in camera.names.items()},
+        delays={row: delay for camera in cameras for row, delay in camera.delays.items()},
+    )

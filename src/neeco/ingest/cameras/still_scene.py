@@ -7,7 +7,7 @@ The world is the scope's own frame (OpenCV axes, mm), which for a stereo scope i
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from neeco.capture.images import open_image, write_image, write_labels
-from neeco.capture.model import Frame, evenly_spaced
+from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
@@ -120,6 +120,7 @@ class RightCamera:
     world_from_camera: np.ndarray  # [4, 4]
     folder: Path  # of its images
     names: Mapping[int, str]  # of its images, by row of the chosen frames; none where it took none
+    delays: Mapping[int, float]  # s, by which these were taken after the left camera's, by row
     mask: Path | None  # of its border
 
     def load(self, row: int) -> np.ndarray:
@@ -166,17 +167,10 @@ def read_right_camera(
         row = rows[frame]
         names[row] = f"{stems[row]}_right.png"
         write_image(folder / names[row], torch.from_numpy(lens.undistort(image).astype(np.float32) / 255))
-    return RightCamera(lens.pinhole(video.size), np.linalg.inv(right_from_left), folder, names, mask)
-
-
-def right_frames(right: RightCamera, frames: tuple[Frame, ...], rows: list[int]) -> tuple[Frame, ...]:
-    """Return the training frames among `frames`, rows of the chosen ones, as taken by the right camera."""
-    camera = right.pinhole.camera(right.world_from_camera)
-    return tuple(
-        replace(frame, image_path=right.folder / right.names[row], camera=camera, mask_path=right.mask)
-        for frame, row in zip(frames, rows, strict=True)
-        if frame.split == "train" and row in right.names
-    )
+    delays = {
+        row: float(video.times[right] - times[selected[row]]) if one_clock else 0.0 for row, right in pairs.items()
+    }
+    return RightCamera(lens.pinhole(video.size), np.linalg.inv(right_from_left), folder, names, delays, mask)
 
 
 def _pairs(right: np.ndarray, left: np.ndarray, selected: np.ndarray, one_clock: bool) -> dict[int, int]:

@@ -88,7 +88,10 @@ def read_dvrk_registration(path: Path) -> StatedBase:
         )
     frame = node.child("base-frame")
     if not isinstance(frame.value, dict):
-        frame.error("is missing", f"give {WHAT}, as …-registration-open-cv.json has it")
+        frame.error(
+            "is missing",
+            f"give {WHAT}, as …-registration-open-cv.json has it, or write {{transform: 4 rows, mm}} instead",
+        )
     matrix = frame.child("transform").rigid()
     assert matrix is not None
     matrix = matrix.copy()

@@ -75,6 +75,9 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
     if not placed:
         notes.add("no instrument was tracked: the capture has cameras and images only (method 3dgs trains)", episode)
     _check_video(recording, video)
+    if recording.stereo is not None:  # before anything that takes long
+        _, lens, _, calibration = recording.read_stereo()
+        lens.check_size(recording.stereo.source.open().size, calibration)
     for note in _length_notes(recording, video, logs):
         notes.add(note, episode)
     clocks = {name: ClockOffset(float(seconds), 0.0, GIVEN) for name, seconds in recording.sync.items()}
