@@ -34,10 +34,11 @@ from neeco.ingest.registration.base import (
     Prior,
     in_camera,
     moved_from,
+    sd_motion,
     unmoved,
 )
 from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S, BasePrior
-from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock
 
 START_FRAMES, FIT_FRAMES = 16, 48  # on which starts are compared, and that the result is fitted to
 ALONG_MM = (-10.0, -5.0, 5.0, 10.0)  # starts along the shaft
@@ -193,18 +194,23 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
         spread = spread + weight / (1 + weight) * np.outer(off, off)
     in_view = in_camera(spread, problem.camera_from_world[0])
     floor = np.array([np.radians(FLOOR_DEG)] * 3 + [FLOOR_MM, FLOOR_MM, FLOOR_DEPTH_MM])
+    spread = in_view + np.diag(floor**2)
+    poses = problem.camera_from_world[0] @ best.world_from_base @ poses_at_clock(problem.poses, best.clock)
+    shaft = (poses[:, :3, :3] @ problem.model.axis).mean(0)
     before = replace(best, world_from_base=given)
     return BaseRegistration(
         world_from_base=best.world_from_base,
         clock_s=best.clock,
         clock_sd_s=SCATTER * float(np.sqrt(full[6, 6])),
-        covariance=in_view + np.diag(floor**2),
+        covariance=spread,
         open_directions=(),
         overlap=overlap(problem, best),
         overlap_before=overlap(problem, before),
         residual_px=best.residual_px * problem.px_scale,
         frames=len(problem.blocks),
         from_masks=True,
+        shaft=shaft / np.linalg.norm(shaft),
+        sd_motion_mm=sd_motion(spread, poses),
         doubts=tuple(_doubts(problem, best, motion)),
         **moved_from(given, best.world_from_base, problem.middle),
     )
