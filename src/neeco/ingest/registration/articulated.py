@@ -95,7 +95,9 @@ def find_articulated_base(
     camera_from_world [F, 4, 4]; hidden: bool [h, w], beyond a round border. Raises NeecoError, naming the instrument,
     where the foreground is not the instrument.
     """
-    problem = _problem(masks, intrinsics, camera_from_world, motion, prior, hidden, clock_known)
+    problem = _problem(
+        masks, intrinsics, camera_from_world, motion, prior, hidden=hidden, sd_clock=0.0 if clock_known else CLOCK_SD_S
+    )
     if problem is None:
         raise NeecoError(
             f"instrument {name!r}: camera_from_base: poses, readings and what moves are there together in fewer than "
@@ -114,8 +116,9 @@ def _problem(
     camera_from_world: np.ndarray,
     motion: ArticulatedMotion,
     prior: Prior,
+    *,
     hidden: np.ndarray | None,
-    clock_known: bool,
+    sd_clock: float,
 ) -> ArticulatedProblem | None:
     """At most FIT_FRAMES frames with masks whose poses and readings are known at all clocks tried."""
     poses = np.stack([motion.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
@@ -137,7 +140,7 @@ def _problem(
         readings={key: part[:, rows] for key, part in readings.items()},
         values=values[:, rows],
         blocks=np.arange(len(rows)) * N_BLOCKS // len(rows),
-        prior=BasePrior(given, np.radians(sd_deg), sd_mm, 0.0 if clock_known else CLOCK_SD_S),
+        prior=BasePrior(given, np.radians(sd_deg), sd_mm, sd_clock),
     )
 
 
