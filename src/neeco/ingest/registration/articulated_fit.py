@@ -108,7 +108,7 @@ def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """What counts in a linearisation: outline points [F, N] of the model, and outline points [F, M] of the masks."""
+    """Outline points that count in a linearisation: [F, N] of the model, and [F, M] of the masks."""
 
     model: np.ndarray
     masks: np.ndarray
