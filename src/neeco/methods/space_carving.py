@@ -129,7 +129,9 @@ def gather_evidence(scene: GaussianScene, views: TrainingViews, settings: Carvin
     device. Pixels outside a mask have no evidence."""
     frames = views.frames
     picked = list(range(0, len(frames), max(1, -(-len(frames) // settings.evidence_frames))))
-    hits, unshaded, depths = [], [], []
+    hits: list[Tensor] = []
+    unshaded: list[Tensor] = []
+    depths: list[Tensor] = []
     for index in picked:
         frame = frames[index]
         rendering = rasterize(scene.at(frame.state), frame.camera)

@@ -274,11 +274,11 @@ def doubted_readings(
     for name in recorded:
         words = f"with the sign of {name} reversed: is its axis, or its gain, the wrong way round?"
         changes.append(((name,), words, partial(_reversed, name)))
-    kept = [volumes.with_readings(change) for _, _, change in changes]
-    most = max(kept, default=0.0)
+    volumes_of_changes = [volumes.with_readings(change) for _, _, change in changes]
+    most = max(volumes_of_changes, default=0.0)
     if most <= MIN_VOLUME_RATIO * named:
         return None
-    names, words, change = changes[len(kept) - 1 - kept[::-1].index(most)]
+    names, words, change = changes[len(volumes_of_changes) - 1 - volumes_of_changes[::-1].index(most)]
     return DoubtedReadings(names, most / max(named, 1), words, change)
 
 
