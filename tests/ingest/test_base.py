@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, disturbed, errors, make_world
+from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, WORLD_FROM_BASE, disturbed, errors, make_world
 
 from neeco.errors import NeecoError
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
@@ -33,6 +33,12 @@ def test_a_base_8_mm_and_5_degrees_off_is_found_with_its_clock():
     assert found.overlap > 0.8 > found.overlap_before + 0.1
     # before one still camera, little but the tip tells the size
     assert all("together with its size" in words for words in found.open_directions)
+    # a rigid shape hardly shows how far in it is: that stays uncertain by mm, unlike the motion that it does show
+    assert found.deviations(found.shaft[None])[0] > 3
+    assert 0.3 * beside < found.sd_motion_mm < 2
+    middle = world.poses_at(0.0)[:, :3, 3].mean(0)
+    off = (found.world_from_base - WORLD_FROM_BASE) @ np.append(middle, 1.0)
+    assert np.all(np.abs(off[:3]) < 2.5 * found.sd_mm)
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from PIL import Image
 from neeco.capture import read_capture
 from neeco.capture.documents import Problem
 from neeco.capture.images import write_image
+from neeco.capture.kinematics import KinematicTree, Link
 from neeco.capture.model import Frame, State
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
@@ -243,8 +244,8 @@ def test_the_side_view_has_the_tissue_ahead_of_the_camera():
         ({"dropped": tuple((i, DropReason("blurred")) for i in range(60))}, "careful", "60 of 106"),
         ({"contradictions": (Contradiction("nothing moves with the tool", True),)}, "bad", "Doubtful: nothing moves"),
         ({"contradictions": (Contradiction("the video is fast", False),)}, "careful", "with care: the video is"),
-        ({"bases": {"psm1": based(0.58)}}, "bad", "overlap by 0.58"),
-        ({"bases": {"psm1": based(0.68)}}, "careful", "overlap by 0.68"),
+        ({"bases": {"psm1": based(0.68)}}, "bad", "overlap by 0.68"),
+        ({"bases": {"psm1": based(0.80)}}, "careful", "overlap by 0.80"),
         ({"bases": {"psm1": based(0.92, sd_mm=4.0)}}, "careful", "psm1 is known to ±4.0 mm only"),
         ({"bases": {"psm1": based(0.92)}}, "good", "Ready"),
         ({"dropped": tuple((i, DropReason("not best", frame_usable=True)) for i in range(60))}, "good", "Ready"),
@@ -259,9 +260,9 @@ def test_the_verdict_names_what_is_doubtful(changes, level, piece):
 @pytest.mark.parametrize(
     ("overlap", "conclusion"),
     [
-        (0.58, "do not train: the outline of psm1 and what moves overlap by 0.58 (usual: 0.8 or more); "),
-        (0.68, "usable: the outline of psm1 and what moves overlap by 0.68 (usual: 0.8 or more); "),
-        (0.93, "good: the outline of psm1 and what moves overlap by 0.93 (usual: 0.8 or more); "),
+        (0.68, "do not train: the outline of psm1 and what moves overlap by 0.68 (usual: 0.85 or more); "),
+        (0.80, "usable: the outline of psm1 and what moves overlap by 0.80 (usual: 0.85 or more); "),
+        (0.93, "good: the outline of psm1 and what moves overlap by 0.93 (usual: 0.85 or more); "),
     ],
 )
 def test_the_conclusion_names_the_two_facts_behind_it(tmp_path, overlap, conclusion):
@@ -274,6 +275,18 @@ def test_the_conclusion_names_the_two_facts_behind_it(tmp_path, overlap, conclus
     write_ingest_page(result, tmp_path / "page.html")
     sentence = f"{conclusion[0].upper()}{conclusion[1:]}{base_known}."
     assert f"{sentence}</p>" in (tmp_path / "page.html").read_text()
+
+
+def test_what_is_unknown_along_a_shaft_counts_where_links_are_stated_from_there():
+    capture = read_capture(SAMPLE)
+    (instrument,) = capture.instruments
+    found = {instrument.name: replace(based(0.95, sd_mm=4.0), shaft=np.array([0.0, 1.0, 0.0]), sd_motion_mm=0.7)}
+    result = made(SAMPLE, bases=found)
+    assert assess_ingest(result, capture).level == "good"
+    links = KinematicTree((Link("shaft"),))
+    verdict = assess_ingest(result, replace(capture, instruments=(replace(instrument, kinematics=links),)))
+    assert verdict.level == "careful"
+    assert f"the place of {instrument.name} along its shaft is known to ±4.0 mm" in verdict.facts[0]
 
 
 def test_what_check_finds_is_in_the_verdict():

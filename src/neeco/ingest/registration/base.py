@@ -10,7 +10,7 @@ only the tip's motion in and out shows it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,13 +28,13 @@ from neeco.ingest.registration.silhouette_fit import (
     FRONT_SHARE,
     WIDTHS_PX,
     BasePrior,
-    FitInformation,
-    fit_information,
+    fit_covariance,
     fit_silhouettes,
     refine,
 )
 from neeco.ingest.registration.silhouette_model import (
     CLOCK_SHIFTS_S,
+    MAX_LENGTH_MM,
     SilhouetteFit,
     SilhouetteProblem,
     instrument_in_base,
@@ -53,8 +53,9 @@ SIZE_FACTORS, MAX_SIZE_STEPS = (1.25, 1.1), 8  # by which the scale is varied, a
 LOG_SIZE_RANGE, SIZE_SAMPLES = 0.15, 9  # of the loss about its minimum
 MIN_OVERLAP_RATIO = 0.95  # to the overlap before: less of an instrument fits more easily
 MIN_OVERLAP = 0.25  # of the instrument's silhouette with the masks
-# standard deviations of the log size that more frames do not lower: jaws blur the tip; and with texture on the shaft
-SIZE_SD, MARKED_SIZE_SD = 0.03, 0.007
+# Standard deviations that more frames do not lower, as wrists and jaws blur the tip: of the logarithm of the size, and
+# of the place along the shaft, which a rigid shape hardly determines (benchmarks/base_calibration.py)
+SIZE_SD, ALONG_SD_MM = 0.03, 4.0
 RADIUS_RANGE_MM, TYPICAL_RADIUS_MM = (1.5, 5.5), 3.5  # of shafts; one outside is first taken to be typical
 LEVER_MM = 40.0  # from the instrument's middle, at which a turn counts as a shift
 OPEN_SD_MM = 3.0  # at that lever, from which a direction counts as undetermined
@@ -72,8 +73,11 @@ class BaseRegistration:
     """A base and its uncertainty.
 
     `covariance` is of turns (rad) and then shifts (mm) of the base about the instrument's mean position, along the
-    first camera's right, down and forward; NaN where a direction is undetermined and has no prior. `open_directions`:
-    what the motion leaves undetermined, in words.
+    first camera's right, down and forward; NaN where a direction is undetermined and has no prior. It includes errors
+    that a learned shape makes up for, such as a shift along a shaft that hardly tilts; `sd_motion_mm` does not: root
+    mean square over the recording, after the best constant offset in the instrument's frame. `shaft`: its mean
+    direction towards the tip, in the first camera's axes. `open_directions`: what the motion leaves undetermined, in
+    words.
     """
 
     world_from_base: np.ndarray  # [4, 4]
@@ -88,7 +92,19 @@ class BaseRegistration:
     residual_px: float = np.nan  # median, of the silhouettes, in the masks' pixels
     frames: int  # that it was found from
     from_masks: bool
+    doubts: tuple[str, ...] = ()  # what contradicts the recording's statements, in sentences
     explained: float = np.nan  # without masks: the share of the change in the images that the shaft explains
+    shaft: np.ndarray | None = None  # [3] unit
+    sd_motion_mm: float = np.nan
+
+    def deviations(self, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Standard deviations, mm [N] and degrees [N], of shifts along and turns about axes [N, 3] of the first
+        camera's frame."""
+        turned, shifted = (
+            np.einsum("ni,ij,nj->n", axes, part, axes) for part in (self.covariance[:3, :3], self.covariance[3:, 3:])
+        )
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(shifted), np.degrees(np.sqrt(turned))
 
     @property
     def sd_mm(self) -> np.ndarray:
@@ -109,9 +125,24 @@ class BaseRegistration:
             listed = [float(value) if np.isfinite(value) else None for value in np.atleast_1d(values)]
             return listed if np.ndim(values) else listed[0]
 
-        numbers = ("sd_mm", "sd_deg", "clock_s", "clock_sd_s", "moved_mm", "turned_deg", "overlap", "explained")
+        numbers = (
+            "sd_mm",
+            "sd_deg",
+            "sd_motion_mm",
+            "clock_s",
+            "clock_sd_s",
+            "moved_mm",
+            "turned_deg",
+            "overlap",
+            "explained",
+        )
         found = {name: known(getattr(self, name)) for name in (*numbers, "overlap_before")}
-        return {"world_from_base": self.world_from_base.tolist(), **found, "open": list(self.open_directions)}
+        return {
+            "world_from_base": self.world_from_base.tolist(),
+            **found,
+            "open": list(self.open_directions),
+            "doubts": list(self.doubts),
+        }
 
 
 def find_base(
@@ -154,7 +185,7 @@ def find_base(
         known = BasePrior(prior[0], np.radians(prior[2]), prior[1], clock_sd)
     starts = _starts(few, known, _distance(problem, prior), generator)
     if not starts:
-        raise NeecoError(_unmoved(name))
+        raise NeecoError(unmoved(name))
     best = max((fit_silhouettes(few, known, start) for start in starts), key=lambda fit: overlap(few, fit))
     radius = float(np.median(best.shape[len(best.shape) // 2 :, 0, 0]))
     if not RADIUS_RANGE_MM[0] < radius < RADIUS_RANGE_MM[1]:
@@ -162,12 +193,11 @@ def find_base(
     best = _best_size(few, known, best)
     fit = fit_silhouettes(problem, known, best, WIDTHS_PX[-2:])
     problem, fit = with_marks(problem, fit)
-    fit, curvature = _settle_size(problem, known, refine(problem, known, fit))
+    fit = _settle_size(problem, known, refine(problem, known, fit))
     problem, fit = with_marks(problem, fit)
     fit = refine(problem, known, fit)
     _require_moved(name, problem, known, fit)
-    information = fit_information(problem, known, fit)
-    return _result(problem, known, fit, information, _size_sd(problem, fit, information, curvature))
+    return _result(problem, known, fit)
 
 
 def _problem(
@@ -251,9 +281,8 @@ def _best_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit)
     return fit
 
 
-def _settle_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> tuple[SilhouetteFit, float]:
-    """The fit at the size of least loss, by a parabola through those of sizes around, and the curvature of the loss
-    there by the logarithm of the size."""
+def _settle_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> SilhouetteFit:
+    """The fit at the size of least loss, by a parabola through those of sizes around."""
     logs = np.linspace(-LOG_SIZE_RANGE, LOG_SIZE_RANGE, SIZE_SAMPLES)
     fits = [refine(problem, known, resized(problem, fit, float(np.exp(log))), 8) for log in logs]
     losses = np.array([other.loss for other in fits])
@@ -264,78 +293,96 @@ def _settle_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFi
     if curve[0] > 0:
         least = float(np.clip(-curve[1] / (2 * curve[0]), *logs[near][[0, -1]]))
     nearest = int(np.argmin(np.abs(logs - least)))
-    settled = refine(problem, known, resized(problem, fits[nearest], float(np.exp(least - logs[nearest]))), 8)
-    return settled, max(float(curve[0]), 0.0)
-
-
-def _size_sd(problem: SilhouetteProblem, fit: SilhouetteFit, found: FitInformation, curvature: float) -> float:
-    """Standard deviation of the logarithm of the size, from the curvature of the mean loss."""
-    count = len(problem.blocks) * 2 * len(fit.stations) * (1 - FRONT_SHARE)
-    used = np.flatnonzero(np.diag(found.information) > 0)
-    expected = np.maximum(found.noise * np.diag(found.information)[used], 1e-12)
-    inflation = max(float(np.median(np.diag(found.scatter)[used] / expected)), 1.0)  # of variances, by correlation
-    variance = (fit.residual_px / 0.67 / problem.px_scale) ** 2 * inflation
-    still = len(np.unique(problem.camera_from_world.round(3), axis=0)) == 1
-    least = SIZE_SD if problem.marks is None else MARKED_SIZE_SD
-    return float(np.hypot(np.sqrt(variance / max(curvature * count, 1e-9)), least if still else 0.0))
+    return refine(problem, known, resized(problem, fits[nearest], float(np.exp(least - logs[nearest]))), 8)
 
 
 def overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
     """Intersection over union of the fit's filled silhouette with the masks, over all frames."""
     both, either = 0, 0
     left, right = np.split(sides(problem, fit).pixels, 2, axis=1)
-    corners = np.rint(np.clip(np.concatenate([left, right[:, ::-1]], 1), -1e4, 1e4) - 0.5).astype(np.int32)
-    for corner, mask in zip(corners, problem.silhouettes.masks, strict=True):
-        filled = np.zeros(mask.shape, np.uint8)
-        cv2.fillPoly(filled, [corner], 1)
-        both += int((filled.astype(bool) & mask).sum())
-        either += int((filled.astype(bool) | mask).sum())
+    for row, mask in enumerate(problem.silhouettes.masks):
+        filled = _filled(left[row], right[row], mask.shape)
+        both += int((filled & mask).sum())
+        either += int((filled | mask).sum())
     return both / max(either, 1)
+
+
+def shaft_overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
+    """Intersection over union of the fit's shaft with the masks behind its front, over all frames: wrists and jaws are
+    no part of the rigid shape."""
+    counted = fit.stations > FRONT_SHARE * fit.stations[-1]
+    stations = np.append(fit.stations[counted], fit.stations[-1] + MAX_LENGTH_MM)
+    shape = np.concatenate([fit.shape[counted], fit.shape[-1:]])
+    left, right = np.split(sides(problem, replace(fit, stations=stations, shape=shape)).pixels, 2, axis=1)
+    front, back = (left[:, 0] + right[:, 0]) / 2, (left[:, -2] + right[:, -2]) / 2
+    height, width = problem.silhouettes.masks.shape[1:]
+    y, x = np.mgrid[:height, :width] + 0.5
+    both, either = 0, 0
+    for row, mask in enumerate(problem.silhouettes.masks):
+        filled = _filled(left[row], right[row], mask.shape)
+        along = front[row] - back[row]
+        behind = (x - front[row, 0]) * along[0] + (y - front[row, 1]) * along[1] <= 0
+        both += int((filled & mask & behind).sum())
+        either += int(((filled | mask) & behind).sum())
+    return both / max(either, 1)
+
+
+def _filled(left: np.ndarray, right: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Pixels bool [h, w] between sides [K, 2] px of a silhouette."""
+    corners = np.rint(np.clip(np.concatenate([left, right[::-1]]), -1e4, 1e4) - 0.5).astype(np.int32)
+    filled = np.zeros(shape, np.uint8)
+    cv2.fillPoly(filled, [corners], 1)
+    return filled.astype(bool)
 
 
 def _require_moved(name: str, problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> None:
     """Raise NeecoError where poses of other moments, or none, explain the masks as well."""
     if not (fit.residual_px < MAX_RESIDUAL_PX * problem.px_scale and overlap(problem, fit) > MIN_OVERLAP):
-        raise NeecoError(_unmoved(name))
+        raise NeecoError(unmoved(name))
     for share in EXCHANGED_SHARES:
         exchanged = replace(problem, poses=np.roll(problem.poses, round(share * len(problem.blocks)), axis=1))
         other = refine(exchanged, replace(known, sd_clock=0.0), fit, 12)
         if other.cost < MIN_EXCHANGED_COST * fit.cost:
-            raise NeecoError(_unmoved(name))
+            raise NeecoError(unmoved(name))
 
 
-def _unmoved(name: str) -> str:
+def unmoved(name: str) -> str:
+    """Error where nothing in the images moves as an instrument's log says."""
     return (
         f"instrument {name!r}: camera_from_base: nothing in the images moves with its poses; check which arm and which "
         "clock its log is of, or give the exact transform"
     )
 
 
-def _moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, float]:
-    """Distance between a base and a given one, at the instrument's mean position [3] mm in its frame."""
+def moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, Any]:
+    """Distance mm and degrees between a base and a given one, at the instrument's mean position [3] mm in its frame."""
     shift = (base[:3, :3] - given[:3, :3]) @ middle + base[:3, 3] - given[:3, 3]
     turn = Rotation.from_matrix(base[:3, :3] @ given[:3, :3].T).magnitude()
     return {"moved_mm": float(np.linalg.norm(shift)), "turned_deg": float(np.degrees(turn))}
 
 
-def _result(
-    problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit, information: FitInformation, size_sd: float
-) -> BaseRegistration:
-    covariance, open_directions, clock_sd = _covariance(problem, known, fit, information, size_sd)
-    moved: dict[str, float] = {}
+def _result(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> BaseRegistration:
+    poses = fit.world_from_base @ instrument_in_base(problem, fit)
+    shaft = (poses[:, :3, :3] @ fit.axis).mean(0)
+    shaft /= np.linalg.norm(shaft)
+    covariance, open_directions, clock_sd = _covariance(problem, known, fit, shaft)
+    moved: dict[str, Any] = {}
     if known.sd_mm is not None:
-        moved = _moved_from(known.world_from_base, fit.world_from_base, problem.middle)
-        moved["overlap_before"] = overlap(problem, replace(fit, world_from_base=known.world_from_base))
+        moved = moved_from(known.world_from_base, fit.world_from_base, problem.middle)
+        given = replace(fit, world_from_base=known.world_from_base)
+        moved["overlap_before"] = shaft_overlap(problem, given)
     return BaseRegistration(
         world_from_base=fit.world_from_base,
         clock_s=fit.clock,
         clock_sd_s=clock_sd,
         covariance=in_camera(covariance, problem.camera_from_world[0]),
         open_directions=open_directions,
-        overlap=overlap(problem, fit),
+        overlap=shaft_overlap(problem, fit),
         residual_px=fit.residual_px,
         frames=len(problem.blocks),
         from_masks=True,
+        shaft=problem.camera_from_world[0, :3, :3] @ shaft,
+        sd_motion_mm=sd_motion(covariance, poses),
         **moved,
     )
 
@@ -347,55 +394,59 @@ def in_camera(covariance: np.ndarray, camera_from_world: np.ndarray) -> np.ndarr
 
 
 def _covariance(
-    problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit, found: FitInformation, size_sd: float
+    problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit, shaft: np.ndarray
 ) -> tuple[np.ndarray, tuple[str, ...], float]:
     """Covariance [6, 6] of the base (rad, mm, in the world's directions at the instrument), what is undetermined, in
-    words, and the standard deviation of the clock s."""
-    away = pivot_of(problem, fit) - np.linalg.inv(problem.camera_from_world)[:, :3, 3].mean(0)  # moves by it
-    depth = float(np.linalg.norm(away))
-    used = np.array([True] * 6 + [known.sd_clock > 0])
-    units = np.array([1 / LEVER_MM] * 3 + [1.0] * 3 + [0.05])[used]  # about as much motion of a silhouette each
-    information = found.information[np.ix_(used, used)] * np.outer(units, units)
-    scatter = found.scatter[np.ix_(used, used)] * np.outer(units, units)
-    before = np.zeros(7)
-    if known.sd_rad is not None and known.sd_mm is not None:
-        before[:6] = [known.sd_rad**-2.0] * 3 + [known.sd_mm**-2.0] * 3
-    before[6] = known.sd_clock**-2.0 if known.sd_clock > 0 else 0.0
-    prior = np.diag(before[used] * units**2)
-    values, vectors = np.linalg.eigh(information)
-    values = np.maximum(values, 1e-12)
-    variances = np.einsum("ip,ij,jp->p", vectors, scatter, vectors) / values**2 + found.noise / values
-    posterior = np.linalg.inv(vectors @ np.diag(1 / variances) @ vectors.T + prior + 1e-12 * np.eye(len(prior)))
-    covariance = posterior * np.outer(units, units)
-    shaft = (fit.world_from_base[:3, :3] @ instrument_in_base(problem, fit)[:, :3, :3] @ fit.axis).mean(0)
-    shaft /= np.linalg.norm(shaft)
-    words = []
-    if depth * size_sd > OPEN_SD_MM or (known.sd_mm is not None and depth * size_sd > OPEN_SHARE * known.sd_mm):
-        words.append(BY_SIZE)
-    if known.sd_mm is not None:
-        size_sd = (size_sd**-2 + (known.sd_mm / depth) ** -2) ** -0.5
-    covariance[3:6, 3:6] += size_sd**2 * np.outer(away, away)
-    for index in np.argsort(values):
-        vector, sd = vectors[:, index], float(variances[index]) ** 0.5
-        given = float(vector @ prior @ vector)
-        undetermined = sd > OPEN_SD_MM or (given > 0 and sd > OPEN_SHARE * given**-0.5)
-        if np.square(vector[:6]).sum() >= 0.5 and undetermined:
-            words.append(_direction(problem.camera_from_world[0, :3, :3], shaft, vector[:6]))
-    if known.sd_mm is None and words:
-        covariance[:6, :6] = np.where(np.abs(covariance[:6, :6]) > 1e6, np.nan, covariance[:6, :6])
+    words, and the standard deviation of the clock s. shaft [3]: its direction, world."""
+    away = pivot_of(problem, fit) - np.linalg.inv(problem.camera_from_world)[:, :3, 3].mean(0)  # moves by the size
+    still = len(np.unique(problem.camera_from_world.round(3), axis=0)) == 1
+    covariance = fit_covariance(problem, known, fit)
     clock_sd = float(np.sqrt(covariance[6, 6])) if known.sd_clock > 0 else 0.0
-    return covariance[:6, :6], tuple(dict.fromkeys(words)), clock_sd
+    covariance = covariance[:6, :6]
+    valleys = [ALONG_SD_MM * shaft] + ([SIZE_SD * away] if still else [])
+    for valley in valleys:
+        covariance[3:6, 3:6] += np.outer(valley, valley)
+    units = np.array([1 / LEVER_MM] * 3 + [1.0] * 3)  # about as much motion of a silhouette each
+    limit = OPEN_SD_MM**2
+    if known.sd_rad is not None and known.sd_mm is not None:
+        units, limit = np.array([known.sd_rad] * 3 + [known.sd_mm] * 3), OPEN_SHARE**2
+    values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
+    if known.sd_mm is not None:  # no less is known than before
+        values = np.minimum(values, 1.0)
+        covariance = (vectors * values) @ vectors.T * np.outer(units, units)
+    words = [
+        _direction(problem.camera_from_world[0, :3, :3], valleys, vector)
+        for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
+        if value > limit
+    ]
+    if known.sd_mm is None and words:
+        covariance = np.where(np.abs(covariance) > 1e6, np.nan, covariance)
+    return covariance, tuple(dict.fromkeys(words)), clock_sd
 
 
-def _direction(view: np.ndarray, shaft: np.ndarray, vector: np.ndarray) -> str:
+def sd_motion(covariance: np.ndarray, poses: np.ndarray) -> float:
+    """Root mean square mm over poses world_from_instrument [F, 4, 4] by which a base of this covariance [6, 6] moves
+    the instrument, after the best constant offset in its frame."""
+    arms = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
+    turns = np.cross(np.eye(3), arms[:, None]).transpose(0, 2, 1)  # [F, 3, 3]: rotation vector -> shift
+    moves = np.concatenate([turns, np.broadcast_to(np.eye(3), turns.shape)], 2)
+    local = np.einsum("fji,fjk->fik", poses[:, :3, :3], moves)
+    local = local - local.mean(0)
+    return float(np.sqrt(np.einsum("fij,jk,fik->", local, covariance, local) / len(poses)))
+
+
+def _direction(view: np.ndarray, valleys: Sequence[np.ndarray], vector: np.ndarray) -> str:
     """Describe a direction in which the base may move: turns and shifts [6], world, at LEVER_MM. view:
-    camera_from_world [3, 3]; shaft [3]: its direction, world."""
+    camera_from_world [3, 3]; valleys [3] each: the shaft's direction, world, and that of a change of size."""
+    shaft = valleys[0] / np.linalg.norm(valleys[0])
     turns = np.square(vector[:3]).sum() > 0.5 * np.square(vector).sum()
     way = vector[:3] if turns else vector[3:]
     way = way / np.linalg.norm(way)
     what, at = ("a turn", "about") if turns else ("a shift", "along")
-    if abs(way @ shaft) > 0.94:
+    if turns and abs(way @ shaft) > 0.94:
         return f"{what} {at} the shaft"
+    if not turns and max(abs(way @ valley) / np.linalg.norm(valley) for valley in valleys) > 0.7:
+        return BY_SIZE if len(valleys) > 1 else f"{what} {at} the shaft"
     local = view @ way
     names = ("the image's width", "the image's height", "the view (depth)")
     largest = int(np.argmax(np.abs(local)))
@@ -412,11 +463,12 @@ def base_from_layers(
     base_from_instrument."""
     base = world_from_camera @ found.camera_from_base
     shaft = (found.camera_from_base[:3, :3] @ poses[:, :3, :3] @ line.axis).mean(0)
+    shaft /= np.linalg.norm(shaft)
     units = np.array([1 / LEVER_MM] * 3 + [1.0] * 3)
     after, before = found.covariance[:6, :6] / np.outer(units, units), np.square(found.given[:6] / units)
     values, vectors = np.linalg.eigh(after)
     words = [
-        _direction(np.eye(3), shaft / np.linalg.norm(shaft), vector)
+        _direction(np.eye(3), [shaft], vector)
         for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
         if value > OPEN_SHARE**2 / (np.square(vector) @ (1 / before))
     ]
@@ -429,5 +481,7 @@ def base_from_layers(
         frames=found.frames,
         from_masks=False,
         explained=found.explained,
-        **_moved_from(prior[0], base, poses[:, :3, 3].mean(0)),
+        shaft=shaft,
+        sd_motion_mm=sd_motion(found.covariance[:6, :6], found.camera_from_base @ poses),
+        **moved_from(prior[0], base, poses[:, :3, 3].mean(0)),
     )

@@ -40,6 +40,8 @@ MARK_SHARE = 0.125  # of that width for marks, which are exact; outlines have co
 MAX_STEPS, TOLERANCE = 12, 1e-5  # of Levenberg-Marquardt, at each width; share of the loss
 DAMPING, SMOOTH_DAMPING = 1e-2, 1e-4  # at first
 MAX_TURN_RAD, MAX_SHIFT_MM = 0.15, 15.0  # of the base in one step
+# errors of a log's poses that last, rad and mm along each axis: trackers and robots drift by 0.2 to 0.4 mm
+POSE_SDS = np.array([0.0015] * 3 + [0.3] * 3)
 STEPS = np.array([0.012] * 3 + [0.8] * 3 + [0.02] + [0.012] * 2 + [0.8] * 2)  # of differences, by parameter
 
 
@@ -263,37 +265,30 @@ def _minimise(
     return replace(fit, cost=cost, loss=cost + noise**2 * system.prior_loss(fit) / count, residual_px=median)
 
 
-@dataclass(frozen=True, eq=False)
-class FitInformation:
-    """Information [BASE, BASE] of silhouettes on base and clock with line and shape marginalised, scatter of its
-    gradient over the recording's blocks [BASE, BASE], and the variance of one residual in widths of the loss. rad and
-    mm about the instrument, s."""
+def fit_covariance(problem: SilhouetteProblem, prior: BasePrior, fit: SilhouetteFit) -> np.ndarray:
+    """Covariance [BASE, BASE] of base and clock at a fit: rad and mm about the instrument, s.
 
-    information: np.ndarray
-    scatter: np.ndarray
-    noise: float
-
-
-def fit_information(problem: SilhouetteProblem, prior: BasePrior, fit: SilhouetteFit) -> FitInformation:
-    """Information at a fit: errors are correlated within a block of the recording, and independent between blocks."""
+    That of the least-squares solution under the errors that there are, not those that its weights assume (White,
+    Econometrica 1982): of the log's poses, which move both sides of a silhouette and last for a block of the recording;
+    of outlines, within blocks and between them; and of the priors.
+    """
     system = _System(problem, prior, fit)
     at = system.residuals(fit)
     columns = system.jacobian(fit, at, smooth=True)
     weights = _robust_weights(at, _widths(at, WIDTHS_PX[-1] * problem.px_scale))
+    by_pose = np.einsum("fkp,fk,fkq->fpq", columns, weights, columns[..., :6])  # of scores, by errors of a frame's pose
     scores = np.einsum("fkp,fk,fk->fp", columns, weights, at.px)
+    blocks = [problem.blocks == block for block in np.unique(problem.blocks)]
+    moved = np.stack([by_pose[rows].sum(0) for rows in blocks]) * POSE_SDS
+    left = np.stack([scores[rows].sum(0) for rows in blocks])
     rows = system.prior_residuals(fit)[1]
-    on_base = rows[:, :BASE].any(1)
-    total = _information(columns, weights) + rows[~on_base].T @ rows[~on_base]
-    base, free = np.flatnonzero(system.free[:BASE]), np.flatnonzero(system.free)
-    rest = free[free >= BASE]
-    taken = np.linalg.solve(total[np.ix_(rest, rest)], total[np.ix_(rest, base)])  # by line and shape
-    information, left = np.zeros((BASE, BASE)), np.zeros((len(scores), BASE))
-    information[np.ix_(base, base)] = total[np.ix_(base, base)] - total[np.ix_(base, rest)] @ taken
-    left[:, base] = scores[:, base] - scores[:, rest] @ taken
-    blocks = np.stack([left[problem.blocks == block].sum(0) for block in np.unique(problem.blocks)])
-    blocks = blocks - blocks.mean(0)
     noise = float((weights * at.px**2).sum() / max(int(at.valid.sum()), 1))
-    return FitInformation(information, blocks.T @ blocks * len(blocks) / max(len(blocks) - 1, 1), noise)
+    observed, known = _information(columns, weights), rows.T @ rows
+    scatter = np.einsum("bpq,brq->pr", moved, moved) + left.T @ left + noise * observed + known
+    free = np.flatnonzero(system.free)
+    inverse = np.zeros_like(known)
+    inverse[np.ix_(free, free)] = np.linalg.inv((observed + known)[np.ix_(free, free)] + 1e-12 * np.eye(len(free)))
+    return np.asarray((inverse @ scatter @ inverse)[:BASE, :BASE])
 
 
 def _information(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
