@@ -67,6 +67,8 @@ def test_the_pose_may_be_that_of_any_link() -> None:
     tip = root @ tree.poses(readings)["tip"]
     assert np.allclose(tree.world_from_root(tip, readings), root)
     assert np.array_equal(KinematicTree(tree.links).world_from_root(root, readings), root)
+    without_jaw = {name: value for name, value in readings.items() if name != "jaw"}  # nobody recorded it
+    assert np.allclose(tree.world_from_root(tip, without_jaw), root)
 
 
 def test_a_tree_is_written_as_it_is_read() -> None:

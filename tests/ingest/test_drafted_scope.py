@@ -16,6 +16,7 @@ from neeco.ingest.cameras.still_scene import video_stands_still
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.recording.template import write_template
+from neeco.ingest.timing.reading import read_episodes
 
 INTRINSICS = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 LEFT, RIGHT = "/stereo/left/image_raw", "/stereo/right/image_raw"
@@ -114,3 +115,20 @@ def test_the_forms_of_a_base_and_the_links_count_once_their_marks_are_removed(tm
 def test_limits_are_proposed_by_the_readings(tmp_path: Path) -> None:
     text = drafted(write_bag(tmp_path))[1]
     assert "# limits: [-0.5, 0.5]   # how far it goes; its readings are -0.50 to 0.42" in text
+
+
+def test_a_calibration_of_another_scope_than_the_bags_own_is_doubted(tmp_path: Path) -> None:
+    path = write_bag(tmp_path)
+    _, text = drafted(path)
+    for focal, doubted in ((FOCAL, False), (1.1 * FOCAL, True)):
+        with BagWriter(tmp_path, "other.bag") as bag:
+            for side, baseline in (("left", 0.0), ("right", 0.008)):
+                lens = (focal, focal, *INTRINSICS[2:])
+                bag.camera_info(f"/scope/{side}/camera_info", 0.0, (WIDTH, HEIGHT), lens, baseline=baseline)
+        stated = re.sub(r"^(stereo: \{.*\})\}", r"\1, calibration: other.bag}", text, flags=re.MULTILINE)
+        (tmp_path / "recording.yaml").write_text(stated)
+        recording = read_recording(tmp_path / "recording.yaml")
+        assert recording.read_stereo()[0].fl_x == pytest.approx(focal)
+        doubts = [item.sentence for item in read_episodes([recording]).notes.contradictions]
+        assert any("stereo.calibration: other.bag states a focal length of 165 px" in it for it in doubts) is doubted
+        (tmp_path / "other.bag").unlink()

@@ -433,6 +433,17 @@ def test_two_cameras_of_a_bag_are_paired_by_their_stamps(tmp_path: Path) -> None
     np.testing.assert_allclose(found.world_from_camera[:3, 3], [5, 0, 0], atol=1e-9)
 
 
+def test_a_delay_of_the_images_is_stated_as_the_offset_of_their_own_clock(tmp_path: Path) -> None:
+    with BagWriter(tmp_path, "recording.bag") as bag:
+        write_dvrk(bag)
+    text = write_template(bag.path).replace("# sync: {video: 0.0}", "sync: {video: 0.04}")
+    (tmp_path / "recording.yaml").write_text(text)
+    data = read_episodes([read_recording(tmp_path / "recording.yaml")])
+    times = data.times[2:-4]
+    states, _ = data.with_assumed_clocks().states_at(times)
+    np.testing.assert_allclose(states["PSM1"][1]["wrist_pitch"], times + 0.04, atol=1e-6)
+
+
 def test_what_the_right_camera_took_later_shows_the_state_of_that_moment(tmp_path: Path) -> None:
     theatre, late, path = Theatre(tmp_path), 0.012, tmp_path / "recording.yaml"
     with BagWriter(tmp_path, "recording.bag") as bag:

@@ -5,8 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from neeco.geometry.lens import Lens
+from neeco.geometry.rotations import rigid
 from neeco.ingest.cameras.still_scene import stands_still
+from neeco.ingest.cameras.tissue_surface import epipolar_error
 from neeco.ingest.foreground.background import exposure, find_background
 from neeco.ingest.foreground.masks import moving_masks
 
@@ -109,3 +113,19 @@ def test_exposure_is_told_apart_from_what_moves() -> None:
     image = np.clip(background.colors * (0.8, 0.9, 1.0), 0, 255).astype(np.uint8)
     image[20:80, 20:80] = 90
     assert exposure(image, background.colors) == pytest.approx([0.8, 0.9, 1.0], abs=0.01)
+
+
+def test_cameras_that_are_turned_otherwise_than_stated_show_it_by_their_epipolar_lines() -> None:
+    size, focal = (320, 256), 290.0
+    lens = Lens(focal, focal, 160.0, 128.0, (), size)
+    noise = np.random.default_rng(3).normal(0, 1, (*size[::-1], 1)).astype(np.float32)
+    left = np.repeat(np.clip(128 + 200 * cv2.GaussianBlur(noise, (0, 0), 1.5), 0, 255)[..., None], 3, axis=2)
+    matrix = np.array([[focal, 0, 159.5], [0, focal, 127.5], [0, 0, 1]])
+    shift = np.array([-5.5, 0.0, 0.0])
+    plane = matrix @ (np.eye(3) + np.outer(shift, [0, 0, 1]) / 100.0) @ np.linalg.inv(matrix)  # at 100 mm
+    right = cv2.warpPerspective(left, plane, size)
+    for degrees, expected in ((0.0, 0.0), (0.3, 1.52), (1.0, 5.06)):
+        turn = Rotation.from_rotvec([degrees, 0, 0], degrees=True).as_matrix()
+        error = epipolar_error(left, right, (lens, lens), rigid(turn, turn @ shift))
+        assert error == pytest.approx(expected, abs=0.35)
+    assert epipolar_error(left, np.zeros_like(left), (lens, lens), rigid(np.eye(3), shift)) is None

@@ -113,10 +113,11 @@ class KinematicTree:
         return {reading for link in chain for reading in link.value}
 
     def world_from_root(self, pose: Array, readings: Mapping[str, float]) -> Array:
-        """[4, 4] mm from the recorded pose of the link `pose_of`."""
+        """[4, 4] mm from the recorded pose of the link `pose_of`. Raises KeyError without a reading that moves it."""
         if self.pose_of is None:
             return pose
-        root_from_link = self.poses(readings)[self.pose_of]
+        own = {name: readings[name] for name in self.readings_of(self.pose_of)}
+        root_from_link = self.poses(dict.fromkeys(self.readings, 0.0) | own)[self.pose_of]
         back: Array = pose @ np.linalg.inv(root_from_link)
         return back
 

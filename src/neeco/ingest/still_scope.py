@@ -103,6 +103,7 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     behind = look_behind(views, tracked, longest_lag(data), data.recording.settings, right)
     for note in behind.notes:
         data.notes.add(note)
+    data.notes.contradict("stereo", behind.doubt, severe=True)
     for name, lag in behind.lags.items():
         note_motion_contradiction(data, name, name in behind.shapes, lag)
     states, usable = data.states_at(views.times)

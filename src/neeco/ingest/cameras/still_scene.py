@@ -20,7 +20,7 @@ from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
-from neeco.ingest.cameras.tissue_surface import TissueSurface, surface_behind, surface_from_stereo
+from neeco.ingest.cameras.tissue_surface import TissueSurface, epipolar_error, surface_behind, surface_from_stereo
 from neeco.ingest.foreground.background import Background, find_background
 from neeco.ingest.foreground.masks import moving_masks
 from neeco.ingest.foreground.residual_flow import STEP_PX
@@ -37,6 +37,7 @@ TRACKING: dict[str, Any] = {"winSize": (15, 15), "maxLevel": 1, "flags": cv2.OPT
 IN_PLACE = 0.0125  # share of the image's width within which a feature is in place (tissue breathes)
 MAX_RETURN_PX = 1.0  # error of a feature that is tracked there and back
 STILL_SHARE = 0.2  # of the features, in place in frames of a still scope; the others move or breathe
+MAX_EPIPOLAR = 0.004  # of the image's width, distance from epipolar lines: a quarter of a degree
 STILL_PAIRS = 0.85  # share of the pairs of frames, in which they are
 Tracked = Mapping[str, PosesAt]  # instrument -> camera_from_instrument [K, 4, 4] of the chosen frames
 
@@ -100,7 +101,7 @@ def _features(grey: np.ndarray) -> np.ndarray:
     return np.array(places, np.float32).reshape(-1, 1, 2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StillScene:
     """The tissue, the instruments and the remarks that a still scope's images give."""
 
@@ -110,6 +111,7 @@ class StillScene:
     lags: dict[str, float]  # by instrument, s at which its poses fit what moves better (0: none)
     how: str  # the tissue's depth was found, in words
     notes: tuple[str, ...]  # one sentence each
+    doubt: str  # about the second camera's calibration, in a sentence; "" without
 
 
 @dataclass(frozen=True)
@@ -210,7 +212,7 @@ def look_behind(
     """
     shapes, lags = _rough_shapes(views, tracked, longest_lag, settings.shape_frames)
     poses = {name: poses_at(0.0) for name, poses_at in tracked.items()}
-    notes = []
+    notes, doubt = [], ""
 
     def hidden_from(lens: Lens, world_from_camera: np.ndarray, rows: list[int]) -> Callable[[int], np.ndarray] | None:
         camera, camera_from_world = lens.camera(np.eye(4)), np.linalg.inv(world_from_camera)
@@ -233,7 +235,7 @@ def look_behind(
         rows = sorted(right.names)
         hidden = hidden_from(right.pinhole, right.world_from_camera, rows)
         other = find_background(lambda place: right.load(rows[place]), len(rows), hidden)
-        surface = _by_stereo(background, other, views, right)
+        surface, doubt = _by_stereo(background, other, views, right)
         if surface is None:
             notes.append("the stereo partner's images match too little for depth; is its calibration this scope's?")
     if surface is None:
@@ -242,19 +244,31 @@ def look_behind(
         small = views.reduced_pinhole
         surface = surface_behind(swept, small, max(deepest, default=None), settings.scene_distance_mm)
     points, colors = surface.points(background.colors, pinhole, visible)
-    return StillScene(points, colors, shapes, lags, surface.how, tuple(notes))
+    return StillScene(
+        points=points, colors=colors, shapes=shapes, lags=lags, how=surface.how, notes=tuple(notes), doubt=doubt
+    )
 
 
-def _by_stereo(left: Background, right: Background, views: Views, other: RightCamera) -> TissueSurface | None:
-    """Return the surface from two cameras' backgrounds; None where they match too little or differ in size."""
+def _by_stereo(
+    left: Background, right: Background, views: Views, other: RightCamera
+) -> tuple[TissueSurface | None, str]:
+    """Return the surface from two cameras' backgrounds, None where they match too little or differ in size; and a doubt
+    about their calibration."""
     shown = left.seen > 0 if views.visible is None else (left.seen > 0) & views.visible
     if right.colors.shape != left.colors.shape:
-        return None
+        return None, ""
     size = views.reduced_pinhole.size
     assert size is not None
     right_from_left = np.linalg.inv(other.world_from_camera)
     lenses = (views.pinhole, other.pinhole)
-    return surface_from_stereo(left.colors, right.colors, lenses, right_from_left, shown, size)
+    error = epipolar_error(left.colors, right.colors, lenses, right_from_left)
+    limit, doubt = MAX_EPIPOLAR * left.colors.shape[1], ""
+    if error is not None and error > limit:
+        doubt = (
+            f"what the second camera shows lies {error:.1f} px off where its calibration puts it (median; up to "
+            f"{limit:.1f} px is usual): is the calibration this scope's, and of these images?"
+        )
+    return surface_from_stereo(left.colors, right.colors, lenses, right_from_left, shown, size), doubt
 
 
 def _rough_shapes(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,6 +29,8 @@ PULL_WEIGHT = 1e-3  # towards the instruments, in cells where the tissue may be 
 MAX_ROUNDS = 30  # in which instruments behind the surface are found
 MIN_DEPTH_MM = 20.0  # mm from a stereo scope, where the tissue is not
 MIN_MATCHED = 0.2  # share of the image, for depth from stereo
+MAX_FEATURES, MIN_MATCHES = 2000, 30  # of two backgrounds, for their epipolar geometry
+MAX_DISTANCE_RATIO = 0.75  # of the best match's descriptor to the second best's (Lowe 2004)
 MAX_DEVIATION = 0.15  # of a matched depth from its surroundings', relative
 
 
@@ -169,6 +172,39 @@ def surface_from_stereo(
     return TissueSurface(
         1 / fine, f"from the stereo partner, {share:.0%} of the image ({far[0]:.0f} to {far[1]:.0f} mm)", True
     )
+
+
+def epipolar_error(
+    left: np.ndarray, right: np.ndarray, pinholes: tuple[Lens, Lens], right_from_left: np.ndarray
+) -> float | None:
+    """Return the median distance, px, of features of the right background from the epipolar lines of their matches in
+    the left one, float32 [H, W, 3] of 255; None where too few match.
+
+    It shows cameras that are turned against each other otherwise than stated, but no wrong baseline and no turn about
+    the vertical, which only make the depth another one. pinholes, right_from_left as in `surface_from_stereo`.
+    """
+    sift: Any = cv2.SIFT.create(MAX_FEATURES)
+    (points, descriptors), (others, of_right) = (
+        sift.detectAndCompute(cv2.cvtColor(np.clip(image, 0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY), None)
+        for image in (left, right)
+    )
+    if descriptors is None or of_right is None or min(len(descriptors), len(of_right)) < MIN_MATCHES:
+        return None
+    pairs = cv2.BFMatcher().knnMatch(descriptors, of_right, k=2)
+    good = [first for first, second in pairs if first.distance < MAX_DISTANCE_RATIO * second.distance]
+    if len(good) < MIN_MATCHES:
+        return None
+    # OpenCV counts from the first pixel's centre
+    seen = np.array([[*points[match.queryIdx].pt, *others[match.trainIdx].pt] for match in good]) + 0.5
+    rays = [
+        np.column_stack(
+            [(seen[:, k] - lens.cx) / lens.fl_x, (seen[:, k + 1] - lens.cy) / lens.fl_y, np.ones(len(seen))]
+        )
+        for k, lens in zip((0, 2), pinholes, strict=True)
+    ]
+    normals = np.cross(right_from_left[:3, 3], rays[0] @ right_from_left[:3, :3].T)  # of the epipolar planes
+    slopes = np.linalg.norm(normals[:, :2] / (pinholes[1].fl_x, pinholes[1].fl_y), axis=1)
+    return float(np.median(np.abs((normals * rays[1]).sum(axis=1)) / np.maximum(slopes, 1e-12)))
 
 
 def _median_filled(depth: np.ndarray) -> np.ndarray:

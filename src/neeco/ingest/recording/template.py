@@ -174,6 +174,7 @@ def write_template(
         scope_hints=scopes[0][0].hints if scopes else (),
         other_scopes=[", ".join(log.lines()) for log, _ in scopes[1:]],
         sync=next(iter(found.syncs), None),
+        shares_clock=any(log.stream is not None and log.file == frames[0].name for log, _ in found.poses),
         others=found.others[:MAX_OTHERS],
         episodes=found.episodes,
     )

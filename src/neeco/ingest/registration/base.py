@@ -92,6 +92,7 @@ class BaseRegistration:
     residual_px: float = np.nan  # median, of the silhouettes, in the masks' pixels
     frames: int  # that it was found from
     from_masks: bool
+    doubts: tuple[str, ...] = ()  # what contradicts the recording's statements, in sentences
     explained: float = np.nan  # without masks: the share of the change in the images that the shaft explains
     shaft: np.ndarray | None = None  # [3] unit
     sd_motion_mm: float = np.nan
@@ -136,7 +137,12 @@ class BaseRegistration:
             "explained",
         )
         found = {name: known(getattr(self, name)) for name in (*numbers, "overlap_before")}
-        return {"world_from_base": self.world_from_base.tolist(), **found, "open": list(self.open_directions)}
+        return {
+            "world_from_base": self.world_from_base.tolist(),
+            **found,
+            "open": list(self.open_directions),
+            "doubts": list(self.doubts),
+        }
 
 
 def find_base(
@@ -179,7 +185,7 @@ def find_base(
         known = BasePrior(prior[0], np.radians(prior[2]), prior[1], clock_sd)
     starts = _starts(few, known, _distance(problem, prior), generator)
     if not starts:
-        raise NeecoError(_unmoved(name))
+        raise NeecoError(unmoved(name))
     best = max((fit_silhouettes(few, known, start) for start in starts), key=lambda fit: overlap(few, fit))
     radius = float(np.median(best.shape[len(best.shape) // 2 :, 0, 0]))
     if not RADIUS_RANGE_MM[0] < radius < RADIUS_RANGE_MM[1]:
@@ -332,23 +338,24 @@ def _filled(left: np.ndarray, right: np.ndarray, shape: tuple[int, ...]) -> np.n
 def _require_moved(name: str, problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> None:
     """Raise NeecoError where poses of other moments, or none, explain the masks as well."""
     if not (fit.residual_px < MAX_RESIDUAL_PX * problem.px_scale and overlap(problem, fit) > MIN_OVERLAP):
-        raise NeecoError(_unmoved(name))
+        raise NeecoError(unmoved(name))
     for share in EXCHANGED_SHARES:
         exchanged = replace(problem, poses=np.roll(problem.poses, round(share * len(problem.blocks)), axis=1))
         other = refine(exchanged, replace(known, sd_clock=0.0), fit, 12)
         if other.cost < MIN_EXCHANGED_COST * fit.cost:
-            raise NeecoError(_unmoved(name))
+            raise NeecoError(unmoved(name))
 
 
-def _unmoved(name: str) -> str:
+def unmoved(name: str) -> str:
+    """Error where nothing in the images moves as an instrument's log says."""
     return (
         f"instrument {name!r}: camera_from_base: nothing in the images moves with its poses; check which arm and which "
         "clock its log is of, or give the exact transform"
     )
 
 
-def _moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, float]:
-    """Distance between a base and a given one, at the instrument's mean position [3] mm in its frame."""
+def moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, Any]:
+    """Distance mm and degrees between a base and a given one, at the instrument's mean position [3] mm in its frame."""
     shift = (base[:3, :3] - given[:3, :3]) @ middle + base[:3, 3] - given[:3, 3]
     turn = Rotation.from_matrix(base[:3, :3] @ given[:3, :3].T).magnitude()
     return {"moved_mm": float(np.linalg.norm(shift)), "turned_deg": float(np.degrees(turn))}
@@ -359,9 +366,9 @@ def _result(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) ->
     shaft = (poses[:, :3, :3] @ fit.axis).mean(0)
     shaft /= np.linalg.norm(shaft)
     covariance, open_directions, clock_sd = _covariance(problem, known, fit, shaft)
-    moved: dict[str, float] = {}
+    moved: dict[str, Any] = {}
     if known.sd_mm is not None:
-        moved = _moved_from(known.world_from_base, fit.world_from_base, problem.middle)
+        moved = moved_from(known.world_from_base, fit.world_from_base, problem.middle)
         given = replace(fit, world_from_base=known.world_from_base)
         moved["overlap_before"] = shaft_overlap(problem, given)
     return BaseRegistration(
@@ -375,7 +382,7 @@ def _result(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) ->
         frames=len(problem.blocks),
         from_masks=True,
         shaft=problem.camera_from_world[0, :3, :3] @ shaft,
-        sd_motion_mm=_sd_motion(covariance, poses),
+        sd_motion_mm=sd_motion(covariance, poses),
         **moved,
     )
 
@@ -417,7 +424,7 @@ def _covariance(
     return covariance, tuple(dict.fromkeys(words)), clock_sd
 
 
-def _sd_motion(covariance: np.ndarray, poses: np.ndarray) -> float:
+def sd_motion(covariance: np.ndarray, poses: np.ndarray) -> float:
     """Root mean square mm over poses world_from_instrument [F, 4, 4] by which a base of this covariance [6, 6] moves
     the instrument, after the best constant offset in its frame."""
     arms = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
@@ -475,6 +482,6 @@ def base_from_layers(
         from_masks=False,
         explained=found.explained,
         shaft=shaft,
-        sd_motion_mm=_sd_motion(found.covariance[:6, :6], found.camera_from_base @ poses),
-        **_moved_from(prior[0], base, poses[:, :3, 3].mean(0)),
+        sd_motion_mm=sd_motion(found.covariance[:6, :6], found.camera_from_base @ poses),
+        **moved_from(prior[0], base, poses[:, :3, 3].mean(0)),
     )

@@ -16,6 +16,7 @@ from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import ReadingLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
+from neeco.ingest.registration.articulated import ArticulatedMotion, find_articulated_base
 from neeco.ingest.registration.base import MIN_FRAMES, BaseRegistration, base_from_layers, find_base
 from neeco.ingest.registration.layers import ArmImages, covered_by, evenly_lit, fit_layers, line_through_trocar
 from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S
@@ -107,6 +108,11 @@ def find_bases(
             clock = replace(clock.later(registration.clock_s), sd=registration.clock_sd_s, source=FOUND)
         data = data.with_base(name, registration.world_from_base).with_moved_clock(logs[name].clock, clock)
         data.notes.add(describe(name, registration))
+        if registration.doubts:
+            doubts = "; ".join(registration.doubts)
+            data.notes.contradict(
+                f"base of {name}", f"instrument {name!r}: its base is doubtful: {doubts}", severe=True
+            )
         found[name] = registration
     return data, found
 
@@ -162,6 +168,7 @@ class _Arm:
     clock: ClockOffset
     readings: dict[str, np.ndarray]  # [F] of each joint
     prior: tuple[np.ndarray, float, float] | None  # as `find_base` takes it
+    readings_at: Callable[[float], dict[str, np.ndarray]]  # as `readings`, so many s later, NaN where a log has none
     poses_at: Callable[[float], np.ndarray]  # base_from_instrument [F, 4, 4], so many s later; with links, the root's
     wrists: np.ndarray | None  # [F, 3] mm in the root's frame, with links: where the link is whose pose is logged
 
@@ -181,13 +188,18 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
     log, times, stated = data.joint_log(lambda part: part.poses[item.name]), observed.times, item.base
     assert stated is not None
     clock = data.clock(log.clock) or ClockOffset(0.0, float("nan"), ASSUMED)
-    readings = {}
-    for joint in item.joints:
-        reading = data.joint_log(partial(_reading, name=item.name, joint=joint))
-        values, _ = readings_at(reading, (data.clock(reading.clock) or clock).at(times))
-        if np.isfinite(values).all():
-            readings[joint] = values
 
+    def readings_later(shift: float) -> dict[str, np.ndarray]:
+        found = {}
+        for joint in item.joints:
+            reading = data.joint_log(partial(_reading, name=item.name, joint=joint))
+            own = data.clock(reading.clock) or clock
+            # a clock that is known does not move with the pose's
+            later = 0.0 if own.source in KNOWN else shift
+            found[joint] = readings_at(reading, own.at(times) + later)[0]
+        return found
+
+    readings = {joint: values for joint, values in readings_later(0.0).items() if np.isfinite(values).all()}
     tree = item.kinematics
     bends = tree is not None and tree.pose_of is not None and set(tree.readings) <= set(readings)
     states = [{joint: float(values[row]) for joint, values in readings.items()} for row in range(len(times))]
@@ -212,7 +224,7 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
         prior = (_in_world(stated, observed.cameras), stated.sd_mm, stated.sd_deg)
     return _Arm(
         item=item, where=str(data.recording.path), clock=clock, readings=readings, prior=prior,
-        poses_at=base_from_shaft, wrists=wrists,
+        readings_at=readings_later, poses_at=base_from_shaft, wrists=wrists,
     )  # fmt: skip
 
 
@@ -227,11 +239,19 @@ def _find(
     if not alone and (found := _without_masks(arm, observed, usable)) is not None:
         return found
     readings = np.stack(list(arm.readings.values()), -1) if arm.readings else None
+    tree, clock_known = arm.item.kinematics, arm.clock.source in KNOWN
+    motion = None if tree is None else ArticulatedMotion(tree=tree, poses_at=arm.poses_at, readings_at=arm.readings_at)
     try:
+        if motion is not None and arm.prior is not None and alone and motion.bends:
+            registration = find_articulated_base(
+                arm.item.name, observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), motion, arm.prior,
+                hidden=observed.hidden, clock_known=clock_known,
+            )  # fmt: skip
+            return registration, np.zeros_like(usable)
         registration = find_base(
             arm.item.name, observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), arm.poses_at,
             observed.times, prior=arm.prior, readings=readings, hidden=observed.hidden, images=observed.images,
-            clock_known=arm.clock.source in KNOWN,
+            clock_known=clock_known,
         )  # fmt: skip
     except NeecoError as error:
         if alone and (found := _without_masks(arm, observed, usable)) is not None:

@@ -56,9 +56,9 @@ class ShaftLine:
     axis: np.ndarray  # [3] unit
 
 
-def line_through_trocar(poses: np.ndarray) -> ShaftLine | None:
-    """The line, fixed to poses [F, 4, 4], that goes through one fixed point in all of them; None where there is none,
-    or none is determined."""
+def line_through_trocar(poses: np.ndarray, max_bend_mm: float = MAX_BEND_MM) -> ShaftLine | None:
+    """The line, fixed to poses [F, 4, 4], that goes through one fixed point in all of them, within max_bend_mm (rms);
+    None where there is none, or none is determined."""
     back, places = poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3]
 
     def off(trocar: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ def line_through_trocar(poses: np.ndarray) -> ShaftLine | None:
     axis = np.linalg.svd(local - middle, full_matrices=False)[2][0]
     travel = float(np.ptp(local @ axis))
     rms = float(np.sqrt(np.square(found.fun).sum() / len(poses)))
-    if np.linalg.norm(local, axis=1).min() < MIN_LEVER_MM or rms > MAX_BEND_MM or travel < MIN_TRAVEL_MM:
+    if np.linalg.norm(local, axis=1).min() < MIN_LEVER_MM or rms > max_bend_mm or travel < MIN_TRAVEL_MM:
         return None
     axis = -axis if axis @ middle > 0 else axis
     return ShaftLine(middle - (middle @ axis) * axis, axis)

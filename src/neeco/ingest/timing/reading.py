@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from neeco.errors import NeecoError
-from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_lengths
+from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_lengths, format_of
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording.compatibility import check_recordings, episode_names, refusal
@@ -17,6 +18,7 @@ from neeco.ingest.timing.clock_search import GIVEN, MAX_LENGTH_S, ClockOffset
 from neeco.ingest.timing.episodes import PAUSE_S, Episode, Episodes, Notes, assumed_clock
 
 MIN_FPS, MAX_FPS = 0.01, 10_000.0
+SAME_FOCAL = 0.02  # of a focal length, between calibrations of one lens
 MIN_SIDE_PX = 32  # smaller frames have too few features to find cameras
 
 
@@ -76,13 +78,12 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
         notes.add("no instrument was tracked: the capture has cameras and images only (method 3dgs trains)", episode)
     _check_video(recording, video)
     if recording.stereo is not None:  # before anything that takes long
-        _, lens, _, calibration = recording.read_stereo()
-        lens.check_size(recording.stereo.source.open().size, calibration)
+        notes.contradict("calibration", _check_partner(recording), severe=False, episode=episode)
     for note in _length_notes(recording, video, logs):
         notes.add(note, episode)
     clocks = {name: ClockOffset(float(seconds), 0.0, GIVEN) for name, seconds in recording.sync.items()}
     if VIDEO_CLOCK in recording.clocks:
-        clocks[VIDEO_CLOCK] = ClockOffset(0.0, 0.0, "the images' own")
+        clocks.setdefault(VIDEO_CLOCK, ClockOffset(0.0, 0.0, "the images' own"))
     # joints' clocks that nothing gives are the video's: images determine them to some 20 ms at best; trackers' clocks,
     # and those of joints on one of them, are found later, from motion
     found_later = {log.clock for log in (*poses.values(), *([scope] if scope else []))}
@@ -96,6 +97,24 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
             )
     return Episode(
         name=name, recording=recording, video=video, poses=poses, joints=joints, rolls=rolls, scope=scope, clocks=clocks
+    )
+
+
+def _check_partner(recording: Recording) -> str:
+    """Return a sentence on a stereo calibration that differs from the lens that the images' file states; "" without.
+    Raises NeecoError for one of images of another size, and for a right camera without images."""
+    assert recording.stereo is not None
+    left, right, _, calibration = recording.read_stereo()
+    right.check_size(recording.stereo.source.open().size, calibration)
+    known = None if recording.video is None else format_of(recording.video)
+    own = None
+    with suppress(NeecoError):  # what the file states is not used
+        own = None if known is None or recording.video is None else known.lens(recording.video, recording.stream)
+    if own is None or abs(left.fl_x / own.fl_x - 1) < SAME_FOCAL:
+        return ""
+    return (
+        f"stereo.calibration: {calibration.name} states a focal length of {left.fl_x:.0f} px, the images' own file "
+        f"one of {own.fl_x:.0f} px: is it of another scope, or another zoom?"
     )
 
 

@@ -1,0 +1,260 @@
+"""Base registration of an instrument with stated links: its articulated silhouette is fitted to foreground masks.
+
+Where it bends is known along the shaft, which a straight shaft leaves open. The fit starts from several hypotheses, and
+their disagreement counts as uncertainty. What contradicts the recording's statements becomes a doubt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neeco.capture.kinematics import KinematicTree
+from neeco.capture.model import evenly_spaced
+from neeco.errors import NeecoError
+from neeco.ingest.foreground.silhouettes import silhouettes_of
+from neeco.ingest.registration.articulated_fit import (
+    WIDTHS_PX,
+    ArticulatedFit,
+    ArticulatedProblem,
+    contours_of,
+    covariance,
+    fit_articulated,
+    minimise,
+    overlap,
+)
+from neeco.ingest.registration.articulated_model import ArticulatedModel, bends, joint_values
+from neeco.ingest.registration.base import (
+    MIN_FRAMES,
+    N_BLOCKS,
+    BaseRegistration,
+    Prior,
+    in_camera,
+    moved_from,
+    sd_motion,
+    unmoved,
+)
+from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S, BasePrior
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock
+
+START_FRAMES, FIT_FRAMES = 16, 48  # on which starts are compared, and that the result is fitted to
+ALONG_MM = (-10.0, -5.0, 5.0, 10.0)  # starts along the shaft
+ROLLS_RAD = (-0.25, 0.25)  # starts turned about it
+N_REFINED = 3  # starts that are fitted to all frames
+APART_MM, APART_RAD = 3.0, 0.035  # between results that count as different
+LEVER_MM = 40.0  # at which a turn counts as a shift
+# added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
+FLOOR_MM, FLOOR_DEPTH_MM, FLOOR_DEG = 0.25, 0.35, 0.15
+SCATTER = 1.3  # by which stated standard deviations came out too small on rendered captures
+MIN_OVERLAP, USUAL_OVERLAP = 0.75, 0.85  # of the silhouette with the masks: doubted below, and what is usual
+LEAST_OVERLAP, MAX_RESIDUAL_PX = 0.4, 2.5  # beyond, nothing is found
+REVERSED_SHARE = 0.8  # of the cost, from which a joint counts as reversed
+MIN_EXCHANGED = 1.25  # times the cost, with poses of other moments
+EXCHANGED_SHARES = (0.37, 0.61)  # of the recording, by which poses are shifted
+MAX_SDS = 3.2  # from its prior, by which a stated length or angle, or the base, may be off
+MAX_SHIFT_SDS = 3.5  # of the base's prior
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ArticulatedMotion:
+    """The links of an instrument and what its logs say, so many s after frames' times [F]: base_from_root [F, 4, 4] mm,
+    and readings [F] by name, NaN where a log has none."""
+
+    tree: KinematicTree
+    poses_at: Callable[[float], np.ndarray]
+    readings_at: Callable[[float], dict[str, np.ndarray]]
+
+    @property
+    def bends(self) -> bool:
+        """Whether recorded readings move a joint."""
+        readings = self.readings_at(0.0)
+        if not self.tree.readings or not set(self.tree.readings) <= set(readings):
+            return False
+        values = joint_values(self.tree, readings)
+        values = values[np.isfinite(values).all(1)]
+        return len(values) >= MIN_FRAMES and bends(self.tree, values)
+
+
+def find_articulated_base(
+    name: str,
+    masks: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    camera_from_world: np.ndarray,
+    motion: ArticulatedMotion,
+    prior: Prior,
+    *,
+    hidden: np.ndarray | None = None,
+    clock_known: bool = False,
+) -> BaseRegistration:
+    """Find the base of instrument `name`, whose links bend, near a stated one.
+
+    masks: foreground bool [F, h, w], through a pinhole of `intrinsics` (fx, fy, cx, cy px of the masks);
+    camera_from_world [F, 4, 4]; hidden: bool [h, w], beyond a round border. Raises NeecoError, naming the instrument,
+    where the foreground is not the instrument.
+    """
+    problem = _problem(
+        masks, intrinsics, camera_from_world, motion, prior, hidden=hidden, sd_clock=0.0 if clock_known else CLOCK_SD_S
+    )
+    if problem is None:
+        raise NeecoError(
+            f"instrument {name!r}: camera_from_base: poses, readings and what moves are there together in fewer than "
+            f"{MIN_FRAMES} frames; give the transform exactly, or a recording that shows more of it"
+        )
+    fits = _fits(problem)
+    best = fits[0]
+    if best.residual_px > MAX_RESIDUAL_PX or overlap(problem, best) < LEAST_OVERLAP or _exchangeable(problem, best):
+        raise NeecoError(unmoved(name))
+    return _result(problem, fits, motion)
+
+
+def _problem(
+    masks: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    camera_from_world: np.ndarray,
+    motion: ArticulatedMotion,
+    prior: Prior,
+    *,
+    hidden: np.ndarray | None,
+    sd_clock: float,
+) -> ArticulatedProblem | None:
+    """At most FIT_FRAMES frames with masks whose poses and readings are known at all clocks tried."""
+    poses = np.stack([motion.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
+    by_shift = [motion.readings_at(float(shift)) for shift in CLOCK_SHIFTS_S]
+    readings = {key: np.stack([at[key] for at in by_shift]) for key in motion.tree.readings}
+    values = joint_values(motion.tree, readings)
+    known = np.isfinite(poses).all((0, 2, 3)) & np.isfinite(values).all((0, 2))
+    rows = np.flatnonzero(known & masks.any((1, 2)))
+    if len(rows) < MIN_FRAMES:
+        return None
+    rows = rows[evenly_spaced(len(rows), FIT_FRAMES)]
+    given, sd_mm, sd_deg = prior
+    return ArticulatedProblem(
+        model=ArticulatedModel(motion.tree, poses[len(CLOCK_SHIFTS_S) // 2][known]),
+        silhouettes=silhouettes_of(masks[rows], intrinsics, hidden),
+        contours=contours_of(masks[rows], hidden),
+        camera_from_world=camera_from_world[rows],
+        poses=poses[:, rows],
+        readings={key: part[:, rows] for key, part in readings.items()},
+        values=values[:, rows],
+        blocks=np.arange(len(rows)) * N_BLOCKS // len(rows),
+        prior=BasePrior(given, np.radians(sd_deg), sd_mm, sd_clock),
+    )
+
+
+def _fits(problem: ArticulatedProblem) -> list[ArticulatedFit]:
+    """Fits from different starts, the best first; of similar ones the best."""
+    few = problem.take(np.array(evenly_spaced(len(problem.blocks), START_FRAMES)))
+    base, means = problem.prior.world_from_base, problem.model.means
+    shaft = (base[:3, :3] @ problem.poses[len(CLOCK_SHIFTS_S) // 2][:, :3, :3] @ problem.model.axis).mean(0)
+    shaft /= np.linalg.norm(shaft)
+    steps = [np.zeros(6)]
+    steps += [np.append(np.zeros(3), along * shaft) for along in ALONG_MM]
+    steps += [np.append(roll * shaft, np.zeros(3)) for roll in ROLLS_RAD]
+    starts = [ArticulatedFit(moved_base(base, problem.pivot(base), step), 0.0, means.copy()) for step in steps]
+    coarse = [fit_articulated(few, start, WIDTHS_PX[:2], 10, rough=True) for start in starts]
+    chosen = _distinct(problem, coarse)[:N_REFINED]
+    fits = _distinct(problem, [fit_articulated(problem, fit, WIDTHS_PX[1:]) for fit in chosen])
+    return [minimise(problem, fits[0], WIDTHS_PX[-1], 20), *fits[1:]]
+
+
+def _distinct(problem: ArticulatedProblem, fits: list[ArticulatedFit]) -> list[ArticulatedFit]:
+    """The fits that differ from each better one, the best first."""
+    found: list[ArticulatedFit] = []
+    for fit in sorted(fits, key=lambda fit: fit.cost):
+        steps = [_step(problem, other, fit) for other in found]
+        if all(np.linalg.norm(s[:3]) > APART_RAD or np.linalg.norm(s[3:]) > APART_MM for s in steps):
+            found.append(fit)
+    return found
+
+
+def _step(problem: ArticulatedProblem, first: ArticulatedFit, second: ArticulatedFit) -> np.ndarray:
+    """Turn rad and shift mm [6], world, at the instrument, from one base to another."""
+    turn = Rotation.from_matrix(second.world_from_base[:3, :3] @ first.world_from_base[:3, :3].T).as_rotvec()
+    return np.append(turn, problem.pivot(second.world_from_base) - problem.pivot(first.world_from_base))
+
+
+def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
+    """Whether poses and readings of other moments explain the masks about as well."""
+    for share in EXCHANGED_SHARES:
+        by = round(share * len(problem.blocks))
+        poses, values = (np.roll(part, by, axis=1) for part in (problem.poses, problem.values))
+        other = replace(problem, poses=poses, values=values)
+        if minimise(other, fit, WIDTHS_PX[1], 6).cost < MIN_EXCHANGED * minimise(problem, fit, WIDTHS_PX[1], 3).cost:
+            return True
+    return False
+
+
+def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: ArticulatedMotion) -> BaseRegistration:
+    best, given = fits[0], problem.prior.world_from_base
+    full = covariance(problem, best)
+    spread = SCATTER**2 * full[:6, :6]
+    for other in fits[1:]:  # as likely as its cost says
+        weight = float(np.exp(-0.5 * (other.cost - best.cost)))
+        off = _step(problem, best, other)
+        spread = spread + weight / (1 + weight) * np.outer(off, off)
+    in_view = in_camera(spread, problem.camera_from_world[0])
+    floor = np.array([np.radians(FLOOR_DEG)] * 3 + [FLOOR_MM, FLOOR_MM, FLOOR_DEPTH_MM])
+    spread = in_view + np.diag(floor**2)
+    poses = problem.camera_from_world[0] @ best.world_from_base @ poses_at_clock(problem.poses, best.clock)
+    shaft = (poses[:, :3, :3] @ problem.model.axis).mean(0)
+    before = replace(best, world_from_base=given)
+    return BaseRegistration(
+        world_from_base=best.world_from_base,
+        clock_s=best.clock,
+        clock_sd_s=SCATTER * float(np.sqrt(full[6, 6])),
+        covariance=spread,
+        open_directions=(),
+        overlap=overlap(problem, best),
+        overlap_before=overlap(problem, before),
+        residual_px=best.residual_px * problem.px_scale,
+        frames=len(problem.blocks),
+        from_masks=True,
+        shaft=shaft / np.linalg.norm(shaft),
+        sd_motion_mm=sd_motion(spread, poses),
+        doubts=tuple(_doubts(problem, best, motion)),
+        **moved_from(given, best.world_from_base, problem.middle),
+    )
+
+
+def _doubts(problem: ArticulatedProblem, fit: ArticulatedFit, motion: ArticulatedMotion) -> list[str]:
+    """Sentences on what contradicts the recording's statements."""
+    found, model, prior = [], problem.model, problem.prior
+    share = overlap(problem, fit)
+    if share < MIN_OVERLAP:
+        found.append(
+            f"the outline found overlaps what moves by {share:.2f}; {USUAL_OVERLAP:.2f} or more is usual: check links, "
+            "lens, and which arm the log is of"
+        )
+    assert prior.sd_mm is not None
+    assert prior.sd_rad is not None
+    step = _step(problem, replace(fit, world_from_base=prior.world_from_base), fit)
+    off = np.linalg.norm(step[3:]) / prior.sd_mm, np.linalg.norm(step[:3]) / prior.sd_rad
+    if max(off) > MAX_SHIFT_SDS:
+        found.append(
+            f"the base found is {max(off):.1f} standard deviations from the one stated: check camera_from_base, its "
+            "axes and unit, and which arm it is of"
+        )
+    reversed_ = [reading for reading in motion.tree.readings if _reversed(problem, fit, motion, reading)]
+    found += [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
+    sds = (fit.parameters - model.means) / model.sds
+    for index in np.flatnonzero(np.abs(sds) > MAX_SDS):
+        part = model.names[index]
+        if part.startswith(("pivot", "offset")) and not any(part in words for words in found):
+            found.append(
+                f"the {part} is {abs(sds[index]):.1f} standard deviations from what kinematics states: check the "
+                "length of the link before it, its axis, and the reading"
+            )
+    return found
+
+
+def _reversed(problem: ArticulatedProblem, fit: ArticulatedFit, motion: ArticulatedMotion, reading: str) -> bool:
+    """Whether the masks are explained clearly better with a reading's sign reversed."""
+    values = problem.values.copy()
+    for index, link in enumerate(motion.tree.links):
+        values[:, :, index] -= 2 * link.value.get(reading, 0.0) * problem.readings[reading]
+    other = replace(problem, values=values)
+    trial = fit_articulated(other, fit, WIDTHS_PX[1:3], 5)
+    return minimise(other, trial, WIDTHS_PX[-1], 8).cost < REVERSED_SHARE * fit.cost

@@ -1,0 +1,295 @@
+"""Fit of an articulated silhouette to masks: least squares over the base, the clock, and the model's parameters.
+
+Residuals count both ways: points of the model's outline by their distances from the masks' outlines, and points of the
+masks' outlines by their distances from the model's, so that neither a model too small nor one too large fits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
+from neeco.ingest.foreground.silhouettes import EDGE_PX, Silhouettes
+from neeco.ingest.registration.articulated_model import ArticulatedModel, Outlines
+from neeco.ingest.registration.silhouette_fit import BasePrior
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock
+
+BASE = 7  # parameters of the base (turn rad [3], shift mm [3]) and the clock (s); the model's follow
+MAX_POINTS = 90  # of a mask's outline
+WIDTHS_PX = (10.0, 5.0, 2.5, 1.5)  # of the robust loss, one after the other; px of masks 160 wide
+NOISE_PX = 0.6  # standard deviation of an outline, px of masks 160 wide
+SHARE = 0.05  # of an outline's points that count as independent
+STEPS = (0.005, 0.3, 0.01)  # of differences: turns rad, shifts mm, clock s
+PARAMETER_STEP = 0.1  # of differences, in standard deviations of priors
+INSIDE_PX = -0.7  # of another cone's outline, from which a point is no outline
+MAX_TURN_RAD, MAX_SHIFT_MM, MAX_SDS = 0.15, 12.0, 2.0  # of one step
+DAMPING, TOLERANCE = 1e-2, 1e-4
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ArticulatedProblem:
+    """Silhouettes of frames [F], their cameras, the log's poses and joint values at the clock's first guess moved by
+    CLOCK_SHIFTS_S, and the model that is to explain them."""
+
+    model: ArticulatedModel
+    silhouettes: Silhouettes
+    contours: np.ndarray  # [F, N, 2] px of the masks' outlines; NaN: no point
+    camera_from_world: np.ndarray  # [F, 4, 4]
+    poses: np.ndarray  # [S, F, 4, 4] base_from_root
+    readings: dict[str, np.ndarray]  # [S, F] by name
+    values: np.ndarray  # [S, F, L] of all links' joints, rad or mm
+    blocks: np.ndarray  # [F] stretch of the recording, within which errors are correlated
+    prior: BasePrior
+
+    def take(self, rows: np.ndarray) -> ArticulatedProblem:
+        """Return the problem of some of the frames."""
+        return replace(
+            self,
+            silhouettes=self.silhouettes.take(rows),
+            contours=self.contours[rows],
+            camera_from_world=self.camera_from_world[rows],
+            poses=self.poses[:, rows],
+            readings={name: values[:, rows] for name, values in self.readings.items()},
+            values=self.values[:, rows],
+            blocks=self.blocks[rows],
+        )
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Mean position [3] mm of the instrument in the base's frame."""
+        return np.asarray(self.poses[len(CLOCK_SHIFTS_S) // 2, :, :3, 3].mean(0))
+
+    @property
+    def px_scale(self) -> float:
+        """Pixels of these masks per pixel of masks 160 wide."""
+        return self.silhouettes.distances.shape[2] / 160
+
+    def pivot(self, world_from_base: np.ndarray) -> np.ndarray:
+        """Mean position [3] mm of the instrument in the world."""
+        return np.asarray(world_from_base[:3, :3] @ self.middle + world_from_base[:3, 3])
+
+
+@dataclass(frozen=True, eq=False)
+class ArticulatedFit:
+    """A base, the clock s by which the log is ahead, and the model's parameters [P]."""
+
+    world_from_base: np.ndarray
+    clock: float
+    parameters: np.ndarray
+    cost: float = np.inf  # robust loss of the residuals and the priors' squares
+    residual_px: float = np.inf  # median
+
+
+def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
+    """Evenly spaced points [F, MAX_POINTS, 2] px of the outlines of masks bool [F, h, w]; NaN where there are fewer.
+    Those at the image's border, or beside what is hidden (bool [h, w]), do not count."""
+    height, width = masks.shape[1:]
+    open_ = np.zeros((height, width), bool)
+    open_[EDGE_PX:-EDGE_PX, EDGE_PX:-EDGE_PX] = True
+    if hidden is not None:
+        grown = cv2.dilate(hidden.astype(np.uint8), np.ones((2 * EDGE_PX + 1,) * 2, np.uint8))
+        open_ &= ~grown.astype(bool)
+    found = np.full((len(masks), MAX_POINTS, 2), np.nan)
+    for row, mask in enumerate(masks):
+        lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        if not lines:
+            continue
+        points = np.concatenate(lines)[:, 0]
+        points = points[open_[points[:, 1], points[:, 0]]]
+        if len(points):
+            chosen = np.unique(np.linspace(0, len(points) - 1, MAX_POINTS).astype(int))
+            found[row, : len(chosen)] = points[chosen] + 0.5
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Outline points that count in a linearisation: [F, N] of the model, and [F, M] of the masks."""
+
+    model: np.ndarray
+    masks: np.ndarray
+    contours: np.ndarray  # [F, M, 2] px, without NaN
+
+
+def outlines(problem: ArticulatedProblem, fit: ArticulatedFit) -> Outlines:
+    """Project the fit's cones."""
+    root = problem.camera_from_world @ fit.world_from_base @ poses_at_clock(problem.poses, fit.clock)
+    values = poses_at_clock(problem.values, fit.clock)
+    return problem.model.outlines(fit.parameters, values, root, problem.silhouettes.intrinsics)
+
+
+def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
+    found, owner = outlines(problem, fit), problem.model.owner
+    points = problem.model.outline_points(found)
+    others = found.distances(points)[0]
+    others[:, owner, np.arange(len(owner))] = -1e3
+    others[:, 1, owner == 0] = others[:, 0, owner == 1] = -1e3  # the tube continues in its end
+    valid = found.valid[:, owner] & (others.max(1) < INSIDE_PX)
+    valid &= problem.silhouettes.inside(points, margin=1.0 + EDGE_PX)
+    given = np.isfinite(problem.contours[..., 0])
+    return _Points(valid, given, np.nan_to_num(problem.contours))
+
+
+def _residuals(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points) -> np.ndarray:
+    """[F, N + M] px: positive where the model is too small."""
+    found = outlines(problem, fit)
+    ahead, _ = problem.silhouettes.look_up(problem.model.outline_points(found))
+    back = -found.distances(use.contours)[0].max(1)
+    return np.concatenate([np.where(use.model, ahead, 0.0), np.where(use.masks, back, 0.0)], 1)
+
+
+def moved(problem: ArticulatedProblem, fit: ArticulatedFit, step: np.ndarray) -> ArticulatedFit:
+    """The fit after a step [BASE + P] in its parameters."""
+    return ArticulatedFit(
+        moved_base(fit.world_from_base, problem.pivot(fit.world_from_base), step[:6]),
+        float(np.clip(fit.clock + step[6], CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])),
+        fit.parameters + step[BASE:],
+    )
+
+
+def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, free: np.ndarray) -> np.ndarray:
+    """Derivatives [F, N + M, free] of the residuals, through those of the cones' images."""
+    found, model = outlines(problem, fit), problem.model
+    _, slope = problem.silhouettes.look_up(model.outline_points(found))
+    distances, places, ways = found.distances(use.contours)
+    nearest = distances.argmax(1)
+    frame, point = np.indices(nearest.shape)
+    place, way = places[frame, nearest, point], ways[frame, nearest, point]
+    share = np.stack([1 - place, place], -1)  # [F, M, 2] of both ends
+    steps = np.concatenate([[STEPS[0]] * 3, [STEPS[1]] * 3, [STEPS[2]], PARAMETER_STEP * model.sds])
+    columns = []
+    for index in free:
+        step = np.zeros(len(steps))
+        step[index] = steps[index]
+        plus, minus = (outlines(problem, moved(problem, fit, sign * step)) for sign in (1, -1))
+        ahead = (slope * (model.outline_points(plus) - model.outline_points(minus))).sum(-1)
+        ends, widths = plus.ends - minus.ends, plus.widths - minus.widths
+        shifted = (ends[frame, nearest] * way[:, :, None]).sum(-1) + widths[frame, nearest]
+        both = [np.where(use.model, ahead, 0.0), np.where(use.masks, -(share * shifted).sum(-1), 0.0)]
+        columns.append(np.concatenate(both, 1) / (2 * steps[index]))
+    return np.stack(columns, -1)
+
+
+def prior_residuals(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals [BASE + P] of all priors in standard deviations, and the inverse standard deviations [BASE + P]."""
+    model, prior = problem.model, problem.prior
+    scale, off = np.zeros(BASE + len(model.means)), np.zeros(BASE + len(model.means))
+    if prior.sd_rad is not None and prior.sd_mm is not None:
+        given = prior.world_from_base
+        scale[:3], scale[3:6] = 1 / prior.sd_rad, 1 / prior.sd_mm
+        off[:3] = Rotation.from_matrix(fit.world_from_base[:3, :3] @ given[:3, :3].T).as_rotvec()
+        off[3:6] = problem.pivot(fit.world_from_base) - problem.pivot(given)
+    if prior.sd_clock > 0:
+        scale[6], off[6] = 1 / prior.sd_clock, fit.clock
+    scale[BASE:], off[BASE:] = 1 / model.sds, fit.parameters - model.means
+    return off * scale, scale
+
+
+def _free(problem: ArticulatedProblem, rough: bool = False) -> np.ndarray:
+    """Parameters that are fitted; rough: base, clock and the most important of the model's."""
+    model = problem.model
+    count = BASE + len(model.means)
+    free = np.isin(np.arange(count), [*range(BASE), BASE + model.tube, BASE + model.mean_length]) | (not rough)
+    free[6] = problem.prior.sd_clock > 0
+    return np.flatnonzero(free)
+
+
+def _loss(px: np.ndarray, width: float, noise: float) -> float:
+    return SHARE * float(np.log1p((px / width) ** 2).sum()) * (width / noise) ** 2
+
+
+def minimise(
+    problem: ArticulatedProblem, fit: ArticulatedFit, width: float, max_steps: int = 12, *, rough: bool = False
+) -> ArticulatedFit:
+    """The nearest fit under a Cauchy loss of a width px (of masks 160 wide); rough: of few parameters."""
+    free, width, noise = _free(problem, rough), width * problem.px_scale, NOISE_PX * problem.px_scale
+    sds = problem.model.sds
+
+    def linearise(fit: ArticulatedFit) -> Linearisation[ArticulatedFit]:
+        use = _points(problem, fit)
+        px = _residuals(problem, fit, use)
+        columns = _jacobian(problem, fit, use, free).reshape(-1, len(free))
+        weights = (SHARE / noise**2 / (1 + (px / width) ** 2)).ravel()
+        off, scale = prior_residuals(problem, fit)
+
+        def cost(other: ArticulatedFit, px: np.ndarray | None = None) -> float:
+            px = _residuals(problem, other, use) if px is None else px
+            return _loss(px, width, noise) + float(np.square(prior_residuals(problem, other)[0]).sum())
+
+        gradient = columns.T @ (weights * px.ravel()) + (off * scale)[free]
+        information = (columns * weights[:, None]).T @ columns + np.diag(scale[free] ** 2)
+        return Linearisation(information, gradient, cost(fit, px), cost)
+
+    def move(fit: ArticulatedFit, free_step: np.ndarray) -> ArticulatedFit:
+        step = np.zeros(BASE + len(sds))
+        step[free] = free_step
+        step[:3] = np.clip(step[:3], -MAX_TURN_RAD, MAX_TURN_RAD)
+        step[3:6] = np.clip(step[3:6], -MAX_SHIFT_MM, MAX_SHIFT_MM)
+        step[BASE:] = np.clip(step[BASE:], -MAX_SDS * sds, MAX_SDS * sds)
+        return moved(problem, fit, step)
+
+    fit = levenberg_marquardt(fit, linearise, move, max_steps=max_steps, damping=DAMPING, tolerance=TOLERANCE)
+    use = _points(problem, fit)
+    px = _residuals(problem, fit, use)
+    counted = np.concatenate([use.model, use.masks], 1)
+    cost = _loss(px, width, noise) + float(np.square(prior_residuals(problem, fit)[0]).sum())
+    return replace(fit, cost=cost, residual_px=float(np.median(np.abs(px[counted]))) / problem.px_scale)
+
+
+def fit_articulated(
+    problem: ArticulatedProblem,
+    start: ArticulatedFit,
+    widths: tuple[float, ...] = WIDTHS_PX,
+    max_steps: int = 12,
+    *,
+    rough: bool = False,
+) -> ArticulatedFit:
+    """The nearest fit under a Cauchy loss that narrows."""
+    fit = start
+    for width in widths:
+        fit = minimise(problem, fit, width, max_steps, rough=rough)
+    return fit
+
+
+def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
+    """Covariance [BASE + P, BASE + P] at a minimum, with errors that are correlated within the recording's blocks
+    (sandwich estimator); the clock's rows are 0 where it is known."""
+    free, width, noise = _free(problem), WIDTHS_PX[-1] * problem.px_scale, NOISE_PX * problem.px_scale
+    use = _points(problem, fit)
+    px = _residuals(problem, fit, use)
+    columns = _jacobian(problem, fit, use, free)
+    weights = SHARE / noise**2 / (1 + (px / width) ** 2)
+    scores = np.einsum("fnp,fn,fn->fp", columns, weights, px)
+    flat = columns.reshape(-1, len(free))
+    data = (flat * weights.reshape(-1, 1)).T @ flat
+    prior = np.diag(prior_residuals(problem, fit)[1][free] ** 2)
+    blocks = np.stack([scores[problem.blocks == block].sum(0) for block in np.unique(problem.blocks)])
+    blocks = blocks - blocks.mean(0)
+    scatter = blocks.T @ blocks * len(blocks) / max(len(blocks) - 1, 1)
+    inverse = np.linalg.inv(data + prior)
+    full = np.zeros((BASE + len(problem.model.means),) * 2)
+    full[np.ix_(free, free)] = inverse @ (scatter + prior) @ inverse
+    return full
+
+
+def overlap(problem: ArticulatedProblem, fit: ArticulatedFit) -> float:
+    """Intersection over union of the fit's filled silhouette with the masks, over all frames."""
+    found, both, either = outlines(problem, fit), 0, 0
+    along = found.ends[:, :, 1] - found.ends[:, :, 0]
+    along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-6)
+    out = np.stack([-along[..., 1], along[..., 0]], -1)[:, :, None] * found.widths[..., None]
+    corners = np.concatenate([found.ends + out, (found.ends - out)[:, :, ::-1]], 2)  # [F, C, 4, 2]
+    for row, mask in enumerate(problem.silhouettes.masks):
+        filled = np.zeros(mask.shape, np.uint8)
+        for cone in np.flatnonzero(found.valid[row]):
+            polygon = np.rint(np.clip(corners[row, cone], -1e4, 1e4) - 0.5).astype(np.int32)
+            cv2.fillPoly(filled, [polygon], 1)
+            end = np.rint(np.clip(found.ends[row, cone, 1], -1e4, 1e4) - 0.5).astype(int)
+            cv2.circle(filled, (int(end[0]), int(end[1])), int(min(found.widths[row, cone, 1], 1e3)), 1, -1)
+        both += int((filled.astype(bool) & mask).sum())
+        either += int((filled.astype(bool) | mask).sum())
+    return both / max(either, 1)

@@ -1,0 +1,315 @@
+"""The silhouette of an articulated instrument: round cones along stated links, projected to images.
+
+The root link is a tube that ends at the pivot of the first joint, each inner link a cone from its pivot to the next,
+each outermost link one from its pivot outwards. Joints move them as the recording states. Radii, lengths of outermost
+links and the errors of what is stated (pivots, axes, offsets of readings) are parameters with priors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neeco.capture.kinematics import FIXED, PRISMATIC, KinematicTree
+from neeco.geometry.lines import unit
+from neeco.geometry.projection import project
+from neeco.ingest.registration.layers import line_through_trocar
+from neeco.ingest.registration.silhouette_model import frame_about
+
+TUBE_MM = 150.0  # of the root link that is modelled
+NEAREST_MM = 8.0  # depth at which cones are cut off
+PIVOT_SD_MM, AXIS_SD_RAD, OFFSET_SD_RAD = 1.2, 0.06, 0.05  # of what is stated; values of joints include shapes' errors
+SLIDE_SD_MM = 1.0  # of the offset of a prismatic joint
+TILT_SD_RAD, ASIDE_SD_MM = 0.03, 0.7  # of the tube's axis about its first guess, and from the first pivot
+LOG_RADIUS_SD, RATIO_SD = 0.4, 0.3  # of radii, and of the ratio of one link's to its parent's
+FLAT_SD = 0.2  # of the relative change of a radius with the viewing direction
+EARS_MM, EARS_SD_MM = 6.0, 3.0  # from the tube's end to the first pivot
+LENGTH_MM, LENGTH_SD_MM, UNEQUAL_SD_MM = 13.0, 5.0, 1.5  # of outermost links, and of the difference between them
+TUBE_RADIUS_MM, TAPER = 3.8, 0.5  # first guesses; of outermost links
+MIN_RADIUS_MM, MIN_LENGTH_MM = 0.2, 2.0
+MAX_BEND_MM = 1.5  # of a logged pose's line from the trocar, rms
+MIN_PIVOT_MM = 5.0  # from the root's origin, for a direction
+STATIONS = np.array([0.04, 0.15, 0.3, 0.5, 0.7, 0.85, 0.96])  # along a cone, of outline points
+TUBE_STATIONS = 1 - np.array([1, 3, 6, 9, 13, 18, 24, 31, 40, 50, 62, 75, 90]) / TUBE_MM
+CAP_ANGLES = np.radians([-80, -50, -25, 0, 25, 50, 80])  # about a cone's outer end
+MIN_MOTION = 0.02  # standard deviation of a joint's value, rad, from which it bends
+MIN_SLIDE_MM = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Cone:
+    """A round cone fixed to a link, from `start` to a pivot of a child, or outwards (`child` None)."""
+
+    link: int
+    child: int | None
+    radii: int  # its parameters: logarithms of both radii, then two of its flatness
+    length: int | None  # the parameter of an outermost link's length
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """Cones [C] as images [F] show them: middles of both ends [F, C, 2, 2] px, half the widths there [F, C, 2] px, and
+    whether they are before the camera [F, C]."""
+
+    ends: np.ndarray
+    widths: np.ndarray
+    valid: np.ndarray
+
+    def distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Signed distances [F, C, N] px of points [F, N, 2] to every cone's outline, inside positive; where along the
+        cones they are nearest [F, C, N]; and unit directions [F, C, N, 2] from there."""
+        start, along = self.ends[:, :, None, 0], (self.ends[:, :, 1] - self.ends[:, :, 0])[:, :, None]
+        square = np.maximum((along**2).sum(-1), 1e-6)
+        off = points[:, None] - start
+        place = np.clip((off * along).sum(-1) / square, 0, 1)
+        off = off - place[..., None] * along
+        radius = self.widths[..., :1] + place * (self.widths[..., 1:] - self.widths[..., :1])
+        away = np.sqrt((off**2).sum(-1) + 1e-9)
+        return np.where(self.valid[..., None], radius - away, -1e3), place, off / away[..., None]
+
+
+class ArticulatedModel:
+    """Cones, parameters [P] and their priors (`means`, `sds`) of an instrument whose tree states joints.
+
+    poses [F, 4, 4] base_from_root and values [F, L] of all links' joints serve to guess the tube's axis and to tell
+    which joints move.
+    """
+
+    def __init__(self, tree: KinematicTree, poses: np.ndarray) -> None:
+        self.tree = tree
+        names = [link.name for link in tree.links]
+        self.parents = [-1 if link.parent is None else names.index(link.parent) for link in tree.links]
+        self.names: list[str] = []
+        self.means, self.sds = np.zeros(0), np.zeros(0)
+        self.rest = tree_at_rest(tree)
+        self._hinges()
+        first = next(i for i in range(len(names)) if tree.links[i].type != FIXED)
+        self.first = first
+        self.axis = _tube_axis(tree, self.rest[first][:3, 3], poses)
+        self.tilt = self._add("shaft", [0] * 4, [TILT_SD_RAD] * 2 + [ASIDE_SD_MM] * 2)
+        self.ears = self._add("ears", [EARS_MM], [EARS_SD_MM])
+        self.tube = self._add("tube radius", [np.log(TUBE_RADIUS_MM), -0.15], [LOG_RADIUS_SD, RATIO_SD])
+        self._cones()
+        self._outline()
+
+    def _add(self, name: str, means: list[float], sds: list[float]) -> int:
+        start = len(self.means)
+        self.means, self.sds = np.append(self.means, means), np.append(self.sds, sds)
+        self.names += [name] * len(means)
+        return start
+
+    def _hinges(self) -> None:
+        """Parameters of pivots and axes, which links at the same place share, and of offsets."""
+        self.pivots: list[int | None] = []
+        self.offsets: list[int | None] = []
+        places: dict[tuple, int] = {}
+        for link, parent in zip(self.tree.links, self.parents, strict=True):
+            if link.type == FIXED:
+                self.pivots.append(None)
+                self.offsets.append(None)
+                continue
+            key = (parent, *link.origin[:3, 3].round(6), *link.axis.round(6))
+            if key not in places:
+                sds = [PIVOT_SD_MM] * 3 + [AXIS_SD_RAD] * 2
+                places[key] = self._add(f"pivot of {link.name}", [0] * 5, sds)
+            self.pivots.append(places[key])
+            sd = SLIDE_SD_MM if link.type == PRISMATIC else OFFSET_SD_RAD
+            self.offsets.append(self._add(f"offset of {link.name}", [0], [sd]))
+
+    def _cones(self) -> None:
+        self.cones: list[Cone] = []
+        lengths = self._add("length", [LENGTH_MM], [LENGTH_SD_MM])
+        self.mean_length = lengths
+        for index, link in enumerate(self.tree.links):
+            if index == 0 or not link.body or all(self.pivots[i] is None for i in self._chain(index)):
+                continue
+            below = [i for i, parent in enumerate(self.parents) if parent == index]
+            pivots = {tuple(self.tree.links[i].origin[:3, 3].round(3)): i for i in below}
+            for child in pivots.values():
+                if np.linalg.norm(self.tree.links[child].origin[:3, 3]) > 1.0:
+                    radii = self._add(f"radii of {link.name}", [-0.2, 0, 0, 0], [RATIO_SD] * 2 + [FLAT_SD] * 2)
+                    self.cones.append(Cone(index, child, radii, None))
+            if not below:
+                means, sds = [-0.45, np.log(TAPER), 0, 0], [RATIO_SD, 2 * RATIO_SD, FLAT_SD, FLAT_SD]
+                radii = self._add(f"radii of {link.name}", means, sds)
+                self.cones.append(Cone(index, None, radii, self._add(f"length of {link.name}", [0], [UNEQUAL_SD_MM])))
+
+    def _chain(self, index: int) -> list[int]:
+        found = []
+        while index >= 0:
+            found.append(index)
+            index = self.parents[index]
+        return found
+
+    def link_poses(self, parameters: np.ndarray, values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """root_from_link rotations [F, 3, 3] and translations [F, 3] mm of all links; values [F, L] of joints."""
+        count = len(values)
+        turns, shifts = [np.tile(np.eye(3), (count, 1, 1))], [np.zeros((count, 3))]
+        turns[0], shifts[0] = turns[0] @ self.tree.links[0].origin[:3, :3], shifts[0] + self.tree.links[0].origin[:3, 3]
+        for index, link in enumerate(self.tree.links[1:], 1):
+            origin, parent = link.origin, self.parents[index]
+            turn, shift = turns[parent], shifts[parent]
+            place, axis = origin[:3, 3], link.axis
+            start, offset = self.pivots[index], self.offsets[index]
+            if start is None or offset is None:
+                turns.append(turn @ origin[:3, :3])
+                shifts.append(shift + turn @ place)
+                continue
+            place = place + parameters[start : start + 3]
+            axis = unit(axis + frame_about(axis)[:, :2] @ parameters[start + 3 : start + 5])
+            value = values[:, index] + parameters[offset]
+            if link.type == PRISMATIC:
+                turns.append(turn @ origin[:3, :3])
+                shifts.append(shift + turn @ place + value[:, None] * (turn @ axis))
+            else:
+                turns.append(turn @ turns_about(axis, value) @ origin[:3, :3])
+                shifts.append(shift + turn @ place)
+        return turns, shifts
+
+    def cones_at(self, parameters: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Ends [F, C, 2, 3] mm of all cones in the root's frame, their radii [C, 2] mm and flatness [C, 2], and across
+        [F, C, 3], the direction that flatness is against. The first two cones are the tube and its end."""
+        turns, shifts = self.link_poses(parameters, values)
+        basis = frame_about(self.axis)
+        tilt = parameters[self.tilt : self.tilt + 4]
+        axis = unit(self.axis + basis[:, :2] @ tilt[:2])
+        pivot = shifts[self.first] + basis[:, :2] @ tilt[2:]
+        end = pivot - np.clip(parameters[self.ears], 0.5, 20) * axis
+        tube = np.exp(parameters[self.tube])
+        ears = tube * np.exp(parameters[self.tube + 1])
+        across = np.broadcast_to(basis[:, 0], pivot.shape)
+        ends = [np.stack([pivot - TUBE_MM * axis, end], 1), np.stack([end, pivot], 1)]
+        radii, flat, sideways = [(tube, tube), (ears, ears)], [np.zeros(2)] * 2, [across, across]
+        for cone in self.cones:
+            turn, shift = turns[cone.link], shifts[cone.link]
+            rest = self.rest[cone.link][:3, :3].T
+            if cone.child is None:
+                assert cone.length is not None
+                length = max(parameters[self.mean_length] + parameters[cone.length], MIN_LENGTH_MM)
+                far = shift + length * (turn @ (rest @ self.axis))
+            else:
+                far = shifts[cone.child]
+            ends.append(np.stack([shift, far], 1))
+            own = parameters[cone.radii : cone.radii + 4]
+            near = max(tube * np.exp(own[0]), MIN_RADIUS_MM)
+            radii.append((near, max(near * np.exp(own[1]), MIN_RADIUS_MM)))
+            flat.append(np.clip(own[2:], -0.6, 0.6))
+            sideways.append(turn @ (rest @ basis[:, 0]))
+        return np.stack(ends, 1), np.array(radii), np.array(flat), np.stack(sideways, 1)
+
+    def outlines(
+        self,
+        parameters: np.ndarray,
+        values: np.ndarray,
+        camera_from_root: np.ndarray,
+        intrinsics: tuple[float, float, float, float],
+    ) -> Outlines:
+        """Project all cones; camera_from_root [F, 4, 4]."""
+        ends, radii, flat, sideways = self.cones_at(parameters, values)
+        turn = camera_from_root[:, None, :3, :3]
+        a = (turn @ ends[:, :, 0, :, None])[..., 0] + camera_from_root[:, None, :3, 3]
+        b = (turn @ ends[:, :, 1, :, None])[..., 0] + camera_from_root[:, None, :3, 3]
+        sideways = (turn @ sideways[..., None])[..., 0]
+        valid = b[..., 2] > NEAREST_MM
+        gap = np.where(np.abs(b[..., 2] - a[..., 2]) > 1e-6, b[..., 2] - a[..., 2], 1e-6)
+        cut = np.where(valid & (a[..., 2] < NEAREST_MM), (NEAREST_MM - a[..., 2]) / gap, 0.0)
+        a = a + np.clip(cut, 0, 0.999)[..., None] * (b - a)
+        axis = unit(b - a)
+        normal = unit(np.cross(a, b) + 1e-9)  # of the plane through the camera and the cone's axis
+        facing = np.cross(normal, axis)
+        facing = facing * -np.sign((facing * b).sum(-1, keepdims=True))
+        # flatness: a radius as an angle's function, about the axis, of where the outline is
+        other = np.cross(axis, sideways)
+        angle = np.arctan2((normal * other).sum(-1), (normal * sideways).sum(-1))
+        factor = np.exp(flat[:, 0] * np.cos(2 * angle) + flat[:, 1] * np.sin(2 * angle))
+        factor = np.where((flat != 0).any(-1), factor, 1.0)
+        middles, chords = [], []
+        for place, radius in ((a, radii[:, 0]), (b, radii[:, 1])):
+            size = (radius * factor)[..., None]
+            sine = np.clip(size / np.maximum(-(facing * place).sum(-1, keepdims=True), 1e-3), 0, 0.9)
+            near, out = place + size * sine * facing, size * np.sqrt(1 - sine**2) * normal
+            left, right = (
+                np.stack(project(p, *intrinsics, nearest=NEAREST_MM / 2), -1) for p in (near - out, near + out)
+            )
+            middles.append((left + right) / 2)
+            chords.append((right - left) / 2)
+        images, chord = np.stack(middles, 2), np.stack(chords, 2)
+        ahead = images[:, :, 1] - images[:, :, 0]
+        ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-6)
+        # across the cone's image: far from the image's middle, chords are oblique to it
+        across = chord[..., 1] * ahead[:, :, None, 0] - chord[..., 0] * ahead[:, :, None, 1]
+        widths = np.where(
+            np.linalg.norm(images[:, :, 1] - images[:, :, 0], axis=-1)[..., None] > 1.0,
+            np.abs(across),
+            np.linalg.norm(chord, axis=-1),
+        )
+        return Outlines(images, widths, valid)
+
+    def outline_points(self, found: Outlines) -> np.ndarray:
+        """Points [F, N, 2] px of all cones' outlines, of the cone `owner` [N] each."""
+        start, end = found.ends[:, self.owner, 0], found.ends[:, self.owner, 1]
+        ahead = end - start
+        unit_ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-6)
+        out = np.stack([-unit_ahead[..., 1], unit_ahead[..., 0]], -1)
+        near, far = found.widths[:, self.owner, 0], found.widths[:, self.owner, 1]
+        width = (near + self.places * (far - near))[..., None]
+        way = np.cos(self.angles)[:, None] * unit_ahead + np.sin(self.angles)[:, None] * out
+        return np.asarray(start + self.places[:, None] * ahead + width * way)
+
+    def _outline(self) -> None:
+        """The cone of every outline point, its place along the cone, and its angle from the cone's direction."""
+        owners, places, angles = [], [], []
+        for cone in range(2 + len(self.cones)):
+            stations = STATIONS if cone else TUBE_STATIONS
+            caps = CAP_ANGLES if cone >= 2 and self.cones[cone - 2].child is None else np.zeros(0)
+            owners += [cone] * (2 * len(stations) + len(caps))
+            places += [*stations, *stations, *np.ones(len(caps))]
+            angles += [*np.full(len(stations), np.pi / 2), *np.full(len(stations), -np.pi / 2), *caps]
+        self.owner, self.places, self.angles = np.array(owners), np.array(places), np.array(angles)
+
+
+def tree_at_rest(tree: KinematicTree) -> list[np.ndarray]:
+    """root_from_link [4, 4] of all links where the values of all joints are 0."""
+    rest: dict[str, np.ndarray] = {}
+    for link in tree.links:
+        rest[link.name] = link.origin if link.parent is None else rest[link.parent] @ link.origin
+    return [rest[link.name] for link in tree.links]
+
+
+def turns_about(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Rotations [F, 3, 3] about a unit axis [3] by angles [F] rad (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    sine, cosine = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
+    return np.asarray(np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross))
+
+
+def joint_values(tree: KinematicTree, readings: dict[str, np.ndarray]) -> np.ndarray:
+    """Values [..., L] of all links' joints, rad or mm, at readings [...]; 0 for fixed ones."""
+    shape = next(iter(readings.values())).shape
+    columns = []
+    for link in tree.links:
+        value = np.full(shape, link.offset if link.type != FIXED else 0.0)
+        for name, gain in link.value.items():
+            value = value + gain * readings[name]
+        columns.append(value)
+    return np.stack(columns, -1)
+
+
+def bends(tree: KinematicTree, values: np.ndarray) -> bool:
+    """Whether joints move the links in a recording, values [F, L]."""
+    kinds = [link.type for link in tree.links]
+    least = np.array([np.inf if kind == FIXED else MIN_SLIDE_MM if kind == PRISMATIC else MIN_MOTION for kind in kinds])
+    return bool((np.std(values, axis=0) > least).any())
+
+
+def _tube_axis(tree: KinematicTree, pivot: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """First guess [3] of the tube's direction in the root's frame: through the trocar, as the log has it; else from the
+    root's origin to the first pivot; else the root's z."""
+    line = line_through_trocar(poses, MAX_BEND_MM)
+    if line is not None:
+        return line.axis
+    if np.linalg.norm(pivot) > MIN_PIVOT_MM:
+        return np.asarray(unit(pivot))
+    return np.array([0.0, 0.0, 1.0])
