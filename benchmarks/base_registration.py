@@ -73,7 +73,7 @@ def main() -> int:
             rows.append(_found(path, words.found))
             print(", ".join(f"{key} {value:.2f}" for key, value in rows[-1].items()))
             continue
-        recording = _Recording(path, words.masks)
+        recording = BaseRecording(path, words.masks)
         tree = _tree(path, words.kinematics)
         for size in words.errors:
             mm, degrees = (float(part) for part in size.split("x"))
@@ -97,7 +97,7 @@ def _found(path: Path, printed: Path) -> dict[str, float]:
     return errors | {"clock_ms": 1000 * (base["clock_s"] - truth["clock_s"])}
 
 
-class _Recording:
+class BaseRecording:
     """A capture of a still scope with its truth."""
 
     def __init__(self, path: Path, masks: str) -> None:

@@ -133,6 +133,22 @@ def test_a_carved_line_is_kept_where_the_links_agree_and_else_theirs_is_taken(
     assert float(again.seeds[:, :2].norm(dim=1).median()) < 2 * RADIUS
 
 
+def test_a_shaft_that_leaves_no_evidence_is_seeded_about_the_stated_line(carved: tuple[Evidence, CarvedShape]) -> None:
+    """As where the tissue's fit absorbed a dark shaft that hardly moves."""
+    evidence, shape = replace(carved[0], hits=torch.zeros_like(carved[0].hits)), carved[1]
+    links, told = started(carved), session(evidence)
+    far = torch.eye(4)
+    far[0, 3] = 30.0
+    astray = replace(shape, instrument_from_shaft=far, radius=20.0)
+    again = align_to_links(told, links, evidence, "tool", astray, torch.Generator().manual_seed(0))
+    assert told.said
+    along, away = again.seeds[:, 2], again.seeds[:, :2].norm(dim=1)
+    assert float(along.max()) <= PITCH_AT
+    assert float(along.min()) < PITCH_AT - 20
+    assert float(away.max()) < 2 * RADIUS
+    assert again.radius < 2 * RADIUS
+
+
 def test_links_of_a_joint_that_nobody_recorded_are_seeded_on_their_sides(carved: tuple[Evidence, CarvedShape]) -> None:
     """Mirrored, with the jaws exchanged, they would explain the images as well."""
     evidence = carved[0]

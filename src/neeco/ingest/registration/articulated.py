@@ -47,8 +47,8 @@ N_REFINED = 3  # starts that are fitted to all frames
 APART_MM, APART_RAD = 3.0, 0.035  # between results that count as different
 LEVER_MM = 40.0  # at which a turn counts as a shift
 # added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
-FLOOR_MM, FLOOR_DEPTH_MM, FLOOR_DEG = 0.25, 0.35, 0.15
-SCATTER = 1.3  # by which stated standard deviations came out too small on rendered captures
+FLOOR_MM, FLOOR_DEPTH_MM, FLOOR_DEG = 0.25, 0.35, 0.25
+SCATTER = 1.3  # factor on standard deviations; assumed, as the floors are: few recordings were measured
 MIN_OVERLAP, USUAL_OVERLAP = 0.75, 0.85  # of the silhouette with the masks: doubted below, and what is usual
 LEAST_OVERLAP, MAX_RESIDUAL_PX = 0.4, 2.5  # beyond, nothing is found
 REVERSED_SHARE = 0.8  # of the cost, from which a joint counts as reversed

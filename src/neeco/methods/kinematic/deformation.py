@@ -247,12 +247,15 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return Spin(shaft_roll=roll)
 
     def prune_mask(self, canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> Tensor | None:
-        """Return tissue whose centre no frame observes: no image constrains it."""
-        if not self.settings.extrapolate_tissue:
-            return None
-        tissue = canonical.body(0)
+        """Return tissue whose centre no frame observes, as no image constrains it, and what no stated link reaches."""
         mask = torch.zeros(len(canonical), dtype=torch.bool, device=canonical.means.device)
-        mask[tissue] = outside_all_views(canonical.means[tissue].detach(), cameras)
+        for index, articulation in enumerate(self.articulations):
+            if isinstance(articulation, StatedLinks):
+                rows = canonical.body(index + 1)
+                mask[rows] = articulation.out_of_reach(canonical.means[rows].detach())
+        if self.settings.extrapolate_tissue:
+            tissue = canonical.body(0)
+            mask[tissue] = outside_all_views(canonical.means[tissue].detach(), cameras)
         return mask
 
     def training_channels(self, canonical: CanonicalGaussians, iteration: int) -> Tensor | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,6 +37,9 @@ MIN_COSINE = 0.85
 MAX_OFFSET_RADII, MAX_OFFSET_MM = 1.5, 4.0
 MIN_RELATIVE_LEVEL = 0.85  # of the best evidence of a link's points: stated axes may be off, and all points with them
 MIN_RADIUS_RATIO = 0.33  # of the shaft's radius to the distance between the first two pivots
+MAX_SHAFT_RADIUS_MM = 6.5  # of instruments that pass a trocar
+MIN_EVIDENT_RADII = 3.0  # shaft radii behind the first pivot: with less evidence, the shaft is seeded about its line
+SHAFT_LENGTH = 0.3  # of the distance to the tissue: the shaft that is seeded about its line
 SIDE_TOLERANCE_RADII = 0.3  # by which a link that is searched on one side of its pivot may lie on the other
 MIN_VISIBLE_SHARE = 0.05  # of the frames, that must observe a seed
 # jaws whose opening was not recorded: openings (of the limits' range) and headings (rad) that are tried, and the points
@@ -65,7 +69,7 @@ def align_to_links(
         return shape
     pivot, step = line
     direction = nn.functional.normalize(step, dim=0)
-    thickness = MIN_RADIUS_RATIO * float(step.norm())
+    thickness = min(MIN_RADIUS_RATIO * float(step.norm()), MAX_SHAFT_RADIUS_MM)
     origin, along = shape.instrument_from_shaft[:3, 3], shape.instrument_from_shaft[:3, 2]
     apart = pivot - origin
     off = float((apart - (apart @ along) * along).norm())
@@ -75,7 +79,29 @@ def align_to_links(
     base = frame_along(pivot, direction)
     carved = carve_along(evidence, name, base, shape.level, generator, session.config.deformation.carving)
     found = shape if carved is None else carved
-    return replace(found, radius=max(found.radius, thickness))
+    found = replace(found, radius=max(found.radius, thickness))
+    if carved is not None and carved.near < -MIN_EVIDENT_RADII * found.radius and found.radius < MAX_SHAFT_RADIUS_MM:
+        return found
+    return _shaft_about_line(found, base, thickness, SHAFT_LENGTH * evidence.distance, generator)
+
+
+def _shaft_about_line(
+    shape: CarvedShape, base: Tensor, radius: float, length: float, generator: torch.Generator
+) -> CarvedShape:
+    """Return `shape` with a full cylinder of seeds behind the origin of `base` [4, 4] (z along the shaft): where the
+    tissue's fit absorbed a shaft that hardly moves, or what is evident is not on its line."""
+    count = len(shape.seeds)
+    random = torch.rand(count, 3, generator=generator, device=generator.device).to(shape.seeds)
+    across, angle = radius * random[:, 0].sqrt(), 2 * math.pi * random[:, 1]
+    points = torch.stack([across * angle.cos(), across * angle.sin(), -length * random[:, 2]], 1)
+    return replace(
+        shape,
+        instrument_from_shaft=base,
+        near=-length,
+        tip=REACH_RADII * radius,
+        radius=radius,
+        seeds=points @ base[:3, :3].T + base[:3, 3],
+    )
 
 
 @torch.no_grad()

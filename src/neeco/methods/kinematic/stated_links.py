@@ -28,6 +28,7 @@ SIDE_LOGITS = 2.0  # per shaft radius by which a Gaussian lies on the wrong side
 SIDE_START, PRONGS, PRONGS_FROM, PRONGS_TO = 0.4, 0.7, 0.3, 0.7  # the ends: radii along the axis
 MAX_SIDE_LOGITS = 4.0  # that count in the penalty
 MIN_STEP_MM = 1.0  # between two pivots that define a direction
+SHAFT_REACH, END_REACH = 3.0, 8.0  # shaft radii from the axis behind the first pivot; from any pivot before it
 MAX_WRIST_RADII = 1.5  # behind the first joint within which a found shaft end is accepted
 
 
@@ -252,6 +253,18 @@ class StatedLinks(Articulation):
             if float(step.norm()) > MIN_STEP_MM:
                 return pivots[inner], step
         return None
+
+    @torch.no_grad()
+    def out_of_reach(self, points: Tensor) -> Tensor:
+        """Return bool [M]: points [M, 3] mm at rest that are farther from the stated links than any part of them."""
+        if self.rest_line() is None:
+            return torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        origin, direction = self.shaft()
+        along = self.along_shaft(points)
+        aside = (points - origin - along[:, None] * direction).norm(dim=1)
+        ahead = torch.cdist(points, self.axes()[0]).amin(1)
+        behind = along < self.first_joint()
+        return torch.where(behind, aside > SHAFT_REACH * self.radius, ahead > END_REACH * self.radius)
 
     def moved_by(self, reading: str, weights: Tensor) -> Tensor:
         moves = self.gains[:, :, self.reading_names.index(reading)].abs().amax(0) > 0  # [L - 1]
