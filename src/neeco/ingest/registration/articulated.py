@@ -221,7 +221,9 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
 
 def _doubts(problem: ArticulatedProblem, fit: ArticulatedFit, motion: ArticulatedMotion) -> list[str]:
     """Sentences on what contradicts the recording's statements."""
-    found, model, prior = [], problem.model, problem.prior
+    model, prior = problem.model, problem.prior
+    reversed_ = [reading for reading in motion.tree.readings if _reversed(problem, fit, motion, reading)]
+    found = [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
     share = overlap(problem, fit)
     if share < MIN_OVERLAP:
         found.append(
@@ -237,10 +239,8 @@ def _doubts(problem: ArticulatedProblem, fit: ArticulatedFit, motion: Articulate
             f"the base found is {max(off):.1f} standard deviations from the one stated: check camera_from_base, its "
             "axes and unit, and which arm it is of"
         )
-    reversed_ = [reading for reading in motion.tree.readings if _reversed(problem, fit, motion, reading)]
-    found += [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
     sds = (fit.parameters - model.means) / model.sds
-    for index in np.flatnonzero(np.abs(sds) > MAX_SDS):
+    for index in np.flatnonzero(np.abs(sds) > MAX_SDS) if not reversed_ else ():  # they follow from it
         part = model.names[index]
         if part.startswith(("pivot", "offset")) and not any(part in words for words in found):
             found.append(

@@ -108,11 +108,8 @@ def find_bases(
             clock = replace(clock.later(registration.clock_s), sd=registration.clock_sd_s, source=FOUND)
         data = data.with_base(name, registration.world_from_base).with_moved_clock(logs[name].clock, clock)
         data.notes.add(describe(name, registration))
-        if registration.doubts:
-            doubts = "; ".join(registration.doubts)
-            data.notes.contradict(
-                f"base of {name}", f"instrument {name!r}: its base is doubtful: {doubts}", severe=True
-            )
+        for place, doubt in enumerate(registration.doubts):
+            data.notes.contradict(f"base of {name}, {place}", f"instrument {name!r}: {doubt}", severe=True)
         found[name] = registration
     return data, found
 
