@@ -92,7 +92,12 @@ def test_lower_harmonics_make_a_smaller_page_and_still_scenes_have_no_instrument
     sizes = [len(pack(scene, degree)[1]) for degree in (0, 1, 2, 3)]
     assert sizes[0] < sizes[1] < sizes[2] == sizes[3]
     still = make_scene("3dgs")
-    still.instruments, still.recorded = scene.instruments, scene.recorded  # what its capture told it, and it ignores
+    # what its capture told it, and it ignores
+    still.instruments, still.recorded, still.base_corrections = (
+        scene.instruments,
+        scene.recorded,
+        scene.base_corrections,
+    )
     header, planes = pack(still, 1)
     assert header["instruments"] == []
     assert header["recorded"]["poses"] == [[]] * 8
