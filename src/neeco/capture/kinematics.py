@@ -122,12 +122,18 @@ class KinematicTree:
         return back
 
     @cached_property
+    def rest_poses(self) -> dict[str, Array]:
+        """root_from_link [4, 4] mm of every link where the values of all joints are 0."""
+        found: dict[str, Array] = {}
+        for link in self.links:
+            found[link.name] = link.origin if link.parent is None else found[link.parent] @ link.origin
+        return found
+
+    @cached_property
     def axes_at_rest(self) -> tuple[Array, Array]:
         """(points [J, 3] mm, unit directions [J, 3]) of the axes of `joints` in the root's frame, where the values of
         all joints are 0."""
-        rest: dict[str, Array] = {}
-        for link in self.links:
-            rest[link.name] = link.origin if link.parent is None else rest[link.parent] @ link.origin
+        rest = self.rest_poses
         points = [rest[link.name][:3, 3] for link in self.joints]
         parents = [np.eye(4) if link.parent is None else rest[link.parent] for link in self.joints]
         directions = [parent[:3, :3] @ link.axis for parent, link in zip(parents, self.joints, strict=True)]

@@ -124,20 +124,25 @@ class Evidence:
 
 
 @torch.no_grad()
-def gather_evidence(scene: GaussianScene, views: TrainingViews, settings: CarvingSettings) -> Evidence:
+def gather_evidence(
+    scene: GaussianScene, views: TrainingViews, settings: CarvingSettings, *, unshaded: bool = False
+) -> Evidence:
     """Residuals of a tissue-only `scene` against every n-th training image, at most `settings.evidence_frames`, on its
-    device. Pixels outside a mask have no evidence."""
+    device, and with `unshaded` those that no shadow explains. Pixels outside a mask have no evidence."""
     frames = views.frames
     picked = list(range(0, len(frames), max(1, -(-len(frames) // settings.evidence_frames))))
     hits: list[Tensor] = []
-    unshaded: list[Tensor] = []
+    without_shadows: list[Tensor] = []
     depths: list[Tensor] = []
     for index in picked:
         frame = frames[index]
         rendering = rasterize(scene.at(frame.state), frame.camera)
         tissue, image, mask = rendering.color, views.target(index), views.mask(index)
-        dimmed = (image * tissue).sum(-1, keepdim=True) / tissue.square().sum(-1, keepdim=True).clamp_min(1e-6)
-        for found, expected in ((hits, tissue), (unshaded, tissue * dimmed.clamp(DARKEST_SHADOW, 1.0))):
+        explanations = [(hits, tissue)]
+        if unshaded:
+            dimmed = (image * tissue).sum(-1, keepdim=True) / tissue.square().sum(-1, keepdim=True).clamp_min(1e-6)
+            explanations.append((without_shadows, tissue * dimmed.clamp(DARKEST_SHADOW, 1.0)))
+        for found, expected in explanations:
             residual = (expected - image).abs().mean(-1)
             if mask is not None:
                 residual = residual * mask
@@ -151,7 +156,7 @@ def gather_evidence(scene: GaussianScene, views: TrainingViews, settings: Carvin
         torch.stack([torch.linalg.inv(camera.world_from_camera.double()).float() for camera in cameras]).to(device),
         torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras], device=device),
         tuple(frames[i] for i in picked),
-        _pad_and_stack(unshaded, 0.0),
+        _pad_and_stack(without_shadows, 0.0) if unshaded else None,
     )
 
 

@@ -31,12 +31,13 @@ def tissue_evidence(
     """
     settings = config.deformation.carving
     tissue = tissue or fit_tissue(scene, views, config)
-    evidence = gather_evidence(tissue, views, settings)
+    linked = any(instrument.kinematics is not None for instrument in scene.instruments)  # registered without shadows
+    evidence = gather_evidence(tissue, views, settings, unshaded=linked)
     if float(evidence.hits.mean()) <= settings.max_evidence:
         return evidence
     breathing = tissue.deformation.breathing if isinstance(tissue.deformation, Static) else None
     longer = fit_tissue(scene, views, config, settings.long_tissue_steps, DENSITY_START, breathing)
-    return gather_evidence(longer, views, settings)
+    return gather_evidence(longer, views, settings, unshaded=linked)
 
 
 def fit_tissue(

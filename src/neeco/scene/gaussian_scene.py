@@ -78,17 +78,16 @@ class GaussianScene(nn.Module):
         self.background = 0.0
         self.label_threshold: float | None = None
         self.diagnostics: dict[str, Any] = {}
-        self.register_buffer(
-            "center", center.float().to(canonical.means.device)
-        )  # [3] mm, middle of the tissue; [T, 3] of several
-        zeros = partial(torch.zeros, device=canonical.means.device)
+        device = canonical.means.device
+        self.register_buffer("center", center.float().to(device))  # [3] mm, middle of the tissue; [T, 3] of several
+        zeros = partial(torch.zeros, device=device)
         self.registration = nn.Parameter(zeros(*center.shape[:-1], 7))
         self.base_corrections = nn.Parameter(zeros(len(instruments), 6))
         self.falloff = nn.Parameter(zeros(2))
         self.vignette = nn.Parameter(zeros(2))
         self.shadow_offsets = nn.Parameter(zeros(MAX_LAMPS, 3))
         self.shadow_strengths = nn.Parameter(zeros(MAX_LAMPS))
-        self.shadow_width = nn.Parameter(zeros(()) + INITIAL_SHADOW_WIDTH)
+        self.shadow_width = nn.Parameter(torch.full((), INITIAL_SHADOW_WIDTH, device=device))
         self._shines = CachedPredicate(lambda strengths: (strengths > 0).any())
         self._corrects = CachedPredicate(lambda registration: registration.any())
         self._corrects_bases = CachedPredicate(lambda corrections: corrections.any())
@@ -227,9 +226,9 @@ class GaussianScene(nn.Module):
         registration = self.registration
         # a tensor on the device "meta" has no values to test
         corrects = registration.requires_grad or registration.is_meta or self._corrects(registration)
-        bases = dict(zip((item.name for item in self.instruments), self.base_corrections, strict=True))
-        if self.base_corrections.is_meta or not self._corrects_bases(self.base_corrections):
-            bases = {}
+        bases: dict[str, Tensor] = {}
+        if not self.base_corrections.is_meta and self._corrects_bases(self.base_corrections):
+            bases = dict(zip((item.name for item in self.instruments), self.base_corrections, strict=True))
         if not state.instruments or not (corrects or bases):
             return state
         index, center, moved = self._tissue_index(state), self.center, dict(state.instruments)

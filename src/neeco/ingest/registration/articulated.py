@@ -37,6 +37,7 @@ from neeco.ingest.registration.base import (
     sd_motion,
     unmoved,
 )
+from neeco.ingest.registration.layers import EXCHANGED_SHARES
 from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S, BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock
 
@@ -45,7 +46,6 @@ ALONG_MM = (-10.0, -5.0, 5.0, 10.0)  # starts along the shaft
 ROLLS_RAD = (-0.25, 0.25)  # starts turned about it
 N_REFINED = 3  # starts that are fitted to all frames
 APART_MM, APART_RAD = 3.0, 0.035  # between results that count as different
-LEVER_MM = 40.0  # at which a turn counts as a shift
 # added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
 FLOOR_MM, FLOOR_DEPTH_MM, FLOOR_DEG = 0.25, 0.35, 0.25
 SCATTER = 1.3  # factor on standard deviations; assumed, as the floors are: few recordings were measured
@@ -53,7 +53,6 @@ MIN_OVERLAP, USUAL_OVERLAP = 0.75, 0.85  # of the silhouette with the masks: dou
 LEAST_OVERLAP, MAX_RESIDUAL_PX = 0.4, 2.5  # beyond, nothing is found
 REVERSED_SHARE = 0.8  # of the cost, from which a joint counts as reversed
 MIN_EXCHANGED = 1.25  # times the cost, with poses of other moments
-EXCHANGED_SHARES = (0.37, 0.61)  # of the recording, by which poses are shifted
 MAX_SDS = 3.2  # from its prior, by which a stated length or angle, or the base, may be off
 MAX_SHIFT_SDS = 3.5  # of the base's prior
 

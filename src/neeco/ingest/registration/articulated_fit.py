@@ -13,10 +13,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
-from neeco.ingest.foreground.silhouettes import EDGE_PX, Silhouettes
+from neeco.ingest.foreground.silhouettes import EDGE_PX
 from neeco.ingest.registration.articulated_model import ArticulatedModel, Outlines
 from neeco.ingest.registration.silhouette_fit import BasePrior
-from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSilhouettes, moved_base, poses_at_clock
 
 BASE = 7  # parameters of the base (turn rad [3], shift mm [3]) and the clock (s); the model's follow
 MAX_POINTS = 90  # of a mask's outline
@@ -31,18 +31,13 @@ DAMPING, TOLERANCE = 1e-2, 1e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ArticulatedProblem:
-    """Silhouettes of frames [F], their cameras, the log's poses and joint values at the clock's first guess moved by
-    CLOCK_SHIFTS_S, and the model that is to explain them."""
+class ArticulatedProblem(LoggedSilhouettes):
+    """Silhouettes, joint values at the clocks of the poses, and the model that is to explain them."""
 
     model: ArticulatedModel
-    silhouettes: Silhouettes
     contours: np.ndarray  # [F, N, 2] px of the masks' outlines; NaN: no point
-    camera_from_world: np.ndarray  # [F, 4, 4]
-    poses: np.ndarray  # [S, F, 4, 4] base_from_root
     readings: dict[str, np.ndarray]  # [S, F] by name
     values: np.ndarray  # [S, F, L] of all links' joints, rad or mm
-    blocks: np.ndarray  # [F] stretch of the recording, within which errors are correlated
     prior: BasePrior
 
     def take(self, rows: np.ndarray) -> ArticulatedProblem:
@@ -57,20 +52,6 @@ class ArticulatedProblem:
             values=self.values[:, rows],
             blocks=self.blocks[rows],
         )
-
-    @property
-    def middle(self) -> np.ndarray:
-        """Mean position [3] mm of the instrument in the base's frame."""
-        return np.asarray(self.poses[len(CLOCK_SHIFTS_S) // 2, :, :3, 3].mean(0))
-
-    @property
-    def px_scale(self) -> float:
-        """Pixels of these masks per pixel of masks 160 wide."""
-        return self.silhouettes.distances.shape[2] / 160
-
-    def pivot(self, world_from_base: np.ndarray) -> np.ndarray:
-        """Mean position [3] mm of the instrument in the world."""
-        return np.asarray(world_from_base[:3, :3] @ self.middle + world_from_base[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)

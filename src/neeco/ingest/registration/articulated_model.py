@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.capture.kinematics import FIXED, PRISMATIC, KinematicTree
 from neeco.geometry.lines import unit
@@ -82,7 +83,7 @@ class ArticulatedModel:
         self.parents = [-1 if link.parent is None else names.index(link.parent) for link in tree.links]
         self.names: list[str] = []
         self.means, self.sds = np.zeros(0), np.zeros(0)
-        self.rest = tree_at_rest(tree)
+        self.rest = list(tree.rest_poses.values())
         self._hinges()
         first = next(i for i in range(len(names)) if tree.links[i].type != FIXED)
         self.first = first
@@ -163,7 +164,7 @@ class ArticulatedModel:
                 turns.append(turn @ origin[:3, :3])
                 shifts.append(shift + turn @ place + value[:, None] * (turn @ axis))
             else:
-                turns.append(turn @ turns_about(axis, value) @ origin[:3, :3])
+                turns.append(turn @ Rotation.from_rotvec(value[:, None] * axis).as_matrix() @ origin[:3, :3])
                 shifts.append(shift + turn @ place)
         return turns, shifts
 
@@ -267,22 +268,6 @@ class ArticulatedModel:
             places += [*stations, *stations, *np.ones(len(caps))]
             angles += [*np.full(len(stations), np.pi / 2), *np.full(len(stations), -np.pi / 2), *caps]
         self.owner, self.places, self.angles = np.array(owners), np.array(places), np.array(angles)
-
-
-def tree_at_rest(tree: KinematicTree) -> list[np.ndarray]:
-    """root_from_link [4, 4] of all links where the values of all joints are 0."""
-    rest: dict[str, np.ndarray] = {}
-    for link in tree.links:
-        rest[link.name] = link.origin if link.parent is None else rest[link.parent] @ link.origin
-    return [rest[link.name] for link in tree.links]
-
-
-def turns_about(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Rotations [F, 3, 3] about a unit axis [3] by angles [F] rad (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    sine, cosine = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
-    return np.asarray(np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross))
 
 
 def joint_values(tree: KinematicTree, readings: dict[str, np.ndarray]) -> np.ndarray:

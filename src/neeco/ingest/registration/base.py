@@ -22,7 +22,7 @@ from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
 from neeco.ingest.registration.axial_texture import with_marks
-from neeco.ingest.registration.layers import LayerFit, ShaftLine
+from neeco.ingest.registration.layers import EXCHANGED_SHARES, LayerFit, ShaftLine
 from neeco.ingest.registration.silhouette_fit import (
     CLOCK_SD_S,
     FRONT_SHARE,
@@ -60,7 +60,6 @@ RADIUS_RANGE_MM, TYPICAL_RADIUS_MM = (1.5, 5.5), 3.5  # of shafts; one outside i
 LEVER_MM = 40.0  # from the instrument's middle, at which a turn counts as a shift
 OPEN_SD_MM = 3.0  # at that lever, from which a direction counts as undetermined
 OPEN_SHARE = 0.7  # of the prior's standard deviation: the images have hardly reduced it
-EXCHANGED_SHARES = (0.37, 0.61)  # of the recording, by which poses are shifted for comparison
 MIN_EXCHANGED_COST = 1.5  # times the cost with the right poses
 MAX_RESIDUAL_PX = 1.5  # median, of masks 160 wide
 BY_SIZE = "a shift towards where the instrument comes in, together with its size"
@@ -234,7 +233,7 @@ def _distance(problem: SilhouetteProblem, prior: Prior | None) -> float:
     guess = TYPICAL_RADIUS_MM * problem.silhouettes.intrinsics[0] / max(half, 0.5)
     if prior is None:
         return guess
-    place = prior[0][:3, :3] @ problem.middle + prior[0][:3, 3]
+    place = problem.pivot(prior[0])
     depth = float(np.median(problem.camera_from_world[:, 2, :3] @ place + problem.camera_from_world[:, 2, 3]))
     return depth if depth > 0.2 * guess else guess
 
@@ -250,7 +249,7 @@ def _starts(
     else:
         given = known.world_from_base
         rotations = rotations_about(given[:3, :3], known.sd_rad, N_ROTATIONS, generator)
-        center, sd_mm, step = given[:3, :3] @ problem.middle + given[:3, 3], known.sd_mm, 0.5 * known.sd_rad
+        center, sd_mm, step = problem.pivot(given), known.sd_mm, 0.5 * known.sd_rad
     views = ShaftViews(
         lines=shaft_lines(problem.silhouettes.masks),
         intrinsics=problem.silhouettes.intrinsics,

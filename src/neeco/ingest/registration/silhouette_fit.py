@@ -81,13 +81,9 @@ class _System:
         self.free[6] = prior.sd_clock > 0
         self.free[-1] = problem.marks is not None
 
-    def pivot(self, world_from_base: np.ndarray) -> np.ndarray:
-        """Mean position [3] of the instrument in the world."""
-        return np.asarray(world_from_base[:3, :3] @ self.problem.middle + world_from_base[:3, 3])
-
     def moved(self, fit: SilhouetteFit, step: np.ndarray) -> SilhouetteFit:
         """The fit after a step in its parameters."""
-        return moved(fit, step, self.pivot(fit.world_from_base))
+        return moved(fit, step, self.problem.pivot(fit.world_from_base))
 
     def residuals(self, fit: SilhouetteFit) -> _Residuals:
         """Distances px of the sides from the masks' outlines, and along the line of the tip from the masks' ends and of
@@ -156,7 +152,7 @@ class _System:
         prior, given = self.prior, self.prior.world_from_base
         if prior.sd_rad is not None and prior.sd_mm is not None:
             add(np.arange(3), _turn_between(fit.world_from_base, given), prior.sd_rad)
-            add(np.arange(3, 6), self.pivot(fit.world_from_base) - self.pivot(given), prior.sd_mm)
+            add(np.arange(3, 6), self.problem.pivot(fit.world_from_base) - self.problem.pivot(given), prior.sd_mm)
         if prior.sd_clock > 0:
             add(np.array([6]), np.array([fit.clock]), prior.sd_clock)
         off = fit.shape.copy()

@@ -30,14 +30,34 @@ RADIUS_RANGE_MM, DEFAULT_RADIUS_MM = (0.5, 15.0), 3.0  # of a first guess
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SilhouetteProblem:
+class LoggedSilhouettes:
     """Silhouettes of frames [F], their cameras, and the poses at the clock's first guess moved by CLOCK_SHIFTS_S."""
 
     silhouettes: Silhouettes
     camera_from_world: np.ndarray  # [F, 4, 4]
-    poses: np.ndarray  # [S, F, 4, 4] base_from_instrument
-    readings: np.ndarray  # [F, J] of its joints, standardised
+    poses: np.ndarray  # [S, F, 4, 4] base_from_instrument; of one with links, of its root
     blocks: np.ndarray  # [F] stretch of the recording, within which errors are correlated
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Mean position [3] mm of the instrument in the base's frame."""
+        return np.asarray(self.poses[len(CLOCK_SHIFTS_S) // 2, :, :3, 3].mean(0))
+
+    @property
+    def px_scale(self) -> float:
+        """Pixels of these masks per pixel of masks 160 wide, in which losses are stated."""
+        return self.silhouettes.distances.shape[2] / 160
+
+    def pivot(self, world_from_base: np.ndarray) -> np.ndarray:
+        """Mean position [3] mm of the instrument in the world."""
+        return np.asarray(world_from_base[:3, :3] @ self.middle + world_from_base[:3, 3])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SilhouetteProblem(LoggedSilhouettes):
+    """Silhouettes of a shape that is rigid, or changed by readings."""
+
+    readings: np.ndarray  # [F, J] of its joints, standardised
     images: np.ndarray | None = None  # uint8 [F, h, w, 3]
     marks: np.ndarray | None = None  # [F, 2] px where a place on its surface is observed, NaN: nowhere
 
@@ -52,16 +72,6 @@ class SilhouetteProblem:
             images=None if self.images is None else self.images[rows],
             marks=None if self.marks is None else self.marks[rows],
         )
-
-    @property
-    def middle(self) -> np.ndarray:
-        """Mean position [3] mm of the instrument in the base's frame."""
-        return np.asarray(self.poses[len(CLOCK_SHIFTS_S) // 2, :, :3, 3].mean(0))
-
-    @property
-    def px_scale(self) -> float:
-        """Pixels of these masks per pixel of masks 160 wide, in which losses are stated."""
-        return self.silhouettes.distances.shape[2] / 160
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixels [..., 2] of points [..., 3] mm in the cameras' frames."""

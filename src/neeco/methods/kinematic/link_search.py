@@ -300,11 +300,11 @@ def doubted_readings(
     for name in recorded:
         words = f"with the sign of {name} reversed: is its axis, or its gain, the wrong way round?"
         changes.append(((name,), words, partial(_reversed, name)))
-    volumes_of_changes = [volumes.with_readings(change) for _, _, change in changes]
-    most = max(volumes_of_changes, default=0.0)
+    found = [(volumes.with_readings(change), index) for index, (_, _, change) in enumerate(changes)]
+    most, index = max(found, default=(0.0, 0))
     if most <= MIN_VOLUME_RATIO * named:
         return None
-    names, words, change = changes[len(volumes_of_changes) - 1 - volumes_of_changes[::-1].index(most)]
+    names, words, change = changes[index]
     return DoubtedReadings(names, most / max(named, 1), words, change)
 
 
