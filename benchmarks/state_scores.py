@@ -2,16 +2,17 @@
 
     python benchmarks/state_scores.py CAPTURE… RUN…
 
-Captures need truth/transforms.json (`benchmarks/rendered_captures.py`, `benchmarks/state_errors.py`). A run's states are
-those of its checkpoint, with the scene's corrections of bases. A constant offset in an instrument's own frame, and of
-every joint, is no error: the learned shape absorbs it. Their medians are taken off, and the scale about the camera that
+Captures need truth/transforms.json (`benchmarks/rendered_captures.py`, `benchmarks/state_errors.py`). A run's
+states are those of its checkpoint, with the scene's corrections of bases. A constant offset in an instrument's own
+frame, and of
+every joint, is no error: the learned shape absorbs it. Medians are taken off, and the scale about the camera that
 fits best (a larger instrument farther away). Prints a row per instrument, root mean squares over the training frames:
 
     across, depth    mm, of the instrument's origin (across: along each of the view's axes)
     tilt, roll       degrees, of the shaft (tilt: about each of both axes across it)
     each joint       degrees (mm where it slides)
-    / sd             errors over the standard deviations that the run states, near 1 if these are right: of turns, shifts
-                     and joints
+    / sd             errors over the standard deviations that the run states, near 1 if right: of turns, shifts,
+                     joints
 
 and with --frames a line per frame. Frames of truth/outliers.json have a row of their own.
 """
