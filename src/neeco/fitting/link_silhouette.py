@@ -88,6 +88,7 @@ class ArticulatedModel:
         self.first = first
         self.axis = _tube_axis(tree, self.rest[first][:3, 3], poses)
         self.tilt = self._add("shaft", [0] * 4, [TILT_SD_RAD] * 2 + [ASIDE_SD_MM] * 2)
+        self.least_ears = 0.5  # mm
         self.ears = self._add("ears", [EARS_MM], [EARS_SD_MM])
         self.tube = self._add("tube radius", [np.log(TUBE_RADIUS_MM), -0.15], [LOG_RADIUS_SD, RATIO_SD])
         self._cones()
@@ -175,7 +176,7 @@ class ArticulatedModel:
         tilt = parameters[self.tilt : self.tilt + 4]
         axis = unit(self.axis + basis[:, :2] @ tilt[:2])
         pivot = shifts[self.first] + basis[:, :2] @ tilt[2:]
-        end = pivot - np.clip(parameters[self.ears], 0.5, 20) * axis
+        end = pivot - np.clip(parameters[self.ears], self.least_ears, 20) * axis
         tube = np.exp(parameters[self.tube])
         ears = tube * np.exp(parameters[self.tube + 1])
         across = np.broadcast_to(basis[:, 0], pivot.shape)
