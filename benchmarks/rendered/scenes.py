@@ -347,7 +347,9 @@ SCENES["cloth-wristed"] = replace(
             Material((0.76, 0.75, 0.72), 0.08, 2.0, 120.0),
         ),
     ),
-    lamps=Lamps(((-13.0, 0.0, 0.0), (13.0, 0.0, 0.0)), power=1.5, distance=105.0, focus=1.5, sharpness=28.0, contact=5.0),
+    lamps=Lamps(
+        ((-13.0, 0.0, 0.0), (13.0, 0.0, 0.0)), power=1.5, distance=105.0, focus=1.5, sharpness=28.0, contact=5.0
+    ),
     path=replace(
         SCENES["bowel-wristed"].path,
         trocar=(-62.0, 118.0, 112.0),
