@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from pose_errors import true_states
 from scipy.spatial.transform import Rotation
-from state_errors import shaft_axis
+from state_errors import shaft_of
 
 from neeco.capture import Capture, State, read_capture
 from neeco.capture.model import Instrument
@@ -189,7 +189,7 @@ def errors_of(found: States, instrument: Instrument) -> Errors:
         shifts=np.einsum("fij,fj->fi", there[:, :3, :3], off[:, :3, 3]),
         values=np.array(values).reshape(len(frames), -1),
         camera_from_instrument=there,
-        axis=shaft_axis(replace(capture, frames=tuple(known)), name),
+        axis=shaft_of(replace(capture, frames=tuple(known)), name).axis,
     )
 
 

@@ -94,6 +94,15 @@ class ArticulatedModel:
         self._cones()
         self._outline()
 
+    def widen_shaft(self, tilt_sd_rad: float, end_sd_mm: float, least_end_mm: float) -> None:
+        """Let the shaft's axis be farther from its first guess, and its end farther from the first pivot."""
+        self.sds[self.tilt : self.tilt + 2], self.sds[self.ears] = tilt_sd_rad, end_sd_mm
+        self.least_ears = least_end_mm
+
+    def shaft_axis(self, parameters: np.ndarray) -> np.ndarray:
+        """Direction [3] of the tube in the root's frame."""
+        return np.asarray(unit(self.axis + frame_about(self.axis)[:, :2] @ parameters[self.tilt : self.tilt + 2]))
+
     def _add(self, name: str, means: list[float], sds: list[float]) -> int:
         start = len(self.means)
         self.means, self.sds = np.append(self.means, means), np.append(self.sds, sds)

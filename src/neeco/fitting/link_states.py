@@ -1,9 +1,9 @@
 """States of an instrument with stated links, fitted to where its colours are: a bundle adjustment before any Gaussian.
 
-Every pixel belongs to the tissue, the shaft or what lies beyond it, each with colours of its own (region-based tracking:
-Prisacariu, Reid, IJCV 2012). Unknown are the shape that all frames share (radii, lengths, errors of the stated links, a
-rigid error of the base) and each state's own error: pose and joints. A state's block is eliminated, so that the cost
-grows linearly with their number.
+Tissue, shaft and what lies beyond it have colours of their own; pixels say by these how likely the instrument covers
+them (region-based tracking: Prisacariu, Reid, IJCV 2012). Unknown are the shape that all states share (radii, lengths,
+errors of the stated links, a rigid error of the base) and each state's own error: pose and joints. Each state's block is
+eliminated, so that the cost grows linearly with their number.
 """
 
 from __future__ import annotations
@@ -13,25 +13,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from neeco.capture.kinematics import KinematicTree
-from neeco.fitting.link_silhouette import ArticulatedModel, Outlines, joint_values
+from neeco.fitting.link_silhouette import MAX_BEND_MM, ArticulatedModel, Outlines, joint_values
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
-from neeco.geometry.lines import frame_about
+from neeco.geometry.lines import frame_about, unit
+from neeco.geometry.trocar import line_through_trocar
 
-CLASSES = 3  # tissue, shaft, beyond the shaft
 POSE = 6  # parameters of a state's pose: two tilts, roll (rad), two shifts across the view, depth (mm); joints follow
 BINS, SMOOTH_BINS = 24, 0.8  # of colours, per channel
-COMMON = 0.05  # share of every class's pixels with any colour of the images
-EARS_MM = 15.0
-BLOCK_PX = 8  # of images, chosen together
-# pixels that count as one: errors of outlines are correlated along them; a shaft is round, what lies beyond it no cone
-SHAFT_PX, REST_PX = 3.0, 12.0
+COMMON = 0.05  # share of pixels whose colour says nothing
+BLOCK_PX, GRID_PX = 8, 4  # blocks of cells that are chosen together; grid on which colours are attributed
+CORRELATED_PX = 12.0  # pixels that count as one: errors of outlines and of the model are correlated along them
+MAX_RATIO, MIN_BLOCKS = 3.0, 40.0  # of likelihoods that count in a misfit; and blocks' worth of them, at least
+EARS_MM = 15.0  # before the first joint, that count neither as shaft nor as beyond it
 BASE_SD_RAD, BASE_SD_MM = 0.035, 3.0
+TUBE_TILT_SD, END_SD_MM, LEAST_END_MM = 0.1, 6.0, -10.0  # of the shaft's axis and end, where no trocar gives the axis
 STEPS = (0.002, 0.05)  # rad, mm, of differences
 PARAMETER_STEP = 0.02  # standard deviations
 MAX_STEP_SDS = 3.0  # of one step
-STAGES = ((8, 6.0, 8), (4, 3.0, 8), (2, 1.5, 8))  # px of cells and of the outlines' softness; steps
+FIRST_SOFTNESS = 10.0  # px of outlines from which colours are learned at first
+STAGES = ((8, 6.0, 8), (4, 3.0, 8), (4, 2.0, 8))  # px of cells and of the outlines' softness; steps
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,7 +42,7 @@ class LinkViews:
     """V images of an instrument in S states, and what was recorded of these."""
 
     tree: KinematicTree
-    images: np.ndarray  # float32 [V, H, W, 3]
+    images: np.ndarray  # uint8 [V, H, W, 3]
     usable: np.ndarray  # bool [V, H, W]
     camera_from_world: np.ndarray  # [V, 4, 4]
     intrinsics: np.ndarray  # [V, 4] fx, fy, cx, cy px
@@ -57,31 +60,36 @@ class StatesFit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Cells:
-    """Cells [V, N] of the images near outlines: middles px, log likelihoods of the classes, and weights."""
+class Cells:
+    """Cells [V, N] of the images near outlines: middles px, log likelihood ratios of the instrument to the tissue, and
+    weights."""
 
     points: np.ndarray  # [V, N, 2]
-    likelihoods: np.ndarray  # [V, N, CLASSES]
+    ratios: np.ndarray  # [V, N]
     weights: np.ndarray  # [V, N]
-    softness: float
+    softness: float  # px
 
 
 class StatesProblem:
-    """Bundle adjustment of states; `sds` [S, 6 + R]: the priors of their corrections."""
+    """Bundle adjustment of states; `sds` [S, 6 + R]: standard deviations of the priors on their corrections."""
 
-    def __init__(self, views: LinkViews, sds: np.ndarray) -> None:
+    def __init__(self, views: LinkViews, sds: np.ndarray, like: StatesProblem | None = None) -> None:
+        """like: the problem of other states, whose shape and base are meant."""
         self.views, self.sds = views, sds
-        self.binary = False
-        self.model = ArticulatedModel(views.tree, views.poses)
-        self.center = views.poses[:, :3, 3].mean(0)
-        self.basis = frame_about(self.model.axis)
+        if like is None:
+            self.model = ArticulatedModel(views.tree, views.poses)
+            self.center = views.poses[:, :3, 3].mean(0)
+            self.basis = frame_about(self.model.axis)
+            if line_through_trocar(views.poses, MAX_BEND_MM) is None:
+                self.model.widen_shaft(TUBE_TILT_SD, END_SD_MM, LEAST_END_MM)
+        else:
+            self.model, self.center, self.basis = like.model, like.center, like.basis
         base = [BASE_SD_RAD] * 3 + [BASE_SD_MM] * 3
         self.shared_sds = np.append(self.model.sds, base)
         self.shared_means = np.append(self.model.means, np.zeros(6))
         first = [int(np.flatnonzero(views.state_of_view == s)[0]) for s in range(len(views.poses))]
         turns = views.camera_from_world[first, :3, :3] @ views.poses[:, :3, :3]
         self.root_from_camera = turns.transpose(0, 2, 1)  # [S, 3, 3]
-        self.tube = np.array([True] + [False] * (1 + len(self.model.cones)))  # [C] cones of the shaft
 
     def start(self) -> StatesFit:
         """The states as recorded, and the shape expected."""
@@ -114,124 +122,129 @@ class StatesProblem:
         intrinsics = tuple(views.intrinsics.T[..., None])
         return self.model.outlines(fit.shared[:-6], values[shown], views.camera_from_world @ poses[shown], intrinsics)
 
-    def memberships(self, found: Outlines, points: np.ndarray, softness: float) -> np.ndarray:
-        """Probabilities [V, N, CLASSES] of the classes at points [V, N, 2] px."""
-        return _softmax(self._sizes(found.distances(points)[0]), softness)
-
-    def _sizes(self, distances: np.ndarray) -> np.ndarray:
-        """Signed distances [V, N, 2] px of shaft and of the rest, of cones' [V, C, N]."""
-        return np.stack([distances[:, self.tube].max(1), distances[:, ~self.tube].max(1)], -1)
-
     def learn_colors(self, fit: StatesFit, softness: float) -> np.ndarray:
-        """Log likelihoods float32 [V, H, W, CLASSES] of the images' colours under the classes, from where they are."""
+        """Log likelihood ratios float32 [V, H, W] of the instrument to the tissue, by the colours of both where a fit
+        has them."""
         images = self.views.images
         count, height, width, _ = images.shape
-        grid = _grid(height, width, BLOCK_PX // 2)
+        grid = _grid(-(-height // GRID_PX) * GRID_PX, -(-width // GRID_PX) * GRID_PX, GRID_PX)
         apart = fit.shared.copy()
-        apart[self.model.ears] = EARS_MM  # between shaft and first joint: of neither
+        apart[self.model.ears] = EARS_MM
         distances = self.outlines(replace(fit, shared=apart)).distances(np.broadcast_to(grid, (count, *grid.shape)))[0]
-        sizes = [distances[:, 0], distances[:, 2:].max(1), distances[:, 1]]
-        member = _softmax(np.stack(sizes, -1), softness)
-        rows, columns = -(-height // (BLOCK_PX // 2)), -(-width // (BLOCK_PX // 2))
-        member = member.reshape(count, rows, columns, CLASSES + 1)
-        index = np.minimum((images * BINS).astype(np.int32), BINS - 1)
-        index = (index[..., 0] * BINS + index[..., 1]) * BINS + index[..., 2]
-        rows, columns = np.arange(height) // (BLOCK_PX // 2), np.arange(width) // (BLOCK_PX // 2)
-        own = member[:, rows[:, None], columns[None]]
-        densities = []
-        for label in range(CLASSES):
-            weights = np.where(self.views.usable, own[..., label], 0.0)
-            counted = np.bincount(index.ravel(), weights.ravel(), BINS**3).reshape((BINS,) * 3)
-            densities.append(gaussian_filter(counted, SMOOTH_BINS) + 1e-9)
-        every = sum(densities)
-        every = every / every.sum()
-        logs = [np.log((1 - COMMON) * d / d.sum() + COMMON * every + 1e-12) for d in densities]
-        table = np.stack(logs, -1).reshape(-1, CLASSES).astype(np.float32)
-        if self.binary:
-            table[:, 1:] = np.log(np.exp(table[:, 1:].astype(np.float64)).mean(-1, keepdims=True))
-        found = table[index]
-        return found - found.max(-1, keepdims=True)
+        sizes = [np.zeros_like(distances[:, 0]), distances[:, 0], distances[:, 2:].max(1), distances[:, 1]]
+        scaled = np.stack(sizes, -1) / softness
+        member = np.exp(scaled - scaled.max(-1, keepdims=True))
+        member = (member / member.sum(-1, keepdims=True)).reshape(count, -(-height // GRID_PX), -1, len(sizes))
+        bins = (images.astype(np.uint16) * BINS // 256).astype(np.int32)
+        index = (bins[..., 0] * BINS + bins[..., 1]) * BINS + bins[..., 2]
+        rows, columns = np.arange(height) // GRID_PX, np.arange(width) // GRID_PX
+        found = []
+        for label in range(3):
+            own = np.where(self.views.usable, member[..., label][:, rows[:, None], columns[None]], 0.0)
+            counted = np.bincount(index.ravel(), own.ravel(), BINS**3).reshape((BINS,) * 3)
+            density = gaussian_filter(counted, SMOOTH_BINS) + 1e-9
+            found.append(density / density.sum())
+        tissue, instrument = found[0], (found[1] + found[2]) / 2
+        common = COMMON * (tissue + instrument) / 2
+        ratio = np.log(((1 - COMMON) * instrument + common) / ((1 - COMMON) * tissue + common))
+        return np.asarray(ratio.astype(np.float32).ravel()[index])
 
-    def cells(self, fit: StatesFit, likelihoods: np.ndarray, cell: int, softness: float) -> _Cells:
-        """Cells of blocks near outlines of a fit."""
-        count, height, width, _ = likelihoods.shape
-        rows, columns = height // BLOCK_PX, width // BLOCK_PX
+    def cells(self, fit: StatesFit, ratios: np.ndarray, cell: int, softness: float) -> Cells:
+        """Cells of `cell` px in the blocks near a fit's outlines; ratios [V, H, W] as `learn_colors` returns them."""
+        count, height, width = ratios.shape
+        rows, columns, inner = height // BLOCK_PX, width // BLOCK_PX, BLOCK_PX // cell
         grid = _grid(rows * BLOCK_PX, columns * BLOCK_PX, BLOCK_PX)
-        member = self.memberships(self.outlines(fit), np.broadcast_to(grid, (count, *grid.shape)), softness + BLOCK_PX / 2)
-        near = (member**2).sum(-1) < 0.98  # [V, B]
-        inner = BLOCK_PX // cell
-        shape = (count, rows, inner, cell, columns, inner, cell, -1)
-        cut = likelihoods[:, : rows * BLOCK_PX, : columns * BLOCK_PX]
-        pooled = cut.reshape(shape).mean((3, 6))  # [V, rows, inner, columns, inner, CLASSES]
-        pooled = pooled.transpose(0, 1, 3, 2, 4, 5).reshape(count, len(grid), inner**2, CLASSES)
-        counted = self.views.usable[:, : rows * BLOCK_PX, : columns * BLOCK_PX]
-        counted = counted.reshape(shape).mean((3, 6))[..., 0].transpose(0, 1, 3, 2, 4).reshape(count, len(grid), -1)
-        offsets = _grid(BLOCK_PX, BLOCK_PX, cell) - BLOCK_PX / 2
-        most = max(int(near.sum(1).max()), 1)
-        order = np.argsort(~near, axis=1, kind="stable")[:, :most]  # near blocks first
-        used = np.take_along_axis(near, order, 1)
-        points = grid[order][:, :, None] + offsets
-        picked = np.take_along_axis(pooled, order[..., None, None], 1)
-        shaft = np.take_along_axis(member[..., 1] * member[..., 0] > member[..., 2], order, 1)
-        independent = cell**2 / np.where(shaft, SHAFT_PX, REST_PX)
-        weights = np.take_along_axis(counted, order[..., None], 1) * (used * independent)[..., None]
-        return _Cells(
+        distances = self.outlines(fit).distances(np.broadcast_to(grid, (count, *grid.shape)))[0].max(1)
+        near = np.abs(distances) < BLOCK_PX + 3 * softness  # [V, B]
+
+        def pooled(images: np.ndarray) -> np.ndarray:
+            cut = images[:, : rows * BLOCK_PX, : columns * BLOCK_PX]
+            parts = cut.reshape(count, rows, inner, cell, columns, inner, cell).mean((3, 6), dtype=np.float32)
+            return np.asarray(parts.transpose(0, 1, 3, 2, 4).reshape(count, len(grid), inner**2))
+
+        order = np.argsort(~near, axis=1, kind="stable")[:, : max(int(near.sum(1).max()), 1)]  # near blocks first
+        used = np.take_along_axis(near, order, 1)[..., None]
+        points = grid[order][:, :, None] + _grid(BLOCK_PX, BLOCK_PX, cell) - BLOCK_PX / 2
+        picked, weights = (
+            np.take_along_axis(pooled(part), order[..., None], 1) for part in (ratios, self.views.usable)
+        )
+        return Cells(
             points.reshape(count, -1, 2).astype(np.float32),
-            picked.reshape(count, -1, CLASSES).astype(np.float32),
-            weights.reshape(count, -1).astype(np.float32),
+            picked.reshape(count, -1),
+            (weights * used * np.float32(cell**2 / CORRELATED_PX)).reshape(count, -1),
             softness,
         )
 
-    def losses(self, fit: StatesFit, cells: _Cells) -> np.ndarray:
+    def losses(self, fit: StatesFit, cells: Cells) -> np.ndarray:
         """Negative log likelihoods [V] of the views' cells."""
-        member = self.memberships(self.outlines(fit), cells.points, cells.softness)
-        return -(np.log((member * np.exp(cells.likelihoods)).sum(-1) + 1e-9) * cells.weights).sum(1)
+        inside = expit(self.outlines(fit).distances(cells.points)[0].max(1) / cells.softness)
+        return np.asarray(_losses(inside, cells))
+
+    def misfits(self, fit: StatesFit, ratios: np.ndarray) -> np.ndarray:
+        """How badly [V] a fit explains each view: likelihood ratios on its wrong side, by those on its right side."""
+        count, height, width = ratios.shape
+        rows, columns = height // BLOCK_PX, width // BLOCK_PX
+        grid = _grid(rows * BLOCK_PX, columns * BLOCK_PX, BLOCK_PX)
+        distances = self.outlines(fit).distances(np.broadcast_to(grid, (count, *grid.shape)))[0].max(1)
+        inside = expit(distances / (BLOCK_PX / 4))
+        cut = np.clip(ratios, -MAX_RATIO, MAX_RATIO) * self.views.usable
+        cut = cut[:, : rows * BLOCK_PX, : columns * BLOCK_PX].reshape(count, rows, BLOCK_PX, columns, BLOCK_PX)
+        for_it, against = (np.clip(sign * cut, 0, None).mean((2, 4)).reshape(count, -1) for sign in (1, -1))
+        wrong = ((1 - inside) * for_it + inside * against).sum(1)
+        return np.asarray(wrong / ((inside * for_it).sum(1) + MAX_RATIO * MIN_BLOCKS))
+
+    def turned_to_shaft(self, fit: StatesFit) -> StatesFit:
+        """The same fit with tilts and roll counted about the shaft's axis as fitted, from now on."""
+        basis = frame_about(self.model.shaft_axis(fit.shared))
+        own = fit.own.copy()
+        own[:, :3] = own[:, :3] @ (self.basis.T @ basis)
+        self.basis = basis
+        return StatesFit(fit.shared, own)
 
     def prior_cost(self, fit: StatesFit) -> float:
         """Half the sum of squares of all parameters, in standard deviations of their priors."""
         shared = (fit.shared - self.shared_means) / self.shared_sds
         return 0.5 * float((shared**2).sum() + ((fit.own / self.sds) ** 2).sum())
 
-    def blocks(self, fit: StatesFit, cells: _Cells, shared: bool = True) -> Blocks:
-        """Gradient and information of the cells' likelihood, without priors."""
+    def blocks(self, fit: StatesFit, cells: Cells, shared: bool = True) -> Blocks:
+        """Gradient and information of the cells' likelihood, without priors; `shared`: of shared parameters, too."""
         found = self.outlines(fit)
         distances, places, ways = found.distances(cells.points)
-        member = _softmax(self._sizes(distances), cells.softness)
-        joint = member * np.exp(cells.likelihoods)
-        total = joint.sum(-1, keepdims=True) + 1e-9
-        posterior = joint / total
-        loss = -(np.log(total[..., 0]) * cells.weights).sum(1)
-        spread, left = 1 - (member**2).sum(-1), 1 - (posterior**2).sum(-1)
-        certain = np.clip(1 - left / np.maximum(spread, 1e-6), 0, 1) * cells.weights / cells.softness**2
-        columns = []
-        view, cell = np.indices(cells.weights.shape)
-        for label, cones in ((1, np.flatnonzero(self.tube)), (2, np.flatnonzero(~self.tube))):
-            nearest = cones[distances[:, cones].argmax(1)]  # [V, N]
-            place, way = places[view, nearest, cell], ways[view, nearest, cell]
-            by = np.zeros((*nearest.shape, distances.shape[1], 6), np.float32)
-            share = np.stack([1 - place, place], -1)
-            own = np.concatenate([(share[..., None] * way[..., None, :]).reshape(*nearest.shape, 4), share], -1)
-            by[view, cell, nearest] = own
-            columns.append(by.reshape(*nearest.shape, -1))
-        gradient = sum(
-            np.einsum("vnk,vn->vk", columns[k], (member - posterior)[..., k + 1] * cells.weights / cells.softness)
-            for k in range(2)
-        )
-        information = 0
-        for a in range(2):
-            for b in range(2):
-                factor = (member[..., a + 1] * (a == b) - member[..., a + 1] * member[..., b + 1]) * certain
-                information = information + (columns[a] * factor[..., None]).transpose(0, 2, 1) @ columns[b]
+        nearest = distances.argmax(1)
+        view, cell = np.indices(nearest.shape)
+        place, way = places[view, nearest, cell], ways[view, nearest, cell]
+        inside = expit(distances[view, nearest, cell] / cells.softness)
+        odds = inside * np.exp(cells.ratios)
+        posterior = odds / (odds + 1 - inside)
+        spread = inside * (1 - inside)
+        # information of labels less what colours leave open (Louis, JRSS B 1982)
+        known = np.clip(spread - posterior * (1 - posterior), 0, None) * cells.weights / cells.softness**2
+        slope = (inside - posterior) * cells.weights / cells.softness
+        share = np.stack([1 - place, place], -1)
+        by = np.concatenate([(share[..., None] * way[..., None, :]).reshape(*nearest.shape, 4), share], -1)  # [V, N, 6]
         by_own, by_shared = self._slopes(fit, found, shared)
         shown, states = self.views.state_of_view, len(self.views.poses)
         d, p = by_own.shape[-1], by_shared.shape[-1]
-        out = Blocks(np.zeros((states, d, d)), np.zeros((states, d, p)), np.zeros((p, p)), np.zeros((states, d)), np.zeros(p), loss)
-        own_info = by_own.transpose(0, 2, 1) @ information
-        np.add.at(out.own, shown, own_info @ by_own)
-        np.add.at(out.cross, shown, own_info @ by_shared)
-        np.add.at(out.own_gradient, shown, (by_own * gradient[..., None]).sum(1))
-        out.shared[:] = (by_shared.transpose(0, 2, 1) @ information @ by_shared).sum(0)
-        out.shared_gradient[:] = (by_shared * gradient[..., None]).sum((0, 1))
+        out = Blocks(
+            own=np.zeros((states, d, d)),
+            cross=np.zeros((states, d, p)),
+            shared=np.zeros((p, p)),
+            own_gradient=np.zeros((states, d)),
+            shared_gradient=np.zeros(p),
+            losses=_losses(inside, cells),
+        )
+        for cone in range(distances.shape[1]):
+            mine = nearest == cone
+            information = (by * (known * mine)[..., None]).transpose(0, 2, 1) @ by
+            gradient = (by * (slope * mine)[..., None]).sum(1)
+            rows = slice(6 * cone, 6 * cone + 6)
+            own, common = by_own[:, rows], by_shared[:, rows]
+            weighed = own.transpose(0, 2, 1) @ information
+            np.add.at(out.own, shown, weighed @ own)
+            np.add.at(out.cross, shown, weighed @ common)
+            np.add.at(out.own_gradient, shown, (own * gradient[..., None]).sum(1))
+            out.shared[:] += (common.transpose(0, 2, 1) @ information @ common).sum(0)
+            out.shared_gradient[:] += (common * gradient[..., None]).sum((0, 1))
         return out
 
     def _slopes(self, fit: StatesFit, found: Outlines, shared: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -288,7 +301,7 @@ class _Arrow(Linearisation[StatesFit]):
         return np.concatenate([shared, (-solved[..., p] - solved[..., :p] @ shared).ravel()])
 
 
-def adjust(problem: StatesProblem, fit: StatesFit, cells: _Cells, max_steps: int, *, shared: bool = True) -> StatesFit:
+def adjust(problem: StatesProblem, fit: StatesFit, cells: Cells, max_steps: int, *, shared: bool = True) -> StatesFit:
     """Minimise over all states and, with `shared`, what they share."""
     sds, shared_sds = problem.sds, problem.shared_sds
 
@@ -324,11 +337,9 @@ def _flat(found: Outlines) -> np.ndarray:
     return both.reshape(len(both), -1)
 
 
-def _softmax(sizes: np.ndarray, softness: float) -> np.ndarray:
-    """Probabilities [..., CLASSES] of tissue (distance 0) and the classes of signed distances [..., 2]."""
-    scaled = np.concatenate([np.zeros_like(sizes[..., :1]), sizes / softness], -1)
-    scaled = np.exp(scaled - scaled.max(-1, keepdims=True))
-    return scaled / scaled.sum(-1, keepdims=True)
+def _losses(inside: np.ndarray, cells: Cells) -> np.ndarray:
+    """Negative log likelihoods [V] of cells that the instrument covers by `inside` [V, N], relative to tissue."""
+    return -(np.log(inside * np.exp(cells.ratios) + 1 - inside + 1e-9) * cells.weights).sum(1)
 
 
 def _grid(height: int, width: int, cell: int) -> np.ndarray:
@@ -337,11 +348,15 @@ def _grid(height: int, width: int, cell: int) -> np.ndarray:
     return np.stack([x, y], -1).reshape(-1, 2)
 
 
-def posterior(problem: StatesProblem, fit: StatesFit, cells: _Cells) -> np.ndarray:
-    """Covariances [S, 6 + R, 6 + R] of the corrections at a minimum."""
-    b = problem.blocks(fit, cells)
+def posterior(problem: StatesProblem, fit: StatesFit, cells: Cells, *, shared: bool = True) -> np.ndarray:
+    """Covariances [S, 6 + R, 6 + R] of the corrections at a minimum; `shared`: what is shared was fitted, too."""
+    b = problem.blocks(fit, cells, shared)
     own = b.own + np.eye(problem.sds.shape[1]) / problem.sds[..., None] ** 2
     inverse = np.linalg.inv(own)
+    if not shared:
+        return np.asarray(inverse)
     carried = inverse @ b.cross  # [S, d, p]
     left = b.shared + np.diag(problem.shared_sds**-2) - np.einsum("sdp,sdq->pq", b.cross, carried)
     return np.asarray(inverse + carried @ np.linalg.inv(left) @ carried.transpose(0, 2, 1))
+
+

@@ -12,6 +12,7 @@ from neeco.methods.kinematic.hinge_search import start_hinges
 from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
+from neeco.methods.kinematic.state_registration import corrected_evidence, register_states
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import carved_shape
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
@@ -35,6 +36,9 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
     if isinstance(articulated, BreathingTissue) and articulated.may_breathe and session.timed:
         tissue = _learn_breathing(session, articulated, tissue)
     recorded = evidence = tissue_evidence(scene, session.views, session.config, tissue)
+    found = register_states(session, articulated.articulations)
+    if found is not None:
+        recorded = evidence = corrected_evidence(session, evidence, found)
     generator = torch.Generator().manual_seed(session.config.seed)
     bodies = [scene.canonical]
     for index, instrument in enumerate(scene.instruments):

@@ -1,0 +1,270 @@
+"""Sizes of the errors of recorded states, and states that are wrong altogether, from where images show an instrument.
+
+Fits of all states (`link_states`) say how far each is off and how well that is known. The standard deviations under
+which these corrections are most likely (restricted maximum likelihood of variance components: Patterson, Thompson,
+Biometrika 1971) replace those that were expected where they are clearly larger.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scipy.spatial.transform import Rotation
+
+from neeco.capture.kinematics import PRISMATIC, REVOLUTE
+from neeco.capture.model import evenly_spaced
+from neeco.fitting.link_states import (
+    FIRST_SOFTNESS,
+    POSE,
+    STAGES,
+    Cells,
+    LinkViews,
+    StatesFit,
+    StatesProblem,
+    adjust,
+    posterior,
+)
+from neeco.geometry.lines import unit
+
+DEG = np.pi / 180
+# standard deviations of errors that are tried: tilts, roll (rad), across, depth (mm), revolute (rad), prismatic (mm)
+TRIED = (2 * DEG, 6 * DEG, 0.4, 1.5, 4 * DEG, 1.5)
+# of a state that is wrong altogether, about each of its starts
+LOST = (12 * DEG, 30 * DEG, 4.0, 8.0, 20 * DEG, 8.0)
+# sizes that errors of the model alone may feign: no cone is a wrist
+FEIGNED = (0.35 * DEG, 2.3 * DEG, 0.25, 0.25, 3 * DEG, 1.0)
+MIN_FACTOR = 2.0  # times these, from which a size counts
+EM_STEPS = 200
+TAIL = 3.0  # degrees of freedom of a t distribution: wrong states do not widen what the others have
+MAX_ESTIMATED = 30  # states from which sizes are estimated
+BAD_MADS, BAD_MISFIT = 4.0, 0.1  # median absolute deviations, and more than the median, from which a state is bad
+BAD_WEIGHT = 0.02
+LARGE_SDS = 2.5  # root mean square of a correction in standard deviations
+BETTER = 0.75  # share of the misfit, below which another start is right
+N_OTHERS = 4  # states of other moments that are tried
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FoundStates:
+    """What was found of S states."""
+
+    large: bool  # whether the errors of all are larger than expected, not only those of lost ones
+    sds: np.ndarray  # [6 + R] of the recorded states' errors: two tilts, roll, across, across, depth, readings
+    poses: np.ndarray  # [S, 4, 4] world_from_root
+    readings: np.ndarray  # [S, R]
+    covariances: np.ndarray  # [S, 6 + R, 6 + R] of pose (rad, mm, the root's frame) and readings
+    lost: np.ndarray  # bool [S], whose states contradict the others
+    refitted: np.ndarray  # bool [S], of those: explained from another start
+    ratios: np.ndarray  # [V, H, W] log likelihood ratios of the instrument to the tissue
+    misfits: np.ndarray  # [V]
+
+
+def sds_of(sizes: tuple[float, ...], slides: np.ndarray) -> np.ndarray:
+    """Standard deviations [6 + R] of sizes as TRIED has them."""
+    tilt, roll, across, depth, turn, slide = sizes
+    return np.append([tilt, tilt, roll, across, across, depth], np.where(slides, slide, turn))
+
+
+def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> FoundStates | None:
+    """Return the states and the sizes of their errors, or None where nothing is found beyond what is expected.
+
+    expected [6 + R]: standard deviations of the recorded states; slides [R]: which readings are of prismatic joints.
+    """
+    tried = np.maximum(expected, sds_of(TRIED, slides))
+    few = take(views, np.array(evenly_spaced(len(views.poses), MAX_ESTIMATED)))
+    first = _fit(few, tried)
+    found = error_sizes(first, expected)
+    large = bool((found > MIN_FACTOR * sds_of(FEIGNED, slides)).any())
+    if not large and not _bad(first).any():
+        return None
+    sds = np.maximum(found if large else expected, expected)
+    return replace(_with_lost(_fit(views, sds, first), sds, slides), large=large)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    problem: StatesProblem
+    fit: StatesFit
+    ratios: np.ndarray
+    cells: Cells
+    misfits: np.ndarray  # [V]
+
+
+def _fit(views: LinkViews, sds: np.ndarray, known: _Fitted | None = None) -> _Fitted:
+    """Fit all states from those recorded; known: a fit of some of them, whose shape and base are where it begins."""
+    problem = StatesProblem(views, np.tile(sds, (len(views.poses), 1)))
+    fit, softness, stages = problem.start(), FIRST_SOFTNESS, STAGES
+    if known is not None:
+        fit = problem.turned_to_shaft(replace(fit, shared=known.fit.shared))
+        stages = STAGES[1:]
+        if len(views.poses) == len(known.problem.views.poses):
+            fit, softness, stages = replace(fit, own=known.fit.own), STAGES[-1][1], STAGES[-1:]
+    for cell, next_softness, steps in stages:
+        ratios = problem.learn_colors(fit, softness)
+        cells = problem.cells(fit, ratios, cell, next_softness)
+        if softness < FIRST_SOFTNESS:  # wrong states do not count in the shape and the base
+            bad = _bad(_Fitted(problem, fit, ratios, cells, problem.misfits(fit, ratios)))
+            weights = np.where(bad, BAD_WEIGHT, 1.0)[views.state_of_view, None]
+            cells = replace(cells, weights=cells.weights * weights)
+        fit = problem.turned_to_shaft(adjust(problem, fit, cells, steps))
+        softness = next_softness
+    return _Fitted(problem, fit, ratios, cells, problem.misfits(fit, ratios))
+
+
+def error_sizes(found: _Fitted, expected: np.ndarray) -> np.ndarray:
+    """Most likely standard deviations [6 + R] of the states' errors, from those expected on (EM of a t distribution)."""
+    problem, fit = found.problem, found.fit
+    b = problem.blocks(fit, found.cells, shared=False)
+    use = ~_bad(found)
+    information = b.own[use]
+    linear = np.einsum("sij,sj->si", information, fit.own[use]) - b.own_gradient[use]
+    # without a constant error, which the shape takes up
+    linear = linear - np.einsum("sij,j->si", information, np.linalg.lstsq(information.sum(0), linear.sum(0), rcond=1e-3)[0])
+    groups = [np.array(own) for own in ((0, 1), (2,), (3, 4), (5,), *((k,) for k in range(POSE, len(expected))))]
+
+    sds = expected.copy()
+    for _ in range(EM_STEPS):
+        covariance = np.linalg.inv(information + np.diag(sds**-2))
+        mean = np.einsum("sij,sj->si", covariance, linear)
+        second = mean**2 + np.einsum("sii->si", covariance)
+        weights = (TAIL + len(sds)) / (TAIL + (second / sds**2).sum(1))
+        second = (second * weights[:, None]).sum(0) / weights.sum()
+        for group in groups:
+            sds[group] = np.sqrt(second[group].mean())
+    return sds
+
+
+def _bad(found: _Fitted) -> np.ndarray:
+    """bool [S]: states that a fit explains far worse than most, or that it moves far."""
+    problem = found.problem
+    worst = np.zeros(len(problem.views.poses))
+    np.maximum.at(worst, problem.views.state_of_view, found.misfits)
+    off = worst - np.median(worst)
+    far = np.sqrt(((found.fit.own / problem.sds) ** 2).mean(1)) > LARGE_SDS
+    return np.asarray((off > max(BAD_MADS * 1.48 * float(np.median(np.abs(off))), BAD_MISFIT)) | far)
+
+
+def _with_lost(found: _Fitted, sds: np.ndarray, slides: np.ndarray) -> FoundStates:
+    """The states of a fit; those that are badly explained, from other starts."""
+    problem, fit = found.problem, found.fit
+    poses, readings = problem.corrected(fit)
+    covariances = posterior(problem, fit, found.cells)
+    to_root = np.zeros((len(poses), *covariances.shape[1:]))
+    to_root[:, :3, :3] = problem.basis
+    to_root[:, 3:POSE, 3:POSE] = problem.root_from_camera
+    to_root[:, POSE:, POSE:] = np.eye(readings.shape[1])
+    lost, refitted = _bad(found), np.zeros(len(poses), bool)
+    good = np.flatnonzero(~lost)
+    worst = np.array([found.misfits[problem.views.state_of_view == s].max() for s in range(len(poses))])
+    usual = worst[good]
+    limit = np.median(usual) + max(BAD_MADS * 1.48 * float(np.median(np.abs(usual - np.median(usual)))), BAD_MISFIT)
+    for state in np.flatnonzero(lost):
+        trial = _from_starts(found, state, good, slides)
+        best = trial.misfits.argmin()
+        if trial.misfits[best] > limit and trial.misfits[best] > BETTER * worst[state]:
+            continue
+        own, values = trial.problem.corrected(trial.fit)
+        poses[state], readings[state] = own[best], values[best]
+        covariances[state] = posterior(trial.problem, trial.fit, trial.cells, shared=False)[best]
+        to_root[state, :3, :3], to_root[state, 3:POSE, 3:POSE] = trial.problem.basis, trial.problem.root_from_camera[best]
+        refitted[state] = trial.misfits[best] <= limit
+    return FoundStates(
+        large=True,
+        sds=sds,
+        poses=poses,
+        readings=readings,
+        covariances=to_root @ covariances @ to_root.transpose(0, 2, 1),
+        lost=lost,
+        refitted=refitted,
+        ratios=found.ratios,
+        misfits=found.misfits,
+    )
+
+
+def _from_starts(found: _Fitted, state: int, good: np.ndarray, slides: np.ndarray) -> _Fitted:
+    """Fits of one state from several starts, each as a state of its own, in its first view."""
+    problem, views = found.problem, found.problem.views
+    view = int(np.flatnonzero(views.state_of_view == state)[0])
+    given, readings = views.poses[state], views.readings[state]
+    axis = problem.model.shaft_axis(found.fit.shared)
+    starts = [(given, readings), (problem.corrected(found.fit)[0][state], problem.corrected(found.fit)[1][state])]
+    starts += [(given @ _turn(axis, angle), readings) for angle in (np.pi / 2, np.pi, -np.pi / 2)]
+    starts.append(_mirrored(views, given, readings, axis, view))
+    own_poses, own_readings = problem.corrected(found.fit)
+    others = _subproblem(found, view, own_poses[good], own_readings[good], sds_of(LOST, slides))
+    ratios = np.broadcast_to(found.ratios[view], (len(good), *found.ratios.shape[1:]))
+    near = np.argsort(others.misfits(StatesFit(found.fit.shared, np.zeros_like(others.sds)), ratios))[:N_OTHERS]
+    starts += [(own_poses[good[k]], own_readings[good[k]]) for k in near]
+    poses, values = (np.stack(part) for part in zip(*starts, strict=True))
+    trial = _subproblem(found, view, poses, values, sds_of(LOST, slides))
+    ratios = np.broadcast_to(found.ratios[view], (len(starts), *found.ratios.shape[1:]))
+    fit = StatesFit(found.fit.shared, np.zeros_like(trial.sds))
+    for cell, softness, steps in STAGES[:2]:
+        cells = trial.cells(fit, ratios, cell, softness)
+        fit = adjust(trial, fit, cells, steps, shared=False)
+    return _Fitted(trial, fit, ratios, cells, trial.misfits(fit, ratios))
+
+
+def _subproblem(
+    found: _Fitted, view: int, poses: np.ndarray, readings: np.ndarray, sds: np.ndarray
+) -> StatesProblem:
+    """The problem of one view at several states, with the shape as found."""
+    views, count = found.problem.views, len(poses)
+    repeated = replace(
+        views,
+        images=np.broadcast_to(views.images[view], (count, *views.images.shape[1:])),
+        usable=np.broadcast_to(views.usable[view], (count, *views.usable.shape[1:])),
+        camera_from_world=np.repeat(views.camera_from_world[view][None], count, 0),
+        intrinsics=np.repeat(views.intrinsics[view][None], count, 0),
+        state_of_view=np.arange(count),
+        poses=poses,
+        readings=readings,
+    )
+    return StatesProblem(repeated, np.tile(sds, (count, 1)), like=found.problem)
+
+
+def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation [4, 4] about an axis through the origin."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
+    return turn
+
+
+def _mirrored(
+    views: LinkViews, pose: np.ndarray, readings: np.ndarray, axis: np.ndarray, view: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The state with nearly the same silhouette: mirrored in depth about the first joint and, in its own frame, along
+    that joint's axis; what bends across it then bends the other way."""
+    here = views.camera_from_world[view] @ pose
+    bending = [link for link in views.tree.links if link.type in (REVOLUTE, PRISMATIC)]
+    first = unit(bending[0].axis - (bending[0].axis @ axis) * axis) if abs(bending[0].axis @ axis) < 0.9 else None
+    if first is None:
+        first = np.linalg.svd(axis[None])[2][1]
+    pivot = bending[0].origin[:3, 3]
+    center = here[:3, :3] @ pivot + here[:3, 3]
+    here = here.copy()
+    here[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ here[:3, :3] @ (np.eye(3) - 2 * np.outer(first, first))
+    here[:3, 3] = center - here[:3, :3] @ pivot
+    values = readings.copy()
+    for index, reading in enumerate(views.tree.readings):
+        gains = [link.value[reading] for link in bending if reading in link.value and abs(link.axis @ first) < 0.5]
+        if gains and abs(sum(gains)) > 0.5 * len(gains):
+            values[index] = -values[index]
+    return np.linalg.inv(views.camera_from_world[view]) @ here, values
+
+
+def take(views: LinkViews, states: np.ndarray) -> LinkViews:
+    """Return the views of some of the states."""
+    shown = np.isin(views.state_of_view, states)
+    return replace(
+        views,
+        images=views.images[shown],
+        usable=views.usable[shown],
+        camera_from_world=views.camera_from_world[shown],
+        intrinsics=views.intrinsics[shown],
+        state_of_view=np.searchsorted(states, views.state_of_view[shown]),
+        poses=views.poses[states],
+        readings=views.readings[states],
+    )

@@ -1,0 +1,139 @@
+"""States of training frames whose errors are larger than a tracker's, found before any Gaussian exists."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.special import expit
+from torch.nn.functional import interpolate
+
+from neeco.capture.model import InstrumentState
+from neeco.fitting.link_states import LinkViews
+from neeco.fitting.state_search import FoundStates, find_states, sds_of
+from neeco.methods.kinematic.stated_links import StatedLinks
+from neeco.methods.space_carving import Evidence
+from neeco.training.session import GaussianSession
+
+WIDTH_PX = 320  # of the images compared
+MIN_STATES = 8  # with fewer, nothing is said about them
+
+
+def register_states(session: GaussianSession, articulations: Sequence[object]) -> FoundStates | None:
+    """Correct the states of the training frames, and leave out those that contradict the others; None where they are
+    no worse than expected.
+
+    For one instrument, with stated links and all readings recorded.
+    """
+    scene, refinement, config = session.scene, session.refinement, session.config.refine
+    frames = session.views.frames
+    if len(scene.instruments) != 1 or not isinstance(articulations[0], StatedLinks):
+        return None
+    (instrument,) = scene.instruments
+    tree = instrument.kinematics
+    sizes = {(frame.camera.width, frame.camera.height, frame.state.tissue) for frame in frames}
+    count = len(refinement.frames_of_pose)
+    if tree is None or instrument.unrecorded or len(sizes) > 1 or count < MIN_STATES or not config.frame_poses:
+        return None
+    scale = min(1.0, WIDTH_PX / frames[0].camera.width)
+    views = session.views if scale == 1.0 else session.views.scaled(scale)
+    cameras = [frame.camera for frame in views.frames]
+    firsts = [frames[shown[0]].state.instruments[instrument.name] for shown in refinement.frames_of_pose]
+    images = np.stack([(views.target(index) * 255).round().byte().cpu().numpy() for index in range(len(views))])
+    masks = [views.mask(index) for index in range(len(views))]
+    usable = [np.ones(images.shape[1:3], bool) if mask is None else mask.bool().cpu().numpy() for mask in masks]
+    given = LinkViews(
+        tree=tree,
+        images=images,
+        usable=np.stack(usable),
+        camera_from_world=np.stack([np.linalg.inv(camera.world_from_camera.double().numpy()) for camera in cameras]),
+        intrinsics=np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras], np.float64),
+        state_of_view=np.array(refinement.pose_rows),
+        poses=np.stack([state.pose.double().numpy() for state in firsts]),
+        readings=np.array([[state.joints[reading] for reading in tree.readings] for state in firsts], np.float64),
+    )
+    slides = np.array([instrument.slides(reading) for reading in tree.readings])
+    usual = refinement.deviations(0).numpy()
+    turn, shift = float(usual[:3].min()), float(usual[3:6].min())
+    expected = np.append([turn] * 3 + [shift] * 3, usual[6:])
+    found = find_states(given, expected, slides)
+    if found is None:
+        return None
+    _correct(session, found)
+    _report(session, found, slides)
+    return found
+
+
+def _correct(session: GaussianSession, found: FoundStates) -> None:
+    """Set the states that were found, and the weights of those that nothing explains to 0."""
+    refinement, (instrument,) = session.refinement, session.scene.instruments
+    assert instrument.kinematics is not None
+    for row, shown in enumerate(refinement.frames_of_pose):
+        if found.lost[row] and not found.refitted[row]:
+            refinement.weights[shown] = 0
+        elif found.large or found.lost[row]:
+            recorded = session.views.frames[shown[0]].state
+            own = recorded.instruments[instrument.name]
+            readings = dict(zip(instrument.kinematics.readings, found.readings[row].tolist(), strict=True))
+            state = InstrumentState(torch.from_numpy(found.poses[row]).to(own.pose), {**own.joints, **readings})
+            deviations = torch.from_numpy(np.sqrt(np.diagonal(found.covariances[row])).copy())
+            refinement.set_state(shown[0], recorded, replace(recorded, instruments={instrument.name: state}), deviations)
+
+
+def _report(session: GaussianSession, found: FoundStates, slides: np.ndarray) -> None:
+    (instrument,) = session.scene.instruments
+    assert instrument.kinematics is not None
+    names = ["tilt", "", "roll", "across", "", "depth", *instrument.kinematics.readings]
+    degrees = [True] * 3 + [False] * 3 + [not slide for slide in slides]
+    sizes = {
+        f"{name}_{'deg' if turns else 'mm'}": round(float(np.degrees(sd) if turns else sd), 2)
+        for name, sd, turns in zip(names, found.sds, degrees, strict=True)
+        if name
+    }
+    frames = session.views.frames
+    rows = session.refinement.frames_of_pose
+    lost = {
+        kind: [frames[shown].name for row in np.flatnonzero(which) for shown in rows[row]]
+        for kind, which in (("left_out", found.lost & ~found.refitted), ("refitted", found.lost & found.refitted))
+    }
+    session.scene.diagnostics.setdefault("states", {})[instrument.name] = {"states": len(rows)} | lost | (
+        {"errors_sd": sizes} if found.large else {}
+    )
+    if found.large:
+        shown = ", ".join(f"{key.rpartition('_')[0]} {value} {key.rpartition('_')[2]}" for key, value in sizes.items())
+        session.report(f"{instrument.name}: its states err more than a tracker's (standard deviations: {shown}); refined")
+
+
+def contradictions(diagnostics: dict[str, dict[str, object]]) -> list[str]:
+    """Return a line per instrument on the states that contradict the others."""
+    lines = []
+    for name, found in diagnostics.items():
+        kinds = {"left_out": "left out", "refitted": "refitted"}
+        parts = [f"{', '.join(found[key])} ({words})" for key, words in kinds.items() if found[key]]  # type: ignore[arg-type]
+        count = sum(len(found[key]) for key in kinds)  # type: ignore[arg-type]
+        if count:
+            lines.append(f"{name}: {count} of {found['states']} states contradict the others: {'; '.join(parts)}")
+    return lines
+
+
+def corrected_evidence(session: GaussianSession, evidence: Evidence, found: FoundStates) -> Evidence:
+    """Return the evidence with the states as corrected, without frames that were left out; where all states were, its
+    images are those of the instrument's colours."""
+    index = {frame.name: number for number, frame in enumerate(session.views.frames)}
+    numbers = [index[frame.name] for frame in evidence.frames]
+    weights = session.refinement.weights
+    kept = torch.tensor([place for place, number in enumerate(numbers) if weights[number] > 0])
+    frames = tuple(
+        replace(frame, state=session.refinement.state(number, frame.state))
+        if session.refinement.fitted[number]
+        else frame
+        for frame, number in zip(evidence.frames, numbers, strict=True)
+    )
+    evidence = replace(evidence, frames=frames)
+    if found.large:
+        hits = torch.from_numpy(expit(found.ratios[numbers])).to(evidence.hits)
+        hits = interpolate(hits[:, None], size=tuple(evidence.hits.shape[1:]), mode="bilinear")[:, 0]
+        evidence = replace(evidence, hits=hits, unshaded=None if evidence.unshaded is None else hits)
+    return evidence.subset(kept)
