@@ -79,7 +79,7 @@ def of_run(path: Path) -> States:
         frames = capture.split("train")
         refinement = Refinement(config.refine, frames, scene.instruments, torch.device("cpu"))
         parts = {name.removeprefix("refinement/"): t for name, t in tensors.items() if name.startswith("refinement/")}
-        refinement.restore(parts)
+        refinement.restore(refinement.tensors() | parts)  # older runs have fewer
         states = []
         for index, frame in enumerate(frames):
             state, _, _ = refinement.apply(index, frame.state, frame.camera, sys.maxsize)

@@ -2,8 +2,8 @@
 
 Tissue, shaft and what lies beyond it have colours of their own; pixels say by these how likely the instrument covers
 them (region-based tracking: Prisacariu, Reid, IJCV 2012). Unknown are the shape that all states share (radii, lengths,
-errors of the stated links, a rigid error of the base) and each state's own error: pose and joints. Each state's block is
-eliminated, so that the cost grows linearly with their number.
+errors of the stated links, a rigid error of the base) and each state's own error: pose and joints. Each state's block
+is eliminated, so that the cost grows linearly with their number.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy.special import expit
 from neeco.capture.kinematics import KinematicTree
 from neeco.fitting.link_silhouette import MAX_BEND_MM, ArticulatedModel, Outlines, joint_values
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
-from neeco.geometry.lines import frame_about, unit
+from neeco.geometry.lines import frame_about
 from neeco.geometry.trocar import line_through_trocar
 
 POSE = 6  # parameters of a state's pose: two tilts, roll (rad), two shifts across the view, depth (mm); joints follow
@@ -34,7 +34,11 @@ STEPS = (0.002, 0.05)  # rad, mm, of differences
 PARAMETER_STEP = 0.02  # standard deviations
 MAX_STEP_SDS = 3.0  # of one step
 FIRST_SOFTNESS = 10.0  # px of outlines from which colours are learned at first
-STAGES = ((8, 6.0, 8), (4, 3.0, 8), (4, 2.0, 8))  # px of cells and of the outlines' softness; steps
+STAGES: tuple[tuple[int, float, int], ...] = (
+    (8, 6.0, 8),
+    (4, 3.0, 8),
+    (4, 2.0, 8),
+)  # px of cells and of the outlines' softness; steps
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -358,5 +362,3 @@ def posterior(problem: StatesProblem, fit: StatesFit, cells: Cells, *, shared: b
     carried = inverse @ b.cross  # [S, d, p]
     left = b.shared + np.diag(problem.shared_sds**-2) - np.einsum("sdp,sdq->pq", b.cross, carried)
     return np.asarray(inverse + carried @ np.linalg.inv(left) @ carried.transpose(0, 2, 1))
-
-

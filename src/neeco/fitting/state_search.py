@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.kinematics import PRISMATIC, REVOLUTE
@@ -33,15 +32,18 @@ DEG = np.pi / 180
 TRIED = (2 * DEG, 6 * DEG, 0.4, 1.5, 4 * DEG, 1.5)
 # of a state that is wrong altogether, about each of its starts
 LOST = (12 * DEG, 30 * DEG, 4.0, 8.0, 20 * DEG, 8.0)
+# standard deviations of a refitted one, at most, for it to count
+SETTLED = (6 * DEG, 15 * DEG, 1.5, 4.0, 15 * DEG, 4.0)
 # sizes that errors of the model alone may feign: no cone is a wrist
 FEIGNED = (0.35 * DEG, 2.3 * DEG, 0.25, 0.25, 3 * DEG, 1.0)
+MIN_SHARE = 0.5  # of the errors tried, the least that is assumed of any parameter where those of another are large
 MIN_FACTOR = 2.0  # times these, from which a size counts
 EM_STEPS = 200
-TAIL = 3.0  # degrees of freedom of a t distribution: wrong states do not widen what the others have
 MAX_ESTIMATED = 30  # states from which sizes are estimated
-BAD_MADS, BAD_MISFIT = 4.0, 0.1  # median absolute deviations, and more than the median, from which a state is bad
+BAD_MADS, BAD_MISFIT = 6.0, 0.08  # median absolute deviations, and more than the median, from which a state is bad
 BAD_WEIGHT = 0.02
-LARGE_SDS = 2.5  # root mean square of a correction in standard deviations
+LARGE_SDS = 1.8  # root mean square of a correction in standard deviations
+MAX_MISFIT = 0.4  # from which a state is wrong even where nothing explains it better
 BETTER = 0.75  # share of the misfit, below which another start is right
 N_OTHERS = 4  # states of other moments that are tried
 
@@ -79,7 +81,9 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
     large = bool((found > MIN_FACTOR * sds_of(FEIGNED, slides)).any())
     if not large and not _bad(first).any():
         return None
-    sds = np.maximum(found if large else expected, expected)
+    sds = expected
+    if large:  # parameters that make up for each other must not hold each other
+        sds = np.maximum(np.maximum(found, MIN_SHARE * sds_of(TRIED, slides)), expected)
     return replace(_with_lost(_fit(views, sds, first), sds, slides), large=large)
 
 
@@ -113,24 +117,23 @@ def _fit(views: LinkViews, sds: np.ndarray, known: _Fitted | None = None) -> _Fi
     return _Fitted(problem, fit, ratios, cells, problem.misfits(fit, ratios))
 
 
-def error_sizes(found: _Fitted, expected: np.ndarray) -> np.ndarray:
-    """Most likely standard deviations [6 + R] of the states' errors, from those expected on (EM of a t distribution)."""
+def error_sizes(found: _Fitted, sds: np.ndarray) -> np.ndarray:
+    """Most likely standard deviations [6 + R] of the states' errors, from `sds` [6 + R] on (EM)."""
     problem, fit = found.problem, found.fit
     b = problem.blocks(fit, found.cells, shared=False)
     use = ~_bad(found)
     information = b.own[use]
     linear = np.einsum("sij,sj->si", information, fit.own[use]) - b.own_gradient[use]
     # without a constant error, which the shape takes up
-    linear = linear - np.einsum("sij,j->si", information, np.linalg.lstsq(information.sum(0), linear.sum(0), rcond=1e-3)[0])
-    groups = [np.array(own) for own in ((0, 1), (2,), (3, 4), (5,), *((k,) for k in range(POSE, len(expected))))]
+    constant = np.linalg.lstsq(information.sum(0), linear.sum(0), rcond=1e-3)[0]
+    linear = linear - np.einsum("sij,j->si", information, constant)
+    groups = [np.array(own) for own in ((0, 1), (2,), (3, 4), (5,), *((k,) for k in range(POSE, len(sds))))]
 
-    sds = expected.copy()
+    sds = sds.copy()
     for _ in range(EM_STEPS):
         covariance = np.linalg.inv(information + np.diag(sds**-2))
         mean = np.einsum("sij,sj->si", covariance, linear)
-        second = mean**2 + np.einsum("sii->si", covariance)
-        weights = (TAIL + len(sds)) / (TAIL + (second / sds**2).sum(1))
-        second = (second * weights[:, None]).sum(0) / weights.sum()
+        second = (mean**2 + np.einsum("sii->si", covariance)).mean(0)
         for group in groups:
             sds[group] = np.sqrt(second[group].mean())
     return sds
@@ -142,8 +145,13 @@ def _bad(found: _Fitted) -> np.ndarray:
     worst = np.zeros(len(problem.views.poses))
     np.maximum.at(worst, problem.views.state_of_view, found.misfits)
     off = worst - np.median(worst)
-    far = np.sqrt(((found.fit.own / problem.sds) ** 2).mean(1)) > LARGE_SDS
-    return np.asarray((off > max(BAD_MADS * 1.48 * float(np.median(np.abs(off))), BAD_MISFIT)) | far)
+    return np.asarray((off > max(BAD_MADS * 1.48 * float(np.median(np.abs(off))), BAD_MISFIT)) | _far(found))
+
+
+def _far(found: _Fitted) -> np.ndarray:
+    """bool [S]: states that a fit moves far, in standard deviations of their priors."""
+    size = np.sqrt(((found.fit.own / found.problem.sds) ** 2).mean(1))
+    return np.asarray(size > LARGE_SDS * max(1.0, 1.5 * float(np.median(size))))
 
 
 def _with_lost(found: _Fitted, sds: np.ndarray, slides: np.ndarray) -> FoundStates:
@@ -155,21 +163,27 @@ def _with_lost(found: _Fitted, sds: np.ndarray, slides: np.ndarray) -> FoundStat
     to_root[:, :3, :3] = problem.basis
     to_root[:, 3:POSE, 3:POSE] = problem.root_from_camera
     to_root[:, POSE:, POSE:] = np.eye(readings.shape[1])
+    far = _far(found)
     lost, refitted = _bad(found), np.zeros(len(poses), bool)
     good = np.flatnonzero(~lost)
     worst = np.array([found.misfits[problem.views.state_of_view == s].max() for s in range(len(poses))])
     usual = worst[good]
     limit = np.median(usual) + max(BAD_MADS * 1.48 * float(np.median(np.abs(usual - np.median(usual)))), BAD_MISFIT)
-    for state in np.flatnonzero(lost):
+    for state in np.flatnonzero(lost).tolist():
         trial = _from_starts(found, state, good, slides)
         best = trial.misfits.argmin()
-        if trial.misfits[best] > limit and trial.misfits[best] > BETTER * worst[state]:
+        if trial.misfits[best] > BETTER * worst[state]:  # nothing explains it much better
+            lost[state] = worst[state] > MAX_MISFIT or far[state]
             continue
         own, values = trial.problem.corrected(trial.fit)
         poses[state], readings[state] = own[best], values[best]
         covariances[state] = posterior(trial.problem, trial.fit, trial.cells, shared=False)[best]
-        to_root[state, :3, :3], to_root[state, 3:POSE, 3:POSE] = trial.problem.basis, trial.problem.root_from_camera[best]
-        refitted[state] = trial.misfits[best] <= limit
+        to_root[state, :3, :3], to_root[state, 3:POSE, 3:POSE] = (
+            trial.problem.basis,
+            trial.problem.root_from_camera[best],
+        )
+        known = np.sqrt(np.diagonal(covariances[state])) < sds_of(SETTLED, slides)
+        refitted[state] = trial.misfits[best] <= limit and bool(known.all())
     return FoundStates(
         large=True,
         sds=sds,
@@ -207,9 +221,7 @@ def _from_starts(found: _Fitted, state: int, good: np.ndarray, slides: np.ndarra
     return _Fitted(trial, fit, ratios, cells, trial.misfits(fit, ratios))
 
 
-def _subproblem(
-    found: _Fitted, view: int, poses: np.ndarray, readings: np.ndarray, sds: np.ndarray
-) -> StatesProblem:
+def _subproblem(found: _Fitted, view: int, poses: np.ndarray, readings: np.ndarray, sds: np.ndarray) -> StatesProblem:
     """The problem of one view at several states, with the shape as found."""
     views, count = found.problem.views, len(poses)
     repeated = replace(

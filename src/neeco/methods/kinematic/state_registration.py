@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch.nn.functional import interpolate
 
 from neeco.capture.model import InstrumentState
 from neeco.fitting.link_states import LinkViews
-from neeco.fitting.state_search import FoundStates, find_states, sds_of
+from neeco.fitting.state_search import FoundStates, find_states
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import Evidence
 from neeco.training.session import GaussianSession
@@ -35,6 +36,8 @@ def register_states(session: GaussianSession, articulations: Sequence[object]) -
     tree = instrument.kinematics
     sizes = {(frame.camera.width, frame.camera.height, frame.state.tissue) for frame in frames}
     count = len(refinement.frames_of_pose)
+    if not all(frame.camera.is_pinhole for frame in frames):
+        return None
     if tree is None or instrument.unrecorded or len(sizes) > 1 or count < MIN_STATES or not config.frame_poses:
         return None
     scale = min(1.0, WIDTH_PX / frames[0].camera.width)
@@ -56,8 +59,8 @@ def register_states(session: GaussianSession, articulations: Sequence[object]) -
     )
     slides = np.array([instrument.slides(reading) for reading in tree.readings])
     usual = refinement.deviations(0).numpy()
-    turn, shift = float(usual[:3].min()), float(usual[3:6].min())
-    expected = np.append([turn] * 3 + [shift] * 3, usual[6:])
+    tilt, roll, across, depth = usual[:3].min(), usual[:3].max(), usual[3:6].min(), usual[3:6].max()
+    expected = np.append([tilt, tilt, roll, across, across, depth], usual[6:])
     found = find_states(given, expected, slides)
     if found is None:
         return None
@@ -79,7 +82,9 @@ def _correct(session: GaussianSession, found: FoundStates) -> None:
             readings = dict(zip(instrument.kinematics.readings, found.readings[row].tolist(), strict=True))
             state = InstrumentState(torch.from_numpy(found.poses[row]).to(own.pose), {**own.joints, **readings})
             deviations = torch.from_numpy(np.sqrt(np.diagonal(found.covariances[row])).copy())
-            refinement.set_state(shown[0], recorded, replace(recorded, instruments={instrument.name: state}), deviations)
+            refinement.set_state(
+                shown[0], recorded, replace(recorded, instruments={instrument.name: state}), deviations
+            )
 
 
 def _report(session: GaussianSession, found: FoundStates, slides: np.ndarray) -> None:
@@ -98,23 +103,25 @@ def _report(session: GaussianSession, found: FoundStates, slides: np.ndarray) ->
         kind: [frames[shown].name for row in np.flatnonzero(which) for shown in rows[row]]
         for kind, which in (("left_out", found.lost & ~found.refitted), ("refitted", found.lost & found.refitted))
     }
-    session.scene.diagnostics.setdefault("states", {})[instrument.name] = {"states": len(rows)} | lost | (
-        {"errors_sd": sizes} if found.large else {}
+    session.scene.diagnostics.setdefault("states", {})[instrument.name] = (
+        {"frames": len(frames)} | lost | ({"errors_sd": sizes} if found.large else {})
     )
     if found.large:
         shown = ", ".join(f"{key.rpartition('_')[0]} {value} {key.rpartition('_')[2]}" for key, value in sizes.items())
-        session.report(f"{instrument.name}: its states err more than a tracker's (standard deviations: {shown}); refined")
+        session.report(
+            f"{instrument.name}: its states err more than a tracker's (standard deviations: {shown}); refined"
+        )
 
 
-def contradictions(diagnostics: dict[str, dict[str, object]]) -> list[str]:
-    """Return a line per instrument on the states that contradict the others."""
+def contradictions(states: dict[str, dict[str, Any]]) -> list[str]:
+    """Return a line per instrument on the states that contradict the others; states: of a scene's diagnostics."""
     lines = []
-    for name, found in diagnostics.items():
-        kinds = {"left_out": "left out", "refitted": "refitted"}
-        parts = [f"{', '.join(found[key])} ({words})" for key, words in kinds.items() if found[key]]  # type: ignore[arg-type]
-        count = sum(len(found[key]) for key in kinds)  # type: ignore[arg-type]
-        if count:
-            lines.append(f"{name}: {count} of {found['states']} states contradict the others: {'; '.join(parts)}")
+    for name, found in states.items():
+        parts = {"they were left out": found["left_out"], "refitted": found["refitted"]}
+        told = "; ".join(f"{', '.join(names)} ({words})" for words, names in parts.items() if names)
+        if told:
+            count = sum(map(len, parts.values()))
+            lines.append(f"{name}: {count} of {found['frames']} states contradict the others: {told}")
     return lines
 
 
