@@ -99,7 +99,7 @@ def test_states_as_exact_as_a_tracker_states_them_are_left_alone() -> None:
 def test_errors_larger_than_a_trackers_are_found_at_their_size() -> None:
     found = found_large()
     assert found.large
-    assert not found.lost.any()
+    assert not found.inconsistent.any()
     tilt = found.sds[0] / LARGE[0]
     assert 0.6 < tilt < 1.5
 
@@ -121,7 +121,7 @@ def test_states_of_other_moments_contradict_the_others(sizes: tuple[float, ...])
     poses[wrong], readings[wrong] = views.poses[others], views.readings[others]
     found = found_of(replace(views, poses=poses, readings=readings))
     assert found is not None
-    assert set(np.flatnonzero(found.lost)) == set(wrong)
+    assert set(np.flatnonzero(found.inconsistent)) == set(wrong)
     assert found.large == (sizes == LARGE)
     refitted = np.flatnonzero(found.refitted)
     before, after = errors_of(poses, readings), errors_of(found.poses, found.readings)

@@ -163,7 +163,7 @@ class StatesProblem:
 
         def pooled(images: np.ndarray) -> np.ndarray:
             cut = images[:, : rows * BLOCK_PX, : columns * BLOCK_PX]
-            parts = cut.reshape(count, rows, inner, cell, columns, inner, cell).mean((3, 6), dtype=np.float32)
+            parts = cut.reshape((count, rows, inner, cell, columns, inner, cell)).mean((3, 6), dtype=np.float32)
             return np.asarray(parts.transpose(0, 1, 3, 2, 4).reshape(count, len(grid), inner**2))
 
         order = np.argsort(~near, axis=1, kind="stable")[:, : max(int(near.sum(1).max()), 1)]  # near blocks first
@@ -185,7 +185,7 @@ class StatesProblem:
         return np.asarray(_losses(inside, cells))
 
     def misfits(self, fit: StatesFit, ratios: np.ndarray) -> np.ndarray:
-        """How badly [V] a fit explains each view: likelihood ratios on its wrong side, by those on its right side."""
+        """Misfit [V] of each view: likelihood ratios on the wrong side of the outline, by those on its right side."""
         count, height, width = ratios.shape
         rows, columns = height // BLOCK_PX, width // BLOCK_PX
         grid = _grid(rows * BLOCK_PX, columns * BLOCK_PX, BLOCK_PX)

@@ -31,7 +31,7 @@ DEG = np.pi / 180
 # standard deviations of errors that are tried: tilts, roll (rad), across, depth (mm), revolute (rad), prismatic (mm)
 TRIED = (2 * DEG, 6 * DEG, 0.4, 1.5, 4 * DEG, 1.5)
 # of a state that is wrong altogether, about each of its starts
-LOST = (12 * DEG, 30 * DEG, 4.0, 8.0, 20 * DEG, 8.0)
+WRONG = (12 * DEG, 30 * DEG, 4.0, 8.0, 20 * DEG, 8.0)
 # standard deviations of a refitted one, at most, for it to count
 SETTLED = (6 * DEG, 15 * DEG, 1.5, 4.0, 15 * DEG, 4.0)
 # sizes that errors of the model alone may feign: no cone is a wrist
@@ -50,14 +50,14 @@ N_OTHERS = 4  # states of other moments that are tried
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FoundStates:
-    """What was found of S states."""
+    """Result of the search over S states."""
 
-    large: bool  # whether the errors of all are larger than expected, not only those of lost ones
+    large: bool  # whether the errors of all are larger than expected, not only those of inconsistent ones
     sds: np.ndarray  # [6 + R] of the recorded states' errors: two tilts, roll, across, across, depth, readings
     poses: np.ndarray  # [S, 4, 4] world_from_root
     readings: np.ndarray  # [S, R]
     covariances: np.ndarray  # [S, 6 + R, 6 + R] of pose (rad, mm, the root's frame) and readings
-    lost: np.ndarray  # bool [S], whose states contradict the others
+    inconsistent: np.ndarray  # bool [S], whose states contradict the others
     refitted: np.ndarray  # bool [S], of those: explained from another start
     ratios: np.ndarray  # [V, H, W] log likelihood ratios of the instrument to the tissue
     misfits: np.ndarray  # [V]
@@ -84,7 +84,7 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
     sds = expected
     if large:  # parameters that make up for each other must not hold each other
         sds = np.maximum(np.maximum(found, MIN_SHARE * sds_of(TRIED, slides)), expected)
-    return replace(_with_lost(_fit(views, sds, first), sds, slides), large=large)
+    return replace(_with_inconsistent(_fit(views, sds, first), sds, slides), large=large)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +154,7 @@ def _far(found: _Fitted) -> np.ndarray:
     return np.asarray(size > LARGE_SDS * max(1.0, 1.5 * float(np.median(size))))
 
 
-def _with_lost(found: _Fitted, sds: np.ndarray, slides: np.ndarray) -> FoundStates:
+def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray) -> FoundStates:
     """The states of a fit; those that are badly explained, from other starts."""
     problem, fit = found.problem, found.fit
     poses, readings = problem.corrected(fit)
@@ -164,16 +164,16 @@ def _with_lost(found: _Fitted, sds: np.ndarray, slides: np.ndarray) -> FoundStat
     to_root[:, 3:POSE, 3:POSE] = problem.root_from_camera
     to_root[:, POSE:, POSE:] = np.eye(readings.shape[1])
     far = _far(found)
-    lost, refitted = _bad(found), np.zeros(len(poses), bool)
-    good = np.flatnonzero(~lost)
+    inconsistent, refitted = _bad(found), np.zeros(len(poses), bool)
+    good = np.flatnonzero(~inconsistent)
     worst = np.array([found.misfits[problem.views.state_of_view == s].max() for s in range(len(poses))])
     usual = worst[good]
     limit = np.median(usual) + max(BAD_MADS * 1.48 * float(np.median(np.abs(usual - np.median(usual)))), BAD_MISFIT)
-    for state in np.flatnonzero(lost).tolist():
+    for state in np.flatnonzero(inconsistent).tolist():
         trial = _from_starts(found, state, good, slides)
         best = trial.misfits.argmin()
         if trial.misfits[best] > BETTER * worst[state]:  # nothing explains it much better
-            lost[state] = worst[state] > MAX_MISFIT or far[state]
+            inconsistent[state] = worst[state] > MAX_MISFIT or far[state]
             continue
         own, values = trial.problem.corrected(trial.fit)
         poses[state], readings[state] = own[best], values[best]
@@ -190,7 +190,7 @@ def _with_lost(found: _Fitted, sds: np.ndarray, slides: np.ndarray) -> FoundStat
         poses=poses,
         readings=readings,
         covariances=to_root @ covariances @ to_root.transpose(0, 2, 1),
-        lost=lost,
+        inconsistent=inconsistent,
         refitted=refitted,
         ratios=found.ratios,
         misfits=found.misfits,
@@ -207,12 +207,12 @@ def _from_starts(found: _Fitted, state: int, good: np.ndarray, slides: np.ndarra
     starts += [(given @ _turn(axis, angle), readings) for angle in (np.pi / 2, np.pi, -np.pi / 2)]
     starts.append(_mirrored(views, given, readings, axis, view))
     own_poses, own_readings = problem.corrected(found.fit)
-    others = _subproblem(found, view, own_poses[good], own_readings[good], sds_of(LOST, slides))
+    others = _subproblem(found, view, own_poses[good], own_readings[good], sds_of(WRONG, slides))
     ratios = np.broadcast_to(found.ratios[view], (len(good), *found.ratios.shape[1:]))
     near = np.argsort(others.misfits(StatesFit(found.fit.shared, np.zeros_like(others.sds)), ratios))[:N_OTHERS]
     starts += [(own_poses[good[k]], own_readings[good[k]]) for k in near]
     poses, values = (np.stack(part) for part in zip(*starts, strict=True))
-    trial = _subproblem(found, view, poses, values, sds_of(LOST, slides))
+    trial = _subproblem(found, view, poses, values, sds_of(WRONG, slides))
     ratios = np.broadcast_to(found.ratios[view], (len(starts), *found.ratios.shape[1:]))
     fit = StatesFit(found.fit.shared, np.zeros_like(trial.sds))
     for cell, softness, steps in STAGES[:2]:

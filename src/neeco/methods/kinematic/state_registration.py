@@ -74,9 +74,9 @@ def _correct(session: GaussianSession, found: FoundStates) -> None:
     refinement, (instrument,) = session.refinement, session.scene.instruments
     assert instrument.kinematics is not None
     for row, shown in enumerate(refinement.frames_of_pose):
-        if found.lost[row] and not found.refitted[row]:
+        if found.inconsistent[row] and not found.refitted[row]:
             refinement.weights[shown] = 0
-        elif found.large or found.lost[row]:
+        elif found.large or found.inconsistent[row]:
             recorded = session.views.frames[shown[0]].state
             own = recorded.instruments[instrument.name]
             readings = dict(zip(instrument.kinematics.readings, found.readings[row].tolist(), strict=True))
@@ -99,12 +99,15 @@ def _report(session: GaussianSession, found: FoundStates, slides: np.ndarray) ->
     }
     frames = session.views.frames
     rows = session.refinement.frames_of_pose
-    lost = {
+    inconsistent = {
         kind: [frames[shown].name for row in np.flatnonzero(which) for shown in rows[row]]
-        for kind, which in (("left_out", found.lost & ~found.refitted), ("refitted", found.lost & found.refitted))
+        for kind, which in (
+            ("left_out", found.inconsistent & ~found.refitted),
+            ("refitted", found.inconsistent & found.refitted),
+        )
     }
     session.scene.diagnostics.setdefault("states", {})[instrument.name] = (
-        {"frames": len(frames)} | lost | ({"errors_sd": sizes} if found.large else {})
+        {"frames": len(frames)} | inconsistent | ({"errors_sd": sizes} if found.large else {})
     )
     if found.large:
         shown = ", ".join(f"{key.rpartition('_')[0]} {value} {key.rpartition('_')[2]}" for key, value in sizes.items())
@@ -118,10 +121,10 @@ def contradictions(states: dict[str, dict[str, Any]]) -> list[str]:
     lines = []
     for name, found in states.items():
         parts = {"they were left out": found["left_out"], "refitted": found["refitted"]}
-        told = "; ".join(f"{', '.join(names)} ({words})" for words, names in parts.items() if names)
-        if told:
+        listed = "; ".join(f"{', '.join(names)} ({words})" for words, names in parts.items() if names)
+        if listed:
             count = sum(map(len, parts.values()))
-            lines.append(f"{name}: {count} of {found['frames']} states contradict the others: {told}")
+            lines.append(f"{name}: {count} of {found['frames']} states contradict the others: {listed}")
     return lines
 
 
@@ -131,7 +134,7 @@ def corrected_evidence(session: GaussianSession, evidence: Evidence, found: Foun
     index = {frame.name: number for number, frame in enumerate(session.views.frames)}
     numbers = [index[frame.name] for frame in evidence.frames]
     weights = session.refinement.weights
-    kept = torch.tensor([place for place, number in enumerate(numbers) if weights[number] > 0])
+    remaining = torch.tensor([place for place, number in enumerate(numbers) if weights[number] > 0])
     frames = tuple(
         replace(frame, state=session.refinement.state(number, frame.state))
         if session.refinement.fitted[number]
@@ -143,4 +146,4 @@ def corrected_evidence(session: GaussianSession, evidence: Evidence, found: Foun
         hits = torch.from_numpy(expit(found.ratios[numbers])).to(evidence.hits)
         hits = interpolate(hits[:, None], size=tuple(evidence.hits.shape[1:]), mode="bilinear")[:, 0]
         evidence = replace(evidence, hits=hits, unshaded=None if evidence.unshaded is None else hits)
-    return evidence.subset(kept)
+    return evidence.subset(remaining)
