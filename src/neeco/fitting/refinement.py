@@ -81,9 +81,14 @@ class Refinement:
             [reading in missing for reading in self.readings], dtype=torch.bool, device=device
         )  # [R]
         self.instants, self.neighbours = _instants(frames, names)
-        self.pose_rows = _numbered(
-            [(instant, _scope(frame)) for instant, frame in zip(self.instants, frames, strict=True)]
-        )
+        import os
+
+        if os.environ.get("SHARE"):
+            self.pose_rows = list(self.instants)
+        else:
+            self.pose_rows = _numbered(
+                [(instant, _scope(frame)) for instant, frame in zip(self.instants, frames, strict=True)]
+            )
         self.frames_of_pose = _members(self.pose_rows)
         first = tuple(frames[shown[0]] for shown in self.frames_of_pose)
         tissues = _members(_numbered([frame.state.tissue for frame in first]))
@@ -201,6 +206,10 @@ class Refinement:
             self.joints -= torch.where(self.unrecorded, 0.0, self.joints.mean(0))
             used = used.to(self.cameras.device)
             self.cameras[used] -= self.cameras[used].mean(0)
+
+    def pose_rows_of(self, instant: int) -> list[int]:
+        """Return the rows of `poses` of an instant."""
+        return sorted({row for row, other in zip(self.pose_rows, self.instants, strict=True) if other == instant})
 
     def found(self, recorded: Recorded, instruments: tuple[Instrument, ...]) -> Recorded:
         """Return the recording with unrecorded joints as estimated, within their limits."""
