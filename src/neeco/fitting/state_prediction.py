@@ -56,7 +56,7 @@ def predict_corrections(
         columns = [refinement.readings.index((name, reading)) for reading in readings]
         poses = torch.stack([refinement.poses[refinement.pose_rows_of(instant), index].mean(0) for instant in order])
         rows = torch.cat([poses, refinement.joints[order][:, columns]], 1).double().cpu()
-        sigma = torch.cat([refinement.prior_sigma[:, index].mean(0), refinement.joint_sigma[:, columns].mean(0)])
+        sigma = torch.cat([refinement.pose_sd[:, index].mean(0), refinement.joint_sd[:, columns].mean(0)])
         parts = {name: slice(0, 6)} | {f"{name}.{reading}": slice(6 + k, 7 + k) for k, reading in enumerate(readings)}
         residuals, usual, length, noise = _best(features, rows / sigma.double().cpu())
         applied = torch.zeros(rows.shape[1], dtype=rows.dtype)

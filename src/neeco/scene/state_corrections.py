@@ -54,9 +54,7 @@ class StateCorrections(nn.Module):
         joints = [float(given.joints[reading]) / unit
                   for reading, unit in zip(self.readings[index], self._units[index], strict=True)]  # fmt: skip
         joints += [0.0] * (self.anchors.shape[2] - N_POSE_FEATURES - len(joints))
-        rotation = pose[:3, :3].flatten() / (
-            2**0.5 * ANGLE_UNIT
-        )  # a turn by a small angle moves the matrix by √2 of it
+        rotation = pose[:3, :3].flatten() / (2**0.5 * ANGLE_UNIT)
         return torch.cat([pose[:3, 3] / POSITION_UNIT_MM, rotation, pose.new_tensor(joints)])
 
     def increments(self, index: int, given: InstrumentState) -> Tensor:
