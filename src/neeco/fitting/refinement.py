@@ -27,6 +27,7 @@ PRIORS = ("pose_mean", "joint_mean", "pose_sd", "joint_sd")
 STATE = (*LEARNED, *PRIORS, "frame_steps", "fitted", "weights")  # tensors of a checkpoint, without the moments
 ON_CPU = ("frame_steps", "fitted", "weights")  # read in every step
 MM_PER_RAD = 20.0  # motion of a prismatic joint that counts as much as 1 rad of a revolute one
+SEVERAL_SCOPES = 5.0  # times the usual priors and rates where scopes that stand apart observe an instant
 MAX_SPEEDUP = 10.0  # of the learning rates where a pose is less certain than usual
 MIN_DEVIATION = 1e-4  # rad, mm: a standard deviation of 0 would hold a pose for ever
 MAX_NEIGHBOUR_S = 1.0  # s between instants whose unrecorded joints are similar
@@ -64,11 +65,11 @@ class Refinement:
     latency in s.
 
     Readings of joints in stated kinematics are corrected in rad or mm. Those that nobody recorded start half way
-    between their limits and are smooth in time. Both are corrected once for all frames of one instant, as several
-    cameras observe it. Poses are corrected once for both images of a stereo scope, P in total; where scopes stand
-    apart, every image has its own, which absorbs errors of the cameras. Tensors: `poses` [P, I, 6], `joints`
-    [instants, R], `cameras` [F, 6], `latency` [1]; of the priors on the first two `pose_mean`, `pose_sd`, `joint_mean`,
-    `joint_sd`; `fitted` [F] bool: frames whose state was set (`set_state`); `weights` [F] of frames in the loss.
+    between their limits and are smooth in time. A state is corrected once for all frames of one instant, as several
+    cameras observe it; where these stand apart, they determine it, and its prior is wide. Tensors: `poses` [P, I, 6] of
+    P instants, `joints` [P, R], `cameras` [F, 6], `latency` [1]; of the priors on the first two `pose_mean`, `pose_sd`,
+    `joint_mean`, `joint_sd`; `fitted` [F] bool: frames whose state was set (`set_state`); `weights` [F] of frames in
+    the loss.
     """
 
     def __init__(
@@ -89,14 +90,7 @@ class Refinement:
             [place for place, (name, _) in enumerate(self.readings) if name in stated], dtype=torch.int64, device=device
         )
         self.instants, self.neighbours = _instants(frames, names)
-        import os
-
-        if os.environ.get("SHARE"):
-            self.pose_rows = list(self.instants)
-        else:
-            self.pose_rows = _numbered(
-                [(instant, _scope(frame)) for instant, frame in zip(self.instants, frames, strict=True)]
-            )
+        self.pose_rows = self.instants
         self.frames_of_pose = _members(self.pose_rows)
         first = tuple(frames[shown[0]] for shown in self.frames_of_pose)
         tissues = _members(_numbered([frame.state.tissue for frame in first]))
@@ -120,13 +114,18 @@ class Refinement:
     def _set_priors_and_rates(self, frames: tuple[Frame, ...], first: tuple[Frame, ...], device: torch.device) -> None:
         """Set standard deviations and learning rates of all corrections; `first`: a frame of every pose."""
         config, items = self.config, self.layout.instruments
+        scopes: list[set[bytes]] = [set() for _ in self.neighbours]
+        for frame, instant in zip(frames, self.instants, strict=True):
+            scopes[instant].add(_scope(frame))
+        wide = torch.tensor([[SEVERAL_SCOPES if len(seen) > 1 else 1.0] for seen in scopes])  # [P, 1]
         usual_pose_sd = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3)
-        priors = _pose_priors(first, tuple(item.name for item in items), usual_pose_sd)  # [P, I, 6]
+        priors = _pose_priors(first, tuple(item.name for item in items), wide * usual_pose_sd)  # [P, I, 6]
         self.camera_sigma, self.pose_sd = usual_pose_sd.to(device), priors.to(device)
         slides = [slides for item in items for slides in item.slides]
         per_rad = torch.tensor([MM_PER_RAD if each else 1.0 for each in slides], device=device)
         usual_joint_sd = per_rad * torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
-        self.joint_sd = usual_joint_sd.repeat(len(self.neighbours), 1)  # [instants, R] rad or mm
+        wide = torch.where(self.unrecorded, 1.0, wide.to(device))  # [P, R]
+        self.joint_sd = usual_joint_sd * wide  # [P, R] rad or mm
         for frame, instant in zip(frames, self.instants, strict=True):
             for column, ((name, reading), slide) in enumerate(zip(self.readings, slides, strict=True)):
                 stated = frame.state.instruments[name].uncertainty
@@ -137,7 +136,9 @@ class Refinement:
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
             "poses": rates.to(device),  # multiplied where poses are less certain than usual
-            "joints": per_rad * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
+            "joints": wide
+            * per_rad
+            * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),  # [P, R]
             "cameras": (rates * config.camera_rate).to(device),
             "latency": torch.tensor(config.latency_rate, device=device),
         }
@@ -263,7 +264,7 @@ class Refinement:
             if name == "joints" and len(self.learned) < len(self.readings):
                 leaf.grad[~torch.isin(torch.arange(len(leaf)).to(self.learned), self.learned)] = 0
             update = adam_update(leaf.grad, first, second, steps, (0.9, 0.99), 1e-12)
-            rate = self.rates[name]
+            rate = self.rates[name][row] if name == "joints" else self.rates[name]
             if name == "poses":
                 rate = rate * (self.pose_sd[row] / self.camera_sigma).clamp(1, MAX_SPEEDUP)
             getattr(self, name)[row] -= decay * rate * update
@@ -282,10 +283,6 @@ class Refinement:
             self.joints -= torch.where(self.unrecorded, 0.0, self.joints.mean(0))
             used = used.to(self.cameras.device)
             self.cameras[used] -= self.cameras[used].mean(0)
-
-    def pose_rows_of(self, instant: int) -> list[int]:
-        """Return the rows of `poses` of an instant."""
-        return sorted({row for row, other in zip(self.pose_rows, self.instants, strict=True) if other == instant})
 
     def found(self, recorded: Recorded, instruments: tuple[Instrument, ...]) -> Recorded:
         """Return the recording with unrecorded joints as estimated, within their limits, and fitted states as such."""
@@ -377,8 +374,8 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
 
 def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual_sd: Tensor) -> Tensor:
     """Return the standard deviations [F, I, 6] of corrections (rad, mm, in the instrument's own frame): the states' own
-    uncertainties, else `usual_sd` [6]."""
-    priors = usual_sd.repeat(len(frames), len(instruments), 1)
+    uncertainties, else `usual_sd` [F, 6]."""
+    priors = usual_sd[:, None].repeat(1, len(instruments), 1)
     for row, frame in enumerate(frames):
         for k, name in enumerate(instruments):
             state = frame.state.instruments[name]

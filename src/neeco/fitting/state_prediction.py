@@ -54,14 +54,14 @@ def predict_corrections(
         features = torch.stack([corrections.features(index, state) for state in states]).double().cpu()
         readings = corrections.readings[index]
         columns = [refinement.readings.index((name, reading)) for reading in readings]
-        poses = torch.stack([refinement.poses[refinement.pose_rows_of(instant), index].mean(0) for instant in order])
-        rows = torch.cat([poses, refinement.joints[order][:, columns]], 1).double().cpu()
+        rows = torch.cat([refinement.poses[order, index], refinement.joints[order][:, columns]], 1).double().cpu()
         sigma = torch.cat([refinement.pose_sd[:, index].mean(0), refinement.joint_sd[:, columns].mean(0)])
         parts = {name: slice(0, 6)} | {f"{name}.{reading}": slice(6 + k, 7 + k) for k, reading in enumerate(readings)}
         residuals, usual, length, noise = _best(features, rows / sigma.double().cpu())
         applied = torch.zeros(rows.shape[1], dtype=rows.dtype)
         for part, places in parts.items():
-            explained = 1 - float(residuals[places].sum() / usual[places].sum().clamp_min(1e-30))
+            total = float(usual[places].sum())
+            explained = 1 - float(residuals[places].sum()) / total if total else 0.0
             found[part] = Prediction(explained=explained, applied=explained >= MIN_EXPLAINED)
             applied[places] = float(found[part].applied)
         anchors = features[evenly_spaced(len(features), MAX_ANCHORS)]
@@ -71,7 +71,7 @@ def predict_corrections(
         corrections.lengths[index] = length
         for instant, state in zip(order, states, strict=True):
             increments = corrections.increments(index, state)
-            refinement.poses[refinement.pose_rows_of(instant), index] -= increments[:6]
+            refinement.poses[instant, index] -= increments[:6]
             refinement.joints[instant, columns] -= increments[6 : 6 + len(columns)]
     return found
 
