@@ -27,7 +27,6 @@ PRIORS = ("pose_mean", "joint_mean", "pose_sd", "joint_sd")
 STATE = (*LEARNED, *PRIORS, "frame_steps", "fitted", "weights")  # tensors of a checkpoint, without the moments
 ON_CPU = ("frame_steps", "fitted", "weights")  # read in every step
 MM_PER_RAD = 20.0  # motion of a prismatic joint that counts as much as 1 rad of a revolute one
-SEVERAL_SCOPES = 5.0  # times the usual priors and rates where scopes that stand apart observe an instant
 MAX_SPEEDUP = 10.0  # of the learning rates where a pose is less certain than usual
 MIN_DEVIATION = 1e-4  # rad, mm: a standard deviation of 0 would hold a pose for ever
 MAX_NEIGHBOUR_S = 1.0  # s between instants whose unrecorded joints are similar
@@ -66,8 +65,8 @@ class Refinement:
 
     Readings of joints in stated kinematics are corrected in rad or mm. Those that nobody recorded start half way
     between their limits and are smooth in time. A state is corrected once for all frames of one instant, as several
-    cameras observe it; where these stand apart, they determine it, and its prior is wide. Tensors: `poses` [P, I, 6] of
-    P instants, `joints` [P, R], `cameras` [F, 6], `latency` [1]; of the priors on the first two `pose_mean`, `pose_sd`,
+    cameras observe it: errors of single cameras are not what differs between instants. Tensors: `poses` [P, I, 6] of P
+    instants, `joints` [P, R], `cameras` [F, 6], `latency` [1]; of the priors on the first two `pose_mean`, `pose_sd`,
     `joint_mean`, `joint_sd`; `fitted` [F] bool: frames whose state was set (`set_state`); `weights` [F] of frames in
     the loss.
     """
@@ -114,18 +113,13 @@ class Refinement:
     def _set_priors_and_rates(self, frames: tuple[Frame, ...], first: tuple[Frame, ...], device: torch.device) -> None:
         """Set standard deviations and learning rates of all corrections; `first`: a frame of every pose."""
         config, items = self.config, self.layout.instruments
-        scopes: list[set[bytes]] = [set() for _ in self.neighbours]
-        for frame, instant in zip(frames, self.instants, strict=True):
-            scopes[instant].add(_scope(frame))
-        wide = torch.tensor([[SEVERAL_SCOPES if len(seen) > 1 else 1.0] for seen in scopes])  # [P, 1]
         usual_pose_sd = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3)
-        priors = _pose_priors(first, tuple(item.name for item in items), wide * usual_pose_sd)  # [P, I, 6]
+        priors = _pose_priors(first, tuple(item.name for item in items), usual_pose_sd)  # [P, I, 6]
         self.camera_sigma, self.pose_sd = usual_pose_sd.to(device), priors.to(device)
         slides = [slides for item in items for slides in item.slides]
         per_rad = torch.tensor([MM_PER_RAD if each else 1.0 for each in slides], device=device)
         usual_joint_sd = per_rad * torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
-        wide = torch.where(self.unrecorded, 1.0, wide.to(device))  # [P, R]
-        self.joint_sd = usual_joint_sd * wide  # [P, R] rad or mm
+        self.joint_sd = usual_joint_sd.repeat(len(self.neighbours), 1)  # [P, R] rad or mm
         for frame, instant in zip(frames, self.instants, strict=True):
             for column, ((name, reading), slide) in enumerate(zip(self.readings, slides, strict=True)):
                 stated = frame.state.instruments[name].uncertainty
@@ -136,9 +130,7 @@ class Refinement:
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
             "poses": rates.to(device),  # multiplied where poses are less certain than usual
-            "joints": wide
-            * per_rad
-            * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),  # [P, R]
+            "joints": per_rad * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
             "cameras": (rates * config.camera_rate).to(device),
             "latency": torch.tensor(config.latency_rate, device=device),
         }
@@ -264,7 +256,7 @@ class Refinement:
             if name == "joints" and len(self.learned) < len(self.readings):
                 leaf.grad[~torch.isin(torch.arange(len(leaf)).to(self.learned), self.learned)] = 0
             update = adam_update(leaf.grad, first, second, steps, (0.9, 0.99), 1e-12)
-            rate = self.rates[name][row] if name == "joints" else self.rates[name]
+            rate = self.rates[name]
             if name == "poses":
                 rate = rate * (self.pose_sd[row] / self.camera_sigma).clamp(1, MAX_SPEEDUP)
             getattr(self, name)[row] -= decay * rate * update
@@ -374,8 +366,8 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
 
 def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual_sd: Tensor) -> Tensor:
     """Return the standard deviations [F, I, 6] of corrections (rad, mm, in the instrument's own frame): the states' own
-    uncertainties, else `usual_sd` [F, 6]."""
-    priors = usual_sd[:, None].repeat(1, len(instruments), 1)
+    uncertainties, else `usual_sd` [6]."""
+    priors = usual_sd.repeat(len(frames), len(instruments), 1)
     for row, frame in enumerate(frames):
         for k, name in enumerate(instruments):
             state = frame.state.instruments[name]
@@ -387,13 +379,6 @@ def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual_sd
             turns = torch.tensor(stated.rotation_deg, dtype=torch.float64).deg2rad()
             priors[row, k] = torch.cat([turns, shifts]).clamp(min=MIN_DEVIATION).float()
     return priors
-
-
-def _scope(frame: Frame) -> bytes:
-    """Return a key that differs between scopes: the pose of their lamps."""
-    camera = frame.camera
-    lamps = camera.world_from_camera if camera.world_from_lamps is None else camera.world_from_lamps
-    return lamps.detach().cpu().double().numpy().tobytes()
 
 
 def _numbered(keys: Sequence[Hashable]) -> list[int]:
