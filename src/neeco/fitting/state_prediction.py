@@ -1,7 +1,7 @@
 """Prediction of the errors of new states from those of the training states.
 
 The calibration of a robot is off by what depends on its joints; a tracker drifts with time. Corrections that training
-found are interpolated between the states (a Gaussian process), and that is kept only where stretches of the recording
+found are interpolated between the states (a Gaussian process), and that is used only where stretches of the recording
 that were left out are predicted from the others.
 """
 
@@ -85,15 +85,15 @@ def _best(features: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, float, float]
     prediction and from the mean, and the kernel's length and noise of the best prediction."""
     block = torch.arange(len(rows)) * N_BLOCKS // len(rows)
     left = [(block == number, block != number) for number in range(N_BLOCKS)]
-    usual = torch.stack([(rows[out] - rows[kept].mean(0)).square().sum(0) for out, kept in left]).sum(0)
+    usual = torch.stack([(rows[out] - rows[rest].mean(0)).square().sum(0) for out, rest in left]).sum(0)
     tried = []
     for length in LENGTHS:
         for noise in NOISES:
             error = torch.zeros_like(usual)
-            for out, kept in left:
-                mean = rows[kept].mean(0)
-                anchors = features[kept][evenly_spaced(int(kept.sum()), MAX_ANCHORS)]
-                weights = _weights(features[kept], rows[kept] - mean, anchors, length, noise)
+            for out, rest in left:
+                mean = rows[rest].mean(0)
+                anchors = features[rest][evenly_spaced(int(rest.sum()), MAX_ANCHORS)]
+                weights = _weights(features[rest], rows[rest] - mean, anchors, length, noise)
                 error += (rows[out] - mean - kernel(features[out], anchors, length) @ weights).square().sum(0)
             tried.append((float(error.sum()), length, noise, error))
     _, length, noise, error = min(tried, key=lambda item: item[:3])
