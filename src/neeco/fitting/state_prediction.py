@@ -26,8 +26,8 @@ JITTER = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
+class Prediction:
     """Verdict on the prediction of an instrument's pose corrections, or of those of a reading."""
-    """How well corrections of an instrument's pose, or of a reading, are predicted by its state."""
 
     explained: float  # share of the variance of left-out corrections
     applied: bool  # to new states
