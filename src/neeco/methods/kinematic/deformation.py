@@ -33,6 +33,7 @@ from neeco.methods.kinematic.hinge_search import hinge_joints
 from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.label_shares import store_label_shares
 from neeco.methods.kinematic.lamp_search import find_shadow
+from neeco.methods.kinematic.state_passes import FITTED_AT, fit_states
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.kinematic.wrist import place_wrists, refine_wrists
 from neeco.methods.space_carving import CarvingSettings
@@ -298,6 +299,9 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         if self.settings.shadow and (passed or any(map(session.reached, self.settings.shadow_at))):
             with session.searching(as_learned=True):
                 find_shadow(session)
+        for mark in FITTED_AT:
+            if before < mark <= session.progress:
+                fit_states(session, self, mark)
         if WRISTS_AT in passed:
             with session.searching():
                 place_wrists(session, self)
