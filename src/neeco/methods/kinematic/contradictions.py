@@ -12,16 +12,21 @@ from torch import Tensor
 from neeco.capture.model import State, evenly_spaced
 from neeco.fitting.state_fitter import StateFit
 from neeco.methods.kinematic.state_search import LEVELS, STEPS, StateSearch
+from neeco.training.session import GaussianSession
 
 CONTRADICTING = "contradicting_states"  # of a scene's diagnostics: what became of each, by the frame's name
-OUTLYING = 4.0  # robust standard deviations of a log misfit from which on a state is doubted
+OUTLYING = 3.0  # robust standard deviations of a log misfit from which on a state is doubted
+HOPELESS = 6.0  # from which on a frame that no state explains is left out
+BETTER = 0.6  # of a doubted state's misfit: that of another which refutes it
+MIN_DISTANCE = 3.0  # standard deviations of the prior, root mean square, of a state that is another one
 EXPLAINED = 1.0  # misfit up to which a state explains its image
 MIN_SPREAD = 0.25  # standard deviation of log misfits, at least
 N_OTHERS = 60  # frames whose states are tried
 N_TRIED = 3  # of them that are fitted
 MIN_FRAMES = 8  # with fewer, no state contradicts the others
 START_SCALE = 3.0  # of the prior about another start, times usual errors
-NAMED = 8  # frames in a line
+MAX_NAMED = 8  # frames in a line
+FITTED_ANEW, LEFT_OUT = "fitted anew", "left out"
 
 
 @torch.no_grad()
@@ -36,26 +41,50 @@ def doubt_states(search: StateSearch, scale: float) -> None:
     misfits = torch.tensor([search.misfit(index, state) for index, state in states.items()])
     logs = misfits.clamp(1e-3, 1e3).log()
     spread = max(1.4826 * float((logs - logs.median()).abs().median()), MIN_SPREAD)
-    limit = max(float(logs.median()) + OUTLYING * spread, math.log(EXPLAINED))
-    doubted = [index for index, log in zip(first, logs.tolist(), strict=True) if log > limit]
+    middle = float(logs.median())
+    limit, hopeless = (math.exp(max(middle + many * spread, math.log(EXPLAINED))) for many in (OUTLYING, HOPELESS))
+    doubted = [index for index, misfit in zip(first, misfits.tolist(), strict=True) if misfit > limit]
     if len(doubted) > len(first) // 2:
         return
     others = [states[index] for index in first if index not in doubted]
     others = [others[place] for place in evenly_spaced(len(others), N_OTHERS)]
-    noted = session.scene.diagnostics.setdefault(CONTRADICTING, {}) if doubted else {}
-    highest = math.exp(limit)
+    noted: dict[str, str] = dict(session.scene.diagnostics.get(CONTRADICTING, {}))
     for index in doubted:
-        own = search.fitted(index, scale)
-        if own is not None and own.fit.misfit <= highest:
+        if session.recorded.names[index] in noted:
+            continue
+        own, given = search.fitted(index, scale), session.recorded.states[index]
+        misfit = math.inf if own is None else own.fit.misfit
+        if misfit <= limit:
             continue
         found = _from_other_starts(search, index, others)
         frames = refinement.frames_of_pose[refinement.pose_rows[index]]
-        if found is not None and found[0].misfit <= highest:
-            refinement.set_state(index, session.recorded.states[index], found[0].state, found[1])
-        else:
+        verdict = ""
+        if found is not None and found[0].misfit < BETTER * misfit:
+            apart = refinement.layout.increments_between(given, found[0].state)
+            if float((apart @ search.precision(index, scale) @ apart) / len(apart)) > MIN_DISTANCE**2:
+                verdict = FITTED_ANEW if found[0].misfit < limit else LEFT_OUT
+                refinement.set_state(index, given, found[0].state, found[1])
+        elif misfit > hopeless:
+            verdict = LEFT_OUT
+        if verdict == LEFT_OUT:
             refinement.weights[frames] = 0
-        for frame in frames:
-            noted[session.recorded.names[frame]] = "left out" if refinement.weights[frame] == 0 else "fitted anew"
+        noted |= {session.recorded.names[frame]: verdict for frame in frames if verdict}
+    if noted:
+        session.scene.diagnostics[CONTRADICTING] = noted
+
+
+def report_contradictions(session: GaussianSession) -> None:
+    """Report in one line which training states contradict the others, and what became of them."""
+    noted: dict[str, str] = session.scene.diagnostics.get(CONTRADICTING, {})
+    if not noted:
+        return
+    names = sorted(noted)
+    shown = ", ".join(names[:MAX_NAMED]) + (f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else "")
+    out = sum(verdict == LEFT_OUT for verdict in noted.values())
+    session.report(
+        f"{len(names)} of {len(session.recorded.names)} states contradict the others: {shown}; {len(names) - out} were "
+        f"fitted to their images from other states, {out} left out"
+    )
 
 
 def _from_other_starts(search: StateSearch, index: int, others: Sequence[State]) -> tuple[StateFit, Tensor] | None:

@@ -11,16 +11,17 @@ import torch
 
 from neeco.capture.model import evenly_spaced
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.methods.kinematic.contradictions import doubt_states
+from neeco.methods.kinematic.contradictions import CONTRADICTING, doubt_states
 from neeco.methods.kinematic.discovery import carve_again
 from neeco.methods.kinematic.state_search import LARGEST, StateSearch
 from neeco.training.session import GaussianSession
 
-DECIDED_AT = 0.12  # share of the run at which errors are sized, and wrong states searched
-CARVED_AT = (DECIDED_AT, 0.2, 0.28, 0.36, 0.44)  # shares at which states are fitted, and shapes carved anew
-FITTED_AT = (*CARVED_AT, 0.55, 0.7, 0.85)  # shares at which states are fitted
+DECIDED_AT = (0.12, 0.28)  # shares of the run at which errors are sized, until they are large
+CARVED_AT = (0.2, 0.32, 0.45)  # shares at which states are fitted, and shapes carved anew from them
+FITTED_AT = (0.6, 0.75, 0.9)  # shares at which states are fitted
+MARKS = tuple(sorted({*DECIDED_AT, *CARVED_AT, *FITTED_AT}))
 N_SAMPLED = 16  # frames by which errors are sized
-LARGE = 0.35  # times usual errors of a robot, from which on errors are larger than a tracker's
+LARGE = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
 SCALE = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
 FOUND = "state_errors"  # of a scene's diagnostics
 
@@ -28,29 +29,31 @@ FOUND = "state_errors"  # of a scene's diagnostics
 @torch.no_grad()
 def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, mark: float) -> None:
     """Fit the states of all training frames at a mark of the run where their errors are larger than a tracker's, which
-    is found out at the first."""
+    is found out at the first ones."""
     scene, refinement = session.scene, session.refinement
     if not (scene.instruments and session.config.refine.frame_poses):
         return
-    if mark == DECIDED_AT:
+    if mark in DECIDED_AT and FOUND not in scene.diagnostics:
         search = StateSearch.of(session, articulated)
         sample = evenly_spaced(len(session.full_views.frames), N_SAMPLED)
-        fits = [fit for index in sample if (fit := search.fitted(index, LARGEST)) is not None]
-        scale = search.scale_of(fits) if len(fits) > 2 else 0.0
-        doubt_states(search, max(scale, LARGE))
+        sampled = [fit for index in sample if (fit := search.fitted(index, LARGEST)) is not None]
+        scale = search.scale_of(sampled) if len(sampled) > 2 else 0.0
+        if mark == DECIDED_AT[0]:
+            doubt_states(search, max(scale, LARGE))
         if scale > LARGE:
             scene.diagnostics[FOUND] = {"scale": round(scale, 3)}
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
-    if FOUND not in scene.diagnostics:
+            for index, *_ in refinement.frames_of_pose:
+                refinement.set_deviations(index, search.deviations(index, SCALE))
+    if FOUND not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
-    search = StateSearch.of(session, articulated)
-    fits = [
-        fit
-        for frames in refinement.frames_of_pose
-        if refinement.weights[frames[0]] > 0 and (fit := search.fitted(frames[0], SCALE)) is not None
-    ]
-    for fit in fits:
-        refinement.set_state(fit.index, session.recorded.states[fit.index], fit.fit.state, fit.deviations)
+    search, doubted = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
+    for index, *_ in refinement.frames_of_pose:
+        about = search.state(index) if session.recorded.names[index] in doubted else None
+        if refinement.weights[index] > 0 and (fit := search.fitted(index, SCALE, about)) is not None:
+            # gradients go on with the recorded states' uncertainty until the last fit
+            deviations = fit.deviations if mark == FITTED_AT[-1] else search.deviations(index, SCALE)
+            refinement.set_state(index, session.recorded.states[index], fit.fit.state, deviations)
     if mark in CARVED_AT:
         with session.searching():
             carve_again(session, articulated)

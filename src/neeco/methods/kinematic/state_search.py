@@ -73,11 +73,12 @@ class StateSearch:
         """Return frame `index` over tissue with the shadow of instruments in `state` (None: none)."""
         return self.fitter.view(self.session.full_views.frames[index], state)
 
-    def fitted(self, index: int, scale: float) -> FittedState | None:
-        """Return the state of frame `index` fitted from its present one, with the prior of errors `scale` times as
-        large as usual ones of a robot, or as stated; None where the fit leads out of the image."""
+    def fitted(self, index: int, scale: float, about: State | None = None) -> FittedState | None:
+        """Return the state of frame `index` fitted from its present one, with a prior about that recorded (or `about`
+        another) of errors `scale` times as large as usual ones of a robot, or as stated; None where the fit leads out
+        of the image."""
         start, given, precision = self.state(index), self.session.recorded.states[index], self.precision(index, scale)
-        fit = self.fitter.fit(self.view(index, start), given, precision, start, levels=LEVELS, steps=STEPS)
+        fit = self.fitter.fit(self.view(index, start), about or given, precision, start, levels=LEVELS, steps=STEPS)
         if fit is None:
             return None
         correction = self.session.refinement.layout.increments_between(given, fit.state)
@@ -93,6 +94,10 @@ class StateSearch:
         """Return the precision [P, P] of the prior on corrections of frame `index`."""
         axes = self._axes(index)
         return axes.T @ torch.diag(self._deviations(index, scale) ** -2) @ axes
+
+    def deviations(self, index: int, scale: float) -> Tensor:
+        """Return the standard deviations [P] (rad, mm) of the prior on corrections of frame `index`."""
+        return torch.linalg.inv(self.precision(index, scale)).diagonal().sqrt()
 
     def _deviations(self, index: int, scale: float) -> Tensor:
         """Return standard deviations [P] (rad, mm) of errors along `_axes`: stated ones, else `scale` times usual ones;
@@ -153,6 +158,7 @@ class StateSearch:
                 each = squares[:, kind == number].flatten().sort().values
                 if len(each):
                     variances[number] = each[: math.ceil(KEPT_SHARE * len(each))].mean()
+        object.__setattr__(self, "classes", variances.sqrt().tolist())
         # a tracker's errors across the view are as large as a robot's
         return float(variances[[number for number in (0, 1, 3, 4) if number in kinds]].sqrt().median())
 
