@@ -23,7 +23,7 @@ MARKS = tuple(sorted({*DECIDED_AT, *CARVED_AT, *FITTED_AT}))
 N_SAMPLED = 16  # frames by which errors are sized
 LARGE = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
 SCALE = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
-FOUND = "state_errors"  # of a scene's diagnostics
+FOUND = "scale_of_state_errors"  # of a scene's diagnostics
 
 
 @torch.no_grad()
@@ -41,7 +41,7 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
         if mark == DECIDED_AT[0]:
             doubt_states(search, max(scale, LARGE))
         if scale > LARGE:
-            scene.diagnostics[FOUND] = {"scale": round(scale, 3)}
+            scene.diagnostics[FOUND] = round(scale, 3)
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
             for index, *_ in refinement.frames_of_pose:
                 refinement.set_deviations(index, search.deviations(index, SCALE))
