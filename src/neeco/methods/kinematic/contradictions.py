@@ -32,13 +32,16 @@ FITTED_ANEW, LEFT_OUT = "fitted anew", "left out"
 @torch.no_grad()
 def doubt_states(search: StateSearch, scale: float) -> None:
     """Fit states that leave their images unexplained from other starts, or leave them out; note them in the scene's
-    diagnostics. scale: of the errors of all states (see `StateSearch.fitted`)."""
+    diagnostics. scale: of the errors of all states (see `StateSearch.fitted`). States that several cameras observe are
+    not doubted, nor those that place the instruments outside of the image."""
     session, refinement = search.session, search.session.refinement
-    first = [frames[0] for frames in refinement.frames_of_pose if refinement.weights[frames[0]] > 0]
+    alone = [frames[0] for frames in refinement.frames_of_pose if len(frames) == 1]
+    found_misfits = {index: search.misfit(index, search.state(index)) for index in alone}
+    first = [index for index, misfit in found_misfits.items() if math.isfinite(misfit)]
     if len(first) < MIN_FRAMES:
         return
     states = {index: search.state(index) for index in first}
-    misfits = torch.tensor([search.misfit(index, state) for index, state in states.items()])
+    misfits = torch.tensor([found_misfits[index] for index in first])
     logs = misfits.clamp(1e-3, 1e3).log()
     spread = max(1.4826 * float((logs - logs.median()).abs().median()), MIN_SPREAD)
     middle = float(logs.median())
@@ -53,11 +56,10 @@ def doubt_states(search: StateSearch, scale: float) -> None:
         if session.recorded.names[index] in noted:
             continue
         own, given = search.fitted(index, scale), session.recorded.states[index]
-        misfit = math.inf if own is None else own.fit.misfit
+        misfit = found_misfits[index] if own is None else own.fit.misfit
         if misfit <= limit:
             continue
         found = _from_other_starts(search, index, others)
-        frames = refinement.frames_of_pose[refinement.pose_rows[index]]
         verdict = ""
         if found is not None and found[0].misfit < BETTER * misfit:
             apart = refinement.layout.increments_between(given, found[0].state)
@@ -67,8 +69,9 @@ def doubt_states(search: StateSearch, scale: float) -> None:
         elif misfit > hopeless:
             verdict = LEFT_OUT
         if verdict == LEFT_OUT:
-            refinement.weights[frames] = 0
-        noted |= {session.recorded.names[frame]: verdict for frame in frames if verdict}
+            refinement.weights[index] = 0
+        if verdict:
+            noted[session.recorded.names[index]] = verdict
     if noted:
         session.scene.diagnostics[CONTRADICTING] = noted
 

@@ -48,12 +48,15 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
     if FOUND not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, doubted = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
-    for index, *_ in refinement.frames_of_pose:
-        about = search.state(index) if session.recorded.names[index] in doubted else None
-        if refinement.weights[index] > 0 and (fit := search.fitted(index, SCALE, about)) is not None:
-            # gradients go on with the recorded states' uncertainty until the last fit
-            deviations = fit.deviations if mark == FITTED_AT[-1] else search.deviations(index, SCALE)
-            refinement.set_state(index, session.recorded.states[index], fit.fit.state, deviations)
+    for frames in refinement.frames_of_pose:
+        about = search.state(frames[0]) if session.recorded.names[frames[0]] in doubted else None
+        used = [index for index in frames if refinement.weights[index] > 0]
+        fits = [fit for index in used if (fit := search.fitted(index, SCALE, about)) is not None]
+        if fits:
+            state, deviations = search.combined(fits)
+            if mark != FITTED_AT[-1]:  # until the last fit, gradients go on with the uncertainty of recorded states
+                deviations = search.deviations(frames[0], SCALE)
+            refinement.set_state(frames[0], session.recorded.states[frames[0]], state, deviations)
     if mark in CARVED_AT:
         with session.searching():
             carve_again(session, articulated)

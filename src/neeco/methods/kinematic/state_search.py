@@ -84,6 +84,18 @@ class StateSearch:
         correction = self.session.refinement.layout.increments_between(given, fit.state)
         return FittedState(index=index, fit=fit, precision=precision, correction=correction)
 
+    def combined(self, fits: Sequence[FittedState]) -> tuple[State, Tensor]:
+        """Return the state that the images of one instant show, by their information, and its standard deviations
+        [P]."""
+        if len(fits) == 1:
+            return fits[0].fit.state, fits[0].deviations
+        prior, information = fits[0].precision, torch.stack([found.fit.information for found in fits])
+        weighed = torch.stack([(found.fit.information + prior) @ found.correction for found in fits]).sum(0)
+        covariance = torch.linalg.inv(information.sum(0) + prior)
+        return self.fitter.parameters.moved(self.session.recorded.states[fits[0].index], covariance @ weighed), (
+            covariance.diagonal().sqrt()
+        )
+
     def misfit(self, index: int, state: State) -> float:
         """Return the misfit of a frame's instruments in `state` (see `StateFit`); infinite outside of the image."""
         precision = self.precision(index, 1.0)
