@@ -119,6 +119,7 @@ class Refinement:
         slides = [slides for item in items for slides in item.slides]
         per_rad = torch.tensor([MM_PER_RAD if each else 1.0 for each in slides], device=device)
         usual_joint_sd = per_rad * torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
+        self.usual_joint_sd = usual_joint_sd  # [R]
         self.joint_sd = usual_joint_sd.repeat(len(self.neighbours), 1)  # [P, R] rad or mm
         for frame, instant in zip(frames, self.instants, strict=True):
             for column, ((name, reading), slide) in enumerate(zip(self.readings, slides, strict=True)):
@@ -129,7 +130,8 @@ class Refinement:
                     self.joint_sd[instant, column] = max(own, MIN_DEVIATION)
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
-            "poses": rates.to(device),  # multiplied where poses are less certain than usual
+            # multiplied where states are less certain than usual
+            "poses": rates.to(device),
             "joints": per_rad * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
             "cameras": (rates * config.camera_rate).to(device),
             "latency": torch.tensor(config.latency_rate, device=device),
@@ -259,6 +261,8 @@ class Refinement:
             rate = self.rates[name]
             if name == "poses":
                 rate = rate * (self.pose_sd[row] / self.camera_sigma).clamp(1, MAX_SPEEDUP)
+            elif name == "joints":
+                rate = rate * (self.joint_sd[row] / self.usual_joint_sd).clamp(1, MAX_SPEEDUP)
             getattr(self, name)[row] -= decay * rate * update
         self._leaves = {}
 

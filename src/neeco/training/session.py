@@ -94,15 +94,15 @@ class GaussianSession(GaussianTraining):
     def start(self) -> None:
         """Make the scene's tensors leaves of autograd and clear the statistics, once the canonical Gaussians exist."""
         scene = self.scene
-        self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
         scene.requires_grad_(True)
         several = scene.registration.dim() > 1 and bool(scene.instruments)
         scene.registration.requires_grad_(self.config.refine.registration or several)
         scene.base_corrections.requires_grad_(False)  # found before the first step: gradients hardly move them
-        self.watch_gradients()
+        self.begin_statistics()
 
-    def watch_gradients(self) -> None:
-        """Make the canonical tensors leaves again after they were replaced."""
+    def begin_statistics(self) -> None:
+        """Make the canonical tensors leaves of autograd and clear the statistics, after they were replaced."""
+        self.statistics = GradientStatistics(len(self.scene.canonical), self.scene.center.device)
         for name, tensor in self.scene.canonical.tensors().items():
             tensor.requires_grad_(name == "means" or name in self.gaussian_rates)
 
@@ -270,8 +270,7 @@ class GaussianSession(GaussianTraining):
                 config=config.density,
                 unsupported=self._unsupported(),
             )
-            self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
-            self.watch_gradients()
+            self.begin_statistics()
         if settings.opacity_reset and self._due(settings.opacity_reset) and progress < config.growth_stop:
             reset_opacity(scene.canonical, self.adam, config.density.reset_opacity)
 
