@@ -21,6 +21,7 @@ from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformation import FINAL_RATE, Perturbation, floored_decay, log_linear
+from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_session import GaussianTraining, Report, StepResult, check_finite, members, numbers
 from neeco.scene.training_views import TrainingViews
@@ -45,6 +46,7 @@ class GaussianSession(GaussianTraining):
     full_views: TrainingViews = field(init=False)  # at full size; `views` are those in use
     scale: float = field(init=False)  # of `views`
     limits: tuple[int, int] = field(init=False)  # most Gaussians of the tissue, and of each instrument
+    recorded: Recorded = field(init=False)  # as it was before training
     given: list[tuple[State, Camera]] = field(init=False)  # of every frame of `views`, as recorded, on their device
     statistics: GradientStatistics = field(init=False)
     queue: list[int] = field(default_factory=list)
@@ -61,6 +63,7 @@ class GaussianSession(GaussianTraining):
         self.full_views = self.views
         self.resolution = Resolution(config.resolution, self.views)
         self.limits = config.gaussian_limits(self.resolution.pixels)
+        self.recorded = self.scene.recorded
         self._use_views(self.full_views, 1.0)
 
     def _use_views(self, views: TrainingViews, scale: float) -> None:
@@ -161,7 +164,8 @@ class GaussianSession(GaussianTraining):
         if following is not None:
             self.views.prefetch(following)
         loss = photometric_loss(rendering.color, target, mask, ssim_weight=self.config.ssim_weight)
-        total = trust_of(self.given[index][0]) * loss + self._regularisation(rendering, penalty)
+        weight = trust_of(self.given[index][0]) * float(self.refinement.weights[index])
+        total = weight * loss + self._regularisation(rendering, penalty)
         with tf32_products(self.views.device) if scene.deformation.large_operations else nullcontext():
             (total / views).backward()  # given the gradient instead, torch would import sympy: 2 s of every training
         gradient = rendering.center_offsets.grad
@@ -309,6 +313,9 @@ class GaussianSession(GaussianTraining):
         self.schedule.load_state_dict(fields["schedule"])
         self.rng.bit_generator.state = fields["rng"]
         self.queue, self.queue_phase = fields["queue"], fields["queue_phase"]
+
+    def training_states(self) -> dict[str, Any]:
+        return self.refinement.to_json(self.recorded)
 
     def finish(self) -> None:
         """Freeze the scene, record diagnostics of the run, and run the method's own hook."""
