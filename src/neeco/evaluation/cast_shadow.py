@@ -15,17 +15,17 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import field_pinhole
 from neeco.raster import rasterize
 from neeco.raster.resampling import of_learned_size
-from neeco.raster.shadow import shadowed
+from neeco.raster.shadow import GAMMA, shadowed
 from neeco.scene.gaussian_scene import GaussianScene
 
 SHADOW_FOLDER = "truth/shadow"
-DARKENING = 0.15  # share of the tissue's stored colour, from which a pixel is in shadow
+MISSING_LIGHT = 0.15  # share of the tissue's light, from which a pixel is in shadow
 MIN_AREA = 1e-3  # of the image: a smaller shadow has no score
 
 
 def load_shadow(capture: Capture, frame: Frame) -> Tensor | None:
-    """Return the true shadow of a frame, bool [H, W], of `truth/shadow/<stem>.png` (0/255: tissue darkened by more than
-    DARKENING); None without one. Raises NeecoError where it is damaged or of another size than the frame."""
+    """Return the true shadow of a frame, bool [H, W], of `truth/shadow/<stem>.png` (0/255: tissue that loses more than
+    MISSING_LIGHT); None without one. Raises NeecoError where it is damaged or of another size than the frame."""
     file = capture.root / SHADOW_FOLDER / f"{frame.name}.png"
     if not file.is_file():
         return None
@@ -34,8 +34,8 @@ def load_shadow(capture: Capture, frame: Frame) -> Tensor | None:
 
 @torch.no_grad()
 def rendered_shadow(scene: GaussianScene, state: State, camera: Camera) -> Tensor | None:
-    """Return the scene's own shadow of the instruments in `state`, bool [H, W]: tissue, rendered alone, that it darkens
-    by more than DARKENING. None where the scene models none."""
+    """Return the scene's own shadow of the instruments in `state`, bool [H, W]: tissue, rendered alone, that loses
+    more than MISSING_LIGHT. None where the scene models none."""
     if not scene.casts_shadow:
         return None
     camera = scene.recorded.as_learned(camera)
@@ -51,7 +51,7 @@ def rendered_shadow(scene: GaussianScene, state: State, camera: Camera) -> Tenso
     tissue = ~scene.canonical.of_instruments
     rendering = rasterize(posed.select(tissue), camera, channels=(shares[0] / shares[1])[tissue][:, None])
     assert rendering.channels is not None
-    return (rendering.channels[..., 0] < (1 - DARKENING) * rendering.alpha).cpu()
+    return (rendering.channels[..., 0] < (1 - MISSING_LIGHT) ** (1 / GAMMA) * rendering.alpha).cpu()
 
 
 def labelled_shadow(mask: Tensor, truth: Tensor, shadow: Tensor, counted: Tensor) -> float:
