@@ -76,8 +76,9 @@ scene is one more entry in `scenes.SCENES`.
     bowel-wristed-swapped
               the same with the names of wrist_pitch and wrist_yaw swapped: what a mistake in the logs looks like
     cloth-wristed
-              the same kind of instrument on a bench, meant for --still: a black shaft, nearly as dark as deep shadow, and
-              a mirror-like wrist and jaws over surgical cloth; lamps 13 mm to both sides of the lens cast two shadows
+              the same kind of instrument on a bench, meant for --still: a black shaft, nearly as dark as deep shadow,
+              and a mirror-like wrist and jaws over surgical cloth; lamps 13 mm to both sides of the lens cast two
+              shadows
     bowel-sliding
               8 mm grey shaft out of which a rod with two jaws slides; reading extension, mm
 """

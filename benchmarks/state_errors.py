@@ -49,7 +49,7 @@ from neeco.capture import (
 from neeco.capture.points import read_ply
 from neeco.errors import NeecoError
 from neeco.files import read_json, write_json
-from neeco.geometry.trocar import line_through_trocar
+from neeco.geometry.trocar import ShaftLine, line_through_trocar
 
 USUAL = (2.0, 6.0, 0.3, 1.5, 4.0)  # tilt, roll (degrees), across, depth (mm), joints (degrees)
 
@@ -118,11 +118,10 @@ def thinned(capture: Capture, count: int | None) -> Capture:
     return replace(capture, frames=tuple(f for f in capture.frames if f.split != "train" or f.name in kept))
 
 
-def shaft_axis(capture: Capture, name: str) -> np.ndarray:
-    """Direction [3] of a shaft in its instrument's frame: through the trocar, else the frame's z."""
+def shaft_of(capture: Capture, name: str) -> ShaftLine:
+    """The line of a shaft in its instrument's frame: through the trocar, else the frame's z."""
     poses = np.stack([frame.state.instruments[name].pose.numpy() for frame in capture.frames])
-    line = line_through_trocar(poses, 1.0)
-    return np.array([0.0, 0.0, 1.0]) if line is None else line.axis
+    return line_through_trocar(poses, 1.0) or ShaftLine(np.zeros(3), np.array([0.0, 0.0, 1.0]))
 
 
 def with_errors(
@@ -144,7 +143,7 @@ def with_errors(
         return drawn
 
     for instrument in capture.instruments:
-        name, axis = instrument.name, shaft_axis(capture, instrument.name)
+        name, axis = instrument.name, shaft_of(capture, instrument.name).axis
         basis = np.linalg.svd(axis[None])[2]  # rows: the axis, and two directions across it
         turns = errors(3) * np.radians([roll, tilt, tilt]) @ basis
         shifts, moved = errors(3) * [across, across, depth], errors(len(instrument.joints))
@@ -170,6 +169,7 @@ def with_outliers(capture: Capture, share: float, rng: np.random.Generator) -> t
     """The capture with a share of its training states mirrored or exchanged in turn, and what was done to which."""
     frames, wrong = {frame.name: frame for frame in capture.frames}, {}
     train = [frame.name for frame in capture.split("train")]
+    shafts = {instrument.name: shaft_of(capture, instrument.name) for instrument in capture.instruments}
     chosen = rng.choice(len(train), round(share * len(train)), replace=False)
     for count, index in enumerate(chosen.tolist()):
         frame = frames[train[index]]
@@ -178,21 +178,26 @@ def with_outliers(capture: Capture, share: float, rng: np.random.Generator) -> t
         for instrument in capture.instruments:
             given = other.state.instruments[instrument.name]
             if count % 2 == 0:
-                given = mirrored(frame, instrument.name, instrument.kinematics, shaft_axis(capture, instrument.name))
+                given = mirrored(frame, instrument.name, instrument.kinematics, shafts[instrument.name])
             frames[frame.name] = with_state(frames[frame.name], instrument.name, given)
     return replace(capture, frames=tuple(frames.values())), wrong
 
 
-def mirrored(frame: Frame, name: str, tree: KinematicTree | None, axis: np.ndarray) -> InstrumentState:
-    """The state that looks alike from afar: the pose mirrored in depth and, in its own frame, along the axis of its
-    first joint, with the readings that then bend the other way."""
+def mirrored(frame: Frame, name: str, tree: KinematicTree | None, shaft: ShaftLine) -> InstrumentState:
+    """The state that looks alike from afar: the pose mirrored in depth about the first joint (else the shaft's point)
+    and, in its own frame, along that joint's axis, with the readings that then bend the other way."""
     given = frame.state.instruments[name]
     world_from_camera = frame.camera.world_from_camera.numpy()
     pose = np.linalg.inv(world_from_camera) @ given.pose.numpy()
     bending = [link for link in tree.links if link.type == "revolute"] if tree else []
-    first = np.asarray(bending[0].axis) if bending else np.linalg.svd(axis[None])[2][1]
-    own = np.eye(3) - 2 * np.outer(first, first)
-    pose[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ pose[:3, :3] @ own
+    first = np.asarray(bending[0].axis) if bending else np.linalg.svd(shaft.axis[None])[2][1]
+    first = first - (first @ shaft.axis) * shaft.axis  # links as stated may be oblique to the shaft, and beside it
+    first /= np.linalg.norm(first)
+    along = float(bending[0].origin[:3, 3] @ shaft.axis) if bending else 0.0
+    pivot = shaft.point + along * shaft.axis
+    center = pose[:3, :3] @ pivot + pose[:3, 3]
+    pose[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ pose[:3, :3] @ (np.eye(3) - 2 * np.outer(first, first))
+    pose[:3, 3] = center - pose[:3, :3] @ pivot
     other_way = [link for link in bending if abs(np.asarray(link.axis) @ first) < 0.5]
     joints = {
         joint: -value if (gains := [g for link in other_way if (g := link.value.get(joint))]) and abs(sum(gains)) > 0.5
