@@ -19,7 +19,7 @@ from neeco.scene.state_corrections import MAX_ANCHORS, StateCorrections, kernel
 
 N_BLOCKS = 6  # stretches of the recording, left out one after the other
 MIN_INSTANTS = 12
-MIN_EXPLAINED = 0.5  # share of the corrections' variance; of drifting trackers and of random errors, less
+MIN_EXPLAINED = 0.1  # share of the corrections' variance: independent errors reach 0.06 by chance
 LENGTHS = (0.5, 1.0, 2.0, 4.0)  # of the kernel, in units of features
 NOISES = (0.1, 0.3, 1.0, 3.0)  # variance of a single instant's correction over the kernel's
 JITTER = 1e-6
