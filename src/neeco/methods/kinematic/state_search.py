@@ -39,7 +39,7 @@ class FittedState:
     index: int
     fit: StateFit
     precision: Tensor  # [P, P] of the prior
-    correction: Tensor  # [P] of the recorded state
+    correction: Tensor  # [P] of the state that the prior is about
 
     @property
     def deviations(self) -> Tensor:
@@ -81,7 +81,7 @@ class StateSearch:
         fit = self.fitter.fit(self.view(index, start), about or given, precision, start, levels=LEVELS, steps=STEPS)
         if fit is None:
             return None
-        correction = self.session.refinement.layout.increments_between(given, fit.state)
+        correction = self.session.refinement.layout.increments_between(about or given, fit.state)
         return FittedState(index=index, fit=fit, precision=precision, correction=correction)
 
     def combined(self, fits: Sequence[FittedState]) -> tuple[State, Tensor]:
