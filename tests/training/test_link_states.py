@@ -13,7 +13,7 @@ from wristed_world import shifted
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.fitting.link_silhouette import ArticulatedModel, joint_values
 from neeco.fitting.link_states import LinkViews
-from neeco.fitting.state_search import FoundStates, find_states, sds_of
+from neeco.fitting.silhouette_states import FoundStates, find_states, sds_of
 
 WIDTH, HEIGHT, FOCAL, STATES = 240, 192, 260.0, 20
 DEG = np.pi / 180

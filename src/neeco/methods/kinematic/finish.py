@@ -12,7 +12,6 @@ from torch import Tensor
 from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
 from neeco.geometry.projection import in_image
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments, Articulation
-from neeco.methods.kinematic.state_registration import contradictions
 from neeco.methods.kinematic.wrist import (
     MIN_SOLID_GAUSSIANS,
     SOLID_OPACITY,
@@ -41,8 +40,6 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
     """Drop occluded Gaussians of instruments, set the extent of each, prolong its shaft and write the joints' verdicts
     into `scene.diagnostics`. Warn of an instrument of which hardly anything was learned.
     """
-    for line in contradictions(session.scene.diagnostics.get("states", {})):
-        session.report(line)
     session.scene.recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
     session.scene.canonical = finalise_links(drop_occluded(session.scene), articulated)
     verdicts: dict[str, Any] = {}

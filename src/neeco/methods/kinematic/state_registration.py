@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +12,8 @@ from torch.nn.functional import interpolate
 
 from neeco.capture.model import InstrumentState
 from neeco.fitting.link_states import LinkViews
-from neeco.fitting.state_search import FoundStates, find_states
+from neeco.fitting.silhouette_states import FoundStates, find_states
+from neeco.methods.kinematic.contradictions import CONTRADICTING, FITTED_ANEW, LEFT_OUT
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import Evidence
 from neeco.training.session import GaussianSession
@@ -97,35 +97,19 @@ def _report(session: GaussianSession, found: FoundStates, slides: np.ndarray) ->
         for name, sd, turns in zip(names, found.sds, degrees, strict=True)
         if name
     }
-    frames = session.views.frames
-    rows = session.refinement.frames_of_pose
-    inconsistent = {
-        kind: [frames[shown].name for row in np.flatnonzero(which) for shown in rows[row]]
-        for kind, which in (
-            ("left_out", found.inconsistent & ~found.refitted),
-            ("refitted", found.inconsistent & found.refitted),
-        )
-    }
-    session.scene.diagnostics.setdefault("states", {})[instrument.name] = (
-        {"frames": len(frames)} | inconsistent | ({"errors_sd": sizes} if found.large else {})
-    )
+    diagnostics = session.scene.diagnostics
+    noted: dict[str, str] = {}
+    for row in np.flatnonzero(found.inconsistent).tolist():
+        for shown in session.refinement.frames_of_pose[row]:
+            noted[session.views.frames[shown].name] = FITTED_ANEW if found.refitted[row] else LEFT_OUT
+    if noted:
+        diagnostics[CONTRADICTING] = noted
     if found.large:
+        diagnostics["errors_of_states"] = {instrument.name: sizes}
         shown = ", ".join(f"{key.rpartition('_')[0]} {value} {key.rpartition('_')[2]}" for key, value in sizes.items())
         session.report(
             f"{instrument.name}: its states err more than a tracker's (standard deviations: {shown}); refined"
         )
-
-
-def contradictions(states: dict[str, dict[str, Any]]) -> list[str]:
-    """Return a line per instrument on the states that contradict the others; states: of a scene's diagnostics."""
-    lines = []
-    for name, found in states.items():
-        parts = {"they were left out": found["left_out"], "refitted": found["refitted"]}
-        listed = "; ".join(f"{', '.join(names)} ({words})" for words, names in parts.items() if names)
-        if listed:
-            count = sum(map(len, parts.values()))
-            lines.append(f"{name}: {count} of {found['frames']} states contradict the others: {listed}")
-    return lines
 
 
 def corrected_evidence(session: GaussianSession, evidence: Evidence, found: FoundStates) -> Evidence:
