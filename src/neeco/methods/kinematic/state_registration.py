@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -97,7 +98,7 @@ def _report(session: GaussianSession, found: FoundStates, slides: np.ndarray) ->
         for name, sd, turns in zip(names, found.sds, degrees, strict=True)
         if name
     }
-    diagnostics = session.scene.diagnostics
+    diagnostics: dict[str, Any] = session.scene.diagnostics
     noted: dict[str, str] = {}
     for row in np.flatnonzero(found.inconsistent).tolist():
         for shown in session.refinement.frames_of_pose[row]:
@@ -106,9 +107,9 @@ def _report(session: GaussianSession, found: FoundStates, slides: np.ndarray) ->
         diagnostics[CONTRADICTING] = noted
     if found.large:
         diagnostics["errors_of_states"] = {instrument.name: sizes}
-        shown = ", ".join(f"{key.rpartition('_')[0]} {value} {key.rpartition('_')[2]}" for key, value in sizes.items())
+        listed = ", ".join(f"{key.rpartition('_')[0]} {value} {key.rpartition('_')[2]}" for key, value in sizes.items())
         session.report(
-            f"{instrument.name}: its states err more than a tracker's (standard deviations: {shown}); refined"
+            f"{instrument.name}: its states err more than a tracker's (standard deviations: {listed}); refined"
         )
 
 
