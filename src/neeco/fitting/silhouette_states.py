@@ -35,7 +35,7 @@ WRONG = (12 * DEG, 30 * DEG, 4.0, 8.0, 20 * DEG, 8.0)
 # standard deviations of a refitted one, at most, for it to count
 SETTLED = (6 * DEG, 15 * DEG, 1.5, 4.0, 15 * DEG, 4.0)
 # sizes that errors of the model alone may feign: no cone is a wrist
-FEIGNED = (0.35 * DEG, 2.3 * DEG, 0.25, 0.25, 3 * DEG, 1.0)
+FEIGNED = (0.35 * DEG, 2.3 * DEG, 0.3, 0.6, 3 * DEG, 1.0)
 MIN_SHARE = 0.5  # of the errors tried, the least that is assumed of any parameter where those of another are large
 MIN_FACTOR = 2.0  # times these, from which a size counts
 EM_STEPS = 200
@@ -43,6 +43,7 @@ MAX_ESTIMATED = 30  # states from which sizes are estimated
 BAD_MADS, BAD_MISFIT = 6.0, 0.08  # median absolute deviations, and more than the median, from which a state is bad
 BAD_WEIGHT = 0.02
 LARGE_SDS = 1.8  # root mean square of a correction in standard deviations
+MAX_USUAL_MISFIT = 0.25  # median, above which colours do not show the instrument
 MAX_MISFIT = 0.4  # from which a state is wrong even where nothing explains it better
 BETTER = 0.75  # share of the misfit, below which another start is right
 N_OTHERS = 4  # states of other moments that are tried
@@ -77,6 +78,8 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
     tried = np.maximum(expected, sds_of(TRIED, slides))
     few = take(views, np.array(evenly_spaced(len(views.poses), MAX_ESTIMATED)))
     first = _fit(few, tried)
+    if np.median(first.misfits) > MAX_USUAL_MISFIT:
+        return None
     found = error_sizes(first, expected)
     large = bool((found > MIN_FACTOR * sds_of(FEIGNED, slides)).any())
     if not large and not _bad(first).any():
@@ -84,7 +87,8 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
     sds = expected
     if large:  # parameters that make up for each other must not hold each other
         sds = np.maximum(np.maximum(found, MIN_SHARE * sds_of(TRIED, slides)), expected)
-    return replace(_with_inconsistent(_fit(views, sds, first), sds, slides), large=large)
+    states = replace(_with_inconsistent(_fit(views, sds, first), sds, slides), large=large)
+    return states if large or states.inconsistent.any() else None
 
 
 @dataclass(frozen=True, eq=False)
