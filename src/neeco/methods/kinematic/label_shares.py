@@ -32,6 +32,8 @@ COLOR_ERROR = 0.02, 0.06  # standard deviation of a tissue pixel across its shad
 OTHER_DENSITY = 0.02  # of colours that neither model explains
 MIN_SHADE_LENGTH = 0.05  # of the segment in colour space that shades lie on
 LOW, HIGH = 0.25, 0.35  # mean probability of its pixels at which a Gaussian's share is 0 and 1
+OUTSIDE = 0.2  # mean probability of a Gaussian's pixels in a frame, below which that frame shows it on the tissue
+FEW, MANY = 0.25, 0.45  # of the frames that show a Gaussian: on the tissue in so many, its share is 1 and 0
 MIN_INSIDE = 0.9  # mean probability inside the instruments, below which colours do not separate them from the tissue
 MIN_CERTAIN = 0.15  # share of a part's pixels that must be inside, for its colours to be known by themselves
 MIN_PIXELS = 1e-3  # of a Gaussian in all frames; one with less counts as instrument
@@ -95,11 +97,13 @@ def _separable_parts(scene: GaussianScene, views: list[_View], probable: list[np
 
 
 def _label_shares(session: GaussianSession, views: list[_View], probable: list[np.ndarray]) -> Tensor:
-    """Return label weights [N] in [0, 1] by the mean probability of the pixels that show a Gaussian; 1 for tissue and
-    unobserved Gaussians."""
+    """Return label weights [N] in [0, 1]; 1 for tissue and unobserved Gaussians.
+
+    A weight follows the mean probability of the pixels that show a Gaussian, and the share of frames that show it on
+    the tissue: a fringe beside a surface lies in front of the instrument in some views, the surface never beside it.
+    """
     scene = session.scene
-    shown = torch.zeros_like(scene.canonical.opacity_logits)
-    as_instrument = torch.zeros_like(shown)
+    shown, as_instrument, frames, on_tissue = scene.canonical.opacity_logits.new_zeros(4, len(scene.canonical))
     for view, probability in zip(views, probable, strict=True):
         state, camera = session.corrected(view.index)
         posed = scene.at(state)
@@ -107,9 +111,15 @@ def _label_shares(session: GaussianSession, views: list[_View], probable: list[n
         counted = shown.new_ones(view.pixels.shape) if mask is None else mask.to(shown)
         likely = torch.zeros_like(counted)
         likely[torch.from_numpy(view.pixels).to(shown.device)] = torch.from_numpy(probability).to(shown)
-        shown += visible_pixels(posed, camera, counted)
-        as_instrument += visible_pixels(posed, camera, likely * counted)
+        pixels = visible_pixels(posed, camera, counted)
+        of_instrument = visible_pixels(posed, camera, likely * counted)
+        shown += pixels
+        as_instrument += of_instrument
+        frames += pixels.clamp_max(1)
+        on_tissue += pixels.clamp_max(1) * (of_instrument < OUTSIDE * pixels)
     share = ((as_instrument / shown.clamp_min(MIN_PIXELS) - LOW) / (HIGH - LOW)).clamp(0, 1)
+    outside = on_tissue / frames.clamp_min(MIN_PIXELS)
+    share = torch.minimum(share, ((MANY - outside) / (MANY - FEW)).clamp(0, 1))
     share[~scene.canonical.of_instruments | (shown < MIN_PIXELS)] = 1
     return share
 
