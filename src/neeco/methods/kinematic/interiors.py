@@ -31,7 +31,6 @@ def fade_interior_tissue(session: GaussianSession, articulated: ArticulatedInstr
         return
     logits = canonical.opacity_logits[canonical.body(0)]
     logits[inside] = math.log(REMOVED_OPACITY)
-    session.adam.forget("opacity_logits")
 
 
 @torch.no_grad()
