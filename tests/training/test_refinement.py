@@ -204,4 +204,5 @@ def test_a_state_that_is_set_holds_from_the_first_step_on_and_draws_what_is_lear
     assert kept["instruments"]["rod"]["uncertainty"]["translation_mm"] == pytest.approx([0.1] * 3)
     states = refinement.found(recorded, (instrument,)).states
     assert states[4].instruments["rod"].joints["jaw"] == pytest.approx(0.8)
+    assert isinstance(states[4].instruments["rod"].joints["jaw"], float)  # as files need it
     assert states[6].instruments["rod"].joints["jaw"] == 0.5

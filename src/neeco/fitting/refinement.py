@@ -173,7 +173,8 @@ class Refinement:
     def state(self, index: int, given: State) -> State:
         """Return the recorded state `given` of frame `index` as corrected so far, at any iteration."""
         offset = self.poses[self.pose_rows[index]] + self.velocities[self.pose_rows[index]] * self.latency
-        joints = self._of_instruments(self.joints[self.instants[index]]) if self.readings else None
+        parts = self._of_instruments(self.joints[self.instants[index]]) if self.readings else None
+        joints = None if parts is None else [[float(change) for change in part] for part in parts]
         moved = self.layout.moved_by_parts(given, list(offset), joints)
         instruments = {
             name: replace(own, pose=own.pose.to(given.instruments[name].pose))

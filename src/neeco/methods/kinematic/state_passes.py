@@ -36,7 +36,9 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
     if mark in DECIDED_AT and FOUND not in scene.diagnostics:
         search = StateSearch.of(session, articulated)
         sample = evenly_spaced(len(session.full_views.frames), N_SAMPLED)
-        sampled = [fit for index in sample if (fit := search.fitted(index, LARGEST)) is not None]
+        # states that were fitted before training are judged by what is left of their errors
+        about = {index: search.state(index) if refinement.fitted[index] else None for index in sample}
+        sampled = [fit for index in sample if (fit := search.fitted(index, LARGEST, about[index])) is not None]
         scale = search.scale_of(sampled) if len(sampled) > 2 else 0.0
         if mark == DECIDED_AT[0]:
             doubt_states(search, max(scale, LARGE))
@@ -49,9 +51,9 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
         return
     search, doubted = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
     for frames in refinement.frames_of_pose:
-        about = search.state(frames[0]) if session.recorded.names[frames[0]] in doubted else None
+        known = search.state(frames[0]) if session.recorded.names[frames[0]] in doubted else None
         used = [index for index in frames if refinement.weights[index] > 0]
-        fits = [fit for index in used if (fit := search.fitted(index, SCALE, about)) is not None]
+        fits = [fit for index in used if (fit := search.fitted(index, SCALE, known)) is not None]
         if fits:
             state, deviations = search.combined(fits)
             if mark != FITTED_AT[-1]:  # until the last fit, gradients go on with the uncertainty of recorded states

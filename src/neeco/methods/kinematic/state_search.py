@@ -28,6 +28,7 @@ USUAL = 0.15  # times them: a tracker's errors
 N_ITERATIONS = 40  # of expectation maximisation
 KEPT_SHARE = 0.85  # of squared corrections that count, without the largest
 CORRELATION_PX = 100.0  # pixels that count as one observation, as the scene is still learned
+OWN_SHARE = 0.25  # of an image's information that counts for standard deviations: the learned shape has errors, too
 BEYOND_LIMITS = 0.5  # of the range of a joint's limits, by which readings may be off
 LEVELS, STEPS = (0.25, 0.5, 1.0), (4, 4, 4)
 
@@ -39,12 +40,12 @@ class FittedState:
     index: int
     fit: StateFit
     precision: Tensor  # [P, P] of the prior
-    correction: Tensor  # [P] of the recorded state
+    correction: Tensor  # [P] of the state that the prior is about
 
     @property
     def deviations(self) -> Tensor:
         """Standard deviations [P] of the state."""
-        return torch.linalg.inv(self.fit.information + self.precision).diagonal().sqrt()
+        return torch.linalg.inv(OWN_SHARE * self.fit.information + self.precision).diagonal().sqrt()
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class StateSearch:
         fit = self.fitter.fit(self.view(index, start), about or given, precision, start, levels=LEVELS, steps=STEPS)
         if fit is None:
             return None
-        correction = self.session.refinement.layout.increments_between(given, fit.state)
+        correction = self.session.refinement.layout.increments_between(about or given, fit.state)
         return FittedState(index=index, fit=fit, precision=precision, correction=correction)
 
     def combined(self, fits: Sequence[FittedState]) -> tuple[State, Tensor]:
@@ -89,12 +90,11 @@ class StateSearch:
         [P]."""
         if len(fits) == 1:
             return fits[0].fit.state, fits[0].deviations
-        prior, information = fits[0].precision, torch.stack([found.fit.information for found in fits])
-        weighed = torch.stack([(found.fit.information + prior) @ found.correction for found in fits]).sum(0)
-        covariance = torch.linalg.inv(information.sum(0) + prior)
-        return self.fitter.parameters.moved(self.session.recorded.states[fits[0].index], covariance @ weighed), (
-            covariance.diagonal().sqrt()
-        )
+        prior, information = fits[0].precision, torch.stack([each.fit.information for each in fits])
+        weighed = torch.stack([(each.fit.information + prior) @ each.correction for each in fits]).sum(0)
+        found = torch.linalg.solve(information.sum(0) + prior, weighed)
+        deviations = torch.linalg.inv(OWN_SHARE * information.sum(0) + prior).diagonal().sqrt()
+        return self.fitter.parameters.moved(self.session.recorded.states[fits[0].index], found), deviations
 
     def misfit(self, index: int, state: State) -> float:
         """Return the misfit of a frame's instruments in `state` (see `StateFit`); infinite outside of the image."""
