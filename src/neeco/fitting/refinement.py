@@ -64,11 +64,11 @@ class Refinement:
     latency in s.
 
     Readings of joints in stated kinematics are corrected in rad or mm. Those that nobody recorded start half way
-    between their limits and are smooth in time. Both are corrected once for all frames of one instant, as several
-    cameras observe it. Poses are corrected once for both images of a stereo scope, P in total; where scopes stand
-    apart, every image has its own, which absorbs errors of the cameras. Tensors: `poses` [P, I, 6], `joints`
-    [instants, R], `cameras` [F, 6], `latency` [1]; of the priors on the first two `pose_mean`, `pose_sd`, `joint_mean`,
-    `joint_sd`; `fitted` [F] bool: frames whose state was set (`set_state`); `weights` [F] of frames in the loss.
+    between their limits and are smooth in time. A state is corrected once for all frames of one instant, as several
+    cameras observe it: errors of single cameras are not what differs between instants. Tensors: `poses` [P, I, 6] of P
+    instants, `joints` [P, R], `cameras` [F, 6], `latency` [1]; of the priors on the first two `pose_mean`, `pose_sd`,
+    `joint_mean`, `joint_sd`; `fitted` [F] bool: frames whose state was set (`set_state`); `weights` [F] of frames in
+    the loss.
     """
 
     def __init__(
@@ -89,9 +89,7 @@ class Refinement:
             [place for place, (name, _) in enumerate(self.readings) if name in stated], dtype=torch.int64, device=device
         )
         self.instants, self.neighbours = _instants(frames, names)
-        self.pose_rows = _numbered(
-            [(instant, _scope(frame)) for instant, frame in zip(self.instants, frames, strict=True)]
-        )
+        self.pose_rows = self.instants
         self.frames_of_pose = _members(self.pose_rows)
         first = tuple(frames[shown[0]] for shown in self.frames_of_pose)
         tissues = _members(_numbered([frame.state.tissue for frame in first]))
@@ -121,7 +119,8 @@ class Refinement:
         slides = [slides for item in items for slides in item.slides]
         per_rad = torch.tensor([MM_PER_RAD if each else 1.0 for each in slides], device=device)
         usual_joint_sd = per_rad * torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
-        self.joint_sd = usual_joint_sd.repeat(len(self.neighbours), 1)  # [instants, R] rad or mm
+        self.usual_joint_sd = usual_joint_sd  # [R]
+        self.joint_sd = usual_joint_sd.repeat(len(self.neighbours), 1)  # [P, R] rad or mm
         for frame, instant in zip(frames, self.instants, strict=True):
             for column, ((name, reading), slide) in enumerate(zip(self.readings, slides, strict=True)):
                 stated = frame.state.instruments[name].uncertainty
@@ -131,7 +130,8 @@ class Refinement:
                     self.joint_sd[instant, column] = max(own, MIN_DEVIATION)
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
-            "poses": rates.to(device),  # multiplied where poses are less certain than usual
+            # multiplied where states are less certain than usual
+            "poses": rates.to(device),
             "joints": per_rad * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
             "cameras": (rates * config.camera_rate).to(device),
             "latency": torch.tensor(config.latency_rate, device=device),
@@ -173,7 +173,8 @@ class Refinement:
     def state(self, index: int, given: State) -> State:
         """Return the recorded state `given` of frame `index` as corrected so far, at any iteration."""
         offset = self.poses[self.pose_rows[index]] + self.velocities[self.pose_rows[index]] * self.latency
-        joints = self._of_instruments(self.joints[self.instants[index]]) if self.readings else None
+        parts = self._of_instruments(self.joints[self.instants[index]]) if self.readings else None
+        joints = None if parts is None else [[float(change) for change in part] for part in parts]
         moved = self.layout.moved_by_parts(given, list(offset), joints)
         instruments = {
             name: replace(own, pose=own.pose.to(given.instruments[name].pose))
@@ -261,6 +262,8 @@ class Refinement:
             rate = self.rates[name]
             if name == "poses":
                 rate = rate * (self.pose_sd[row] / self.camera_sigma).clamp(1, MAX_SPEEDUP)
+            elif name == "joints":
+                rate = rate * (self.joint_sd[row] / self.usual_joint_sd).clamp(1, MAX_SPEEDUP)
             getattr(self, name)[row] -= decay * rate * update
         self._leaves = {}
 
@@ -381,13 +384,6 @@ def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual_sd
             turns = torch.tensor(stated.rotation_deg, dtype=torch.float64).deg2rad()
             priors[row, k] = torch.cat([turns, shifts]).clamp(min=MIN_DEVIATION).float()
     return priors
-
-
-def _scope(frame: Frame) -> bytes:
-    """Return a key that differs between scopes: the pose of their lamps."""
-    camera = frame.camera
-    lamps = camera.world_from_camera if camera.world_from_lamps is None else camera.world_from_lamps
-    return lamps.detach().cpu().double().numpy().tobytes()
 
 
 def _numbered(keys: Sequence[Hashable]) -> list[int]:
