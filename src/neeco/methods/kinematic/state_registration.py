@@ -20,6 +20,7 @@ from neeco.methods.space_carving import Evidence
 from neeco.training.session import GaussianSession
 
 WIDTH_PX = 320  # of the images compared
+SIZES = "errors_of_states"  # of a scene's diagnostics: standard deviations where they are large
 MIN_STATES = 8  # with fewer, nothing is said about them
 
 
@@ -106,7 +107,7 @@ def _report(session: GaussianSession, found: FoundStates, slides: np.ndarray) ->
     if noted:
         diagnostics[CONTRADICTING] = noted
     if found.large:
-        diagnostics["errors_of_states"] = {instrument.name: sizes}
+        diagnostics[SIZES] = {instrument.name: sizes}
         listed = ", ".join(f"{key.rpartition('_')[0]} {value} {key.rpartition('_')[2]}" for key, value in sizes.items())
         session.report(
             f"{instrument.name}: its states err more than a tracker's (standard deviations: {listed}); refined"
