@@ -25,6 +25,7 @@ from neeco.ingest.registration.articulated_fit import (
     fit_articulated,
     minimise,
     overlap,
+    with_pose_errors,
 )
 from neeco.ingest.registration.articulated_model import ArticulatedModel, bends, joint_values
 from neeco.ingest.registration.base import (
@@ -187,11 +188,11 @@ def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
 
 
 def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: ArticulatedMotion) -> BaseRegistration:
-    best, given = fits[0], problem.prior.world_from_base
+    best, given = with_pose_errors(problem, fits[0]), problem.prior.world_from_base
     full = covariance(problem, best)
     spread = SCATTER**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
-        weight = float(np.exp(-0.5 * (other.cost - best.cost)))
+        weight = float(np.exp(-0.5 * (other.cost - fits[0].cost)))
         off = _step(problem, best, other)
         spread = spread + weight / (1 + weight) * np.outer(off, off)
     in_view = in_camera(spread, problem.camera_from_world[0])
@@ -213,15 +214,18 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
         from_masks=True,
         shaft=shaft / np.linalg.norm(shaft),
         sd_motion_mm=sd_motion(spread, poses),
-        doubts=tuple(_doubts(problem, best, motion)),
+        doubts=tuple(_doubts(problem, fits[0], best, motion)),
         **moved_from(given, best.world_from_base, problem.middle),
     )
 
 
-def _doubts(problem: ArticulatedProblem, fit: ArticulatedFit, motion: ArticulatedMotion) -> list[str]:
-    """Sentences on what contradicts the recording's statements."""
+def _doubts(
+    problem: ArticulatedProblem, rigid: ArticulatedFit, fit: ArticulatedFit, motion: ArticulatedMotion
+) -> list[str]:
+    """Sentences on what contradicts the recording's statements; `rigid`: the fit without errors of poses, which would
+    make up for reversed joints."""
     model, prior = problem.model, problem.prior
-    reversed_ = [reading for reading in motion.tree.readings if _reversed(problem, fit, motion, reading)]
+    reversed_ = [reading for reading in motion.tree.readings if _reversed(problem, rigid, motion, reading)]
     found = [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
     share = overlap(problem, fit)
     if share < MIN_OVERLAP:

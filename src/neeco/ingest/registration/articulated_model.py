@@ -21,6 +21,7 @@ from neeco.ingest.registration.silhouette_model import frame_about
 TUBE_MM = 150.0  # of the root link that is modelled
 NEAREST_MM = 8.0  # depth at which cones are cut off
 PIVOT_SD_MM, AXIS_SD_RAD, OFFSET_SD_RAD = 1.2, 0.06, 0.05  # of what is stated; values of joints include shapes' errors
+HEADING_SD_RAD = 0.15  # of an outermost link's direction from the tube's at rest: a curved jaw looks like an offset
 SLIDE_SD_MM = 1.0  # of the offset of a prismatic joint
 TILT_SD_RAD, ASIDE_SD_MM = 0.03, 0.7  # of the tube's axis about its first guess, and from the first pivot
 LOG_RADIUS_SD, RATIO_SD = 0.4, 0.3  # of radii, and of the ratio of one link's to its parent's
@@ -105,7 +106,7 @@ class ArticulatedModel:
         self.pivots: list[int | None] = []
         self.offsets: list[int | None] = []
         places: dict[tuple, int] = {}
-        for link, parent in zip(self.tree.links, self.parents, strict=True):
+        for index, (link, parent) in enumerate(zip(self.tree.links, self.parents, strict=True)):
             if link.type == FIXED:
                 self.pivots.append(None)
                 self.offsets.append(None)
@@ -116,6 +117,8 @@ class ArticulatedModel:
                 places[key] = self._add(f"pivot of {link.name}", [0] * 5, sds)
             self.pivots.append(places[key])
             sd = SLIDE_SD_MM if link.type == PRISMATIC else OFFSET_SD_RAD
+            if link.type != PRISMATIC and index not in self.parents:
+                sd = float(np.hypot(sd, HEADING_SD_RAD))
             self.offsets.append(self._add(f"offset of {link.name}", [0], [sd]))
 
     def _cones(self) -> None:
