@@ -22,7 +22,7 @@ from neeco.ingest.registration.articulated_fit import (
     covariance,
     fit_articulated,
 )
-from neeco.ingest.registration.articulated_model import ArticulatedModel, joint_values
+from neeco.ingest.registration.articulated_model import ArticulatedModel, joint_values, with_motion
 from neeco.ingest.registration.silhouette_fit import BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
 
@@ -142,7 +142,7 @@ def test_the_bend_of_a_wrist_tells_the_place_along_the_shaft(masks):
         camera_from_world=STILL[rows],
         poses=poses,
         readings=readings,
-        values=joint_values(_tree(), readings),
+        values=with_motion(joint_values(_tree(), readings)),
         blocks=np.arange(len(rows)) // 2,
         prior=BasePrior(given, np.radians(3.0), 5.0),
     )

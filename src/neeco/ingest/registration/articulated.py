@@ -27,7 +27,7 @@ from neeco.ingest.registration.articulated_fit import (
     overlap,
     with_pose_errors,
 )
-from neeco.ingest.registration.articulated_model import ArticulatedModel, bends, joint_values
+from neeco.ingest.registration.articulated_model import ArticulatedModel, bends, joint_values, with_motion
 from neeco.ingest.registration.base import (
     MIN_FRAMES,
     N_BLOCKS,
@@ -50,7 +50,7 @@ APART_MM, APART_RAD = 3.0, 0.035  # between results that count as different
 # added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
 FLOOR_MM, FLOOR_DEPTH_MM, FLOOR_DEG = 0.25, 0.35, 0.25
 SCATTER = 1.3  # factor on standard deviations; assumed, as the floors are: few recordings were measured
-MIN_OVERLAP, USUAL_OVERLAP = 0.75, 0.85  # of the silhouette with the masks: doubted below, and what is usual
+USUAL_OVERLAP = 0.85  # of the silhouette with the masks
 LEAST_OVERLAP, MAX_RESIDUAL_PX = 0.4, 2.5  # beyond, nothing is found
 REVERSED_SHARE = 0.8  # of the cost, from which a joint counts as reversed
 MIN_EXCHANGED = 1.25  # times the cost, with poses of other moments
@@ -138,7 +138,7 @@ def _problem(
         camera_from_world=camera_from_world[rows],
         poses=poses[:, rows],
         readings={key: part[:, rows] for key, part in readings.items()},
-        values=values[:, rows],
+        values=with_motion(values[:, rows]),
         blocks=np.arange(len(rows)) * N_BLOCKS // len(rows),
         prior=BasePrior(given, np.radians(sd_deg), sd_mm, sd_clock),
     )
@@ -225,14 +225,15 @@ def _doubts(
     """Sentences on what contradicts the recording's statements; `rigid`: the fit without errors of poses, which would
     make up for reversed joints."""
     model, prior = problem.model, problem.prior
-    reversed_ = [reading for reading in motion.tree.readings if _reversed(problem, rigid, motion, reading)]
+    starts = [rigid]
+    if overlap(problem, fit) < USUAL_OVERLAP:  # a reversed joint may have led it astray
+        starts.append(replace(rigid, world_from_base=prior.world_from_base, parameters=model.means.copy()))
+    reversed_ = [
+        reading
+        for reading in motion.tree.readings
+        if any(_reversed(problem, rigid, start, motion, reading) for start in starts)
+    ]
     found = [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
-    share = overlap(problem, fit)
-    if share < MIN_OVERLAP:
-        found.append(
-            f"the outline found overlaps what moves by {share:.2f}; {USUAL_OVERLAP:.2f} or more is usual: check links, "
-            "lens, and which arm the log is of"
-        )
     assert prior.sd_mm is not None
     assert prior.sd_rad is not None
     step = _step(problem, replace(fit, world_from_base=prior.world_from_base), fit)
@@ -253,11 +254,15 @@ def _doubts(
     return found
 
 
-def _reversed(problem: ArticulatedProblem, fit: ArticulatedFit, motion: ArticulatedMotion, reading: str) -> bool:
-    """Whether the masks are explained clearly better with a reading's sign reversed."""
-    values = problem.values.copy()
+def _reversed(
+    problem: ArticulatedProblem, fit: ArticulatedFit, start: ArticulatedFit, motion: ArticulatedMotion, reading: str
+) -> bool:
+    """Whether the masks are explained clearly better than by a fit with a reading's sign reversed, from a start."""
+    count = len(motion.tree.links)
+    values = problem.values[..., :count].copy()
     for index, link in enumerate(motion.tree.links):
         values[:, :, index] -= 2 * link.value.get(reading, 0.0) * problem.readings[reading]
-    other = replace(problem, values=values)
-    trial = fit_articulated(other, fit, WIDTHS_PX[1:3], 5)
+    other = replace(problem, values=with_motion(values))
+    widths = WIDTHS_PX[1:3] if start is fit else WIDTHS_PX[:3]
+    trial = fit_articulated(other, start, widths, 5 if start is fit else 10)
     return minimise(other, trial, WIDTHS_PX[-1], 8).cost < REVERSED_SHARE * fit.cost

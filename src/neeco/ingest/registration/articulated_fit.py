@@ -32,6 +32,7 @@ PARAMETER_STEP = 0.1  # of differences, in standard deviations of priors
 INSIDE_PX = -0.7  # of another cone's outline, from which a point is no outline
 MAX_TURN_RAD, MAX_SHIFT_MM, MAX_SDS = 0.15, 12.0, 2.0  # of one step
 DAMPING, TOLERANCE = 1e-2, 1e-4
+POSE_BLOCKS = 2  # of the recording, after which errors of logged poses are independent
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,7 +42,7 @@ class ArticulatedProblem(LoggedSilhouettes):
     model: ArticulatedModel
     contours: np.ndarray  # [F, N, 2] px of the masks' outlines; NaN: no point
     readings: dict[str, np.ndarray]  # [S, F] by name
-    values: np.ndarray  # [S, F, L] of all links' joints, rad or mm
+    values: np.ndarray  # [S, F, 2 L] of all links' joints, rad or mm, as `with_motion` has them
     prior: BasePrior
 
     def take(self, rows: np.ndarray) -> ArticulatedProblem:
@@ -312,9 +313,9 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     blocks = blocks - blocks.mean(0)
     scatter = blocks.T @ blocks * len(blocks) / max(len(blocks) - 1, 1)
     scatter[: len(free), : len(free)] += prior
-    if fit.pose_errors is not None:  # the same throughout a block, though the fit takes them to be independent
-        same = problem.blocks[:, None] == problem.blocks
-        scatter[len(free) :, len(free) :] += np.kron(same, np.diag(scale[count : count + 6] ** 2))
+    if fit.pose_errors is not None:  # they last for a block or two, though the fit takes them to be independent
+        apart = np.abs(problem.blocks[:, None] - problem.blocks) / POSE_BLOCKS
+        scatter[len(free) :, len(free) :] += np.kron(np.clip(1 - apart, 0, 1), np.diag(scale[count : count + 6] ** 2))
     full = np.zeros((count, count))
     full[np.ix_(free, free)] = inverse @ scatter @ inverse.T
     return full
