@@ -9,7 +9,6 @@ motion of the shaft would seem to determine the base far better than it does.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -158,21 +157,23 @@ def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, fr
     share = np.stack([1 - place, place], -1)  # [F, M, 2] of both ends
     steps = np.concatenate([[STEPS[0]] * 3, [STEPS[1]] * 3, [STEPS[2]], PARAMETER_STEP * model.sds])
 
-    def by(other: Callable[[float], ArticulatedFit], size: float) -> np.ndarray:
-        plus, minus = (outlines(problem, other(sign * size)) for sign in (1, -1))
+    def slopes(plus_fit: ArticulatedFit, minus_fit: ArticulatedFit, size: float) -> np.ndarray:
+        plus, minus = outlines(problem, plus_fit), outlines(problem, minus_fit)
         ahead = (slope * (model.outline_points(plus) - model.outline_points(minus))).sum(-1)
         ends, widths = plus.ends - minus.ends, plus.widths - minus.widths
         shifted = (ends[frame, nearest] * way[:, :, None]).sum(-1) + widths[frame, nearest]
         both = [np.where(use.model, ahead, 0.0), np.where(use.masks, -(share * shifted).sum(-1), 0.0)]
         return np.concatenate(both, 1) / (2 * size)
 
-    units = np.eye(len(steps))
-    columns = [by(lambda size, index=index: moved(problem, fit, size * units[index]), steps[index]) for index in free]
+    columns = []
+    for index in free:
+        step = steps[index] * np.eye(len(steps))[index]
+        columns.append(slopes(moved(problem, fit, step), moved(problem, fit, -step), steps[index]))
     errors = fit.pose_errors
     if errors is not None:
-        unit = np.eye(6)
-        for k in range(6):  # all frames at once: each depends on its own pose only
-            columns.append(by(lambda size, k=k: replace(fit, pose_errors=errors + size * unit[k]), steps[k]))
+        for k, step in enumerate(np.diag(steps[:6])):  # all frames at once: each depends on its own pose only
+            plus_fit, minus_fit = replace(fit, pose_errors=errors + step), replace(fit, pose_errors=errors - step)
+            columns.append(slopes(plus_fit, minus_fit, steps[k]))
     return np.stack(columns, -1)
 
 
