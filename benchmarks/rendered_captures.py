@@ -5,8 +5,9 @@
     python benchmarks/rendered_captures.py stomach OUT --breathing 3 --exposure --lens --video
 
 Writes a complete `neeco-capture/1` folder of 275 frames, 320x256: images, `transforms.json` and `sparse.ply` with the
-errors a tracker, SfM and a jaw sensor make, and `truth/` (part masks, depth, exact `transforms.json`, `hinge.json`
-with the hinge and the shaft in the sensor's frame). Nothing beyond neeco's own dependencies is needed (`--video`: those
+errors a tracker, SfM and a jaw sensor make, and `truth/` (part masks, masks of tissue that the instrument's shadow
+darkens by more than 15 %, depth, exact `transforms.json`, `hinge.json` with the hinge and the shaft in the sensor's
+frame). Nothing beyond neeco's own dependencies is needed (`--video`: those
 of `ingest`). The same command gives the same pixels on the same machine, with any number of workers.
 
     --size WxH       the same scene, motion and errors of the sensors in mm, degrees and s, in images of another size.
@@ -74,6 +75,10 @@ scene is one more entry in `scenes.SCENES`.
               these links, and recording/exact-links.yaml the true ones (encoders without their offsets)
     bowel-wristed-swapped
               the same with the names of wrist_pitch and wrist_yaw swapped: what a mistake in the logs looks like
+    cloth-wristed
+              the same kind of instrument on a bench, meant for --still: a black shaft, nearly as dark as deep shadow,
+              and a mirror-like wrist and jaws over surgical cloth; lamps 13 mm to both sides of the lens cast two
+              shadows
     bowel-sliding
               8 mm grey shaft out of which a rod with two jaws slides; reading extension, mm
 """

@@ -28,6 +28,7 @@ from rendered.render import (
     light_instrument,
     light_tissue,
     mechanical_from_camera,
+    passing,
     widened,
 )
 from rendered.textures import remap
@@ -80,7 +81,8 @@ def draw_detailed(place: Place, detail: Detail, view: View, gain: tuple[float, f
         voted = _sample_again(frame, u.reshape(-1)[again], v.reshape(-1)[again], here)
         light[again], parts[again], depth[again] = voted.light, voted.parts, voted.depth
     blurred = cv2.GaussianBlur(light.reshape(*shape, 3).numpy(), (0, 0), BLOOM, borderType=cv2.BORDER_REPLICATE)
-    return Drawing(develop(torch.from_numpy(blurred), gain), parts.reshape(shape), depth.reshape(shape))
+    lit = F.interpolate(frame.lit[None], size=shape, mode="bilinear", align_corners=False)[0]
+    return Drawing(develop(torch.from_numpy(blurred), gain), parts.reshape(shape), depth.reshape(shape), lit)
 
 
 def _sample_again(frame: _Frame, u: Tensor, v: Tensor, middle: _Samples) -> _Samples:
@@ -128,11 +130,7 @@ def _lit(place: Place, view: View, tissue: Tensor) -> Tensor:
     depth = F.avg_pool2d(tissue[None], step // BLOCK)[0].reshape(-1, 1)
     transform = mechanical_from_camera(view)
     points = (depth * _grid(lens, step)) @ transform[:3, :3].T + transform[:3, 3]
-    lit = [
-        tools.shadow(place.design, view.opening, points, transform[:3, :3] @ torch.tensor(lamp) + transform[:3, 3])
-        for lamp in place.lamps.positions
-    ]
-    return torch.stack(lit).reshape(len(lit), lens.height // step, lens.width // step)
+    return passing(place, view, points).reshape(-1, lens.height // step, lens.width // step)
 
 
 def _grid(lens: Lens, step: int) -> Tensor:

@@ -30,7 +30,7 @@ METAL = 25.0  # mm, after which scratches and engraving repeat
 BRUSHED = 11.0  # mm, after which machining lines repeat
 RING_EVERY, RING_WIDTH = 10.0, 0.32  # mm, engraved around the shaft
 TOOTH = 0.85  # mm, of the serration
-PATTERNS = {"bowel": (0.65, 0.04), "stomach": (0.38, 0.5)}  # strength of capillaries and of pits
+PATTERNS = {"bowel": (0.65, 0.04), "stomach": (0.38, 0.5), "cloth": (0.0, 0.3)}  # strength of capillaries and of pits
 
 
 @dataclass(frozen=True)

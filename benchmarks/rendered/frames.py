@@ -24,7 +24,7 @@ from rendered.detail import Detail, make_detail
 from rendered.hinge import truth_ids
 from rendered.motion import Array, Moment, Trajectory, is_unseen, rigid
 from rendered.optics import Optics
-from rendered.render import Drawing, Lens, Place, draw, view_of
+from rendered.render import Drawing, Lens, Place, draw, shadowed, view_of
 from rendered.scenes import SceneSpec
 from rendered.tissue import ORGANS
 
@@ -138,12 +138,12 @@ class Renderer:
         return Renderer(spec, settings, path, place, detail, gains)
 
     def render(self, shot: Shot) -> Rendered:
-        """Render a frame and write its image, its mask of parts and its depth."""
+        """Render a frame and write its image, its masks of parts and of the shadow, and its depth."""
         place = moved(self.place, self.settings.modes(self.spec), shot.time)
         drawing = self._draw(place, shot)
         pixels = _add_noise(drawing.color, np.random.default_rng((self.spec.seed, shot.number)))
         _write_jpeg(self.path / image_name(shot), pixels)
-        self._write_truth(shot, drawing)
+        self._write_truth(shot, drawing, shadowed(place, view_of(shot.moment), drawing))
         if self.settings.optics:
             optics = Optics.of(self.settings.lens)
             color = optics.add_border(self._draw(replace(place, lens=optics), shot).color)
@@ -159,10 +159,11 @@ class Renderer:
         view, gain = view_of(shot.moment), self.gains.get(shot.number)
         return draw_detailed(place, self.detail, view, gain) if self.detail else draw(place, view, gain)
 
-    def _write_truth(self, shot: Shot, drawing: Drawing) -> None:
+    def _write_truth(self, shot: Shot, drawing: Drawing, shadow: Tensor) -> None:
         truth, name = self.path / "truth", f"{shot.number:06d}.png"
         ids = torch.tensor([0, instrument.SHAFT, instrument.WRIST, *truth_ids(self.spec)], dtype=torch.uint8)
         write_labels(truth / "masks" / name, ids[drawing.parts.long()])
+        write_labels(truth / "shadow" / name, shadow.to(torch.uint8) * 255)
         if has_depth(shot):
             counts = (drawing.depth[::DEPTH_STRIDE, ::DEPTH_STRIDE] / DEPTH_UNIT_MM).round().clamp(0, 65535)
             depth = Image.fromarray(counts.numpy().astype(np.uint16))

@@ -74,6 +74,7 @@ class Design:
     jaws: tuple[Blade, Blade]
     shares: tuple[float, float]
     materials: tuple[Material, Material, Material]
+    mirrors: bool = False  # metal that shows its surroundings instead of a haze of tissue
 
     wrist_joints: ClassVar[tuple[str, ...]] = ()  # readings beside the jaws'
 
@@ -233,7 +234,7 @@ def grain(design: Design, opening: float, points: Tensor, parts: Tensor) -> Tens
     return 0.6 * coarse + 0.4 * fine
 
 
-def shadow(design: Design, opening: float, points: Tensor, light: Tensor, softness: float = 11.0) -> Tensor:
+def shadow(design: Design, opening: float, points: Tensor, light: Tensor, sharpness: float) -> Tensor:
     """Share [M] of a light at `light` [3] that reaches points [M, 3] past the instrument; mechanical frame."""
     towards = light - points
     reach = towards.norm(dim=-1)
@@ -243,7 +244,7 @@ def shadow(design: Design, opening: float, points: Tensor, light: Tensor, softne
     t = torch.full((len(active),), 2.0)
     for _ in range(40):
         gap = design.everything(points[active] + t[:, None] * unit[active], opening)
-        lit[active] = torch.minimum(lit[active], (0.5 + 0.5 * softness * gap / t).clamp(0, 1))
+        lit[active] = torch.minimum(lit[active], (0.5 + 0.5 * sharpness * gap / t).clamp(0, 1))
         t = t + gap.abs().clamp_min(0.5)
         going = (t < 0.9 * reach[active]) & (lit[active] > 0)
         active, t = active[going], t[going]

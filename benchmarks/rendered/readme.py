@@ -7,6 +7,7 @@ import math
 from neeco.capture import Capture
 from rendered.frames import Settings
 from rendered.kinematics import AXIS_ERROR, PIVOT_ERROR
+from rendered.render import SHADOW
 from rendered.scenes import SceneSpec
 from rendered.wristed import Encoders
 
@@ -38,7 +39,8 @@ Shows {spec.words}.
 World: the tracker's frame, mm; `pose` = world_from_sensor, the sensor tilted
 {math.degrees(spec.mount.tilt):.0f} degrees against the shaft and off its axis.
 Reading `jaw_angle` = {joint.zero} + ({joint.sign}) * opening, rad.{wristed}
-`truth/`: masks (0 tissue, 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right), depth (16 bit, 0.05 mm, every second pixel, for
+`truth/`: masks (0 tissue, 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right), shadow (255: tissue that the instrument's shadow
+darkens by more than {SHADOW:.0%} of its linear light), depth (16 bit, 0.05 mm, every second pixel, for
 frames with number % 4 == 0 and all unseen ones), transforms.json (exact), {links}.
 
 Splits: the last frames are `unseen` (opening > {math.degrees(path.opening_train):.0f} deg or |roll| > \

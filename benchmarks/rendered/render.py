@@ -21,6 +21,7 @@ WET = 1.5  # strength of highlights on tissue
 WET_SHARPNESS = 170.0
 BLOOM = 0.5  # px, blur of the lens
 SKY = 0.02  # light from everywhere
+SHADOW = 0.15  # of the tissue's light: `shadowed` are pixels that lose more
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class Lamps:
     power: float  # brightness of a white surface at `distance`
     distance: float
     focus: float  # how fast light falls off away from the view's middle
+    sharpness: float = 11.0  # of shadows: distance from what casts them over half the penumbra's width
+    contact: float = 0.0  # mm from the instrument at which it takes 1 / e of 0.6 of all light from what is below it
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,7 @@ class Drawing:
     color: Tensor
     parts: Tensor  # numbers of `rendered.instrument`; 0 tissue
     depth: Tensor
+    lit: Tensor  # [L, H, W] share of each lamp that reaches the tissue
 
 
 @dataclass(frozen=True)
@@ -88,13 +92,22 @@ def view_of(moment: Moment) -> View:
 
 def draw(place: Place, view: View, gain: tuple[float, float, float] | None = None) -> Drawing:
     """Draw a frame; gain: what the camera multiplies red, green and blue light by."""
-    light, parts, depth = gather(place, view)
+    light, parts, depth, lit = gather(place, view)
     light = blur(light.permute(2, 0, 1), BLOOM).permute(1, 2, 0)
-    return Drawing(develop(light, gain), parts, depth)
+    return Drawing(develop(light, gain), parts, depth, lit)
 
 
-def gather(place: Place, view: View) -> tuple[Tensor, Tensor, Tensor]:
-    """Linear light [H, W, 3] from 2 x 2 samples a pixel; parts [H, W] and depth [H, W], exact at pixel centres."""
+def shadowed(place: Place, view: View, drawing: Drawing) -> Tensor:
+    """Which pixels [H, W] show tissue that the instrument's shadow darkens by more than SHADOW, in linear light."""
+    points = (drawing.depth[..., None] * place.lens.rays().reshape(*drawing.depth.shape, 3)).reshape(-1, 3)
+    lit = drawing.lit.reshape(len(drawing.lit), -1)
+    dark, bright = (_shade_tissue(place, view, points, share).sum(-1) for share in (lit, torch.ones_like(lit)))
+    return (dark < (1 - SHADOW) * bright).reshape(drawing.parts.shape) & (drawing.parts == 0)
+
+
+def gather(place: Place, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Linear light [H, W, 3] from 2 x 2 samples a pixel; parts [H, W], depth [H, W] and the lamps' shares [L, H, W],
+    exact at pixel centres."""
     truth = _truth(place, view)
     lit = _shadows(place, view, truth.tissue)
     planes = truth.tissue[None, None]
@@ -111,7 +124,7 @@ def gather(place: Place, view: View) -> tuple[Tensor, Tensor, Tensor]:
         share = lit[:, row::2, column::2].reshape(len(lit), -1)
         total += _shade(place, view, directions, (near, far), (around, t[hit], parts[hit]), share) / 4
     depth = torch.minimum(truth.tissue, truth.instrument)
-    return total.reshape(*depth.shape, 3), truth.parts, depth
+    return total.reshape(*depth.shape, 3), truth.parts, depth, F.avg_pool2d(lit[None], 2)[0]
 
 
 @dataclass(frozen=True)
@@ -148,12 +161,28 @@ def _shadows(place: Place, view: View, tissue: Tensor) -> Tensor:
     rays = lens.rays((0.5, 0.5)).reshape(lens.height, lens.width, 3)[::2, ::2]
     points = (F.avg_pool2d(tissue[None], 2)[0, ..., None] * rays).reshape(-1, 3)
     points = points @ transform[:3, :3].T + transform[:3, 3]
-    lit = [
-        tools.shadow(place.design, view.opening, points, transform[:3, :3] @ torch.tensor(lamp) + transform[:3, 3])
-        for lamp in place.lamps.positions
-    ]
-    planes = torch.stack(lit).reshape(1, len(lit), *rays.shape[:2])
+    planes = passing(place, view, points).reshape(1, -1, *rays.shape[:2])
     return F.interpolate(planes, scale_factor=4, mode="bilinear", align_corners=False)[0]
+
+
+def passing(place: Place, view: View, points: Tensor) -> Tensor:
+    """Share [L, M] of each lamp's light that passes the instrument to points [M, 3], mechanical frame."""
+    transform, lamps = mechanical_from_camera(view), place.lamps
+    lit = torch.stack(
+        [
+            tools.shadow(
+                place.design,
+                view.opening,
+                points,
+                transform[:3, :3] @ torch.tensor(lamp) + transform[:3, 3],
+                lamps.sharpness,
+            )
+            for lamp in lamps.positions
+        ]
+    )
+    if lamps.contact:
+        lit *= 1 - 0.6 * torch.exp(-place.design.everything(points, view.opening).clamp_min(0) / lamps.contact)
+    return lit
 
 
 def _shade(
@@ -232,7 +261,10 @@ def light_instrument(
     if isinstance(spread, Tensor):
         shine, sharpness = widened(shine, sharpness, spread)
     mirrored = 2 * (normal * towards_eye).sum(-1, keepdim=True) * normal - towards_eye
-    seen = torch.tensor([0.30, 0.13, 0.10]) * (0.25 + 0.75 * (mirrored[:, 2:] * 0.5 + 0.5))  # tissue in the metal
+    if place.design.mirrors:
+        seen = _surroundings(place, points, mirrored)
+    else:
+        seen = torch.tensor([0.30, 0.13, 0.10]) * (0.25 + 0.75 * (mirrored[:, 2:] * 0.5 + 0.5))  # tissue in the metal
     graze = (1 - (normal * towards_eye).sum(-1, keepdim=True).clamp(0, 1)) ** 4
     color = base * SKY
     for lamp in place.lamps.positions:
@@ -245,6 +277,21 @@ def light_instrument(
         mirror = (1 - diffuse_share) * seen * (base + (1 - base) * graze)
         color += strength * (base * diffuse_share * facing + shine * glint * (0.4 + 0.6 * base) + mirror)
     return color
+
+
+def _surroundings(place: Place, points: Tensor, mirrored: Tensor) -> Tensor:
+    """Linear light [M, 3] that mirrored rays [M, 3] from points [M, 3] meet, camera frame: creased tissue where they
+    point away from the scope, a dark room with a bright ceiling light where they come back."""
+    lamps = place.lamps
+    away = (lamps.distance - points[:, 2:]).clamp_min(5) / mirrored[:, 2:].clamp_min(0.1)
+    x, y, _ = (points + away * mirrored).split(1, -1)
+    folds = 0.6 + 0.4 * torch.sin(x / 5) * torch.sin(y / 7 + 1)
+    lit = folds / (1 + (x.square() + y.square()) / 60**2)
+    tissue = place.tissue.surface[:3, ::16, ::16].mean((1, 2)) * lit
+    ceiling = torch.exp(-(((mirrored[:, 1:2] + 0.55) / 0.15) ** 2))
+    room = torch.tensor([0.9, 0.95, 1.0]) * (0.02 + 0.7 * ceiling)
+    share = torch.sigmoid(mirrored[:, 2:] * 12)
+    return share * tissue + (1 - share) * room
 
 
 def widened(strength: float | Tensor, sharpness: float | Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:

@@ -334,6 +334,37 @@ SCENES |= {
         ("stomach", 83, Encoders((-1.2 * DEGREE, 1.9 * DEGREE), 0.6 * DEGREE, 0.3 * DEGREE)),
     )
 }
+# The same on a bench: a black shaft and bare steel over surgical cloth, lamps beside the lens that cast two shadows.
+SCENES["cloth-wristed"] = replace(
+    SCENES["bowel-wristed"],
+    organ="cloth",
+    design=replace(
+        NEEDLE_DRIVER,
+        mirrors=True,
+        materials=(
+            Material((0.008, 0.008, 0.009), 1.0, 0.04, 14.0),
+            Material((0.72, 0.72, 0.74), 0.06, 2.5, 160.0),
+            Material((0.76, 0.75, 0.72), 0.08, 2.0, 120.0),
+        ),
+    ),
+    lamps=Lamps(
+        ((-13.0, 0.0, 0.0), (13.0, 0.0, 0.0)), power=1.5, distance=105.0, focus=1.5, sharpness=28.0, contact=5.0
+    ),
+    path=replace(
+        SCENES["bowel-wristed"].path,
+        trocar=(-62.0, 118.0, 112.0),
+        hinge_center=(2.0, -4.0, 34.0),
+        hinge_sway=(15.0, 11.0, 6.0),
+        hinge_extra=(9.0, 12.0, 10.0),
+        roll_middle=-20 * DEGREE,
+    ),
+    encoders=Encoders((1.3 * DEGREE, -1.7 * DEGREE), 0.8 * DEGREE, 0.3 * DEGREE),
+    seed=113,
+    words="surgical drapes, blue-green and white, under lamps 13 mm to both sides of the lens, which cast two shadows; "
+    "an 8 mm black shaft whose mirror-like steel wrist pitches and, 9 mm further, yaws two unequal jaws",
+    world_turn=(0.3, 0.7, -1.2),
+    world_shift=(25.0, -60.0, 150.0),
+)
 SCENES["bowel-wristed-swapped"] = replace(SCENES["bowel-wristed"], swapped=True)
 
 # A grasper on a rod that slides out of its shaft, as telescoping instruments have it.

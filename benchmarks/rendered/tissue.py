@@ -199,7 +199,32 @@ def stomach(seed: int, resolution: int = 2400) -> Tissue:
     return finish(height, albedo, 0.76 + 0.15 * value_noise(size, 22, generator), relief)
 
 
-ORGANS: dict[str, Callable[[int, int], Tissue]] = {"bowel": bowel, "stomach": stomach}
+def cloth(seed: int, resolution: int = 2400) -> Tissue:
+    """Surgical drapes on a bench: a blue-green cloth in soft creases, partly under a white one; both woven, not wet."""
+    generator = torch.Generator().manual_seed(seed)
+    rows, size = max(64, resolution // 3), resolution
+    creases = ridges(rows, 3, 0.12, generator) + 0.6 * ridges(rows, 6, 0.10, generator)
+    border = 5 * value_noise(size, 4, generator)
+    axis = torch.linspace(-HALF_SIZE, HALF_SIZE, size)
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    white = torch.sigmoid((0.8 * x + 0.6 * y + border - 30) * 4)
+    lift = F.interpolate(white[None, None], size=(rows, rows), mode="area")[0, 0]
+    waves = 2.2 * value_noise(rows, 6, generator) + 0.7 * value_noise(rows, 16, generator)
+    height = waves + blur(5 * creases + 1.5 * lift, 1.5 * (rows - 1) / (2 * HALF_SIZE))
+    # threads over and under each other, every 1.4 mm, no finer than the texels show
+    pitch = max(1.4, 10 * HALF_SIZE / size)
+    bend = value_noise(size, 20, generator)
+    warp, weft = ((2 * torch.pi / pitch) * (along + 0.6 * bend) for along in (x, y))
+    weave = torch.sin(warp) * torch.sin(weft)
+    uneven = octaves(size, 12, 6, generator, 0.6)
+    albedo = _mix(_color(0.045, 0.20, 0.26), _color(0.62, 0.61, 0.57), white)
+    albedo = albedo * (1 + 0.30 * weave + 0.10 * uneven)
+    stains = torch.sigmoid((octaves(size, 9, 4, generator, 0.6) - 2.0) * 9)
+    albedo = _mix(albedo, _color(0.20, 0.06, 0.05), 0.5 * stains)
+    return finish(height, albedo, torch.full((size, size), 0.12), 0.05 * weave)
+
+
+ORGANS: dict[str, Callable[[int, int], Tissue]] = {"bowel": bowel, "stomach": stomach, "cloth": cloth}
 
 
 def _color(red: float, green: float, blue: float) -> Tensor:

@@ -18,7 +18,7 @@ FOCAL, WIDTH, HEIGHT = 54.0, 64, 48
 WRIST = 2
 
 
-@pytest.fixture(scope="module", params=["bowel-wristed", "stomach-wristed", "bowel-sliding"])
+@pytest.fixture(scope="module", params=["bowel-wristed", "stomach-wristed", "cloth-wristed", "bowel-sliding"])
 def capture(request: pytest.FixtureRequest, benchmarks: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eleven frames of a scene."""
     from rendered.frames import Settings
@@ -70,7 +70,7 @@ def test_what_is_seen_lies_on_the_link_that_it_is_labelled_as(capture: Path) -> 
             gaps = solids[link](torch.from_numpy(local).float())
             assert gaps.abs().numpy().max(initial=0.0) < 0.12, (frame["file_path"], link)
             seen[link] += len(local)
-    assert min(seen.values()) > 5, seen
+    assert min(seen.values()) > 2, seen
 
 
 def test_axes_and_pivots_are_stated_as_wrongly_as_said(capture: Path) -> None:
@@ -104,7 +104,7 @@ def test_readings_err_by_their_offsets_play_and_noise(capture: Path) -> None:
         assert errors.std() > 0
 
 
-@pytest.mark.parametrize("scene", ["bowel-wristed", "stomach-wristed", "bowel-sliding"])
+@pytest.mark.parametrize("scene", ["bowel-wristed", "stomach-wristed", "cloth-wristed", "bowel-sliding"])
 def test_the_wrist_goes_beyond_its_training_range_in_unseen_frames_only(benchmarks: ModuleType, scene: str) -> None:
     from rendered.motion import plan
     from rendered.scenes import SCENES

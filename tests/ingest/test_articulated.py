@@ -13,6 +13,7 @@ from wristed_world import shifted
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.errors import NeecoError
+from neeco.fitting.link_silhouette import ArticulatedModel, joint_values, with_motion
 from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.articulated import ArticulatedMotion, find_articulated_base
 from neeco.ingest.registration.articulated_fit import (
@@ -23,7 +24,6 @@ from neeco.ingest.registration.articulated_fit import (
     fit_articulated,
     with_pose_errors,
 )
-from neeco.ingest.registration.articulated_model import ArticulatedModel, joint_values, with_motion
 from neeco.ingest.registration.silhouette_fit import BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
+from neeco.geometry.trocar import line_through_trocar
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
@@ -22,7 +23,6 @@ from neeco.ingest.registration.layers import (
     LayerModel,
     evenly_lit,
     fit_layers,
-    line_through_trocar,
 )
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
 from neeco.ingest.timing.clock_search import GIVEN, ClockOffset

@@ -15,6 +15,7 @@ from neeco.methods.kinematic import wrist
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.kinematic.finish import conclude, extend_shaft, finalise_links, shaft_coverage
 from neeco.methods.kinematic.hinges import Hinges
+from neeco.methods.kinematic.interiors import fade_interior_tissue
 from neeco.methods.kinematic.wrist import color_boundary, measure_radius, place_wrists, refine_wrists
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
@@ -285,3 +286,21 @@ def test_a_scene_is_stored_with_its_links_settled(session: GaussianSession) -> N
     assert bool(beyond.any())
     assert not bool((links[beyond] == 0).any())
     assert torch.equal(settled.extras[LINK_LOGITS][: rows.start], logits[: rows.start])
+
+
+def test_tissue_is_never_inside_a_shaft(session: GaussianSession) -> None:
+    scene = session.scene
+    before = scene.canonical.opacity_logits.clone()
+    fade_interior_tissue(session, scene.deformation)
+    assert torch.equal(scene.canonical.opacity_logits, before)  # the wall is behind the shaft
+    pose = session.corrected(0)[0].instruments[scene.instruments[0].name].pose.float()
+    start, direction = hinges_of(session).shaft()
+    with torch.no_grad():
+        axis = pose[:3, :3] @ (start + (PIVOT_MM - 15) * direction) + pose[:3, 3]
+        scene.canonical.means[0], scene.canonical.means[1] = axis, axis + 10 * pose[:3, 0]
+    fade_interior_tissue(session, scene.deformation)
+    assert torch.equal(scene.canonical.opacity_logits, before)  # the state of this one frame may be wrong
+    session.given = [session.given[0]] * len(session.given)
+    fade_interior_tissue(session, scene.deformation)
+    assert float(torch.sigmoid(scene.canonical.opacity_logits[0])) < 0.01
+    assert torch.equal(scene.canonical.opacity_logits[1:], before[1:])

@@ -40,13 +40,25 @@ class StillScene:
 
     metal: tuple[float, float, float] = METAL
     side: tuple[float, ...] = tuple(SHADE * value for value in TISSUE)
+    wrist: tuple[float, float, float] | None = None  # a third stripe, the instrument's second part
     diagnostics: dict[str, Any] = field(default_factory=dict)
+    label_names = (("tool", "shaft"), ("tool", "wrist"))
     label_threshold: float | None = None
 
     def __post_init__(self) -> None:
         stripes = [flat((-14.0, 4.0), 58.0, self.metal), flat((4.0, 6.0), 58.0, self.side)]  # type: ignore[arg-type]
         self.metal_count = len(stripes[0])
+        self.shaft_count = sum(map(len, stripes))
+        if self.wrist is not None:
+            stripes.append(flat((-34.0, -16.0), 58.0, self.wrist))
         self.canonical = join_bodies([flat((-36.0, 36.0), 60.0, TISSUE), self.joined(stripes)])
+
+    def label_channels(self) -> Tensor:
+        channels = torch.zeros(len(self.canonical), 2)
+        instrument = channels[self.canonical.body(1)]
+        instrument[: self.shaft_count, 0] = 1
+        instrument[self.shaft_count :, 1] = 1
+        return channels
 
     @staticmethod
     def joined(stripes: list[CanonicalGaussians]) -> CanonicalGaussians:
@@ -108,3 +120,17 @@ def test_where_colours_do_not_tell_everything_stays_as_it_was(metal: tuple[float
     assert scene.canonical is before
     assert scene.label_threshold is None
     assert scene.diagnostics["label_shares"]["inside"] < module.MIN_INSIDE
+
+
+def test_a_wrist_that_mirrors_the_tissue_does_not_make_the_shafts_shadow_instrument() -> None:
+    scene = StillScene(wrist=(0.5 * TISSUE[0], 0.5 * TISSUE[1], 0.5 * TISSUE[2]))
+    store_label_shares(session_of(scene))
+    assert scene.diagnostics["label_shares"]["inside"] < module.MIN_INSIDE
+    instrument = scene.canonical.body(1)
+    share, points = scene.canonical.extras[LABEL_SHARE][instrument], scene.canonical.means[instrument]
+    metal, shadow, wrist = share.tensor_split([scene.metal_count, scene.shaft_count])
+    place = points[scene.metal_count : scene.shaft_count]
+    assert float(metal.min()) > 0.9
+    assert float(shadow[(place[:, 0] > 4.5) & (place[:, 1].abs() < 25)].max()) < 0.1
+    assert bool((wrist == 1).all())
+    assert scene.label_threshold == 0.5

@@ -73,9 +73,8 @@ def test_states_that_say_how_sure_they_are_are_corrected_accordingly() -> None:
     refinement = Refinement(config, (unsure, *plain[1:]), (Instrument("rod"),), CPU)
     usual = Refinement(config, plain, (Instrument("rod"),), CPU)
     expected = [*torch.tensor([0.25, 1.0, 20.0]).deg2rad().tolist(), 3.0, 0.2, 0.1]
-    assert refinement.prior_sigma[0, 0].tolist() == pytest.approx(expected, rel=1e-4)
-    assert torch.equal(refinement.prior_sigma[1:], usual.prior_sigma[1:])
-    assert refinement.rates["poses"][0, 0, 2] == pytest.approx(10 * config.rotation_rate)
+    assert refinement.pose_sd[0, 0].tolist() == pytest.approx(expected, rel=1e-4)
+    assert torch.equal(refinement.pose_sd[1:], usual.pose_sd[1:])
     for corrected in (refinement, usual):
         corrected.poses += 0.1
     penalties = [item.apply(0, unsure.state, CAMERA, 1)[2] for item in (refinement, usual)]
@@ -109,7 +108,7 @@ def test_readings_are_corrected_once_for_all_cameras_of_an_instant() -> None:
     assert refinement.found(recorded, (instrument,)) is recorded  # what was recorded stays
 
 
-def on_one_scope(apart: bool) -> tuple[tuple[Frame, ...], Instrument]:
+def on_scopes(apart: bool) -> tuple[tuple[Frame, ...], Instrument]:
     """`seen_twice` by the two cameras of a stereo scope, or by cameras of scopes that stand apart."""
     frames, instrument = seen_twice()
     right = torch.eye(4, dtype=torch.float64)
@@ -120,8 +119,8 @@ def on_one_scope(apart: bool) -> tuple[tuple[Frame, ...], Instrument]:
 
 
 @pytest.mark.parametrize("apart", [False, True], ids=["stereo scope", "scopes apart"])
-def test_poses_are_corrected_once_for_both_cameras_of_a_stereo_scope(apart: bool) -> None:
-    frames, instrument = on_one_scope(apart)
+def test_a_state_is_corrected_once_for_all_cameras_of_an_instant(apart: bool) -> None:
+    frames, instrument = on_scopes(apart)
     refinement = Refinement(RefineConfig(frame_poses=True, start=0), frames, (instrument,), CPU)
     state, _, _ = refinement.apply(4, frames[4].state, CAMERA, 1)
     state.instruments["rod"].pose[0, 3].backward()
@@ -134,7 +133,7 @@ def test_poses_are_corrected_once_for_both_cameras_of_a_stereo_scope(apart: bool
 
     shifts = [moved(frame) for frame in range(12)]
     assert shifts[4] < 0
-    assert shifts[5] == pytest.approx(0.0 if apart else shifts[4], abs=1e-7)
+    assert shifts[5] == pytest.approx(shifts[4], abs=1e-7)
     assert shifts[:4] + shifts[6:] == pytest.approx([0.0] * 10, abs=1e-7)
     refinement.center()  # of the one instant seen, nothing is left
     assert moved(4) == pytest.approx(0.0, abs=1e-7)
@@ -177,3 +176,33 @@ def test_a_joint_that_nobody_recorded_follows_the_instants_beside() -> None:
     before, after = (refinement.apply(k, frames[k].state, CAMERA, 1)[2] for k in (4, 8))
     assert float(before.detach()) > 0
     assert float(after) == 0
+
+
+@pytest.mark.parametrize("stated", [True, False], ids=["stated links", "hinges to be found"])
+def test_a_state_that_is_set_holds_from_the_first_step_on_and_draws_what_is_learned(stated: bool) -> None:
+    frames, instrument = on_scopes(apart=False)
+    instrument = instrument if stated else replace(instrument, kinematics=None)
+    config = RefineConfig(frame_poses=True, frame_joints=True, start=400)
+    refinement = Refinement(config, frames, (instrument,), CPU)
+    pose = frames[4].state.instruments["rod"].pose.clone()
+    pose[:3, 3] += torch.tensor([1.0, 2.0, 3.0])
+    moved = State({"rod": InstrumentState(pose, {"jaw": 0.8})}, frames[4].state.time)
+    deviations = torch.tensor([0.01] * 3 + [0.1] * 3 + [0.02], dtype=torch.float64)
+    refinement.set_state(4, frames[4].state, moved, deviations)
+    assert torch.allclose(refinement.deviations(4), deviations)
+    for iteration in (1, 500):
+        found, _, penalty = refinement.apply(5, frames[5].state, CAMERA, iteration)  # the scope's other camera
+        assert torch.allclose(found.instruments["rod"].pose.double().detach(), pose, atol=1e-5)
+        assert float(torch.as_tensor(found.instruments["rod"].joints["jaw"]).detach()) == pytest.approx(0.8)
+    assert penalty is not None
+    assert float(penalty.detach()) == 0  # the prior is about what was set
+    assert refinement.apply(6, frames[6].state, CAMERA, 1)[0] is frames[6].state
+    recorded = Recorded.of(frames, (instrument,))
+    kept = refinement.to_json(recorded)[frames[4].name]
+    assert kept["fitted"]
+    assert kept["instruments"]["rod"]["joints"]["jaw"] == pytest.approx(0.8)
+    assert kept["instruments"]["rod"]["uncertainty"]["translation_mm"] == pytest.approx([0.1] * 3)
+    states = refinement.found(recorded, (instrument,)).states
+    assert states[4].instruments["rod"].joints["jaw"] == pytest.approx(0.8)
+    assert isinstance(states[4].instruments["rod"].joints["jaw"], float)  # as files need it
+    assert states[6].instruments["rod"].joints["jaw"] == 0.5

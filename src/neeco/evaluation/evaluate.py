@@ -15,6 +15,7 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
+from neeco.evaluation.cast_shadow import labelled_shadow, load_shadow, rendered_shadow
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
 from neeco.evaluation.mask_folders import ReferenceMask, load_reference, truth_names
@@ -33,7 +34,7 @@ from neeco.fitting.alignment import align_frame, pose_changes
 from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
 from neeco.raster.native import synchronise
-from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
+from neeco.scene.gaussian_scene import GaussianScene, is_gaussian, require_gaussians
 
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene
@@ -66,13 +67,14 @@ class _Context:
     coverage: Mapping[str | None, Coverage]  # by tissue; None: there is one
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Recorded:
     """A recorded frame with all that scoring needs, for the given and the aligned rendering."""
 
     image: Tensor  # [H, W, 3] in [0, 1]
     mask: Tensor | None  # [H, W] bool, False where pixels do not count
     reference: ReferenceMask | None
+    shaft: Tensor | None  # [H, W] bool, where the reference tells parts
     unobserved: Tensor  # [H, W] bool, tissue that no training frame observed
     tissue: Tensor  # [H, W] bool
     features: dict[str, list[Tensor]]  # LPIPS features by network name
@@ -166,7 +168,16 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
     image, mask = frame.load_image(), frame.load_mask()
     networks = context.networks if min(image.shape[:2]) >= MIN_SIZE else {}
     features = {name: network.features(image) for name, network in networks.items()}
-    recorded = _Recorded(image, mask, reference, unobserved, tissue, features)
+    recorded = _Recorded(
+        image=image,
+        mask=mask,
+        reference=reference,
+        shaft=_shaft(reference, truth_names(context.capture.root)),
+        unobserved=unobserved,
+        tissue=tissue,
+        features=features,
+    )
+    true_shadow = load_shadow(context.capture, frame)
     for kind, tally in tallies.items():
         row: dict[str, Any] = {"frame": frame.name}
         state, camera = frame.state, frame.camera
@@ -179,14 +190,27 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
             row["joints"] = {name: dict(item.joints) for name, item in state.instruments.items()}
             row["world_from_instrument"] = {name: item.pose.tolist() for name, item in state.instruments.items()}
         drawing = draw(scene, state, camera)
-        tally.scores.append(_scores(drawing, recorded, networks))
+        shadow = true_shadow
+        if shadow is None and reference is not None and is_gaussian(scene):
+            shadow = rendered_shadow(scene, state, camera)
+        tally.scores.append(_scores(drawing, recorded, shadow, networks))
         tally.rows.append(row | tally.scores[-1])
         if drawing.parts is not None and reference is not None and reference.parts is not None:
             ours = to_truth_ids(drawing.parts, scene.label_names, tally.parts.names)
             tally.parts.add(ours, reference.parts, mask)
 
 
-def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]) -> dict[str, float | None]:
+def _shaft(reference: ReferenceMask | None, names: Mapping[int, str]) -> Tensor | None:
+    """Return the true shaft's pixels, bool [H, W]; None where the reference does not tell parts."""
+    number = next((number for number, part in names.items() if part == "shaft"), None)
+    if reference is None or reference.parts is None or number is None:
+        return None
+    return reference.parts == number
+
+
+def _scores(
+    drawing: Drawing, recorded: _Recorded, shadow: Tensor | None, networks: Mapping[str, Lpips]
+) -> dict[str, float | None]:
     """Return the scores of one frame; None where there is nothing to compare with."""
     image, target, mask, reference = drawing.image, recorded.image, recorded.mask, recorded.reference
     counted = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
@@ -206,6 +230,10 @@ def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]
         "mask_dice": None if labelled is None else dice(*labelled, counted),
         "mask_precision": None if labelled is None else precision(*labelled, counted),
         "mask_recall": None if labelled is None else precision(*labelled[::-1], counted),
+        "shaft_recall": precision(recorded.shaft, labelled[0], counted)
+        if labelled and recorded.shaft is not None
+        else None,
+        "shadow_labelled": labelled_shadow(*labelled, shadow, counted) if labelled and shadow is not None else None,
         "psnr_covered": psnr(image, target, counted & ~recorded.unobserved),
         "psnr_uncovered": psnr(image, target, counted & recorded.unobserved),
         "covered_fraction": 1.0 - int((recorded.unobserved & counted).sum()) / tissue if tissue else None,

@@ -206,11 +206,12 @@ class TissueRenderer:
 
 def _without_tissue(scene: GaussianScene) -> GaussianScene:
     """Return a scene of the instruments alone: the same modules, Gaussians of its own."""
-    scene.visibility()  # measured on the whole scene, where training did not store it
     tissue, *others = scene.canonical.counts
-    tensors = {name: tensor[tissue:].contiguous() for name, tensor in scene.canonical.tensors().items()}
+    tensors = {name: tensor[tissue:].detach().contiguous() for name, tensor in scene.canonical.tensors().items()}
     own = CanonicalGaussians.from_tensors(tensors, (0, *others))
     alone = GaussianScene(scene.method, own, scene.deformation, scene.instruments, scene.recorded, scene.center)
     alone.load_state_dict(scene.state_dict())
     alone.sh_degree = scene.sh_degree
-    return alone.to(scene.center.device).requires_grad_(False)
+    for parameter in alone.parameters(recurse=False):  # the modules are the scene's, which may be training
+        parameter.requires_grad_(False)
+    return alone

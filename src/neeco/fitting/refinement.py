@@ -23,7 +23,9 @@ from neeco.scene.deformation import log_linear
 from neeco.scene.drawable import Recorded
 
 LEARNED = ("poses", "joints", "cameras", "latency")
-STATE = (*LEARNED, "frame_steps")  # tensors of a checkpoint, without the moments
+PRIORS = ("pose_mean", "joint_mean", "pose_sd", "joint_sd")
+STATE = (*LEARNED, *PRIORS, "frame_steps", "fitted", "weights")  # tensors of a checkpoint, without the moments
+ON_CPU = ("frame_steps", "fitted", "weights")  # read in every step
 MM_PER_RAD = 20.0  # motion of a prismatic joint that counts as much as 1 rad of a revolute one
 MAX_SPEEDUP = 10.0  # of the learning rates where a pose is less certain than usual
 MIN_DEVIATION = 1e-4  # rad, mm: a standard deviation of 0 would hold a pose for ever
@@ -62,17 +64,18 @@ class Refinement:
     latency in s.
 
     Readings of joints in stated kinematics are corrected in rad or mm. Those that nobody recorded start half way
-    between their limits and are smooth in time. Both are corrected once for all frames of one instant, as several
-    cameras observe it. Poses are corrected once for both images of a stereo scope, P in total; where scopes stand
-    apart, every image has its own, which absorbs errors of the cameras. Tensors: `poses` [P, I, 6], `joints`
-    [instants, R], `cameras` [F, 6], `latency` [1].
+    between their limits and are smooth in time. A state is corrected once for all frames of one instant, as several
+    cameras observe it: errors of single cameras are not what differs between instants. Tensors: `poses` [P, I, 6] of P
+    instants, `joints` [P, R], `cameras` [F, 6], `latency` [1]; of the priors on the first two `pose_mean`, `pose_sd`,
+    `joint_mean`, `joint_sd`; `fitted` [F] bool: frames whose state was set (`set_state`); `weights` [F] of frames in
+    the loss.
     """
 
     def __init__(
         self, config: RefineConfig, frames: tuple[Frame, ...], instruments: tuple[Instrument, ...], device: torch.device
     ) -> None:
         self.config = config
-        self.layout = StateParameters(tuple(map(InstrumentParameters.of, instruments)))
+        self.layout = StateParameters(tuple(map(_parameters_of, instruments)))
         items = self.layout.instruments
         names = tuple(item.name for item in items)
         self.readings = tuple((item.name, reading) for item in items for reading in item.joints)
@@ -80,10 +83,13 @@ class Refinement:
         self.unrecorded = torch.tensor(
             [reading in missing for reading in self.readings], dtype=torch.bool, device=device
         )  # [R]
-        self.instants, self.neighbours = _instants(frames, names)
-        self.pose_rows = _numbered(
-            [(instant, _scope(frame)) for instant, frame in zip(self.instants, frames, strict=True)]
+        stated = {item.name for item in instruments if item.kinematics is not None}
+        # places in the readings of those whose motion is stated; others are corrected by `set_state` alone
+        self.learned = torch.tensor(
+            [place for place, (name, _) in enumerate(self.readings) if name in stated], dtype=torch.int64, device=device
         )
+        self.instants, self.neighbours = _instants(frames, names)
+        self.pose_rows = self.instants
         self.frames_of_pose = _members(self.pose_rows)
         first = tuple(frames[shown[0]] for shown in self.frames_of_pose)
         tissues = _members(_numbered([frame.state.tissue for frame in first]))
@@ -99,7 +105,9 @@ class Refinement:
             for order in ("first", "second")
             for name in LEARNED
         }
-        self.frame_steps = torch.zeros(len(frames))  # on the CPU: read in every step
+        self.pose_mean, self.joint_mean = torch.zeros_like(self.poses), torch.zeros_like(self.joints)
+        self.frame_steps, self.weights = torch.zeros(len(frames)), torch.ones(len(frames))
+        self.fitted = torch.zeros(len(frames), dtype=torch.bool)
         self._leaves: dict[str, Tensor] = {}
 
     def _set_priors_and_rates(self, frames: tuple[Frame, ...], first: tuple[Frame, ...], device: torch.device) -> None:
@@ -107,21 +115,23 @@ class Refinement:
         config, items = self.config, self.layout.instruments
         usual_pose_sd = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3)
         priors = _pose_priors(first, tuple(item.name for item in items), usual_pose_sd)  # [P, I, 6]
-        self.camera_sigma, self.prior_sigma = usual_pose_sd.to(device), priors.to(device)
+        self.camera_sigma, self.pose_sd = usual_pose_sd.to(device), priors.to(device)
         slides = [slides for item in items for slides in item.slides]
         per_rad = torch.tensor([MM_PER_RAD if each else 1.0 for each in slides], device=device)
         usual_joint_sd = per_rad * torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
-        self.joint_sigma = usual_joint_sd.repeat(len(self.neighbours), 1)  # [instants, R] rad or mm
+        self.usual_joint_sd = usual_joint_sd  # [R]
+        self.joint_sd = usual_joint_sd.repeat(len(self.neighbours), 1)  # [P, R] rad or mm
         for frame, instant in zip(frames, self.instants, strict=True):
             for column, ((name, reading), slide) in enumerate(zip(self.readings, slides, strict=True)):
                 stated = frame.state.instruments[name].uncertainty
                 if stated is not None and reading in stated.joints_deg:
                     deviation = stated.joints_deg[reading]
                     own = deviation if slide else math.radians(deviation)
-                    self.joint_sigma[instant, column] = max(own, MIN_DEVIATION)
+                    self.joint_sd[instant, column] = max(own, MIN_DEVIATION)
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
-            "poses": (rates * (priors / usual_pose_sd).clamp(1, MAX_SPEEDUP)).to(device),
+            # multiplied where states are less certain than usual
+            "poses": rates.to(device),
             "joints": per_rad * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
             "cameras": (rates * config.camera_rate).to(device),
             "latency": torch.tensor(config.latency_rate, device=device),
@@ -132,28 +142,91 @@ class Refinement:
         self._leaves = {}
         config, instruments = self.config, self.layout.instruments
         if iteration < config.start:
-            return state, camera, None
+            return self.state(index, state) if self.fitted[index] else state, camera, None
         penalties, instant, row = [], self.instants[index], self.pose_rows[index]
         if instruments and (config.frame_poses or config.latency or config.frame_joints):
             offset = self.latency.new_zeros(len(instruments), 6)
             if config.frame_poses:
                 leaf = self._leaf("poses", self.poses[row])
                 offset = offset + leaf
-                penalties.append(self._prior(leaf, self.prior_sigma[row]))
+                penalties.append(self._prior(leaf - self.pose_mean[row], self.pose_sd[row]))
             if config.latency:
                 offset = offset + self.velocities[row] * self._leaf("latency", self.latency)
             joints: Sequence[Sequence[Any]] | None = None
-            if config.frame_joints and self.readings:
+            if config.frame_joints and len(self.learned):
                 leaf = self._leaf("joints", self.joints[instant])
-                expected = torch.where(self.unrecorded, self.joints[self.neighbours[instant]].mean(0), 0.0)
-                penalties.append(self._prior(leaf - expected, self.joint_sigma[instant]))
-                joints = [tuple(changes) for changes in leaf.split([len(item.joints) for item in instruments])]
+                free = self.unrecorded & ~self.fitted[index].to(self.unrecorded.device)
+                expected = torch.where(free, self.joints[self.neighbours[instant]].mean(0), self.joint_mean[instant])
+                learned = self.learned if len(self.learned) < len(self.readings) else slice(None)
+                penalties.append(self._prior((leaf - expected)[learned], self.joint_sd[instant][learned]))
+                joints = self._of_instruments(leaf)
+            elif self.fitted[index] and self.readings:
+                joints = self._of_instruments(self.joints[instant])
             state = self.layout.moved_by_parts(state, list(offset), joints)
         if config.cameras:
             leaf = self._leaf("cameras", self.cameras[index])
             camera = moved_camera(camera, leaf)
             penalties.append(self._prior(leaf, self.camera_sigma))
         return state, camera, reduce(add, penalties) if penalties else None
+
+    @torch.no_grad()
+    def state(self, index: int, given: State) -> State:
+        """Return the recorded state `given` of frame `index` as corrected so far, at any iteration."""
+        offset = self.poses[self.pose_rows[index]] + self.velocities[self.pose_rows[index]] * self.latency
+        parts = self._of_instruments(self.joints[self.instants[index]]) if self.readings else None
+        joints = None if parts is None else [[float(change) for change in part] for part in parts]
+        moved = self.layout.moved_by_parts(given, list(offset), joints)
+        instruments = {
+            name: replace(own, pose=own.pose.to(given.instruments[name].pose))
+            for name, own in moved.instruments.items()
+        }
+        return replace(moved, instruments=instruments)
+
+    @torch.no_grad()
+    def set_state(self, index: int, given: State, state: State, deviations: Tensor) -> None:
+        """Correct the recorded state `given` of frame `index` to `state`, from iteration 0 on, and of all frames that
+        share its pose or joints.
+
+        deviations [S] of `layout` (rad, mm): standard deviations of `state`, about which the prior is from now on.
+        """
+        row, instant = self.pose_rows[index], self.instants[index]
+        pose, joints = self._parts(self.layout.increments_between(given, state))
+        self.poses[row] = pose - self.velocities[row] * self.latency
+        self.pose_mean[row] = self.poses[row]
+        if self.readings:
+            self.joints[instant] = self.joint_mean[instant] = joints
+        self.set_deviations(index, deviations)
+        for name, place in (("poses", row), ("joints", instant)):
+            for order in ("first", "second"):  # gradients at the former state
+                self.moments[f"{order}.{name}"][place] = 0
+        self.fitted[self.frames_of_pose[row]] = True
+
+    @torch.no_grad()
+    def set_deviations(self, index: int, deviations: Tensor) -> None:
+        """Set the standard deviations [S] of `layout` (rad, mm) of the prior on the corrections of frame `index`."""
+        pose, joints = self._parts(deviations.clamp(min=MIN_DEVIATION))
+        self.pose_sd[self.pose_rows[index]] = pose
+        if self.readings:
+            self.joint_sd[self.instants[index]] = joints
+
+    def deviations(self, index: int) -> Tensor:
+        """Return the standard deviations [S] float64 of `layout` of the prior on the corrections of frame `index`."""
+        found = torch.empty(self.layout.size, dtype=torch.float64)
+        joints = self.joint_sd[self.instants[index]].split([len(item.joints) for item in self.layout.instruments])
+        for number, (rows, joint_rows) in enumerate(self.layout.rows):
+            found[rows] = self.pose_sd[self.pose_rows[index], number].cpu().double()
+            found[joint_rows] = joints[number].cpu().double()
+        return found
+
+    def _parts(self, vector: Tensor) -> tuple[Tensor, Tensor]:
+        """Return poses [I, 6] and joints [R] of a vector [S] of `layout`."""
+        poses, joints = zip(*self.layout.rows, strict=True)
+        both = torch.stack([vector[rows] for rows in poses]), torch.cat([vector[rows] for rows in joints])
+        return both[0].to(self.poses), both[1].to(self.poses)
+
+    def _of_instruments(self, joints: Tensor) -> list[tuple[Tensor, ...]]:
+        """Return joints [R] as those of every instrument."""
+        return [tuple(changes) for changes in joints.split([len(item.joints) for item in self.layout.instruments])]
 
     def _leaf(self, name: str, values: Tensor) -> Tensor:
         """Return a copy of learned values that takes a gradient."""
@@ -183,8 +256,14 @@ class Refinement:
                 continue
             row, steps = rows[name]
             first, second = self.moments[f"first.{name}"][row], self.moments[f"second.{name}"][row]
+            if name == "joints" and len(self.learned) < len(self.readings):
+                leaf.grad[~torch.isin(torch.arange(len(leaf)).to(self.learned), self.learned)] = 0
             update = adam_update(leaf.grad, first, second, steps, (0.9, 0.99), 1e-12)
-            rate = self.rates[name][row] if name == "poses" else self.rates[name]
+            rate = self.rates[name]
+            if name == "poses":
+                rate = rate * (self.pose_sd[row] / self.camera_sigma).clamp(1, MAX_SPEEDUP)
+            elif name == "joints":
+                rate = rate * (self.joint_sd[row] / self.usual_joint_sd).clamp(1, MAX_SPEEDUP)
             getattr(self, name)[row] -= decay * rate * update
         self._leaves = {}
 
@@ -203,10 +282,12 @@ class Refinement:
             self.cameras[used] -= self.cameras[used].mean(0)
 
     def found(self, recorded: Recorded, instruments: tuple[Instrument, ...]) -> Recorded:
-        """Return the recording with unrecorded joints as estimated, within their limits."""
-        if not bool(self.unrecorded.any()):
+        """Return the recording with unrecorded joints as estimated, within their limits, and fitted states as such."""
+        if not bool(self.unrecorded.any() | self.fitted.any()):
             return recorded
-        states = list(recorded.states)
+        states = [
+            self.state(index, given) if self.fitted[index] else given for index, given in enumerate(recorded.states)
+        ]
         for item in instruments:
             for reading in item.unrecorded:
                 column = self.readings.index((item.name, reading))
@@ -220,6 +301,33 @@ class Refinement:
                     )
         return replace(recorded, states=tuple(states))
 
+    def to_json(self, recorded: Recorded) -> dict[str, Any]:
+        """Return the corrected state of every training frame, with its standard deviations as `uncertainty`, and
+        whether it was fitted to the image (`fitted`; else the deviations are the prior's)."""
+        found: dict[str, Any] = {}
+        for index, (name, given, camera) in enumerate(
+            zip(recorded.names, recorded.states, recorded.cameras, strict=True)
+        ):
+            state, deviations = self.state(index, given), self.deviations(index)
+            instruments: dict[str, Any] = {}
+            for item, (pose, joints) in zip(self.layout.instruments, self.layout.rows, strict=True):
+                own = state.instruments[item.name]
+                turn = camera.world_from_camera[:3, :3].cpu().double().T @ own.pose[:3, :3].cpu().double()
+                shifts = (turn.square() @ deviations[pose][3:].square()).sqrt()  # along the camera's axes
+                units = [value if slides else math.degrees(value)
+                         for value, slides in zip(deviations[joints].tolist(), item.slides, strict=True)]  # fmt: skip
+                instruments[item.name] = {
+                    "pose": own.pose.cpu().double().tolist(),
+                    "joints": {joint: float(value) for joint, value in own.joints.items()},
+                    "uncertainty": {
+                        "translation_mm": shifts.tolist(),
+                        "rotation_deg": deviations[pose][:3].rad2deg().tolist(),
+                        "joints_deg": dict(zip(item.joints, units, strict=True)),
+                    },
+                }
+            found[name] = {"instruments": instruments, "fitted": bool(self.fitted[index])}
+        return found
+
     def tensors(self) -> dict[str, Tensor]:
         """Return everything that changes, for a checkpoint."""
         return {name: getattr(self, name) for name in STATE} | self.moments
@@ -230,8 +338,14 @@ class Refinement:
             if tensors[name].shape != tensor.shape:
                 raise ValueError(f"{name}: {list(tensors[name].shape)}, not {list(tensor.shape)}")
         for name in STATE:
-            setattr(self, name, tensors[name].cpu() if name == "frame_steps" else tensors[name])
+            setattr(self, name, tensors[name].cpu() if name in ON_CPU else tensors[name])
         self.moments = {name: tensors[name] for name in self.moments}
+
+
+def _parameters_of(instrument: Instrument) -> InstrumentParameters:
+    """Return the parameters of an instrument's pose and its joints, in stated kinematics or all of them."""
+    joints = tuple(instrument.joints) if instrument.kinematics is None else tuple(instrument.kinematics.readings)
+    return InstrumentParameters(name=instrument.name, joints=joints, slides=tuple(map(instrument.slides, joints)))
 
 
 def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[list[int], list[list[int]]]:
@@ -270,13 +384,6 @@ def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual_sd
             turns = torch.tensor(stated.rotation_deg, dtype=torch.float64).deg2rad()
             priors[row, k] = torch.cat([turns, shifts]).clamp(min=MIN_DEVIATION).float()
     return priors
-
-
-def _scope(frame: Frame) -> bytes:
-    """Return a key that differs between scopes: the pose of their lamps."""
-    camera = frame.camera
-    lamps = camera.world_from_camera if camera.world_from_lamps is None else camera.world_from_lamps
-    return lamps.detach().cpu().double().numpy().tobytes()
 
 
 def _numbered(keys: Sequence[Hashable]) -> list[int]:

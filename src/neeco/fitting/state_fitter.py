@@ -92,6 +92,7 @@ class Fitter(Generic[P]):
     instruments: InstrumentRenderer
     parameters: P
     tissue: TissueRenderer
+    correlation_px: float = CORRELATION_PX  # more where the scene's own errors correlate, too
 
     def view(self, frame: Frame, state: State | None) -> FrameView:
         """Return a frame at the size worked on, over tissue with the shadow of instruments in `state` (None: none)."""
@@ -122,7 +123,7 @@ class Fitter(Generic[P]):
             crop = self.crop_around(view, parameters.moved(expected, increments))
             if crop is None:
                 return None
-            residual = residual_of(crop, level)
+            residual = residual_of(crop, level, self.correlation_px)
             for first in range(0, count, STEPS_AT_ONCE):
                 crop = self.with_shadow(crop, parameters.moved(expected, increments))
                 problem = _CropProblem(self, crop, level, residual, expected, precision)
@@ -168,7 +169,7 @@ class Fitter(Generic[P]):
     def _explained(self, view: FrameView, state: State) -> tuple[float, float]:
         """Return `gain` and `misfit` (see `StateFit`) of a state before a view that holds all of the instruments."""
         color, alpha = self.instruments.render(state, view.camera)
-        residual = residual_of(view, 1.0)
+        residual = residual_of(view, 1.0, self.correlation_px)
         with_it, without = (
             residual.errors(image).sum(2) for image in (composite(color, alpha, view.tissue), view.tissue)
         )
@@ -196,9 +197,11 @@ def widened(mask: Tensor, pixels: int) -> Tensor:
     return torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), square) > 0)
 
 
-def residual_of(view: FrameView, size: float) -> ImageResidual:
-    """Return the residual of a view reduced to `size` times its size, of the same weight at any size."""
-    scale = size**-2 / (HUBER**2 * CORRELATION_PX * 3)
+def residual_of(view: FrameView, size: float, correlation_px: float = CORRELATION_PX) -> ImageResidual:
+    """Return the residual of a view reduced to `size` times its size, of the same weight at any size.
+
+    correlation_px: pixels of the full size that count as one observation."""
+    scale = size**-2 / (HUBER**2 * correlation_px * 3)
     weight = torch.where(downsampled(view.weight[..., None], size)[..., 0] > 0.99, 1.0, 0.0)
     return ImageResidual(downsampled(view.image, size), weight, HUBER, scale)
 

@@ -10,6 +10,12 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
+def frame_about(axis: np.ndarray) -> np.ndarray:
+    """[3, 3] with unit columns across, across and along the axis."""
+    first = unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
+    return np.stack([first, np.cross(axis, first), axis], -1)
+
+
 def across_projectors(directions: np.ndarray) -> np.ndarray:
     """Projectors [N, 3, 3] that remove the component along unit directions [N, 3]."""
     return np.asarray(np.eye(3) - directions[:, :, None] * directions[:, None, :])

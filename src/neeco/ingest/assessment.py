@@ -10,8 +10,8 @@ import numpy as np
 
 from neeco.capture.documents import Problem
 from neeco.capture.model import UNKNOWN_DEG, Capture
+from neeco.geometry.lines import frame_about
 from neeco.ingest.registration.base import BaseRegistration
-from neeco.ingest.registration.silhouette_model import frame_about
 from neeco.ingest.result import IngestResult
 from neeco.plausible import FEW_TRAIN_FRAMES
 

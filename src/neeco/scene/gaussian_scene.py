@@ -26,6 +26,7 @@ from neeco.scene.canonical import SH_COEFFICIENTS, TISSUE, CanonicalGaussians
 from neeco.scene.deformation import UNPERTURBED, Deformation, Deltas, Perturbation
 from neeco.scene.drawable import ArticulatedMotion, DrawableScene, Recorded, Skeleton
 from neeco.scene.method import Stored
+from neeco.scene.state_corrections import StateCorrections
 from neeco.scene.visibility import VISIBILITY, measure_visibility, unobserved_share
 
 MAX_LAMPS = 3  # as many as a laparoscope has light guides
@@ -47,7 +48,8 @@ class GaussianScene(nn.Module):
     in mm, log scale about `center`), applied to every instrument pose; zero unless refined. Several tissues have one
     each, [T, 7], always refined: an instrument's shape absorbs the constant error of one world, but not of several.
     `base_corrections` [I, 6] correct each instrument's poses before that (rotation vector in rad about `center`,
-    translation in mm): the error of its robot's base, zero unless found from the images.
+    translation in mm): the error of its robot's base, zero unless found from the images. Before both,
+    `state_corrections` correct poses and readings by what depends on the state.
     `falloff` (tissue, instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`,
     `shadow_strengths` (0: no such lamp) and `shadow_width` the instruments' shadows on the tissue (see `Shadow`).
     `background` in [0, 1] is the grey behind everything. `label_threshold` in (0, 1) is the share of a pixel from which
@@ -83,6 +85,7 @@ class GaussianScene(nn.Module):
         zeros = partial(torch.zeros, device=device)
         self.registration = nn.Parameter(zeros(*center.shape[:-1], 7))
         self.base_corrections = nn.Parameter(zeros(len(instruments), 6))
+        self.state_corrections = StateCorrections(instruments, device)
         self.falloff = nn.Parameter(zeros(2))
         self.vignette = nn.Parameter(zeros(2))
         self.shadow_offsets = nn.Parameter(zeros(MAX_LAMPS, 3))
@@ -218,12 +221,12 @@ class GaussianScene(nn.Module):
         return Shadow(self.canonical.of_instruments, self.shadow_offsets, strengths, self.shadow_width)
 
     def registered(self, state: State) -> State:
-        """Return `state` with the learned corrections of bases and of tracker to world applied to its poses.
+        """Return `state` with the learned corrections of states, bases and of tracker to world.
 
         Raises NeecoError for poses that are not rigid and joints far beyond their limits (see `State.check`).
         """
         state.check(self.instruments, fitted=True)
-        registration = self.registration
+        state, registration = self.state_corrections.corrected(state), self.registration
         # a tensor on the device "meta" has no values to test
         corrects = registration.requires_grad or registration.is_meta or self._corrects(registration)
         bases: dict[str, Tensor] = {}

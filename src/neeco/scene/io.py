@@ -33,7 +33,7 @@ OLD_SCHEMA = "neeco-scene/1"  # read as scenes without shadows, with readings re
 INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height", "near")  # of a recorded camera, in the order of the file
 # tensors of modules that OLD_SCHEMA lacks
 ADDED = {"shadow_offsets", "shadow_strengths", "shadow_width", "middle", "closed", "radius", "tips"}
-ADDED_SINCE = {"base_corrections"}  # that files of SCHEMA may lack: zero
+ADDED_SINCE = {"base_corrections", "anchors", "weights", "lengths"}  # that files of SCHEMA may lack: zero
 MAX_REASON = 200  # characters of an error's message
 MAX_PIXELS = 2**26  # of a recorded image
 MAX_NUMBER = 1e9  # mm, rad, s or px: larger numbers are damage

@@ -121,6 +121,10 @@ class Session:
     def restore(self, tensors: Mapping[str, Tensor], fields: Mapping[str, Any]) -> None:
         """Restore the state that `pack` returned."""
 
+    def training_states(self) -> dict[str, Any]:
+        """Return the states of the training frames as corrected, by name (JSON-able); empty where none is learned."""
+        return {}
+
     def finish(self) -> None:
         """Derive labels, verdicts and other results from the learned scene after the last step."""
 

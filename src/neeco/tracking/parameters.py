@@ -79,7 +79,9 @@ TrackingFitter = Fitter[TrackedParameters]
 
 def fitter_of(scene: GaussianScene) -> TrackingFitter:
     """Return the fitter of a scene's instruments over its tissue. Raises NeecoError as `TrackedParameters.of`."""
-    return Fitter(InstrumentRenderer(scene), TrackedParameters.of(scene), TissueRenderer(scene))
+    parameters = TrackedParameters.of(scene)
+    scene.visibility()  # by which states are trusted; of the whole scene, where training did not store it
+    return Fitter(InstrumentRenderer(scene), parameters, TissueRenderer(scene))
 
 
 def _tracked(instrument: Instrument, states: Sequence[State], pivot: Tensor, axis: Tensor) -> TrackedInstrument:

@@ -39,6 +39,7 @@ from neeco.training.config import TrainConfig, check_ranges, config_from_dict, c
 
 SCHEMA = "neeco-run/1"
 CONFIG_FILE, SCENE_FILE = "config.yaml", "scene.safetensors"
+STATES_FILE = "states.json"  # training states as corrected
 CAPTURE_DIGEST = "capture_sha256"
 CHECKPOINT_SCHEMA = "neeco-checkpoint/1"
 CHECKPOINT_HEADER = {"schema": str, "scene": {}, "iteration": int, "seconds": float}

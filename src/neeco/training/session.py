@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -16,11 +16,13 @@ from torch.nn.functional import mse_loss
 
 from neeco.capture.model import Camera, Frame, State
 from neeco.fitting.refinement import Refinement
+from neeco.fitting.state_prediction import predict_corrections
 from neeco.raster import Rendering, rasterize
 from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformation import FINAL_RATE, Perturbation, floored_decay, log_linear
+from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_session import GaussianTraining, Report, StepResult, check_finite, members, numbers
 from neeco.scene.training_views import TrainingViews
@@ -45,6 +47,7 @@ class GaussianSession(GaussianTraining):
     full_views: TrainingViews = field(init=False)  # at full size; `views` are those in use
     scale: float = field(init=False)  # of `views`
     limits: tuple[int, int] = field(init=False)  # most Gaussians of the tissue, and of each instrument
+    recorded: Recorded = field(init=False)  # as it was before training
     given: list[tuple[State, Camera]] = field(init=False)  # of every frame of `views`, as recorded, on their device
     statistics: GradientStatistics = field(init=False)
     queue: list[int] = field(default_factory=list)
@@ -61,6 +64,7 @@ class GaussianSession(GaussianTraining):
         self.full_views = self.views
         self.resolution = Resolution(config.resolution, self.views)
         self.limits = config.gaussian_limits(self.resolution.pixels)
+        self.recorded = self.scene.recorded
         self._use_views(self.full_views, 1.0)
 
     def _use_views(self, views: TrainingViews, scale: float) -> None:
@@ -90,15 +94,15 @@ class GaussianSession(GaussianTraining):
     def start(self) -> None:
         """Make the scene's tensors leaves of autograd and clear the statistics, once the canonical Gaussians exist."""
         scene = self.scene
-        self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
         scene.requires_grad_(True)
         several = scene.registration.dim() > 1 and bool(scene.instruments)
         scene.registration.requires_grad_(self.config.refine.registration or several)
         scene.base_corrections.requires_grad_(False)  # found before the first step: gradients hardly move them
-        self.watch_gradients()
+        self.begin_statistics()
 
-    def watch_gradients(self) -> None:
-        """Make the canonical tensors leaves again after they were replaced."""
+    def begin_statistics(self) -> None:
+        """Make the canonical tensors leaves of autograd and clear the statistics, after they were replaced."""
+        self.statistics = GradientStatistics(len(self.scene.canonical), self.scene.center.device)
         for name, tensor in self.scene.canonical.tensors().items():
             tensor.requires_grad_(name == "means" or name in self.gaussian_rates)
 
@@ -161,7 +165,8 @@ class GaussianSession(GaussianTraining):
         if following is not None:
             self.views.prefetch(following)
         loss = photometric_loss(rendering.color, target, mask, ssim_weight=self.config.ssim_weight)
-        total = trust_of(self.given[index][0]) * loss + self._regularisation(rendering, penalty)
+        weight = trust_of(self.given[index][0]) * float(self.refinement.weights[index])
+        total = weight * loss + self._regularisation(rendering, penalty)
         with tf32_products(self.views.device) if scene.deformation.large_operations else nullcontext():
             (total / views).backward()  # given the gradient instead, torch would import sympy: 2 s of every training
         gradient = rendering.center_offsets.grad
@@ -265,8 +270,7 @@ class GaussianSession(GaussianTraining):
                 config=config.density,
                 unsupported=self._unsupported(),
             )
-            self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
-            self.watch_gradients()
+            self.begin_statistics()
         if settings.opacity_reset and self._due(settings.opacity_reset) and progress < config.growth_stop:
             reset_opacity(scene.canonical, self.adam, config.density.reset_opacity)
 
@@ -310,6 +314,23 @@ class GaussianSession(GaussianTraining):
         self.rng.bit_generator.state = fields["rng"]
         self.queue, self.queue_phase = fields["queue"], fields["queue_phase"]
 
+    def training_states(self) -> dict[str, Any]:
+        states = map(self.scene.state_corrections.corrected, self.recorded.states)
+        return self.refinement.to_json(replace(self.recorded, states=tuple(states)))
+
+    def _predict_states(self) -> None:
+        """Correct new states by what the training frames' corrections depend on, and report that."""
+        found = predict_corrections(self.scene.state_corrections, self.refinement, self.views.frames)
+        self.scene.diagnostics["state_errors"] = {
+            part: {"explained": round(item.explained, 4), "corrected": item.applied} for part, item in found.items()
+        }
+        for part, item in found.items():
+            if item.applied:
+                self.report(
+                    f"{part}: errors depend on the state ({item.explained:.0%} of their variance is predicted for "
+                    "stretches left out): new states are corrected, too"
+                )
+
     def finish(self) -> None:
         """Freeze the scene, record diagnostics of the run, and run the method's own hook."""
         scene = self.scene
@@ -323,6 +344,8 @@ class GaussianSession(GaussianTraining):
             scene.diagnostics["still_scope"] = f"the tissue's depth is {known}; draw views near the recorded ones"
         scene.diagnostics["phase_2_began"] = self.schedule.phase_started
         scene.diagnostics["phase_2_forced"] = self.schedule.forced
+        if len(scene.recorded.tissues) < 2:  # corrections are relative to their mean over one tissue
+            self._predict_states()
         scene.deformation.finish(self)
         scene.visibility()
 

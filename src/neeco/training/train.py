@@ -20,7 +20,7 @@ from neeco.capture.checks import read_checked
 from neeco.capture.model import Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError, memory_failure
-from neeco.files import own_folder, read_begun, read_text, require_same, write_text
+from neeco.files import own_folder, read_begun, read_text, require_same, write_json, write_text
 from neeco.scene.io import pack_scene, save_scene
 from neeco.scene.method_registry import method_class, unmet_need
 from neeco.scene.training_session import Session, StepResult
@@ -30,6 +30,7 @@ from neeco.training.initial import begin_session
 from neeco.training.run import (
     CONFIG_FILE,
     SCENE_FILE,
+    STATES_FILE,
     checkpoint_path,
     read_checkpoint,
     read_config,
@@ -127,6 +128,8 @@ def train(
             log.note("finishing: labels, shaft, diagnostics")
             _check_finite(session)
             session.finish()
+            if states := session.training_states():
+                write_json(output / STATES_FILE, {"schema": "neeco-states/1", "frames": states})
             save_scene(session.scene, output / SCENE_FILE)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"while finishing; {go_on}") from None

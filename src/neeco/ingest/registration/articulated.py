@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
+from neeco.fitting.link_silhouette import ArticulatedModel, bends, joint_values, with_motion
 from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.articulated_fit import (
     WIDTHS_PX,
@@ -27,7 +28,6 @@ from neeco.ingest.registration.articulated_fit import (
     overlap,
     with_pose_errors,
 )
-from neeco.ingest.registration.articulated_model import ArticulatedModel, bends, joint_values, with_motion
 from neeco.ingest.registration.base import (
     MIN_FRAMES,
     N_BLOCKS,

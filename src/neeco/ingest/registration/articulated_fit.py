@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.fitting.link_silhouette import ArticulatedModel, Outlines
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.ingest.foreground.silhouettes import EDGE_PX
-from neeco.ingest.registration.articulated_model import ArticulatedModel, Outlines
 from neeco.ingest.registration.silhouette_fit import POSE_SDS, BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSilhouettes, moved_base, poses_at_clock
 

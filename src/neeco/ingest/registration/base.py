@@ -20,9 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import BaseUncertainty, evenly_spaced
 from neeco.errors import NeecoError
+from neeco.geometry.trocar import ShaftLine
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
 from neeco.ingest.registration.axial_texture import with_marks
-from neeco.ingest.registration.layers import EXCHANGED_SHARES, LayerFit, ShaftLine
+from neeco.ingest.registration.layers import EXCHANGED_SHARES, LayerFit
 from neeco.ingest.registration.silhouette_fit import (
     CLOCK_SD_S,
     FRONT_SHARE,

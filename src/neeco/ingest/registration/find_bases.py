@@ -10,6 +10,7 @@ import numpy as np
 
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
+from neeco.geometry.trocar import line_through_trocar
 from neeco.ingest.frames.views import StageProgress, Views, reduced
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.interpolate import poses_at, readings_at
@@ -18,7 +19,7 @@ from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
 from neeco.ingest.registration.articulated import ArticulatedMotion, find_articulated_base
 from neeco.ingest.registration.base import MIN_FRAMES, BaseRegistration, base_from_layers, find_base
-from neeco.ingest.registration.layers import ArmImages, covered_by, evenly_lit, fit_layers, line_through_trocar
+from neeco.ingest.registration.layers import ArmImages, covered_by, evenly_lit, fit_layers
 from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, ClockOffset

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.geometry.lines import nearest_point, unit
+from neeco.geometry.lines import frame_about, nearest_point, unit
 from neeco.geometry.projection import project
 from neeco.ingest.foreground.silhouettes import Silhouettes
 
@@ -133,12 +133,6 @@ def _instrument_in_camera(problem: SilhouetteProblem, fit: SilhouetteFit) -> tup
     """Rotations [F, 3, 3] and translations [F, 3] mm camera_from_instrument."""
     poses = problem.camera_from_world @ fit.world_from_base @ instrument_in_base(problem, fit)
     return poses[:, :3, :3], poses[:, :3, 3]
-
-
-def frame_about(axis: np.ndarray) -> np.ndarray:
-    """[3, 3] with unit columns across, across and along the axis."""
-    first = unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
-    return np.stack([first, np.cross(axis, first), axis], -1)
 
 
 @dataclass(frozen=True, eq=False)

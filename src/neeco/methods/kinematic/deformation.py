@@ -27,12 +27,15 @@ from neeco.methods.kinematic.articulation import (
     ArticulatedInstruments,
     Articulation,
 )
+from neeco.methods.kinematic.contradictions import report_contradictions
 from neeco.methods.kinematic.discovery import find_instruments
 from neeco.methods.kinematic.finish import conclude
 from neeco.methods.kinematic.hinge_search import hinge_joints
 from neeco.methods.kinematic.hinges import Hinges
+from neeco.methods.kinematic.interiors import fade_interior_tissue
 from neeco.methods.kinematic.label_shares import store_label_shares
 from neeco.methods.kinematic.lamp_search import find_shadow
+from neeco.methods.kinematic.state_passes import MARKS, fit_states
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.kinematic.wrist import place_wrists, refine_wrists
 from neeco.methods.space_carving import CarvingSettings
@@ -298,19 +301,26 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         if self.settings.shadow and (passed or any(map(session.reached, self.settings.shadow_at))):
             with session.searching(as_learned=True):
                 find_shadow(session)
+        for mark in MARKS:
+            if before < mark <= session.progress:
+                fit_states(session, self, mark)
         if WRISTS_AT in passed:
             with session.searching():
                 place_wrists(session, self)
         elif passed and self.settings.refine_wrists:
             with session.searching():
                 refine_wrists(session, self)
+        if passed:
+            fade_interior_tissue(session, self)
 
     def finish(self, training: GaussianTraining) -> None:
         session = gaussian_session(training)
         scene = session.scene
+        fade_interior_tissue(session, self)
         if self.settings.label_shares and self.label_names:
             store_label_shares(session)  # at full size: reduced pixels mix thin Gaussians with tissue
         conclude(session, self)
+        report_contradictions(session)
         if self.breathing is not None:
             scene.diagnostics["breathing"] |= self.breathing.describe(scene.recorded.cameras)
         if self.settings.extrapolate_tissue:

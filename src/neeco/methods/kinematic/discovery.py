@@ -13,9 +13,11 @@ from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
-from neeco.methods.space_carving import carved_shape
+from neeco.methods.space_carving import Evidence, carved_shape, gather_evidence
+from neeco.methods.static import Static
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
-from neeco.scene.canonical import join_bodies, seed_instrument
+from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
+from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.training.session import GaussianSession
 
@@ -34,7 +36,46 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
     tissue = fit_tissue(scene, session.views, session.config)
     if isinstance(articulated, BreathingTissue) and articulated.may_breathe and session.timed:
         tissue = _learn_breathing(session, articulated, tissue)
-    recorded = evidence = tissue_evidence(scene, session.views, session.config, tissue)
+    evidence = tissue_evidence(scene, session.views, session.config, tissue)
+    scene.canonical = _with_instruments(session, articulated, evidence, register=True)
+
+
+def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Replace the instruments' Gaussians by seeds on shapes carved anew, at the states as corrected so far: what the
+    former states taught is forgotten. The session's views are those of searches."""
+    scene, refinement = session.scene, session.refinement
+    tissue = scene.canonical.map(
+        lambda tensor: tensor[scene.canonical.body(0)].detach().clone(), scene.canonical.counts[:1]
+    )
+    alone = GaussianScene(Static.method, tissue, Static(), (), Recorded(tissues=scene.recorded.tissues), scene.center)
+    alone.background, alone.sh_degree = scene.background, scene.sh_degree
+    linked = any(instrument.kinematics is not None for instrument in scene.instruments)
+    evidence = gather_evidence(alone, session.views, session.config.deformation.carving, unshaded=linked)
+    places = {frame.name: place for place, frame in enumerate(session.views.frames)}
+    chosen = [row for row, frame in enumerate(evidence.frames) if refinement.weights[places[frame.name]] > 0]
+    evidence = evidence.subset(torch.tensor(chosen))
+    corrected = [scene.registered(refinement.state(places[frame.name], frame.state)) for frame in evidence.frames]
+    evidence = replace(
+        evidence, frames=tuple(replace(f, state=state) for f, state in zip(evidence.frames, corrected, strict=True))
+    )
+    with torch.no_grad():
+        scene.canonical = tissue
+        for articulation in articulated.articulations:
+            articulation.shaft_tilt.zero_()
+            articulation.shaft_shift.zero_()
+        scene.canonical = _with_instruments(session, articulated, evidence, register=False)
+    rows = torch.arange(len(scene.canonical), device=scene.center.device)
+    fresh = rows >= len(tissue)
+    session.adam.select_rows(list(scene.canonical.tensors()), torch.where(fresh, 0, rows), fresh)
+    session.begin_statistics()
+
+
+def _with_instruments(
+    session: GaussianSession, articulated: ArticulatedInstruments, recorded: Evidence, *, register: bool
+) -> CanonicalGaussians:
+    """Return the Gaussians of the session's tissue and of every instrument on its carved shape, and start the joints.
+    register: whether the poses of stated links are corrected first."""
+    scene, evidence = session.scene, recorded
     generator = torch.Generator().manual_seed(session.config.seed)
     bodies = [scene.canonical]
     for index, instrument in enumerate(scene.instruments):
@@ -44,7 +85,7 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
             shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
             articulation.radius.fill_(shape.radius)
             readings = readings_of(session, evidence, instrument.name)
-            if correct_poses(session, articulation, evidence, instrument, shape, readings):
+            if register and correct_poses(session, articulation, evidence, instrument, shape, readings):
                 corrected = (replace(frame, state=scene.registered(frame.state)) for frame in recorded.frames)
                 evidence = replace(recorded, frames=tuple(corrected))
                 shape = carved_shape(session, evidence, instrument.name, generator)
@@ -63,7 +104,7 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
                 session, articulation, evidence, instrument.name, shape, columns=columns, generator=generator
             )
         bodies.append(seed_instrument(seeds, shape.radius).with_extras(**{LINK_LOGITS: logits}))
-    scene.canonical = join_bodies(bodies)
+    return join_bodies(bodies)
 
 
 def _learn_breathing(session: GaussianSession, breathes: BreathingTissue, tissue: GaussianScene) -> GaussianScene:

@@ -8,7 +8,7 @@ instruments' inside.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from neeco.methods.kinematic.articulation import LABEL_SHARE
 from neeco.raster import rasterize
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.visibility import visible_pixels
 from neeco.training.session import GaussianSession
 
@@ -32,11 +33,12 @@ OTHER_DENSITY = 0.02  # of colours that neither model explains
 MIN_SHADE_LENGTH = 0.05  # of the segment in colour space that shades lie on
 LOW, HIGH = 0.25, 0.35  # mean probability of its pixels at which a Gaussian's share is 0 and 1
 MIN_INSIDE = 0.9  # mean probability inside the instruments, below which colours do not separate them from the tissue
+MIN_CERTAIN = 0.15  # share of a part's pixels that must be inside, for its colours to be known by themselves
 MIN_PIXELS = 1e-3  # of a Gaussian in all frames; one with less counts as instrument
 THRESHOLD = 0.5  # of the labels then: half of a pixel
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _View:
     """One training frame with its rendering, reduced to the P pixels that contain any instrument, to save memory."""
 
@@ -45,11 +47,15 @@ class _View:
     image: np.ndarray  # [P, 3] as recorded
     tissue: np.ndarray  # [P, 3] rendered without instruments
     inside: np.ndarray  # [P] bool: certainly instrument
+    parts: np.ndarray  # [P] index of the label column with the largest share, -1 below THRESHOLD
 
 
 def store_label_shares(session: GaussianSession) -> None:
     """Store every instrument Gaussian's label weight in [0, 1] as the extra LABEL_SHARE, and set the scene's label
-    threshold; neither where colours do not separate instruments from tissue."""
+    threshold; neither where colours do not separate instruments from tissue.
+
+    Where they separate only some parts, as a black shaft and not a mirror-like wrist, the others keep their weight.
+    """
     scene = session.scene
     instrument = scene.canonical.of_instruments
     frames = session.frames_along_poses(N_LABEL_FRAMES)
@@ -59,13 +65,33 @@ def store_label_shares(session: GaussianSession) -> None:
     known = np.concatenate([p[view.inside] for p, view in zip(probable, views, strict=True)])
     inside = float(known.mean()) if len(known) else 0.0
     scene.diagnostics["label_shares"] = {"inside": round(inside, 3)}
-    if inside < MIN_INSIDE:
+    separable = _separable_parts(scene, views, probable)
+    if inside >= MIN_INSIDE:
+        separable[:] = True
+    elif not separable.any():
         return
+    else:  # colours of the others are the tissue's, too
+        views = [replace(view, inside=view.inside & separable[view.parts]) for view in views]
+        colors = _color_density(views)
+        probable = [_probability(view, colors) for view in views]
     probable = [np.where(view.inside, 1.0, p) for p, view in zip(probable, views, strict=True)]
     share = _label_shares(session, views, probable)
+    part = scene.label_channels().argmax(1)
+    share[instrument & ~torch.from_numpy(separable).to(part.device)[part]] = 1
     scene.canonical = scene.canonical.with_extras(**{LABEL_SHARE: share})
     scene.label_threshold = THRESHOLD
     scene.diagnostics["label_shares"]["mean"] = round(float(share[instrument].mean()), 3)
+
+
+def _separable_parts(scene: GaussianScene, views: list[_View], probable: list[np.ndarray]) -> np.ndarray:
+    """Return the parts [L] bool that colours separate from the tissue by themselves, whatever the others look like."""
+    found = np.zeros(len(scene.label_names), bool)
+    for part in range(len(found)):
+        own = [view.parts == part for view in views]
+        known = np.concatenate([p[view.inside & rows] for p, view, rows in zip(probable, views, own, strict=True)])
+        count = sum(int(rows.sum()) for rows in own)
+        found[part] = len(known) > MIN_CERTAIN * count and float(known.mean()) >= MIN_INSIDE
+    return found
 
 
 def _label_shares(session: GaussianSession, views: list[_View], probable: list[np.ndarray]) -> Tensor:
@@ -94,9 +120,10 @@ def _view(session: GaussianSession, index: int) -> _View:
     state, camera = session.corrected(index)
     instrument = scene.canonical.of_instruments
     posed = scene.at(state)
-    channels = rasterize(posed, camera, channels=instrument.float()[:, None]).channels
+    columns = torch.cat([instrument.float()[:, None], scene.label_channels()], 1)
+    channels = rasterize(posed, camera, channels=columns).channels
     assert channels is not None
-    share = channels[..., 0].cpu().numpy()
+    share, parts = channels[..., 0].cpu().numpy(), channels[..., 1:].argmax(-1).cpu().numpy()
     reach = 2 * max(1, math.ceil(EDGE * min(share.shape))) + 1
     inside = cv2.erode((share > INSIDE).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
     tissue = rasterize(posed.select(~instrument), camera).color.clamp(0, 1).cpu().numpy()
@@ -104,7 +131,14 @@ def _view(session: GaussianSession, index: int) -> _View:
     if mask is not None:
         inside &= mask.cpu().numpy()
     pixels = share > 0
-    return _View(index, pixels, image[pixels], tissue[pixels], inside[pixels])
+    return _View(
+        index=index,
+        pixels=pixels,
+        image=image[pixels],
+        tissue=tissue[pixels],
+        inside=inside[pixels],
+        parts=np.where(share > THRESHOLD, parts, -1)[pixels],
+    )
 
 
 def _bins(colors: np.ndarray) -> tuple[np.ndarray, ...]:

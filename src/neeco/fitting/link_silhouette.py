@@ -13,10 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.kinematics import FIXED, PRISMATIC, KinematicTree
-from neeco.geometry.lines import unit
+from neeco.geometry.lines import frame_about, unit
 from neeco.geometry.projection import project
-from neeco.ingest.registration.layers import line_through_trocar
-from neeco.ingest.registration.silhouette_model import frame_about
+from neeco.geometry.trocar import line_through_trocar
 
 TUBE_MM = 150.0  # of the root link that is modelled
 NEAREST_MM = 8.0  # depth at which cones are cut off
@@ -24,7 +23,7 @@ PIVOT_SD_MM, AXIS_SD_RAD, OFFSET_SD_RAD = 1.2, 0.06, 0.05  # of what is stated; 
 HEADING_SD_RAD = 0.15  # of an outermost link's direction from the tube's at rest: a curved jaw looks like an offset
 SLIDE_SD_MM = 1.0  # of the offset of a prismatic joint
 PLAY_SD_RAD, PLAY_SD_MM = 0.012, 0.3  # by which readings lag behind, or lead, with the sign of motion
-MOTION_STEPS = 2  # of CLOCK_SHIFTS_S to both sides, over which the sign of motion is taken
+MOTION_STEPS = 2  # moments before and after, between which the sign of motion is taken
 TILT_SD_RAD, ASIDE_SD_MM = 0.03, 0.7  # of the tube's axis about its first guess, and from the first pivot
 LOG_RADIUS_SD, RATIO_SD = 0.4, 0.3  # of radii, and of the ratio of one link's to its parent's
 FLAT_SD = 0.2  # of the relative change of a radius with the viewing direction
@@ -157,8 +156,8 @@ class ArticulatedModel:
         return found
 
     def link_poses(self, parameters: np.ndarray, values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """root_from_link rotations [F, 3, 3] and translations [F, 3] mm of all links; values [F, 2 L] of joints, as
-        `with_motion` has them."""
+        """root_from_link rotations [F, 3, 3] and translations [F, 3] mm of all links; values [F, L] of joints, or
+        [F, 2 L] with the signs of their motion (`with_motion`), by which their play acts."""
         count, links = len(values), len(self.tree.links)
         turns, shifts = [np.tile(np.eye(3), (count, 1, 1))], [np.zeros((count, 3))]
         turns[0], shifts[0] = turns[0] @ self.tree.links[0].origin[:3, :3], shifts[0] + self.tree.links[0].origin[:3, 3]
@@ -173,7 +172,9 @@ class ArticulatedModel:
                 continue
             place = place + parameters[start : start + 3]
             axis = unit(axis + frame_about(axis)[:, :2] @ parameters[start + 3 : start + 5])
-            value = values[:, index] + parameters[offset] + parameters[self.plays[index]] * values[:, index + links]
+            value = values[:, index] + parameters[offset]
+            if values.shape[1] > links:
+                value = value + parameters[self.plays[index]] * values[:, index + links]
             if link.type == PRISMATIC:
                 turns.append(turn @ origin[:3, :3])
                 shifts.append(shift + turn @ place + value[:, None] * (turn @ axis))
@@ -301,7 +302,7 @@ def joint_values(tree: KinematicTree, readings: dict[str, np.ndarray]) -> np.nda
 
 
 def with_motion(values: np.ndarray) -> np.ndarray:
-    """Values [S, F, 2 L]: those [S, F, L] of all links' joints at CLOCK_SHIFTS_S, and the signs of their motion then,
+    """Values [S, F, 2 L]: those [S, F, L] of all links' joints at evenly spaced moments S about those of the frames, and the signs of their motion then,
     rounded where they turn."""
     last = len(values) - 1
     near = np.arange(len(values))

@@ -1,0 +1,106 @@
+"""Prediction of the errors of new states from those of the training states.
+
+The calibration of a robot is off by what depends on its joints; a tracker drifts with time. Corrections that training
+found are interpolated between the states (a Gaussian process), and that is used only where stretches of the recording
+that were left out are predicted from the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Frame, evenly_spaced
+from neeco.fitting.refinement import Refinement
+from neeco.scene.state_corrections import MAX_ANCHORS, StateCorrections, kernel
+
+N_BLOCKS = 6  # stretches of the recording, left out one after the other
+MIN_INSTANTS = 12
+MIN_EXPLAINED = 0.1  # share of the corrections' variance: independent errors reach 0.06 by chance
+LENGTHS = (0.5, 1.0, 2.0, 4.0)  # of the kernel, in units of features
+NOISES = (0.1, 0.3, 1.0, 3.0)  # variance of a single instant's correction over the kernel's
+JITTER = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """Verdict on the prediction of an instrument's pose corrections, or of those of a reading."""
+
+    explained: float  # share of the variance of left-out corrections
+    applied: bool  # to new states
+
+
+@torch.no_grad()
+def predict_corrections(
+    corrections: StateCorrections, refinement: Refinement, frames: Sequence[Frame]
+) -> dict[str, Prediction]:
+    """Estimate `corrections` from those that training found for its frames, where states predict them, and take these
+    out of the training frames' own.
+
+    Returns the verdict on each instrument's pose, under its name, and on its readings, under NAME.READING.
+    """
+    shown: dict[int, int] = {}  # a frame of every instant
+    for frame in (refinement.frame_steps > 0).nonzero()[:, 0].tolist():
+        shown.setdefault(refinement.instants[frame], frame)
+    order = sorted(shown, key=lambda instant: _moment(frames[shown[instant]]))
+    found: dict[str, Prediction] = {}
+    if len(order) < MIN_INSTANTS:
+        return found
+    for index, name in enumerate(corrections.names):
+        states = [frames[shown[instant]].state.instruments[name] for instant in order]
+        features = torch.stack([corrections.features(index, state) for state in states]).double().cpu()
+        readings = corrections.readings[index]
+        columns = [refinement.readings.index((name, reading)) for reading in readings]
+        rows = torch.cat([refinement.poses[order, index], refinement.joints[order][:, columns]], 1).double().cpu()
+        sigma = torch.cat([refinement.pose_sd[:, index].mean(0), refinement.joint_sd[:, columns].mean(0)])
+        parts = {name: slice(0, 6)} | {f"{name}.{reading}": slice(6 + k, 7 + k) for k, reading in enumerate(readings)}
+        residuals, usual, length, noise = _best(features, rows / sigma.double().cpu())
+        applied = torch.zeros(rows.shape[1], dtype=rows.dtype)
+        for part, places in parts.items():
+            total = float(usual[places].sum())
+            explained = 1 - float(residuals[places].sum()) / total if total else 0.0
+            found[part] = Prediction(explained=explained, applied=explained >= MIN_EXPLAINED)
+            applied[places] = float(found[part].applied)
+        anchors = features[evenly_spaced(len(features), MAX_ANCHORS)]
+        weights = _weights(features, rows, anchors, length, noise) * applied
+        corrections.anchors[index, : len(anchors)] = anchors.to(corrections.anchors)
+        corrections.weights[index, : len(anchors), : weights.shape[1]] = weights.to(corrections.weights)
+        corrections.lengths[index] = length
+        for instant, state in zip(order, states, strict=True):
+            increments = corrections.increments(index, state)
+            refinement.poses[instant, index] -= increments[:6]
+            refinement.joints[instant, columns] -= increments[6 : 6 + len(columns)]
+    return found
+
+
+def _moment(frame: Frame) -> tuple[str, float]:
+    return frame.state.tissue or "", frame.state.time
+
+
+def _best(features: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, float, float]:
+    """Return what leaving out stretches of `rows` [n, K] gives: sums [K] of squares of their residuals from the
+    prediction and from the mean, and the kernel's length and noise of the best prediction."""
+    block = torch.arange(len(rows)) * N_BLOCKS // len(rows)
+    left = [(block == number, block != number) for number in range(N_BLOCKS)]
+    usual = torch.stack([(rows[out] - rows[rest].mean(0)).square().sum(0) for out, rest in left]).sum(0)
+    tried = []
+    for length in LENGTHS:
+        for noise in NOISES:
+            error = torch.zeros_like(usual)
+            for out, rest in left:
+                mean = rows[rest].mean(0)
+                anchors = features[rest][evenly_spaced(int(rest.sum()), MAX_ANCHORS)]
+                weights = _weights(features[rest], rows[rest] - mean, anchors, length, noise)
+                error += (rows[out] - mean - kernel(features[out], anchors, length) @ weights).square().sum(0)
+            tried.append((float(error.sum()), length, noise, error))
+    _, length, noise, error = min(tried, key=lambda item: item[:3])
+    return error, usual, length, noise
+
+
+def _weights(features: Tensor, rows: Tensor, anchors: Tensor, length: float, noise: float) -> Tensor:
+    """Return the weights [A, K] of kernels at `anchors` [A, F] that explain `rows` [n, K] (subset of regressors)."""
+    own, across = kernel(anchors, anchors, length), kernel(anchors, features, length)
+    return torch.linalg.solve(across @ across.T + noise * own + JITTER * torch.eye(len(own)).to(own), across @ rows)

@@ -1,0 +1,199 @@
+"""Fits of training frames' states to their images, against the scene as learned so far, and how large their errors are.
+
+The fitter is that of tracking. What differs is the prior: errors of recorded states, along the shaft and the view.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Instrument, State
+from neeco.fitting.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer
+from neeco.fitting.parameters import DEG, InstrumentParameters, StateParameters
+from neeco.fitting.refinement import MIN_DEVIATION, MM_PER_RAD
+from neeco.fitting.state_fitter import Fitter, StateFit
+from neeco.methods.kinematic.articulation import ArticulatedInstruments
+from neeco.training.session import GaussianSession
+
+# standard deviations of states by a robot's log and a rough base: of the shaft's tilt and roll (degrees), of the origin
+# across the view and in depth (mm), of joints (degrees)
+TILT, ROLL, ACROSS, DEPTH, JOINT = 2.0, 6.0, 0.4, 1.5, 4.0
+LARGEST = 1.5  # times them, of errors that are looked for
+USUAL = 0.15  # times them: a tracker's errors
+N_ITERATIONS = 40  # of expectation maximisation
+KEPT_SHARE = 0.85  # of squared corrections that count, without the largest
+CORRELATION_PX = 100.0  # pixels that count as one observation, as the scene is still learned
+OWN_SHARE = 0.25  # of an image's information that counts for standard deviations: the learned shape has errors, too
+BEYOND_LIMITS = 0.5  # of the range of a joint's limits, by which readings may be off
+LEVELS, STEPS = (0.25, 0.5, 1.0), (4, 4, 4)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedState:
+    """A training frame's state as fitted to its image."""
+
+    index: int
+    fit: StateFit
+    precision: Tensor  # [P, P] of the prior
+    correction: Tensor  # [P] of the state that the prior is about
+
+    @property
+    def deviations(self) -> Tensor:
+        """Standard deviations [P] of the state."""
+        return torch.linalg.inv(OWN_SHARE * self.fit.information + self.precision).diagonal().sqrt()
+
+
+@dataclass(frozen=True)
+class StateSearch:
+    """Fits of training frames against the scene as learned so far."""
+
+    session: GaussianSession
+    fitter: Fitter[StateParameters]
+    shafts: list[Tensor]  # directions [3], instrument frame
+
+    @classmethod
+    def of(cls, session: GaussianSession, articulated: ArticulatedInstruments) -> StateSearch:
+        """Return the search against the session's scene as it is now."""
+        scene, layout = session.scene, session.refinement.layout
+        shafts = [articulation.shaft()[1].detach().cpu().double() for articulation in articulated.articulations]
+        bounded = StateParameters(
+            tuple(_bounded(own, item) for own, item in zip(layout.instruments, scene.instruments, strict=True))
+        )
+        return cls(session, Fitter(InstrumentRenderer(scene), bounded, TissueRenderer(scene), CORRELATION_PX), shafts)
+
+    def state(self, index: int) -> State:
+        """Return the state of training frame `index` as corrected so far."""
+        return self.session.refinement.state(index, self.session.recorded.states[index])
+
+    def view(self, index: int, state: State | None) -> FrameView:
+        """Return frame `index` over tissue with the shadow of instruments in `state` (None: none)."""
+        return self.fitter.view(self.session.full_views.frames[index], state)
+
+    def fitted(self, index: int, scale: float, about: State | None = None) -> FittedState | None:
+        """Return the state of frame `index` fitted from its present one, with a prior about that recorded (or `about`
+        another) of errors `scale` times as large as usual ones of a robot, or as stated; None where the fit leads out
+        of the image."""
+        start, given, precision = self.state(index), self.session.recorded.states[index], self.precision(index, scale)
+        fit = self.fitter.fit(self.view(index, start), about or given, precision, start, levels=LEVELS, steps=STEPS)
+        if fit is None:
+            return None
+        correction = self.session.refinement.layout.increments_between(about or given, fit.state)
+        return FittedState(index=index, fit=fit, precision=precision, correction=correction)
+
+    def combined(self, fits: Sequence[FittedState]) -> tuple[State, Tensor]:
+        """Return the state that the images of one instant show, by their information, and its standard deviations
+        [P]."""
+        if len(fits) == 1:
+            return fits[0].fit.state, fits[0].deviations
+        prior, information = fits[0].precision, torch.stack([each.fit.information for each in fits])
+        weighed = torch.stack([(each.fit.information + prior) @ each.correction for each in fits]).sum(0)
+        found = torch.linalg.solve(information.sum(0) + prior, weighed)
+        deviations = torch.linalg.inv(OWN_SHARE * information.sum(0) + prior).diagonal().sqrt()
+        return self.fitter.parameters.moved(self.session.recorded.states[fits[0].index], found), deviations
+
+    def misfit(self, index: int, state: State) -> float:
+        """Return the misfit of a frame's instruments in `state` (see `StateFit`); infinite outside of the image."""
+        precision = self.precision(index, 1.0)
+        fit = self.fitter.fit(self.view(index, state), state, precision, levels=(), steps=())
+        return math.inf if fit is None else fit.misfit
+
+    def precision(self, index: int, scale: float) -> Tensor:
+        """Return the precision [P, P] of the prior on corrections of frame `index`."""
+        axes = self._axes(index)
+        return axes.T @ torch.diag(self._deviations(index, scale) ** -2) @ axes
+
+    def deviations(self, index: int, scale: float) -> Tensor:
+        """Return the standard deviations [P] (rad, mm) of the prior on corrections of frame `index`."""
+        return torch.linalg.inv(self.precision(index, scale)).diagonal().sqrt()
+
+    def _deviations(self, index: int, scale: float) -> Tensor:
+        """Return standard deviations [P] (rad, mm) of errors along `_axes`: stated ones, else `scale` times usual ones;
+        of an unrecorded joint a quarter of its limits."""
+        found: list[float] = []
+        layout = self.session.refinement.layout
+        for item, own, shaft in zip(self.session.scene.instruments, layout.instruments, self.shafts, strict=True):
+            stated = self.session.full_views.frames[index].state.instruments[item.name].uncertainty
+            turns = scale * DEG * torch.tensor([TILT, TILT, ROLL], dtype=torch.float64)
+            shifts: Sequence[float] = (scale * ACROSS, scale * ACROSS, scale * DEPTH)
+            if stated is not None:
+                own_turns = torch.tensor(stated.rotation_deg, dtype=torch.float64).clamp(max=60).deg2rad()
+                turns, shifts = (_about(shaft).square() @ own_turns.square()).sqrt(), stated.translation_mm
+            found += [*turns.tolist(), *shifts]
+            for reading, slides in zip(own.joints, own.slides, strict=True):
+                limits = item.joints[reading] if reading in item.unrecorded else None
+                usual = scale * JOINT * DEG * (MM_PER_RAD if slides else 1.0)
+                if limits is not None and limits[0] != limits[1]:
+                    usual = (limits[1] - limits[0]) / 4
+                elif stated is not None and reading in stated.joints_deg:
+                    usual = stated.joints_deg[reading] * (1.0 if slides else DEG)
+                found.append(usual)
+        return torch.tensor(found, dtype=torch.float64).clamp(min=MIN_DEVIATION)
+
+    def _axes(self, index: int) -> Tensor:
+        """Return the rows [P, P] that take corrections to the axes of errors: tilt, tilt, roll, across, across, depth,
+        joints of every instrument."""
+        layout = self.session.refinement.layout
+        state, camera = self.session.recorded.states[index], self.session.recorded.cameras[index]
+        rows = torch.eye(layout.size, dtype=torch.float64)
+        for item, (pose, _), shaft in zip(layout.instruments, layout.rows, self.shafts, strict=True):
+            rows[pose.start : pose.start + 3, pose.start : pose.start + 3] = _about(shaft)
+            own = state.instruments[item.name].pose[:3, :3].cpu().double()
+            rows[pose.start + 3 : pose.stop, pose.start + 3 : pose.stop] = (
+                camera.world_from_camera[:3, :3].cpu().double().T @ own
+            )
+        return rows
+
+    def scale_of(self, fits: Sequence[FittedState]) -> float:
+        """Return how large errors are, times the usual ones of a robot: the median over the classes of errors of
+        variance components by expectation maximisation, about the median correction, which belongs to the shape."""
+        kinds: list[int] = []
+        for item, own in zip(self.session.scene.instruments, self.session.refinement.layout.instruments, strict=True):
+            kinds += [0, 0, 1, 2, 2, 3, *(5 if reading in item.unrecorded else 4 for reading in own.joints)]
+        kind = torch.tensor(kinds)
+        observed = []  # information on corrections in units of usual errors, and it times the most likely ones
+        for found in fits:
+            back = torch.linalg.inv(self._axes(found.index)) * self._usual()
+            weighed = (found.fit.information + found.precision) @ found.correction
+            observed.append((back.T @ found.fit.information @ back, back.T @ weighed))
+        variances = torch.full((6,), USUAL**2, dtype=torch.float64)
+        for _ in range(N_ITERATIONS):
+            prior = torch.diag(1 / variances[kind])
+            covariances = [torch.linalg.inv(information + prior) for information, _ in observed]
+            means = torch.stack([c @ most for c, (_, most) in zip(covariances, observed, strict=True)])
+            squares = (means - means.median(0).values).square() + torch.stack([c.diagonal() for c in covariances])
+            for number in range(5):
+                each = squares[:, kind == number].flatten().sort().values
+                if len(each):
+                    variances[number] = each[: math.ceil(KEPT_SHARE * len(each))].mean()
+        object.__setattr__(self, "classes", variances.sqrt().tolist())
+        # a tracker's errors across the view are as large as a robot's
+        return float(variances[[number for number in (0, 1, 3, 4) if number in kinds]].sqrt().median())
+
+    def _usual(self) -> Tensor:
+        """Return usual errors [P] of a robot's states (rad, mm)."""
+        found: list[float] = []
+        for own in self.session.refinement.layout.instruments:
+            found += [TILT * DEG, TILT * DEG, ROLL * DEG, ACROSS, ACROSS, DEPTH]
+            found += [JOINT * DEG * (MM_PER_RAD if slides else 1.0) for slides in own.slides]
+        return torch.tensor(found, dtype=torch.float64)
+
+
+def _bounded(parameters: InstrumentParameters, instrument: Instrument) -> InstrumentParameters:
+    """Return the parameters with bounds of the joints: their limits, and half their range beyond."""
+    ends = []
+    for joint in parameters.joints:
+        low, high = instrument.joints[joint] or (-math.inf, math.inf)
+        beyond = BEYOND_LIMITS * (high - low) if math.isfinite(high - low) else 0.0
+        ends.append([low - beyond, high + beyond])
+    bounds = torch.tensor(ends, dtype=torch.float64).reshape(-1, 2)
+    return replace(parameters, low=bounds[:, 0], high=bounds[:, 1])
+
+
+def _about(shaft: Tensor) -> Tensor:
+    """Return the rows [3, 3]: two directions across a shaft, and its own."""
+    return torch.linalg.svd(shaft[None])[2][[1, 2, 0]]

@@ -1,0 +1,89 @@
+"""Corrections of instrument states as smooth functions of the states: errors of a robot's calibration, which depend on
+where its joints are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor, nn
+
+from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.geometry.rotations import rigid_from_vector
+from neeco.raster.devices import CachedPredicate
+
+MAX_ANCHORS = 64  # states that a correction is interpolated between
+N_POSE_FEATURES = 12  # position and rotation matrix
+# of differences that count as one: mm; rad, also of revolute joints; mm of prismatic ones
+POSITION_UNIT_MM, ANGLE_UNIT, SLIDE_UNIT_MM = 10.0, 0.17, 10.0
+
+
+class StateCorrections(nn.Module):
+    """One kernel regression per instrument: increments are sums of Gaussian kernels at `anchors`, so that states far
+    from all of them are not corrected.
+
+    An instrument's increments are six of its pose in its own frame (rotation vector in rad, translation in mm), then
+    one of each recorded reading of its stated kinematics (rad or mm). Buffers: `anchors` [I, MAX_ANCHORS, F] features
+    of states (see `features`), `weights` [I, MAX_ANCHORS, 6 + R], `lengths` [I] of the kernels, in units of features.
+    All weights are zero until errors are found that depend on the state.
+    """
+
+    anchors: Tensor
+    weights: Tensor
+    lengths: Tensor
+
+    def __init__(self, instruments: Sequence[Instrument], device: torch.device) -> None:
+        super().__init__()
+        self.names = tuple(item.name for item in instruments)
+        self.readings = tuple(recorded_readings(item) for item in instruments)
+        units = [[SLIDE_UNIT_MM if item.slides(reading) else ANGLE_UNIT for reading in readings]
+                 for item, readings in zip(instruments, self.readings, strict=True)]  # fmt: skip
+        self._units = units
+        most = max(map(len, self.readings), default=0)
+        zeros = partial(torch.zeros, device=device)
+        self.register_buffer("anchors", zeros(len(units), MAX_ANCHORS, N_POSE_FEATURES + most))
+        self.register_buffer("weights", zeros(len(units), MAX_ANCHORS, 6 + most))
+        self.register_buffer("lengths", zeros(len(units)) + 1)
+        self._corrects = CachedPredicate(lambda weights: weights.any())
+
+    def features(self, index: int, given: InstrumentState) -> Tensor:
+        """Return the features [F] of a state of instrument `index`, differences of which are compared by kernels."""
+        pose = given.pose.detach().to(self.anchors)
+        joints = [float(given.joints[reading]) / unit
+                  for reading, unit in zip(self.readings[index], self._units[index], strict=True)]  # fmt: skip
+        joints += [0.0] * (self.anchors.shape[2] - N_POSE_FEATURES - len(joints))
+        rotation = pose[:3, :3].flatten() / (2**0.5 * ANGLE_UNIT)
+        return torch.cat([pose[:3, 3] / POSITION_UNIT_MM, rotation, pose.new_tensor(joints)])
+
+    def increments(self, index: int, given: InstrumentState) -> Tensor:
+        """Return the increments [6 + R] of a state of instrument `index`."""
+        similar = kernel(self.features(index, given)[None], self.anchors[index], self.lengths[index])
+        return similar[0] @ self.weights[index]
+
+    def corrected(self, state: State) -> State:
+        """Return `state` with the instruments' corrections."""
+        if self.weights.is_meta or not self._corrects(self.weights):
+            return state
+        moved = dict(state.instruments)
+        for index, (name, readings) in enumerate(zip(self.names, self.readings, strict=True)):
+            if name in moved:
+                given, increments = moved[name], self.increments(index, moved[name])
+                joints = {**given.joints}
+                for reading, change in zip(readings, increments[6:].tolist(), strict=False):
+                    joints[reading] = joints[reading] + change
+                pose = given.pose.to(increments) @ rigid_from_vector(increments[:6])
+                moved[name] = InstrumentState(pose, joints)
+        return replace(state, instruments=moved)
+
+
+def recorded_readings(instrument: Instrument) -> tuple[str, ...]:
+    """Return the readings of an instrument's stated kinematics that were recorded."""
+    tree = instrument.kinematics
+    return () if tree is None else tuple(reading for reading in tree.readings if reading not in instrument.unrecorded)
+
+
+def kernel(one: Tensor, other: Tensor, length: Tensor | float) -> Tensor:
+    """Return the Gaussian kernel [A, B] between features [A, F] and [B, F]."""
+    return torch.exp(-0.5 * (one[:, None] - other).square().sum(2) / length**2)

@@ -1,0 +1,115 @@
+"""States of training frames as unknowns of their true size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import grasper_world as world
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from neeco.capture.model import InstrumentState, State, Uncertainty
+from neeco.fitting.state_fitter import StateFit
+from neeco.methods.kinematic.contradictions import CONTRADICTING, doubt_states
+from neeco.methods.kinematic.state_passes import LARGE
+from neeco.methods.kinematic.state_search import JOINT, LARGEST, FittedState, StateSearch
+from neeco.scene import Recorded
+from neeco.scene.training_views import TrainingViews
+from neeco.training.config import method_defaults
+from neeco.training.session import GaussianSession, new_session
+
+TRUE = [world.moving(k) for k in range(-4, 8)]
+
+
+def with_errors(states: Sequence[State], scale: float) -> list[State]:
+    """States with errors of 2 degrees of tilt, 6 of roll, 1.5 mm of depth and 4 degrees of the joint, times `scale`."""
+    rng, wrong = np.random.default_rng(1), []
+    for state in states:
+        given = state.instruments["grasper"]
+        pose = given.pose.clone()
+        turn = Rotation.from_rotvec(scale * np.radians(rng.standard_normal(3) * [2, 2, 6])).as_matrix()
+        pose[:3, :3] = pose[:3, :3] @ torch.from_numpy(turn)
+        pose[:3, 3] += torch.from_numpy(scale * rng.standard_normal(3) * [0.3, 0.3, 1.5])
+        jaw = given.joints["jaw_angle"] + scale * math.radians(4) * float(rng.standard_normal())
+        wrong.append(replace(state, instruments={"grasper": InstrumentState(pose, {"jaw_angle": jaw})}))
+    return wrong
+
+
+def session_of(root: Path, states: Sequence[State]) -> GaussianSession:
+    """A session whose scene is learned, over images in the TRUE states that are recorded as `states`."""
+    scene = world.make_scene()
+    capture = world.record(scene, root, TRUE, "train")
+    frames = tuple(replace(f, state=state) for f, state in zip(capture.frames, states, strict=True))
+    scene.recorded = Recorded.of(frames, scene.instruments)
+    return new_session(scene, TrainingViews.read(frames, 1.0), method_defaults("kinematic"))
+
+
+def search_of(session: GaussianSession) -> StateSearch:
+    return StateSearch.of(session, session.scene.deformation)  # type: ignore[arg-type]
+
+
+def measured(search: StateSearch, scale: float) -> list[FittedState]:
+    """Fits as images of 0.3 degrees and 0.3 mm make them of states with errors of this scale, without images."""
+    fits, rng = [], np.random.default_rng(2)
+    layout = search.session.refinement.layout
+    information = torch.diag(layout.vector_from_degrees(0.3, 0.3, 1.0, 0.1) ** -2)
+    for index, wrong in enumerate(with_errors(TRUE, scale)):
+        noise = torch.from_numpy(rng.standard_normal(layout.size)) * torch.diagonal(information).rsqrt()
+        precision = search.precision(index, LARGEST)
+        most_likely = layout.increments_between(wrong, TRUE[index]) + noise
+        correction = torch.linalg.solve(information + precision, information @ most_likely)
+        fit = StateFit(state=wrong, cost=0.0, gain=0.0, misfit=1.0, information=information, view=search.view(0, None))
+        fits.append(FittedState(index=index, fit=fit, precision=precision, correction=correction))
+    return fits
+
+
+def test_errors_of_a_robot_are_told_from_those_of_a_tracker(tmp_path: Path) -> None:
+    search = search_of(session_of(tmp_path, TRUE))
+    scales = [search.scale_of(measured(search, scale)) for scale in (0.1, 1.0)]
+    assert scales[0] < LARGE < scales[1] < 1.5
+
+
+def test_a_joint_is_fitted_to_its_image(tmp_path: Path) -> None:
+    states = list(TRUE)
+    given = TRUE[6].instruments["grasper"]
+    states[6] = replace(TRUE[6], instruments={"grasper": InstrumentState(given.pose, {"jaw_angle": 0.55})})
+    found = search_of(session_of(tmp_path, states)).fitted(6, 1.0)
+    assert found is not None
+    error = found.fit.state.instruments["grasper"].joints["jaw_angle"] - given.joints["jaw_angle"]
+    assert abs(error) < 1.5 * found.deviations[6]
+    assert found.deviations[6] < math.radians(3.5) < math.radians(JOINT)
+
+
+def test_a_wrong_state_contradicts_the_others_and_is_found_from_one_of_theirs(tmp_path: Path) -> None:
+    states = list(TRUE)
+    states[3] = replace(TRUE[10], time=TRUE[3].time)
+    session = session_of(tmp_path, states)
+    doubt_states(search_of(session), LARGE)
+    assert session.scene.diagnostics[CONTRADICTING] == {"000003": "fitted anew"}
+    found = session.refinement.state(3, states[3])
+    assert session.refinement.layout.increments_between(TRUE[3], found)[3:6].norm() < 0.7
+
+
+def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
+    session = session_of(tmp_path, TRUE)
+    frame = session.full_views.frames[5]
+    world.write_image(frame.image_path, torch.rand(64, 96, 3, generator=torch.Generator().manual_seed(0)))
+    doubt_states(search_of(session), LARGE)
+    assert session.scene.diagnostics[CONTRADICTING] == {"000005": "left out"}
+    assert session.refinement.weights.tolist() == [float(index != 5) for index in range(len(TRUE))]
+
+
+def test_stated_uncertainties_are_the_prior(tmp_path: Path) -> None:
+    stated = Uncertainty((0.1, 0.2, 3.0), (0.5, 0.5, 20.0), {"jaw_angle": 7.0})
+    given = TRUE[0].instruments["grasper"]
+    unsure = State({"grasper": InstrumentState(given.pose, dict(given.joints), uncertainty=stated)}, TRUE[0].time)
+    search = search_of(session_of(tmp_path, [unsure, *TRUE[1:]]))
+    covariance = torch.linalg.inv(search.precision(0, 1.0))
+    assert covariance[6, 6].sqrt() == pytest.approx(math.radians(7.0))
+    turns = covariance[:3, :3].diagonal().sqrt().rad2deg()
+    assert turns.tolist() == pytest.approx([0.5, 0.5, 20.0], rel=0.01)
