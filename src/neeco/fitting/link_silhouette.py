@@ -302,8 +302,8 @@ def joint_values(tree: KinematicTree, readings: dict[str, np.ndarray]) -> np.nda
 
 
 def with_motion(values: np.ndarray) -> np.ndarray:
-    """Values [S, F, 2 L]: those [S, F, L] of all links' joints at evenly spaced moments S about those of the frames, and the signs of their motion then,
-    rounded where they turn."""
+    """Values [S, F, 2 L]: those [S, F, L] of all links' joints at evenly spaced moments S about those of the frames,
+    and the signs of their motion then, rounded where they turn."""
     last = len(values) - 1
     near = np.arange(len(values))
     speed = values[np.minimum(near + MOTION_STEPS, last)] - values[np.maximum(near - MOTION_STEPS, 0)]
