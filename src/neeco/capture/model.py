@@ -168,6 +168,7 @@ class Instrument:
     unrecorded: tuple[str, ...] = ()
     from_video: FromVideo | None = None
     left_out: tuple[str, ...] = ()
+    _: KW_ONLY
     base_uncertainty: BaseUncertainty | None = None  # None: not stated
 
     def __repr__(self) -> str:
