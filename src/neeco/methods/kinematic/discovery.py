@@ -38,9 +38,8 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
     if isinstance(articulated, BreathingTissue) and articulated.may_breathe and session.timed:
         tissue = _learn_breathing(session, articulated, tissue)
     evidence = tissue_evidence(scene, session.views, session.config, tissue)
-    found = register_states(session, articulated.articulations)
-    if found is not None:
-        evidence = corrected_evidence(session, evidence, found)
+    if register_states(session, articulated.articulations) is not None:
+        evidence = corrected_evidence(session, evidence)
     scene.canonical = _with_instruments(session, articulated, evidence, register=True)
 
 

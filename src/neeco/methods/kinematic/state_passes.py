@@ -13,7 +13,6 @@ from neeco.capture.model import evenly_spaced
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.methods.kinematic.contradictions import CONTRADICTING, doubt_states
 from neeco.methods.kinematic.discovery import carve_again
-from neeco.methods.kinematic.state_registration import SIZES
 from neeco.methods.kinematic.state_search import LARGEST, StateSearch
 from neeco.training.session import GaussianSession
 
@@ -43,7 +42,7 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
         scale = search.scale_of(sampled) if len(sampled) > 2 else 0.0
         if mark == DECIDED_AT[0]:
             doubt_states(search, max(scale, LARGE))
-        if scale > LARGE or SIZES in scene.diagnostics:
+        if scale > LARGE:
             scene.diagnostics[FOUND] = round(scale, 3)
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
             for index, *_ in refinement.frames_of_pose:

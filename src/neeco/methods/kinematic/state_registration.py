@@ -1,4 +1,4 @@
-"""States of training frames whose errors are larger than a tracker's, found before any Gaussian exists."""
+"""States of training frames that contradict the others, found before any Gaussian exists."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.special import expit
-from torch.nn.functional import interpolate
 
 from neeco.capture.model import InstrumentState
 from neeco.fitting.link_states import LinkViews
@@ -20,13 +18,11 @@ from neeco.methods.space_carving import Evidence
 from neeco.training.session import GaussianSession
 
 WIDTH_PX = 320  # of the images compared
-SIZES = "errors_of_states"  # of a scene's diagnostics: standard deviations where they are large
 MIN_STATES = 8  # with fewer, nothing is said about them
 
 
 def register_states(session: GaussianSession, articulations: Sequence[object]) -> FoundStates | None:
-    """Correct the states of the training frames, and leave out those that contradict the others; None where they are
-    no worse than expected.
+    """Refit the states of training frames that contradict the others, or leave them out; None where there are none.
 
     For one instrument, with stated links and all readings recorded.
     """
@@ -64,10 +60,10 @@ def register_states(session: GaussianSession, articulations: Sequence[object]) -
     tilt, roll, across, depth = usual[:3].min(), usual[:3].max(), usual[3:6].min(), usual[3:6].max()
     expected = np.append([tilt, tilt, roll, across, across, depth], usual[6:])
     found = find_states(given, expected, slides)
-    if found is None:
+    if found is None or not found.inconsistent.any():  # errors of all states are refined while training
         return None
     _correct(session, found)
-    _report(session, found, slides)
+    _note(session, found)
     return found
 
 
@@ -78,7 +74,7 @@ def _correct(session: GaussianSession, found: FoundStates) -> None:
     for row, shown in enumerate(refinement.frames_of_pose):
         if found.inconsistent[row] and not found.refitted[row]:
             refinement.weights[shown] = 0
-        elif found.large or found.inconsistent[row]:
+        elif found.inconsistent[row]:
             recorded = session.views.frames[shown[0]].state
             own = recorded.instruments[instrument.name]
             readings = dict(zip(instrument.kinematics.readings, found.readings[row].tolist(), strict=True))
@@ -89,16 +85,8 @@ def _correct(session: GaussianSession, found: FoundStates) -> None:
             )
 
 
-def _report(session: GaussianSession, found: FoundStates, slides: np.ndarray) -> None:
-    (instrument,) = session.scene.instruments
-    assert instrument.kinematics is not None
-    names = ["tilt", "", "roll", "across", "", "depth", *instrument.kinematics.readings]
-    degrees = [True] * 3 + [False] * 3 + [not slide for slide in slides]
-    sizes = {
-        f"{name}_{'deg' if turns else 'mm'}": round(float(np.degrees(sd) if turns else sd), 2)
-        for name, sd, turns in zip(names, found.sds, degrees, strict=True)
-        if name
-    }
+def _note(session: GaussianSession, found: FoundStates) -> None:
+    """Note the states that contradict the others in the scene's diagnostics."""
     diagnostics: dict[str, Any] = session.scene.diagnostics
     noted: dict[str, str] = {}
     for row in np.flatnonzero(found.inconsistent).tolist():
@@ -106,17 +94,10 @@ def _report(session: GaussianSession, found: FoundStates, slides: np.ndarray) ->
             noted[session.views.frames[shown].name] = FITTED_ANEW if found.refitted[row] else LEFT_OUT
     if noted:
         diagnostics[CONTRADICTING] = noted
-    if found.large:
-        diagnostics[SIZES] = {instrument.name: sizes}
-        listed = ", ".join(f"{key.rpartition('_')[0]} {value} {key.rpartition('_')[2]}" for key, value in sizes.items())
-        session.report(
-            f"{instrument.name}: its states err more than a tracker's (standard deviations: {listed}); refined"
-        )
 
 
-def corrected_evidence(session: GaussianSession, evidence: Evidence, found: FoundStates) -> Evidence:
-    """Return the evidence with the states as corrected, without frames that were left out; where all states were, its
-    images are those of the instrument's colours."""
+def corrected_evidence(session: GaussianSession, evidence: Evidence) -> Evidence:
+    """Return the evidence with the states as corrected, without frames that were left out."""
     index = {frame.name: number for number, frame in enumerate(session.views.frames)}
     numbers = [index[frame.name] for frame in evidence.frames]
     weights = session.refinement.weights
@@ -128,8 +109,4 @@ def corrected_evidence(session: GaussianSession, evidence: Evidence, found: Foun
         for frame, number in zip(evidence.frames, numbers, strict=True)
     )
     evidence = replace(evidence, frames=frames)
-    if found.large:
-        hits = torch.from_numpy(expit(found.ratios[numbers])).to(evidence.hits)
-        hits = interpolate(hits[:, None], size=tuple(evidence.hits.shape[1:]), mode="bilinear")[:, 0]
-        evidence = replace(evidence, hits=hits, unshaded=None if evidence.unshaded is None else hits)
     return evidence.subset(remaining)
