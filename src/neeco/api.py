@@ -210,8 +210,9 @@ def train(
     """Learn a scene from the training frames of the capture in folder `capture`; writes the run folder `output`.
 
     method: kinematic (None), neeco (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta. iterations: frames
-    that are learned from; minutes: stop in time with a finished run. The same seed (None: 0) gives the same scene on
-    the same machine, unless `minutes` is given. resume: continue an interrupted run in `output`, under its own
+    that are learned from (None: 6,000, with fewer than 60 training frames kinematic takes less); minutes: stop in time
+    with a finished run. The same seed (None: 0) gives the same scene on the same machine, unless `minutes` is given.
+    resume: continue an interrupted run in `output`, under its own
     settings, which what is given here must not contradict. progress: is called with every row of metrics (iteration,
     loss, psnr, num_gaussians, progress in [0, 1], note). settings: any field of the training config, with two
     underscores for a dot (`deformation__shadow=False`); `neeco train --help` lists them.

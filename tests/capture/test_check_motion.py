@@ -122,6 +122,22 @@ def test_states_of_other_frames_are_told_with_their_number(sample, frames, words
     assert line == f"frames[*].instruments[*]: states of 'maryland' fit the images better {words}"
 
 
+def with_a_second(change: Callable[[Document], object]) -> Callable[[Document], None]:
+    """A second instrument, whose states are those of the only one, changed."""
+
+    def added(document: Document) -> None:
+        other = copy.deepcopy(document)
+        change(other)
+        for frame, state in zip(document["frames"], states(other), strict=True):
+            frame["instruments"].append(state | {"name": "second"})
+
+    return added
+
+
+def test_what_one_instrument_explains_is_no_evidence_against_another(sample):
+    assert told(sample, with_a_second(shift(7))) == []
+
+
 @pytest.mark.slow
 def test_a_clock_that_is_off_is_told_in_seconds_where_frames_are_unevenly_spaced(sample):
     (line,) = told(sample, delay(0.48))

@@ -134,3 +134,35 @@ def test_a_wrist_that_mirrors_the_tissue_does_not_make_the_shafts_shadow_instrum
     assert float(shadow[(place[:, 0] > 4.5) & (place[:, 1].abs() < 25)].max()) < 0.1
     assert bool((wrist == 1).all())
     assert scene.label_threshold == 0.5
+
+
+class FringedScene(StillScene):
+    """The side stripe is a translucent fringe of tissue's colour, which a state shifts to the right, in mm."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.canonical.opacity_logits[self.canonical.body(1)][self.metal_count :] = 0.0
+
+    def at(self, state: object) -> Gaussians:
+        posed = super().at(state)
+        means = posed.means.clone()
+        fringe = means[self.canonical.body(1)][self.metal_count :]
+        fringe += torch.tensor([float(state or 0), 0.0, -1.0])  # type: ignore[arg-type]
+        return replace(posed, means=means)
+
+
+def test_a_fringe_is_no_instrument_though_some_frames_show_it_in_front_of_the_instrument() -> None:
+    scene = FringedScene(side=tuple(0.8 * value for value in TISSUE))
+    places = (-10, 8, 12)  # in front of the metal, on the tissue, on the tissue
+    bare = StillScene.at(scene, None).select(slice(0, len(scene.canonical) - 144))
+    session = session_of(scene)
+    image = module.rasterize(bare, CAMERA).color
+    session.views.target = lambda index: image
+    session.corrected = lambda index: (places[index], CAMERA)
+    session.frames_along_poses = lambda count: range(len(places))
+    store_label_shares(session)
+    instrument = scene.canonical.body(1)
+    share, points = scene.canonical.extras[LABEL_SHARE][instrument], scene.canonical.means[instrument]
+    fringe = (torch.arange(len(share)) >= scene.metal_count) & (points[:, 1].abs() < 25)
+    assert float(share[: scene.metal_count].min()) > 0.9
+    assert float(share[fringe].max()) < 0.1

@@ -35,6 +35,13 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
     assert config.refine.cameras
 
 
+def test_few_frames_are_repeated_less_unless_iterations_are_set() -> None:
+    default = training_config("kinematic", {})
+    assert [default.for_frames(frames).iterations for frames in (15, 30, 60, 500)] == [3000, 4000, 6000, 6000]
+    assert training_config("kinematic", {"iterations": 6000}).for_frames(15).iterations == 6000
+    assert training_config("3dgs", {}).for_frames(15).iterations == 6000
+
+
 def test_a_preset_comes_before_whatever_else_is_set() -> None:
     published = training_config("neeco", {}, ["deformation.preset=published"])
     assert published == training_config("neeco", {})

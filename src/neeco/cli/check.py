@@ -63,8 +63,13 @@ def _print(problems: list[Problem], errors: int, summary: CaptureSummary) -> Non
 
 
 def _summary_lines(summary: CaptureSummary) -> list[str]:
+    from neeco.capture.checks.expectation import expected_labels
+
     frames = ", ".join(f"{count} {name!r}" for name, count in summary.splits.items()) or "none"
     lines = [f"frames: {frames}", f"sparse points: {summary.points}"]
+    expected = expected_labels(summary.splits.get("train", 0)) if summary.travel_mm else None
+    if expected is not None:
+        lines.append(expected)
     if summary.still:
         lines.append(
             "scope: stands still; nothing shows the scene from elsewhere, so render views near the recorded ones"

@@ -23,7 +23,7 @@ class Arguments:
     """kinematic (the default), neeco (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's
     training adjustment."""
     iterations: int | None = None
-    """Frames rendered and learned from; by default as the method has it."""
+    """Frames rendered and learned from; by default 6,000, of fewer than 60 training frames fewer (kinematic)."""
     batch_size: int | None = None
     """Frames between two optimisation steps, whose mean loss is minimised; by default 1. More are for a GPU."""
     minutes: float | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ FLAGS = (  # fields that `neeco train` has a flag for; the others are set by --s
 )
 LOG_INTERVAL = 50
 REMOVED_GROUPS = ("search",)  # of settings that config.yaml of version 0.2 and older has; no longer settings
+ITERATIONS = 6000  # of a run of many frames
 TISSUE_GAUSSIANS, INSTRUMENT_GAUSSIANS = 20_000, 4_000  # at most, for images of 320x256
 
 
@@ -71,7 +72,7 @@ class TrainConfig:
     """Settings of one run."""
 
     method: str = DEFAULT
-    iterations: int = 6000  # frames rendered and learned from
+    iterations: int | None = None  # frames rendered and learned from; None: 6,000, fewer of few frames (`for_frames`)
     batch_size: int = 1  # frames between two optimiser steps
     minutes: float | None = None  # stop in time with a finished run; None: no limit
     seed: int = 0
@@ -111,7 +112,18 @@ class TrainConfig:
     @property
     def length(self) -> RunLength:
         """The end of the run, in iterations or minutes."""
-        return RunLength(self.iterations, self.minutes)
+        return RunLength(self.iterations or ITERATIONS, self.minutes)
+
+    def for_frames(self, frames: int) -> TrainConfig:
+        """Return the settings of a run of so many training frames: its iterations, where these are not set.
+
+        A third of them, in which shapes form, does not depend on the frames. The others are proportional to the frames
+        up to the method's `enough_frames`: repeated longer, few frames are memorised.
+        """
+        if self.iterations is not None:
+            return self
+        share = min(1.0, frames / max(1, method_class(self.method).enough_frames))
+        return replace(self, iterations=round(ITERATIONS * (1 + 2 * share) / 3))
 
 
 def method_defaults(method: str) -> TrainConfig:
@@ -245,7 +257,7 @@ def _with_preset(config: TrainConfig, assignments: Sequence[tuple[str, Any]]) ->
 
 def check_ranges(config: TrainConfig) -> None:
     """Raise NeecoError naming the option of a number that is out of range."""
-    if config.iterations < 1:
+    if config.iterations is not None and config.iterations < 1:
         raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
     if config.minutes is not None and not config.minutes > 0:
         raise NeecoError(f"--minutes: {config.minutes} is not a positive number")

@@ -108,6 +108,7 @@ def train(
             with own_folder(output):  # removes temporary files of a process killed after its last step
                 return output
     frames = _training_frames(capture, capture_path, config)
+    config = config.for_frames(len(frames))
     log = _Log(output / "metrics.jsonl", progress, watch, clock)
     go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
     with own_folder(output), method_class(config.method).torch_threads(), _stating_memory(frames, config):

@@ -111,12 +111,24 @@ def check_motion(parsed: Parsed, known: Mapping[str, MotionVerdict]) -> None:
 
 def judge_motion(parsed: Parsed, instrument: Instrument, motion: MotionEvidence) -> MotionVerdict:
     """Compare the states of an instrument, which every frame has, with the motion in the images."""
-    states = [frame.state.instruments[instrument.name] for frame in parsed.frames]
-    recorded = np.stack([state.pose.numpy() for state in states])
-    judged = _Judged(parsed, instrument, states, root_poses(instrument, recorded, states), motion)
-    given = motion.mean(judged.given)
+    states, poses = _recorded(parsed, instrument)
+    rows = motion.views.rows
+    others = [_recorded(parsed, item)[1][rows] for item in parsed.instruments if item.name != instrument.name]
+    own = motion.without(others, poses[rows])
+    if own is None:
+        return MotionVerdict(None, False)
+    judged = _Judged(parsed, instrument, states, poses, own)
+    given = own.mean(judged.given)
     fault = _fault(judged, given)
+    if fault is not None and not fault.named and len(own.ray_views) < len(motion.ray_views) / 2:
+        fault = None  # the others explain most of what moves
     return MotionVerdict(fault, fault is None and given > CONTRADICTED)
+
+
+def _recorded(parsed: Parsed, instrument: Instrument) -> tuple[list[InstrumentState], np.ndarray]:
+    """Return the states of an instrument, which every frame has, and the poses [N, 4, 4] of its root."""
+    states = [frame.state.instruments[instrument.name] for frame in parsed.frames]
+    return states, root_poses(instrument, np.stack([state.pose.numpy() for state in states]), states)
 
 
 @dataclass(frozen=True)

@@ -204,9 +204,23 @@ class MotionEvidence:
 
     def thinned(self) -> MotionEvidence:
         """Fewer of the rays, at fewer depths, for a first comparison of many poses."""
+        return self._subset(slice(None, None, QUICK_RAYS), slice(None, None, QUICK_DEPTHS))
+
+    def without(self, others: list[np.ndarray], poses: np.ndarray) -> MotionEvidence | None:
+        """The rays but those that poses of other instruments, each [F, 4, 4], explain, and better than `poses` do:
+        mirrored, the motion of one arm is like that of another. None where too few are left."""
+        if not others:
+            return self
+        everywhere = np.ones(len(poses), dtype=bool)
+        own = self.explained(self.evidence(poses), everywhere)
+        theirs = np.max([self.explained(self.evidence(other), everywhere) for other in others], axis=0)
+        rest = theirs <= np.maximum(own, MIN_EVIDENCE)
+        return self._subset(rest) if len(np.unique(self.ray_views[rest])) >= MIN_FRAMES else None
+
+    def _subset(self, rays: np.ndarray | slice, depths: slice = slice(None)) -> MotionEvidence:
         few = copy.copy(self)
-        few.ray_views, few._others = self.ray_views[::QUICK_RAYS], self._others[::QUICK_RAYS]
-        few.points = self.points[::QUICK_RAYS, ::QUICK_DEPTHS]
+        few.ray_views, few._others = self.ray_views[rays], self._others[rays]
+        few.points = self.points[rays][:, depths]
         return few
 
     def evidence(self, poses: np.ndarray) -> np.ndarray:

@@ -116,6 +116,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
     Settings = KinematicSettings
     separates_instruments = True
     learns_tissues = True
+    enough_frames = 60
     training_defaults: ClassVar[Mapping[str, Any]] = {
         **PLAIN_TRAINING,
         "schedule.sh_interval": 500,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neeco.methods.kinematic.articulation import ArticulatedInstruments, Articulation
-from neeco.methods.kinematic.wrist import MIN_SOLID_GAUSSIANS, solid_gaussians
+from neeco.methods.kinematic.wrist import MIN_SOLID_GAUSSIANS, SOLID_OPACITY, solid_gaussians
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.training.session import GaussianSession
 
@@ -24,14 +24,14 @@ REMOVED_OPACITY = 1e-4  # of tissue that is to be pruned
 
 @torch.no_grad()
 def fade_interior_tissue(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Make tissue inside a shaft transparent, so that it is pruned and the instrument takes its place."""
+    """Make tissue inside a shaft transparent, so that it is pruned and the instrument takes its place, where enough of
+    it is solid to be taken for the shaft."""
     canonical = session.scene.canonical
     inside = interior_tissue(session, articulated)
-    if not bool(inside.any()):
-        return
     logits = canonical.opacity_logits[canonical.body(0)]
+    if int((inside & (torch.sigmoid(logits) > SOLID_OPACITY)).sum()) < MIN_SOLID_GAUSSIANS:
+        return
     logits[inside] = math.log(REMOVED_OPACITY)
-    session.adam.forget("opacity_logits")
 
 
 @torch.no_grad()

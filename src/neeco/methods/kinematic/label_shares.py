@@ -32,8 +32,10 @@ COLOR_ERROR = 0.02, 0.06  # standard deviation of a tissue pixel across its shad
 OTHER_DENSITY = 0.02  # of colours that neither model explains
 MIN_SHADE_LENGTH = 0.05  # of the segment in colour space that shades lie on
 LOW, HIGH = 0.25, 0.35  # mean probability of its pixels at which a Gaussian's share is 0 and 1
+OUTSIDE = 0.2  # mean probability of a Gaussian's pixels in a frame, below which that frame shows it on the tissue
+FEW, MANY = 0.25, 0.45  # of the frames that show a Gaussian: on the tissue in so many, its share is 1 and 0
 MIN_INSIDE = 0.9  # mean probability inside the instruments, below which colours do not separate them from the tissue
-MIN_CERTAIN = 0.15  # share of a part's pixels that must be inside, for its colours to be known by themselves
+MIN_CERTAIN = 0.15  # share of a part's pixels that must be inside, for its colours to be known
 MIN_PIXELS = 1e-3  # of a Gaussian in all frames; one with less counts as instrument
 THRESHOLD = 0.5  # of the labels then: half of a pixel
 
@@ -65,41 +67,49 @@ def store_label_shares(session: GaussianSession) -> None:
     known = np.concatenate([p[view.inside] for p, view in zip(probable, views, strict=True)])
     inside = float(known.mean()) if len(known) else 0.0
     scene.diagnostics["label_shares"] = {"inside": round(inside, 3)}
-    separable = _separable_parts(scene, views, probable)
+    known_parts, separable = _known_parts(scene, views, probable)
     if inside >= MIN_INSIDE:
         separable[:] = True
     elif not separable.any():
         return
     else:  # colours of the others are the tissue's, too
+        known_parts[:] = False
         views = [replace(view, inside=view.inside & separable[view.parts]) for view in views]
         colors = _color_density(views)
         probable = [_probability(view, colors) for view in views]
     probable = [np.where(view.inside, 1.0, p) for p, view in zip(probable, views, strict=True)]
-    share = _label_shares(session, views, probable)
+    share, fringe = _label_shares(session, views, probable)
     part = scene.label_channels().argmax(1)
-    share[instrument & ~torch.from_numpy(separable).to(part.device)[part]] = 1
+    learned = torch.from_numpy(known_parts).to(part.device)[part] & instrument
+    weighed = torch.from_numpy(separable).to(part.device)[part]
+    share = torch.where(learned, torch.minimum(share, fringe), share)
+    share[instrument & ~weighed] = 1
     scene.canonical = scene.canonical.with_extras(**{LABEL_SHARE: share})
     scene.label_threshold = THRESHOLD
     scene.diagnostics["label_shares"]["mean"] = round(float(share[instrument].mean()), 3)
 
 
-def _separable_parts(scene: GaussianScene, views: list[_View], probable: list[np.ndarray]) -> np.ndarray:
-    """Return the parts [L] bool that colours separate from the tissue by themselves, whatever the others look like."""
-    found = np.zeros(len(scene.label_names), bool)
-    for part in range(len(found)):
+def _known_parts(scene: GaussianScene, views: list[_View], probable: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return two bool [L]: parts whose colours are known, since many of their pixels are inside, and those of them that
+    colours separate from the tissue by themselves, whatever the others look like."""
+    known, separable = np.zeros((2, len(scene.label_names)), bool)
+    for part in range(len(known)):
         own = [view.parts == part for view in views]
-        known = np.concatenate([p[view.inside & rows] for p, view, rows in zip(probable, views, own, strict=True)])
-        count = sum(int(rows.sum()) for rows in own)
-        found[part] = len(known) > MIN_CERTAIN * count and float(known.mean()) >= MIN_INSIDE
-    return found
+        inside = np.concatenate([p[view.inside & rows] for p, view, rows in zip(probable, views, own, strict=True)])
+        known[part] = len(inside) > MIN_CERTAIN * sum(int(rows.sum()) for rows in own)
+        separable[part] = known[part] and float(inside.mean()) >= MIN_INSIDE
+    return known, separable
 
 
-def _label_shares(session: GaussianSession, views: list[_View], probable: list[np.ndarray]) -> Tensor:
-    """Return label weights [N] in [0, 1] by the mean probability of the pixels that show a Gaussian; 1 for tissue and
-    unobserved Gaussians."""
+def _label_shares(session: GaussianSession, views: list[_View], probable: list[np.ndarray]) -> tuple[Tensor, Tensor]:
+    """Return label weights [N] in [0, 1] by two criteria; 1 for tissue and unobserved Gaussians.
+
+    The first follows the mean probability of the pixels that show a Gaussian, the second the share of frames that show
+    it on the tissue: a fringe beside a surface lies in front of the instrument in some views, the surface never beside
+    it.
+    """
     scene = session.scene
-    shown = torch.zeros_like(scene.canonical.opacity_logits)
-    as_instrument = torch.zeros_like(shown)
+    shown, as_instrument, frames, on_tissue = scene.canonical.opacity_logits.new_zeros(4, len(scene.canonical))
     for view, probability in zip(views, probable, strict=True):
         state, camera = session.corrected(view.index)
         posed = scene.at(state)
@@ -107,11 +117,18 @@ def _label_shares(session: GaussianSession, views: list[_View], probable: list[n
         counted = shown.new_ones(view.pixels.shape) if mask is None else mask.to(shown)
         likely = torch.zeros_like(counted)
         likely[torch.from_numpy(view.pixels).to(shown.device)] = torch.from_numpy(probability).to(shown)
-        shown += visible_pixels(posed, camera, counted)
-        as_instrument += visible_pixels(posed, camera, likely * counted)
+        pixels = visible_pixels(posed, camera, counted)
+        of_instrument = visible_pixels(posed, camera, likely * counted)
+        shown += pixels
+        as_instrument += of_instrument
+        frames += pixels.clamp_max(1)
+        on_tissue += pixels.clamp_max(1) * (of_instrument < OUTSIDE * pixels)
     share = ((as_instrument / shown.clamp_min(MIN_PIXELS) - LOW) / (HIGH - LOW)).clamp(0, 1)
-    share[~scene.canonical.of_instruments | (shown < MIN_PIXELS)] = 1
-    return share
+    outside = on_tissue / frames.clamp_min(MIN_PIXELS)
+    fringe = ((MANY - outside) / (MANY - FEW)).clamp(0, 1)
+    for weight in (share, fringe):
+        weight[~scene.canonical.of_instruments | (shown < MIN_PIXELS)] = 1
+    return share, fringe
 
 
 @torch.no_grad()

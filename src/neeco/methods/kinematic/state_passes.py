@@ -16,11 +16,11 @@ from neeco.methods.kinematic.discovery import carve_again
 from neeco.methods.kinematic.state_search import LARGEST, StateSearch
 from neeco.training.session import GaussianSession
 
-DECIDED_AT = 0.12  # share of the run at which errors are sized
-DOUBTED_AT = (DECIDED_AT, 0.28)  # shares at which wrong states are searched
+# share of the run at which errors are sized and wrong states searched: later, the scene has learned from these
+DECIDED_AT = 0.12
 CARVED_AT = (0.2, 0.32, 0.45)  # shares at which states are fitted, and shapes carved anew from them
 FITTED_AT = (0.6, 0.75, 0.9)  # shares at which states are fitted
-MARKS = tuple(sorted({*DOUBTED_AT, *CARVED_AT, *FITTED_AT}))
+MARKS = tuple(sorted({DECIDED_AT, *CARVED_AT, *FITTED_AT}))
 N_SAMPLED = 16  # frames by which errors are sized
 LARGE = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
 SCALE = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
@@ -46,8 +46,7 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
             for index, *_ in refinement.frames_of_pose:
                 refinement.set_deviations(index, search.deviations(index, SCALE))
-    if mark in DOUBTED_AT:
-        doubt_states(StateSearch.of(session, articulated), SCALE if FOUND in scene.diagnostics else LARGE)
+        doubt_states(search, SCALE if scale > LARGE else LARGE)
     if FOUND not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, doubted = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
