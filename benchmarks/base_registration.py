@@ -74,7 +74,7 @@ def main() -> int:
             print(", ".join(f"{key} {value:.2f}" for key, value in rows[-1].items()))
             continue
         recording = BaseRecording(path, words.masks)
-        tree = _tree(path, words.kinematics)
+        tree = tree_of(path, words.kinematics)
         for size in words.errors:
             mm, degrees = (float(part) for part in size.split("x"))
             found = [recording.find(mm, degrees, seed, tree) for seed in range(words.seeds)]
@@ -178,7 +178,7 @@ class BaseRecording:
         return np.append(view @ turn, view @ shift)
 
 
-def _tree(path: Path, which: str) -> KinematicTree | None:
+def tree_of(path: Path, which: str) -> KinematicTree | None:
     """The links that a capture states or has, without offsets of readings; or those of a file."""
     if which == "none":
         return None

@@ -64,6 +64,11 @@ def _joint(index, value):
     return lambda document: document["frames"][index]["instruments"][0]["joints"].__setitem__("jaw_angle", value)
 
 
+def _shared(covariance):
+    given = {"center": [0, 0, 90], "covariance": covariance}
+    return lambda document: document["instruments"][0].update(base_uncertainty=given)
+
+
 def _uncertainty(**changes):
     given = {"translation_mm": [0.2, 0.2, 1.0], "rotation_deg": [1, 1, 180], **changes}
     return lambda document: document["frames"][3]["instruments"][0].update(uncertainty=given)
@@ -113,6 +118,8 @@ EDITS = [
     (_uncertainty(rotation_deg=[1, -1, 2]), "frames[3].instruments[0].uncertainty.rotation_deg", "standard deviation"),
     (_uncertainty(joints_deg={"x": 1}), "frames[3].instruments[0].uncertainty.joints_deg.x", "no such joint"),
     (_uncertainty(joints_deg=[]), "frames[3].instruments[0].uncertainty.joints_deg", "expected an object"),
+    (_shared(np.diag([1.0] * 5 + [-1.0]).tolist()), "instruments[0].base_uncertainty.covariance", "no covariance"),
+    (_shared([[1.0] * 5] * 6), "instruments[0].base_uncertainty.covariance[0]", "6 numbers"),
     (_from_video({"shaft_diameter_mm": 0}), "instruments[0].from_video.shaft_diameter_mm", "out of range"),
     (_from_video({"shaft_diameter_mm": 5}), "instruments[0].from_video.working_length_mm", "expected a number"),
     (_head("cx", 900), "cx", "outside the image"),

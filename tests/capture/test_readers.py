@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from neeco.capture import check_capture, errors_only, read_capture, write_capture
 from neeco.capture.images import read_image, read_labels, read_mask, write_image, write_labels
 from neeco.capture.model import (
+    BaseUncertainty,
     Capture,
     Frame,
     FromVideo,
@@ -85,7 +86,9 @@ def test_the_lens_of_a_recording_is_written_and_read_back(folder, tmp_path, lens
 
 def test_what_was_found_in_video_is_written_and_read_back(folder, tmp_path):
     capture = read_capture(folder.root)
-    instruments = (replace(capture.instruments[0], from_video=FromVideo(5.0, 26.0)),)
+    shared = BaseUncertainty((1.0, 2.0, 90.0), tuple(map(tuple, np.diag([1e-4] * 3 + [0.5, 0.5, 2.0]).tolist())))
+    (item,) = capture.instruments
+    instruments = (replace(item, from_video=FromVideo(5.0, 26.0), base_uncertainty=shared),)
     (name, state), *_ = capture.frames[0].state.instruments.items()
     sure = Uncertainty((0.2, 0.1, 1.5), (0.5, 0.7, 180.0), {"jaw_angle": 6.0})
     first = replace(capture.frames[0], state=State({name: replace(state, uncertainty=sure)}))
@@ -96,6 +99,8 @@ def test_what_was_found_in_video_is_written_and_read_back(folder, tmp_path):
     assert copy.frames[0].state.instruments[name].uncertainty == sure
     assert copy.frames[1].state.instruments[name].uncertainty is None
     assert fingerprint(copy) == fingerprint(changed) != fingerprint(replace(changed, instruments=capture.instruments))
+    without = replace(changed, instruments=(replace(item, from_video=FromVideo(5.0, 26.0)),))
+    assert fingerprint(without) != fingerprint(changed)
     unsure = replace(changed, frames=(capture.frames[0], *capture.frames[1:]))
     assert fingerprint(unsure) != fingerprint(changed)
 

@@ -13,7 +13,7 @@ from wristed_world import shifted
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.errors import NeecoError
-from neeco.fitting.link_silhouette import ArticulatedModel, joint_values
+from neeco.fitting.link_silhouette import ArticulatedModel, joint_values, with_motion
 from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.articulated import ArticulatedMotion, find_articulated_base
 from neeco.ingest.registration.articulated_fit import (
@@ -22,6 +22,7 @@ from neeco.ingest.registration.articulated_fit import (
     contours_of,
     covariance,
     fit_articulated,
+    with_pose_errors,
 )
 from neeco.ingest.registration.silhouette_fit import BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
@@ -142,7 +143,7 @@ def test_the_bend_of_a_wrist_tells_the_place_along_the_shaft(masks):
         camera_from_world=STILL[rows],
         poses=poses,
         readings=readings,
-        values=joint_values(_tree(), readings),
+        values=with_motion(joint_values(_tree(), readings)),
         blocks=np.arange(len(rows)) // 2,
         prior=BasePrior(given, np.radians(3.0), 5.0),
     )
@@ -153,6 +154,23 @@ def test_the_bend_of_a_wrist_tells_the_place_along_the_shaft(masks):
     assert np.abs(turn).max() < 0.8
     assert abs(fit.clock - TRUE_CLOCK_S) < 0.01
     assert np.linalg.norm(sd[3:6]) < 2.5
+    # errors of logged poses count, most in turns, which the shaft's motion would seem to determine
+    logged = np.sqrt(np.diag(covariance(problem, with_pose_errors(problem, fit, max_steps=3))))
+    assert (logged[:3] > 1.2 * sd[:3]).all()
+
+
+def test_play_turns_a_joint_with_the_sign_of_its_motion():
+    shifted_readings = [_readings(TIMES + shift) for shift in CLOCK_SHIFTS_S]
+    readings = {name: np.stack([at[name] for at in shifted_readings]) for name in shifted_readings[0]}
+    values = with_motion(joint_values(_tree(), readings))[len(CLOCK_SHIFTS_S) // 2]
+    model = ArticulatedModel(_tree(), _poses_at(0.0))
+    lagging = model.means.copy()
+    lagging[model.plays[1]] = 0.02
+    wrist, moved = (model.link_poses(at, values)[0][1] for at in (model.means, lagging))
+    turned = Rotation.from_matrix(moved @ wrist.transpose(0, 2, 1)).as_rotvec()[:, 1]
+    fast = np.abs(values[:, 1 + 4]) > 0.5
+    assert (np.sign(turned[fast]) == np.sign(np.cos(1.9 * TIMES + 0.3)[fast])).all()
+    assert 0.01 < np.abs(turned[fast]).max() < 0.02
 
 
 @pytest.mark.slow

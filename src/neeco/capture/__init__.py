@@ -4,6 +4,7 @@ from neeco.capture.checks import CaptureSummary, Checked, check_capture, inspect
 from neeco.capture.documents import Problem, errors_only
 from neeco.capture.kinematics import KinematicTree, Link
 from neeco.capture.model import (
+    BaseUncertainty,
     Camera,
     Capture,
     Frame,
@@ -31,6 +32,7 @@ from neeco.capture.readers import (
 from neeco.capture.writer import camera_to_json, fingerprint, state_to_json, write_capture
 
 __all__ = [
+    "BaseUncertainty",
     "Camera",
     "Capture",
     "CaptureSummary",

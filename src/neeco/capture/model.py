@@ -43,6 +43,15 @@ class Uncertainty:
 
 
 @dataclass(frozen=True)
+class BaseUncertainty:
+    """Covariance of an error that all recorded poses of an instrument share, as that of a robot's base: a turn (rad)
+    about `center` (mm) and a shift (mm), both in the world's axes."""
+
+    center: tuple[float, ...]  # [3]
+    covariance: tuple[tuple[float, ...], ...]  # [6][6]
+
+
+@dataclass(frozen=True)
 class InstrumentState:
     """Pose and joint values of one instrument.
 
@@ -151,7 +160,7 @@ class Instrument:
     or None when not stated. `kinematics`: the links and which reading drives which joint, where that is known.
     `unrecorded`: joints of those that move the links and that no sensor logged, each with limits; in a capture's states
     they stand half way between these until they are found. `from_video`: its poses were found in the images.
-    `left_out`: recorded joints that a learned scene does not use."""
+    `left_out`: recorded joints that a learned scene does not use. `base_uncertainty`: of what all poses share."""
 
     name: str
     joints: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
@@ -159,6 +168,8 @@ class Instrument:
     unrecorded: tuple[str, ...] = ()
     from_video: FromVideo | None = None
     left_out: tuple[str, ...] = ()
+    _: KW_ONLY
+    base_uncertainty: BaseUncertainty | None = None  # None: not stated
 
     def __repr__(self) -> str:
         return f"Instrument({self.name!r}, joints: {', '.join(self.joints) or 'none'})"

@@ -113,6 +113,8 @@ def fingerprint(capture: Capture) -> str:
             digest.update(json.dumps([item.kinematics.to_json(), item.unrecorded]).encode())
         if item.from_video is not None:
             digest.update(json.dumps(from_video_to_json(item.from_video)).encode())
+        if item.base_uncertainty is not None:
+            digest.update(json.dumps(asdict(item.base_uncertainty)).encode())
     if capture.lens is not None:
         digest.update(json.dumps(capture.lens.to_json()).encode())
     if capture.still:
@@ -166,6 +168,8 @@ def _instrument_to_json(instrument: Instrument) -> dict[str, Any]:
         written["kinematics"] = instrument.kinematics.to_json()
     if instrument.from_video is not None:
         written["from_video"] = from_video_to_json(instrument.from_video)
+    if instrument.base_uncertainty is not None:
+        written["base_uncertainty"] = asdict(instrument.base_uncertainty)
     return written
 
 

@@ -20,7 +20,10 @@ from neeco.geometry.trocar import line_through_trocar
 TUBE_MM = 150.0  # of the root link that is modelled
 NEAREST_MM = 8.0  # depth at which cones are cut off
 PIVOT_SD_MM, AXIS_SD_RAD, OFFSET_SD_RAD = 1.2, 0.06, 0.05  # of what is stated; values of joints include shapes' errors
+HEADING_SD_RAD = 0.15  # of an outermost link's direction from the tube's at rest: a curved jaw looks like an offset
 SLIDE_SD_MM = 1.0  # of the offset of a prismatic joint
+PLAY_SD_RAD, PLAY_SD_MM = 0.012, 0.3  # by which readings lag behind, or lead, with the sign of motion
+MOTION_STEPS = 2  # moments before and after, between which the sign of motion is taken
 TILT_SD_RAD, ASIDE_SD_MM = 0.03, 0.7  # of the tube's axis about its first guess, and from the first pivot
 LOG_RADIUS_SD, RATIO_SD = 0.4, 0.3  # of radii, and of the ratio of one link's to its parent's
 FLAT_SD = 0.2  # of the relative change of a radius with the viewing direction
@@ -45,6 +48,7 @@ class Cone:
     child: int | None
     radii: int  # its parameters: logarithms of both radii, then two of its flatness
     length: int | None  # the parameter of an outermost link's length
+    heading: int | None = None  # that of its direction out of the plane in which it turns
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +107,13 @@ class ArticulatedModel:
         """Parameters of pivots and axes, which links at the same place share, and of offsets."""
         self.pivots: list[int | None] = []
         self.offsets: list[int | None] = []
+        self.plays: list[int] = []
         places: dict[tuple, int] = {}
-        for link, parent in zip(self.tree.links, self.parents, strict=True):
+        for index, (link, parent) in enumerate(zip(self.tree.links, self.parents, strict=True)):
             if link.type == FIXED:
                 self.pivots.append(None)
                 self.offsets.append(None)
+                self.plays.append(-1)
                 continue
             key = (parent, *link.origin[:3, 3].round(6), *link.axis.round(6))
             if key not in places:
@@ -115,7 +121,12 @@ class ArticulatedModel:
                 places[key] = self._add(f"pivot of {link.name}", [0] * 5, sds)
             self.pivots.append(places[key])
             sd = SLIDE_SD_MM if link.type == PRISMATIC else OFFSET_SD_RAD
+            if link.type != PRISMATIC and index not in self.parents:
+                sd = float(np.hypot(sd, HEADING_SD_RAD))
             self.offsets.append(self._add(f"offset of {link.name}", [0], [sd]))
+            self.plays.append(
+                self._add(f"play of {link.name}", [0], [PLAY_SD_MM if link.type == PRISMATIC else PLAY_SD_RAD])
+            )
 
     def _cones(self) -> None:
         self.cones: list[Cone] = []
@@ -133,7 +144,9 @@ class ArticulatedModel:
             if not below:
                 means, sds = [-0.45, np.log(TAPER), 0, 0], [RATIO_SD, 2 * RATIO_SD, FLAT_SD, FLAT_SD]
                 radii = self._add(f"radii of {link.name}", means, sds)
-                self.cones.append(Cone(index, None, radii, self._add(f"length of {link.name}", [0], [UNEQUAL_SD_MM])))
+                length = self._add(f"length of {link.name}", [0], [UNEQUAL_SD_MM])
+                heading = self._add(f"heading of {link.name}", [0], [HEADING_SD_RAD])
+                self.cones.append(Cone(index, None, radii, length, heading))
 
     def _chain(self, index: int) -> list[int]:
         found = []
@@ -143,8 +156,9 @@ class ArticulatedModel:
         return found
 
     def link_poses(self, parameters: np.ndarray, values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """root_from_link rotations [F, 3, 3] and translations [F, 3] mm of all links; values [F, L] of joints."""
-        count = len(values)
+        """root_from_link rotations [F, 3, 3] and translations [F, 3] mm of all links; values [F, L] of joints, or
+        [F, 2 L] with the signs of their motion (`with_motion`), by which their play acts."""
+        count, links = len(values), len(self.tree.links)
         turns, shifts = [np.tile(np.eye(3), (count, 1, 1))], [np.zeros((count, 3))]
         turns[0], shifts[0] = turns[0] @ self.tree.links[0].origin[:3, :3], shifts[0] + self.tree.links[0].origin[:3, 3]
         for index, link in enumerate(self.tree.links[1:], 1):
@@ -159,6 +173,8 @@ class ArticulatedModel:
             place = place + parameters[start : start + 3]
             axis = unit(axis + frame_about(axis)[:, :2] @ parameters[start + 3 : start + 5])
             value = values[:, index] + parameters[offset]
+            if values.shape[1] > links:
+                value = value + parameters[self.plays[index]] * values[:, index + links]
             if link.type == PRISMATIC:
                 turns.append(turn @ origin[:3, :3])
                 shifts.append(shift + turn @ place + value[:, None] * (turn @ axis))
@@ -186,8 +202,12 @@ class ArticulatedModel:
             rest = self.rest[cone.link][:3, :3].T
             if cone.child is None:
                 assert cone.length is not None
+                assert cone.heading is not None
+                link = self.tree.links[cone.link]
+                out_of_plane = link.origin[:3, :3].T @ link.axis
+                ahead = unit(rest @ self.axis + parameters[cone.heading] * out_of_plane)
                 length = max(parameters[self.mean_length] + parameters[cone.length], MIN_LENGTH_MM)
-                far = shift + length * (turn @ (rest @ self.axis))
+                far = shift + length * (turn @ ahead)
             else:
                 far = shifts[cone.child]
             ends.append(np.stack([shift, far], 1))
@@ -279,6 +299,16 @@ def joint_values(tree: KinematicTree, readings: dict[str, np.ndarray]) -> np.nda
             value = value + gain * readings[name]
         columns.append(value)
     return np.stack(columns, -1)
+
+
+def with_motion(values: np.ndarray) -> np.ndarray:
+    """Values [S, F, 2 L]: those [S, F, L] of all links' joints at evenly spaced moments S about those of the frames,
+    and the signs of their motion then, rounded where they turn."""
+    last = len(values) - 1
+    near = np.arange(len(values))
+    speed = values[np.minimum(near + MOTION_STEPS, last)] - values[np.maximum(near - MOTION_STEPS, 0)]
+    usual = np.abs(speed).mean((0, 1))
+    return np.concatenate([values, np.tanh(speed / np.maximum(usual, 1e-6))], -1)
 
 
 def bends(tree: KinematicTree, values: np.ndarray) -> bool:

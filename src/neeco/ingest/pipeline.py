@@ -110,7 +110,12 @@ def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
     assert images.lens is not None
     registered = world.registration is not None or set(data.parts[0].poses) <= set(data.world_from_base)
     lens = replace(images.lens, size=images.size, border=images.border)
-    instruments = instruments_of(data.recording, shaft)
+    instruments = tuple(
+        replace(one, base_uncertainty=base.uncertainty(views.world_from_camera[0], world.states[one.name][0][chosen]))
+        if (base := world.bases.get(one.name)) is not None
+        else one
+        for one in instruments_of(data.recording, shaft)
+    )
     return Capture(
         images.folder, frames, instruments, world.tissue, registered=registered, lens=lens, still=world.still
     )

@@ -69,7 +69,11 @@ def _joined(captures: dict[str, Capture]) -> Capture:
                 )
     lens = parts[0].lens if all(capture.lens == parts[0].lens for capture in parts) else None  # each was estimated
     tissues = tuple(Tissue(tissue, capture.points) for tissue, capture in captures.items())
-    return replace(parts[0], frames=frames, points=PointCloud(measured=False), lens=lens, tissues=tissues)
+    # the base stands elsewhere in each world
+    instruments = tuple(replace(item, base_uncertainty=None) for item in parts[0].instruments)
+    return replace(
+        parts[0], frames=frames, instruments=instruments, points=PointCloud(measured=False), lens=lens, tissues=tissues
+    )
 
 
 def by_tissue(recordings: Sequence[Recording]) -> dict[str | None, list[Recording]]:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from neeco.capture.documents import Node, RaisingReport, printable
-from neeco.capture.model import Frame, FromVideo, Instrument, InstrumentState, State, Uncertainty
+from neeco.capture.model import BaseUncertainty, Frame, FromVideo, Instrument, InstrumentState, State, Uncertainty
 from neeco.capture.readers.kinematics import parse_kinematics
 from neeco.errors import NeecoError
 from neeco.files import read_text
@@ -104,7 +104,8 @@ def declared_instruments(document: Node) -> tuple[Instrument, ...]:
             item.child("name").error(f"{printable(name)} is declared twice", "give every instrument its own name")
         tree = parse_kinematics(item.child("kinematics")) if item.has("kinematics") else None
         shaft = parse_from_video(item.child("from_video")) if item.has("from_video") else None
-        instruments[name] = Instrument(name, joints, tree, tuple(unrecorded), shaft)
+        shared = parse_base_uncertainty(item.child("base_uncertainty")) if item.has("base_uncertainty") else None
+        instruments[name] = Instrument(name, joints, tree, tuple(unrecorded), shaft, base_uncertainty=shared)
     return tuple(instruments.values())
 
 
@@ -130,6 +131,21 @@ def parse_from_video(node: Node) -> FromVideo | None:
     diameter = node.child("shaft_diameter_mm").number(above=0)
     working = node.child("working_length_mm").number(least=0)
     return None if diameter is None or working is None else FromVideo(diameter, working)
+
+
+def parse_base_uncertainty(node: Node) -> BaseUncertainty | None:
+    """`{"center": [x, y, z], "covariance": 6x6}`; None, and reported, where it is not that."""
+    if not node.is_object():
+        return None
+    center, covariance = node.child("center").numbers(3, "mm"), node.child("covariance")
+    rows = [row for item in covariance.items() if (row := item.numbers(6, "rad and mm")) is not None]
+    if center is None or not isinstance(covariance.value, list) or len(rows) < len(covariance.value):
+        return None
+    found = np.array(rows)
+    if found.shape != (6, 6) or not np.allclose(found, found.T) or np.linalg.eigvalsh(found).min() <= 0:
+        covariance.error("is no covariance", "give 6 x 6 numbers, symmetric and positive definite")
+        return None
+    return BaseUncertainty(tuple(center), tuple(map(tuple, rows)))
 
 
 def parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty | None:

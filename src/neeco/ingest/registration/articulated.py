@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
-from neeco.fitting.link_silhouette import ArticulatedModel, bends, joint_values
+from neeco.fitting.link_silhouette import ArticulatedModel, bends, joint_values, with_motion
 from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.articulated_fit import (
     WIDTHS_PX,
@@ -26,6 +26,7 @@ from neeco.ingest.registration.articulated_fit import (
     fit_articulated,
     minimise,
     overlap,
+    with_pose_errors,
 )
 from neeco.ingest.registration.base import (
     MIN_FRAMES,
@@ -49,7 +50,7 @@ APART_MM, APART_RAD = 3.0, 0.035  # between results that count as different
 # added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
 FLOOR_MM, FLOOR_DEPTH_MM, FLOOR_DEG = 0.25, 0.35, 0.25
 SCATTER = 1.3  # factor on standard deviations; assumed, as the floors are: few recordings were measured
-MIN_OVERLAP, USUAL_OVERLAP = 0.75, 0.85  # of the silhouette with the masks: doubted below, and what is usual
+USUAL_OVERLAP = 0.85  # of the silhouette with the masks
 LEAST_OVERLAP, MAX_RESIDUAL_PX = 0.4, 2.5  # beyond, nothing is found
 REVERSED_SHARE = 0.8  # of the cost, from which a joint counts as reversed
 MIN_EXCHANGED = 1.25  # times the cost, with poses of other moments
@@ -137,7 +138,7 @@ def _problem(
         camera_from_world=camera_from_world[rows],
         poses=poses[:, rows],
         readings={key: part[:, rows] for key, part in readings.items()},
-        values=values[:, rows],
+        values=with_motion(values[:, rows]),
         blocks=np.arange(len(rows)) * N_BLOCKS // len(rows),
         prior=BasePrior(given, np.radians(sd_deg), sd_mm, sd_clock),
     )
@@ -187,11 +188,11 @@ def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
 
 
 def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: ArticulatedMotion) -> BaseRegistration:
-    best, given = fits[0], problem.prior.world_from_base
+    best, given = with_pose_errors(problem, fits[0]), problem.prior.world_from_base
     full = covariance(problem, best)
     spread = SCATTER**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
-        weight = float(np.exp(-0.5 * (other.cost - best.cost)))
+        weight = float(np.exp(-0.5 * (other.cost - fits[0].cost)))
         off = _step(problem, best, other)
         spread = spread + weight / (1 + weight) * np.outer(off, off)
     in_view = in_camera(spread, problem.camera_from_world[0])
@@ -213,22 +214,26 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
         from_masks=True,
         shaft=shaft / np.linalg.norm(shaft),
         sd_motion_mm=sd_motion(spread, poses),
-        doubts=tuple(_doubts(problem, best, motion)),
+        doubts=tuple(_doubts(problem, fits[0], best, motion)),
         **moved_from(given, best.world_from_base, problem.middle),
     )
 
 
-def _doubts(problem: ArticulatedProblem, fit: ArticulatedFit, motion: ArticulatedMotion) -> list[str]:
-    """Sentences on what contradicts the recording's statements."""
+def _doubts(
+    problem: ArticulatedProblem, rigid: ArticulatedFit, fit: ArticulatedFit, motion: ArticulatedMotion
+) -> list[str]:
+    """Sentences on what contradicts the recording's statements; `rigid`: the fit without errors of poses, which would
+    make up for reversed joints."""
     model, prior = problem.model, problem.prior
-    reversed_ = [reading for reading in motion.tree.readings if _reversed(problem, fit, motion, reading)]
+    starts = [rigid]
+    if overlap(problem, fit) < USUAL_OVERLAP:  # a reversed joint may have led it astray
+        starts.append(replace(rigid, world_from_base=prior.world_from_base, parameters=model.means.copy()))
+    reversed_ = [
+        reading
+        for reading in motion.tree.readings
+        if any(_reversed(problem, rigid, start, motion, reading) for start in starts)
+    ]
     found = [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
-    share = overlap(problem, fit)
-    if share < MIN_OVERLAP:
-        found.append(
-            f"the outline found overlaps what moves by {share:.2f}; {USUAL_OVERLAP:.2f} or more is usual: check links, "
-            "lens, and which arm the log is of"
-        )
     assert prior.sd_mm is not None
     assert prior.sd_rad is not None
     step = _step(problem, replace(fit, world_from_base=prior.world_from_base), fit)
@@ -249,11 +254,15 @@ def _doubts(problem: ArticulatedProblem, fit: ArticulatedFit, motion: Articulate
     return found
 
 
-def _reversed(problem: ArticulatedProblem, fit: ArticulatedFit, motion: ArticulatedMotion, reading: str) -> bool:
-    """Whether the masks are explained clearly better with a reading's sign reversed."""
-    values = problem.values.copy()
+def _reversed(
+    problem: ArticulatedProblem, fit: ArticulatedFit, start: ArticulatedFit, motion: ArticulatedMotion, reading: str
+) -> bool:
+    """Whether the masks are explained clearly better than by a fit with a reading's sign reversed, from a start."""
+    count = len(motion.tree.links)
+    values = problem.values[..., :count].copy()
     for index, link in enumerate(motion.tree.links):
         values[:, :, index] -= 2 * link.value.get(reading, 0.0) * problem.readings[reading]
-    other = replace(problem, values=values)
-    trial = fit_articulated(other, fit, WIDTHS_PX[1:3], 5)
+    other = replace(problem, values=with_motion(values))
+    widths = WIDTHS_PX[1:3] if start is fit else WIDTHS_PX[:3]
+    trial = fit_articulated(other, start, widths, 5 if start is fit else 10)
     return minimise(other, trial, WIDTHS_PX[-1], 8).cost < REVERSED_SHARE * fit.cost

@@ -2,6 +2,9 @@
 
 Residuals count both ways: points of the model's outline by their distances from the masks' outlines, and points of the
 masks' outlines by their distances from the model's, so that neither a model too small nor one too large fits.
+
+The errors of the logged poses are unknowns of every frame: they are larger than those of outlines, and without them the
+motion of the shaft would seem to determine the base far better than it does.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from neeco.fitting.link_silhouette import ArticulatedModel, Outlines
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.ingest.foreground.silhouettes import EDGE_PX
-from neeco.ingest.registration.silhouette_fit import BasePrior
+from neeco.ingest.registration.silhouette_fit import POSE_SDS, BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSilhouettes, moved_base, poses_at_clock
 
 BASE = 7  # parameters of the base (turn rad [3], shift mm [3]) and the clock (s); the model's follow
@@ -28,6 +31,7 @@ PARAMETER_STEP = 0.1  # of differences, in standard deviations of priors
 INSIDE_PX = -0.7  # of another cone's outline, from which a point is no outline
 MAX_TURN_RAD, MAX_SHIFT_MM, MAX_SDS = 0.15, 12.0, 2.0  # of one step
 DAMPING, TOLERANCE = 1e-2, 1e-4
+POSE_BLOCKS = 2  # of the recording, after which errors of logged poses are independent
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -37,7 +41,7 @@ class ArticulatedProblem(LoggedSilhouettes):
     model: ArticulatedModel
     contours: np.ndarray  # [F, N, 2] px of the masks' outlines; NaN: no point
     readings: dict[str, np.ndarray]  # [S, F] by name
-    values: np.ndarray  # [S, F, L] of all links' joints, rad or mm
+    values: np.ndarray  # [S, F, 2 L] of all links' joints, rad or mm, as `with_motion` has them
     prior: BasePrior
 
     def take(self, rows: np.ndarray) -> ArticulatedProblem:
@@ -61,6 +65,7 @@ class ArticulatedFit:
     world_from_base: np.ndarray
     clock: float
     parameters: np.ndarray
+    pose_errors: np.ndarray | None = None  # [F, 6] rad, mm: turns about the root, shifts, world; None: not fitted
     cost: float = np.inf  # robust loss of the residuals and the priors' squares
     residual_px: float = np.inf  # median
 
@@ -98,7 +103,12 @@ class _Points:
 
 def outlines(problem: ArticulatedProblem, fit: ArticulatedFit) -> Outlines:
     """Project the fit's cones."""
-    root = problem.camera_from_world @ fit.world_from_base @ poses_at_clock(problem.poses, fit.clock)
+    root = fit.world_from_base @ poses_at_clock(problem.poses, fit.clock)
+    if fit.pose_errors is not None:
+        root = root.copy()
+        root[:, :3, :3] = Rotation.from_rotvec(fit.pose_errors[:, :3]).as_matrix() @ root[:, :3, :3]
+        root[:, :3, 3] += fit.pose_errors[:, 3:]
+    root = problem.camera_from_world @ root
     values = poses_at_clock(problem.values, fit.clock)
     return problem.model.outlines(fit.parameters, values, root, problem.silhouettes.intrinsics)
 
@@ -124,16 +134,20 @@ def _residuals(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points) -
 
 
 def moved(problem: ArticulatedProblem, fit: ArticulatedFit, step: np.ndarray) -> ArticulatedFit:
-    """The fit after a step [BASE + P] in its parameters."""
+    """The fit after a step [BASE + P] in its parameters, or [BASE + P + 6 F] with the poses' errors."""
+    count = BASE + len(fit.parameters)
+    errors = fit.pose_errors
     return ArticulatedFit(
         moved_base(fit.world_from_base, problem.pivot(fit.world_from_base), step[:6]),
         float(np.clip(fit.clock + step[6], CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])),
-        fit.parameters + step[BASE:],
+        fit.parameters + step[BASE:count],
+        errors if errors is None or len(step) == count else errors + step[count:].reshape(errors.shape),
     )
 
 
 def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, free: np.ndarray) -> np.ndarray:
-    """Derivatives [F, N + M, free] of the residuals, through those of the cones' images."""
+    """Derivatives [F, N + M, free] of the residuals, through those of the cones' images; and where poses' errors are
+    fitted, by those of the own frame [F, N + M, free + 6]."""
     found, model = outlines(problem, fit), problem.model
     _, slope = problem.silhouettes.look_up(model.outline_points(found))
     distances, places, ways = found.distances(use.contours)
@@ -142,21 +156,57 @@ def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, fr
     place, way = places[frame, nearest, point], ways[frame, nearest, point]
     share = np.stack([1 - place, place], -1)  # [F, M, 2] of both ends
     steps = np.concatenate([[STEPS[0]] * 3, [STEPS[1]] * 3, [STEPS[2]], PARAMETER_STEP * model.sds])
-    columns = []
-    for index in free:
-        step = np.zeros(len(steps))
-        step[index] = steps[index]
-        plus, minus = (outlines(problem, moved(problem, fit, sign * step)) for sign in (1, -1))
+
+    def slopes(plus_fit: ArticulatedFit, minus_fit: ArticulatedFit, size: float) -> np.ndarray:
+        plus, minus = outlines(problem, plus_fit), outlines(problem, minus_fit)
         ahead = (slope * (model.outline_points(plus) - model.outline_points(minus))).sum(-1)
         ends, widths = plus.ends - minus.ends, plus.widths - minus.widths
         shifted = (ends[frame, nearest] * way[:, :, None]).sum(-1) + widths[frame, nearest]
         both = [np.where(use.model, ahead, 0.0), np.where(use.masks, -(share * shifted).sum(-1), 0.0)]
-        columns.append(np.concatenate(both, 1) / (2 * steps[index]))
+        return np.concatenate(both, 1) / (2 * size)
+
+    columns = []
+    for index in free:
+        step = steps[index] * np.eye(len(steps))[index]
+        columns.append(slopes(moved(problem, fit, step), moved(problem, fit, -step), steps[index]))
+    errors = fit.pose_errors
+    if errors is not None:
+        for k, step in enumerate(np.diag(steps[:6])):  # all frames at once: each depends on its own pose only
+            plus_fit, minus_fit = replace(fit, pose_errors=errors + step), replace(fit, pose_errors=errors - step)
+            columns.append(slopes(plus_fit, minus_fit, steps[k]))
     return np.stack(columns, -1)
 
 
+def _information(columns: np.ndarray, weights: np.ndarray, free: int) -> np.ndarray:
+    """Information of the residuals, of the `free` parameters and then of every frame's own ones: columns
+    [F, N + M, free + K], weights [F, N + M]; returns [free + F K] squared."""
+    common, own = columns[..., :free], columns[..., free:]
+    frames, kinds = len(columns), own.shape[-1]
+    flat = common.reshape(-1, free)
+    top = (flat * weights.reshape(-1, 1)).T @ flat
+    if not kinds:
+        return top
+    full = np.zeros((free + frames * kinds,) * 2)
+    full[:free, :free] = top
+    mixed = np.einsum("fnp,fn,fnk->pfk", common, weights, own).reshape(free, -1)
+    full[:free, free:], full[free:, :free] = mixed, mixed.T
+    blocks = full[free:, free:].reshape(frames, kinds, frames, kinds)
+    blocks[np.arange(frames), :, np.arange(frames)] = np.einsum("fnj,fn,fnk->fjk", own, weights, own)
+    return full
+
+
+def _scores(columns: np.ndarray, weighted: np.ndarray, free: int) -> np.ndarray:
+    """Scores [F, free + F K] of frames: products of columns [F, N + M, free + K] and weighted residuals [F, N + M]."""
+    products = np.einsum("fnp,fn->fp", columns, weighted)
+    frames = len(products)
+    own = np.zeros((frames, frames, products.shape[1] - free))
+    own[np.arange(frames), np.arange(frames)] = products[:, free:]
+    return np.concatenate([products[:, :free], own.reshape(frames, -1)], 1)
+
+
 def prior_residuals(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals [BASE + P] of all priors in standard deviations, and the inverse standard deviations [BASE + P]."""
+    """Residuals [BASE + P] of all priors in standard deviations, and the inverse standard deviations [BASE + P]; with
+    poses' errors [BASE + P + 6 F]."""
     model, prior = problem.model, problem.prior
     scale, off = np.zeros(BASE + len(model.means)), np.zeros(BASE + len(model.means))
     if prior.sd_rad is not None and prior.sd_mm is not None:
@@ -167,6 +217,9 @@ def prior_residuals(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[n
     if prior.sd_clock > 0:
         scale[6], off[6] = 1 / prior.sd_clock, fit.clock
     scale[BASE:], off[BASE:] = 1 / model.sds, fit.parameters - model.means
+    if fit.pose_errors is not None:
+        scale = np.append(scale, np.tile(1 / POSE_SDS, len(fit.pose_errors)))
+        off = np.append(off, fit.pose_errors.ravel())
     return off * scale, scale
 
 
@@ -189,28 +242,30 @@ def minimise(
     """The nearest fit under a Cauchy loss of a width px (of masks 160 wide); rough: of few parameters."""
     free, width, noise = _free(problem, rough), width * problem.px_scale, NOISE_PX * problem.px_scale
     sds = problem.model.sds
+    count = BASE + len(sds)
 
     def linearise(fit: ArticulatedFit) -> Linearisation[ArticulatedFit]:
         use = _points(problem, fit)
         px = _residuals(problem, fit, use)
-        columns = _jacobian(problem, fit, use, free).reshape(-1, len(free))
-        weights = (SHARE / noise**2 / (1 + (px / width) ** 2)).ravel()
+        columns = _jacobian(problem, fit, use, free)
+        weights = SHARE / noise**2 / (1 + (px / width) ** 2)
         off, scale = prior_residuals(problem, fit)
+        fitted = np.append(free, np.arange(count, len(scale)))
 
         def cost(other: ArticulatedFit, px: np.ndarray | None = None) -> float:
             px = _residuals(problem, other, use) if px is None else px
             return _loss(px, width, noise) + float(np.square(prior_residuals(problem, other)[0]).sum())
 
-        gradient = columns.T @ (weights * px.ravel()) + (off * scale)[free]
-        information = (columns * weights[:, None]).T @ columns + np.diag(scale[free] ** 2)
+        gradient = _scores(columns, weights * px, len(free)).sum(0) + (off * scale)[fitted]
+        information = _information(columns, weights, len(free)) + np.diag(scale[fitted] ** 2)
         return Linearisation(information, gradient, cost(fit, px), cost)
 
-    def move(fit: ArticulatedFit, free_step: np.ndarray) -> ArticulatedFit:
-        step = np.zeros(BASE + len(sds))
-        step[free] = free_step
+    def move(fit: ArticulatedFit, fitted_step: np.ndarray) -> ArticulatedFit:
+        step = np.zeros(count + len(fitted_step) - len(free))
+        step[free], step[count:] = fitted_step[: len(free)], fitted_step[len(free) :]
         step[:3] = np.clip(step[:3], -MAX_TURN_RAD, MAX_TURN_RAD)
         step[3:6] = np.clip(step[3:6], -MAX_SHIFT_MM, MAX_SHIFT_MM)
-        step[BASE:] = np.clip(step[BASE:], -MAX_SDS * sds, MAX_SDS * sds)
+        step[BASE:count] = np.clip(step[BASE:count], -MAX_SDS * sds, MAX_SDS * sds)
         return moved(problem, fit, step)
 
     fit = levenberg_marquardt(fit, linearise, move, max_steps=max_steps, damping=DAMPING, tolerance=TOLERANCE)
@@ -236,24 +291,34 @@ def fit_articulated(
     return fit
 
 
+def with_pose_errors(problem: ArticulatedProblem, fit: ArticulatedFit, max_steps: int = 20) -> ArticulatedFit:
+    """The nearest fit in which every frame's pose has an error of its own, under the narrowest loss."""
+    return minimise(problem, replace(fit, pose_errors=np.zeros((len(problem.blocks), 6))), WIDTHS_PX[-1], max_steps)
+
+
 def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
-    """Covariance [BASE + P, BASE + P] at a minimum, with errors that are correlated within the recording's blocks
-    (sandwich estimator); the clock's rows are 0 where it is known."""
+    """Covariance [BASE + P, BASE + P] at a minimum, with outlines' and poses' errors that are correlated within the
+    recording's blocks (sandwich estimator); the clock's rows are 0 where it is known."""
     free, width, noise = _free(problem), WIDTHS_PX[-1] * problem.px_scale, NOISE_PX * problem.px_scale
     use = _points(problem, fit)
     px = _residuals(problem, fit, use)
     columns = _jacobian(problem, fit, use, free)
     weights = SHARE / noise**2 / (1 + (px / width) ** 2)
-    scores = np.einsum("fnp,fn,fn->fp", columns, weights, px)
-    flat = columns.reshape(-1, len(free))
-    data = (flat * weights.reshape(-1, 1)).T @ flat
-    prior = np.diag(prior_residuals(problem, fit)[1][free] ** 2)
+    scores = _scores(columns, weights * px, len(free))
+    scale = prior_residuals(problem, fit)[1]
+    count = BASE + len(problem.model.means)
+    prior = np.diag(scale[free] ** 2)
+    known = np.diag(np.append(scale[free], scale[count:]) ** 2)
+    inverse = np.linalg.inv(_information(columns, weights, len(free)) + known)[: len(free)]
     blocks = np.stack([scores[problem.blocks == block].sum(0) for block in np.unique(problem.blocks)])
     blocks = blocks - blocks.mean(0)
     scatter = blocks.T @ blocks * len(blocks) / max(len(blocks) - 1, 1)
-    inverse = np.linalg.inv(data + prior)
-    full = np.zeros((BASE + len(problem.model.means),) * 2)
-    full[np.ix_(free, free)] = inverse @ (scatter + prior) @ inverse
+    scatter[: len(free), : len(free)] += prior
+    if fit.pose_errors is not None:  # they last for a block or two, though the fit takes them to be independent
+        apart = np.abs(problem.blocks[:, None] - problem.blocks) / POSE_BLOCKS
+        scatter[len(free) :, len(free) :] += np.kron(np.clip(1 - apart, 0, 1), np.diag(scale[count : count + 6] ** 2))
+    full = np.zeros((count, count))
+    full[np.ix_(free, free)] = inverse @ scatter @ inverse.T
     return full
 
 

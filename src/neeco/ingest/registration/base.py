@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.model import evenly_spaced
+from neeco.capture.model import BaseUncertainty, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.trocar import ShaftLine
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
@@ -118,6 +118,18 @@ class BaseRegistration:
         with np.errstate(invalid="ignore"):
             return np.asarray(np.degrees(np.sqrt(np.diag(self.covariance)[:3])))
 
+    def uncertainty(self, world_from_camera: np.ndarray, poses: np.ndarray) -> BaseUncertainty | None:
+        """Return the covariance for a capture, in the world's axes; None where a direction is undetermined.
+
+        world_from_camera [4, 4] of the first camera; poses [F, 4, 4] world_from_instrument.
+        """
+        if not np.isfinite(self.covariance).all():
+            return None
+        covariance = in_camera(self.covariance, world_from_camera)
+        return BaseUncertainty(
+            tuple(poses[:, :3, 3].mean(0).tolist()), tuple(map(tuple, ((covariance + covariance.T) / 2).tolist()))
+        )
+
     def as_json(self) -> dict[str, Any]:
         """Numbers for scripts: mm, degrees, s; None where a direction is undetermined and has no prior."""
 
@@ -142,6 +154,7 @@ class BaseRegistration:
             **found,
             "open": list(self.open_directions),
             "doubts": list(self.doubts),
+            "covariance": [known(row) for row in self.covariance],
         }
 
 

@@ -16,10 +16,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
-from neeco.capture.model import Instrument, evenly_spaced
+from neeco.capture.model import BaseUncertainty, Instrument, evenly_spaced
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.projection import project
-from neeco.geometry.rotations import rigid_from_vector, rotation_from_vector
+from neeco.geometry.rotations import rigid_from_vector, rotation_from_vector, skew
 from neeco.methods.kinematic.link_search import doubted_readings, note_doubt
 from neeco.methods.kinematic.stated_links import AXIS_SD, OFFSET_SD, PIVOT_SD, StatedLinks
 from neeco.methods.space_carving import CarvedShape, Evidence, camera_from_instrument
@@ -32,7 +32,7 @@ EVIDENCE_SD = 0.3  # of a cell; beyond it, the cost is linear
 MIN_WEIGHT = 0.1  # of a residual; less where most frames have evidence, since the tissue's fit absorbed the instrument
 EDGE_CELLS = 0.6  # width over which a silhouette fades
 SHAFT_LENGTH_MM, NEAREST_MM = 150.0, 5.0  # of the shaft from its end; depth from which it is compared
-# standard deviations: of the base's error, and of the frame's about and along the shaft
+# standard deviations: of the base's error where the capture states none, and of the frame's about and along the shaft
 BASE_SD_RAD, BASE_SD_MM = 0.035, 3.0
 FRAME_SD = (0.035, 2.0)  # rad, mm
 # of the shape: tilts (rad) and shifts (mm) of the carved shaft, log radii, heading (rad) and log length of end links
@@ -69,10 +69,16 @@ class LinkRegistration:
 
 @torch.no_grad()
 def register_links(
-    links: StatedLinks, evidence: Evidence, name: str, shape: CarvedShape, readings: list[dict[str, float]]
+    links: StatedLinks,
+    evidence: Evidence,
+    name: str,
+    shape: CarvedShape,
+    readings: list[dict[str, float]],
+    *,
+    stated: BaseUncertainty | None = None,
 ) -> LinkRegistration | None:
     """Return the correction of instrument `name` with which its links explain the evidence best; None where no two
-    joints follow each other. `readings`: of every frame of the evidence.
+    joints follow each other. `readings`: of every frame of the evidence; `stated`: the uncertainty of the base.
 
     The links as stated, corrected links, and a corrected base and frame as well are compared: the simplest model
     counts that no other betters significantly. A base's error moves all poses by one rigid motion of the world, the
@@ -83,6 +89,8 @@ def register_links(
     if line is None:
         return None
     problem = _SilhouetteProblem(links, evidence, name, shape, line, readings)
+    if stated is not None:
+        problem.state_base(stated)
     fits: list[tuple[tuple[str, ...], np.ndarray, Linearisation[np.ndarray]]] = []
     names: list[str] = []
     for more in MODELS:
@@ -129,9 +137,10 @@ def correct_poses(
     """
     scene, name = session.scene, instrument.name
     doubt = doubted_readings(session, links, evidence, instrument, readings)
-    found = register_links(links, evidence, name, shape, readings)
+    stated = instrument.base_uncertainty
+    found = register_links(links, evidence, name, shape, readings, stated=stated)
     if doubt is not None and found is not None:
-        other = register_links(links, evidence, name, shape, [doubt.change(given) for given in readings])
+        other = register_links(links, evidence, name, shape, [doubt.change(given) for given in readings], stated=stated)
         doubt = doubt if other is not None and other.cost < found.cost else None
     if doubt is not None:
         note_doubt(session, name, doubt)
@@ -158,12 +167,22 @@ def correct_poses(
     return bool(base.any())
 
 
+def base_root(stated: BaseUncertainty, center: Tensor) -> Tensor:
+    """Return the Cholesky factor [6, 6] of the covariance of a base's turn (rad) about `center` [3] and shift (mm)."""
+    arm = center.double().cpu() - torch.tensor(stated.center, dtype=torch.float64)
+    to_center = torch.eye(6, dtype=torch.float64)  # a turn about another point shifts this one
+    to_center[3:, :3] = -skew(arm)
+    covariance = to_center @ torch.tensor(stated.covariance, dtype=torch.float64) @ to_center.T
+    return torch.linalg.cholesky(covariance).to(center)
+
+
 class _SilhouetteProblem:
     """Silhouettes of capsules along an instrument's links, against the evidence of F frames.
 
     `layout` has the standard deviations of all parameters, in which vectors of those that are fitted are counted."""
 
     layout: dict[str, Tensor]
+    base_root: Tensor | None = None  # [6, 6] of the stated covariance, in which `base` is counted
 
     def __init__(
         self,
@@ -201,6 +220,11 @@ class _SilhouetteProblem:
         }
         self.layout = {key: torch.tensor(spread).to(self.axis) for key, spread in spreads.items()}
 
+    def state_base(self, stated: BaseUncertainty) -> None:
+        """Take the base's error to have the stated covariance."""
+        self.base_root = base_root(stated, self.center)
+        self.layout["base"] = torch.ones_like(self.layout["base"])
+
     def fit_only(self, names: Sequence[str]) -> None:
         """Fit the parameters of these names; others, and those without deviation, stay 0."""
         spread = torch.cat([spread * float(key in names) for key, spread in self.layout.items()])
@@ -211,7 +235,8 @@ class _SilhouetteProblem:
         """Return the parameters by name, in their own units."""
         full = torch.zeros_like(self.spread)
         full[self.columns] = torch.from_numpy(at).to(full) * self.spread[self.columns]
-        return dict(zip(self.layout, full.split([len(spread) for spread in self.layout.values()]), strict=True))
+        parts = dict(zip(self.layout, full.split([len(spread) for spread in self.layout.values()]), strict=True))
+        return parts if self.base_root is None else parts | {"base": self.base_root @ parts["base"]}
 
     def compare_at(self, width: int) -> None:
         """Compare images about `width` cells wide from now on."""
