@@ -103,3 +103,14 @@ def test_a_readings_error_is_predicted_with_its_own_verdict() -> None:
     assert torch.allclose(moved.pose, state_at(0.8, 0.0).instruments["rod"].pose.float())
     unrecorded = StateCorrections((replace(ROD, unrecorded=("jaw",)),), CPU)
     assert unrecorded.readings == ((),)  # found from the images, or interpolated
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_state_that_is_being_learned_is_corrected_too() -> None:
+    frames = there_and_back()
+    places = [frame.state.instruments["rod"].joints["jaw"] for frame in frames]
+    corrections, _, _ = learned(frames, torch.stack([error_at(place) for place in places]))
+    jaw = torch.tensor(0.3, requires_grad=True)
+    given = InstrumentState(state_at(0.3, 0.0).instruments["rod"].pose, {"jaw": jaw})  # type: ignore[dict-item]
+    moved = corrections.corrected(State({"rod": given})).instruments["rod"]
+    assert moved.joints["jaw"].requires_grad  # type: ignore[attr-defined]

@@ -51,7 +51,7 @@ class StateCorrections(nn.Module):
     def features(self, index: int, given: InstrumentState) -> Tensor:
         """Return the features [F] of a state of instrument `index`, differences of which are compared by kernels."""
         pose = given.pose.detach().to(self.anchors)
-        joints = [float(given.joints[reading]) / unit
+        joints = [float(torch.as_tensor(given.joints[reading]).detach()) / unit
                   for reading, unit in zip(self.readings[index], self._units[index], strict=True)]  # fmt: skip
         joints += [0.0] * (self.anchors.shape[2] - N_POSE_FEATURES - len(joints))
         rotation = pose[:3, :3].flatten() / (2**0.5 * ANGLE_UNIT)
