@@ -19,6 +19,7 @@ from neeco.training.session import GaussianSession
 # share of the run at which errors are sized and wrong states searched: later, the scene has learned from these
 DECIDED_AT = 0.12
 CARVED_AT = (0.2, 0.32, 0.45)  # shares at which states are fitted, and shapes carved anew from them
+SIZED_AT = (DECIDED_AT, CARVED_AT[0])  # some shapes form later, and their errors show only at the second
 FITTED_AT = (0.6, 0.75, 0.9)  # shares at which states are fitted
 MARKS = tuple(sorted({DECIDED_AT, *CARVED_AT, *FITTED_AT}))
 N_SAMPLED = 16  # frames by which errors are sized
@@ -30,35 +31,43 @@ FOUND = "scale_of_state_errors"  # of a scene's diagnostics
 @torch.no_grad()
 def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, mark: float) -> None:
     """Fit the states of all training frames at a mark of the run where their errors are larger than a tracker's, which
-    is found out at the first."""
+    is found out at the first ones."""
     scene, refinement = session.scene, session.refinement
-    if not (scene.instruments and session.config.refine.frame_poses):
-        return
-    if mark == DECIDED_AT:
+    several = any(len(frames) > 1 for frames in refinement.frames_of_pose)
+    if several or not (scene.instruments and session.config.refine.frame_poses):
+        return  # gradients of several cameras' images determine an instant's state better than each image does
+    if mark in SIZED_AT and FOUND not in scene.diagnostics:
         search = StateSearch.of(session, articulated)
-        sample = evenly_spaced(len(session.full_views.frames), N_SAMPLED)
-        # states that were fitted before training are judged by what is left of their errors
-        about = {index: search.state(index) if refinement.fitted[index] else None for index in sample}
-        sampled = [fit for index in sample if (fit := search.fitted(index, LARGEST, about[index])) is not None]
-        scale = search.scale_of(sampled) if len(sampled) > 2 else 0.0
+        scale = _size_of_errors(search)
         if scale > LARGE:
             scene.diagnostics[FOUND] = round(scale, 3)
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
-            for index, *_ in refinement.frames_of_pose:
+            for (index,) in refinement.frames_of_pose:
                 refinement.set_deviations(index, search.deviations(index, SCALE))
-        doubt_states(search, SCALE if scale > LARGE else LARGE)
+        if mark == DECIDED_AT:
+            doubt_states(search, SCALE if scale > LARGE else LARGE)
     if FOUND not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, doubted = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
-    for frames in refinement.frames_of_pose:
-        known = search.state(frames[0]) if session.recorded.names[frames[0]] in doubted else None
-        used = [index for index in frames if refinement.weights[index] > 0]
-        fits = [fit for index in used if (fit := search.fitted(index, SCALE, known)) is not None]
-        if fits:
-            state, deviations = search.combined(fits)
-            if mark != FITTED_AT[-1]:  # until the last fit, gradients go on with the uncertainty of recorded states
-                deviations = search.deviations(frames[0], SCALE)
-            refinement.set_state(frames[0], session.recorded.states[frames[0]], state, deviations)
+    for (index,) in refinement.frames_of_pose:
+        known = search.state(index) if session.recorded.names[index] in doubted else None
+        fit = search.fitted(index, SCALE, known) if refinement.weights[index] > 0 else None
+        if fit is not None:
+            # until the last fit, gradients go on with the uncertainty of recorded states
+            last = mark == FITTED_AT[-1]
+            deviations = fit.deviations if last else search.deviations(index, SCALE)
+            refinement.set_state(index, session.recorded.states[index], fit.fit.state, deviations)
     if mark in CARVED_AT:
         with session.searching():
             carve_again(session, articulated)
+
+
+def _size_of_errors(search: StateSearch) -> float:
+    """Return how large the errors of a sample of states are, times the usual ones of a robot."""
+    refinement = search.session.refinement
+    fits = []
+    for index in evenly_spaced(len(search.session.full_views.frames), N_SAMPLED):
+        # states that were fitted before training are judged by what is left of their errors
+        fit = search.fitted(index, LARGEST, search.state(index) if refinement.fitted[index] else None)
+        fits += [] if fit is None else [fit]
+    return search.scale_of(fits) if len(fits) > 2 else 0.0

@@ -85,17 +85,6 @@ class StateSearch:
         correction = self.session.refinement.layout.increments_between(about or given, fit.state)
         return FittedState(index=index, fit=fit, precision=precision, correction=correction)
 
-    def combined(self, fits: Sequence[FittedState]) -> tuple[State, Tensor]:
-        """Return the state that the images of one instant show, by their information, and its standard deviations
-        [P]."""
-        if len(fits) == 1:
-            return fits[0].fit.state, fits[0].deviations
-        prior, information = fits[0].precision, torch.stack([each.fit.information for each in fits])
-        weighed = torch.stack([(each.fit.information + prior) @ each.correction for each in fits]).sum(0)
-        found = torch.linalg.solve(information.sum(0) + prior, weighed)
-        deviations = torch.linalg.inv(OWN_SHARE * information.sum(0) + prior).diagonal().sqrt()
-        return self.fitter.parameters.moved(self.session.recorded.states[fits[0].index], found), deviations
-
     def misfit(self, index: int, state: State) -> float:
         """Return the misfit of a frame's instruments in `state` (see `StateFit`); infinite outside of the image."""
         precision = self.precision(index, 1.0)
