@@ -67,6 +67,21 @@ def test_an_error_that_depends_on_the_state_is_corrected_in_new_states() -> None
     assert torch.allclose(corrections.corrected(far).instruments["rod"].pose, far.instruments["rod"].pose.float())
 
 
+def test_a_state_that_was_wrong_altogether_tells_nothing_of_others() -> None:
+    frames = there_and_back()
+    generator = torch.Generator().manual_seed(0)
+    poses = 0.01 * torch.randn(len(frames), 6, generator=generator)
+    poses[::8, 3:] += 20.0  # as states of another moment were corrected
+    refinement = Refinement(RefineConfig(), frames, (ROD,), CPU)
+    refinement.poses[:, 0] = poses
+    refinement.frame_steps += 1
+    refinement.fitted[::8] = True
+    refinement.center()
+    assert (refinement.poses[1::8, 0] - poses[1::8]).abs().max() < 0.1
+    corrections = StateCorrections((ROD,), CPU)
+    assert not predict_corrections(corrections, refinement, frames)["rod"].applied
+
+
 @pytest.mark.parametrize("kind", ["drift", "noise"])
 def test_errors_that_do_not_depend_on_the_state_are_left_alone(kind: str) -> None:
     frames = there_and_back()

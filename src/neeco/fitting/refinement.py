@@ -270,16 +270,20 @@ class Refinement:
     @torch.no_grad()
     def center(self) -> None:
         """Subtract the mean correction, of poses per tissue: a constant one belongs to the instrument's shape (and to
-        `GaussianScene.registration`)."""
+        `GaussianScene.registration`). The median where states were fitted, single ones of which were wrong."""
         used = (self.frame_steps > 0).nonzero()[:, 0]
         if len(used):
             rows = torch.tensor(sorted({self.pose_rows[frame] for frame in used.tolist()}), device=self.poses.device)
             for rows_of_tissue in self.pose_rows_of_tissue:
                 own = rows[torch.isin(rows, rows_of_tissue)]
-                self.poses[own] -= self.poses[own].mean(0)
-            self.joints -= torch.where(self.unrecorded, 0.0, self.joints.mean(0))
+                self.poses[own] -= self._middle(self.poses[own])
+            self.joints -= torch.where(self.unrecorded, 0.0, self._middle(self.joints))
             used = used.to(self.cameras.device)
             self.cameras[used] -= self.cameras[used].mean(0)
+
+    def _middle(self, corrections: Tensor) -> Tensor:
+        """Return the constant part of corrections [n, ...]."""
+        return corrections.median(0).values if bool(self.fitted.any()) else corrections.mean(0)
 
     def found(self, recorded: Recorded, instruments: tuple[Instrument, ...]) -> Recorded:
         """Return the recording with unrecorded joints as estimated, within their limits, and fitted states as such."""

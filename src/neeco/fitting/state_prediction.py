@@ -23,6 +23,7 @@ MIN_EXPLAINED = 0.1  # share of the corrections' variance: independent errors re
 LENGTHS = (0.5, 1.0, 2.0, 4.0)  # of the kernel, in units of features
 NOISES = (0.1, 0.3, 1.0, 3.0)  # variance of a single instant's correction over the kernel's
 JITTER = 1e-6
+MAX_DEVIATIONS = 8.0  # median absolute deviations of the corrections of states that were not wrong altogether
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,16 +57,18 @@ def predict_corrections(
         columns = [refinement.readings.index((name, reading)) for reading in readings]
         rows = torch.cat([refinement.poses[order, index], refinement.joints[order][:, columns]], 1).double().cpu()
         sigma = torch.cat([refinement.pose_sd[:, index].mean(0), refinement.joint_sd[:, columns].mean(0)])
+        usual_rows = _consistent(rows) if bool(refinement.fitted.any()) else torch.ones(len(rows), dtype=torch.bool)
         parts = {name: slice(0, 6)} | {f"{name}.{reading}": slice(6 + k, 7 + k) for k, reading in enumerate(readings)}
-        residuals, usual, length, noise = _best(features, rows / sigma.double().cpu())
+        residuals, usual, length, noise = _best(features[usual_rows], rows[usual_rows] / sigma.double().cpu())
         applied = torch.zeros(rows.shape[1], dtype=rows.dtype)
         for part, places in parts.items():
             total = float(usual[places].sum())
             explained = 1 - float(residuals[places].sum()) / total if total else 0.0
             found[part] = Prediction(explained=explained, applied=explained >= MIN_EXPLAINED)
             applied[places] = float(found[part].applied)
-        anchors = features[evenly_spaced(len(features), MAX_ANCHORS)]
-        weights = _weights(features, rows, anchors, length, noise) * applied
+        learned, anchors = features[usual_rows], features[usual_rows]
+        anchors = anchors[evenly_spaced(len(anchors), MAX_ANCHORS)]
+        weights = _weights(learned, rows[usual_rows], anchors, length, noise) * applied
         corrections.anchors[index, : len(anchors)] = anchors.to(corrections.anchors)
         corrections.weights[index, : len(anchors), : weights.shape[1]] = weights.to(corrections.weights)
         corrections.lengths[index] = length
@@ -74,6 +77,12 @@ def predict_corrections(
             refinement.poses[instant, index] -= increments[:6]
             refinement.joints[instant, columns] -= increments[6 : 6 + len(columns)]
     return found
+
+
+def _consistent(rows: Tensor) -> Tensor:
+    """Return which corrections [n] bool of `rows` [n, K] are none of a state that was wrong altogether."""
+    off = (rows - rows.median(0).values).abs()
+    return (off <= MAX_DEVIATIONS * off.median(0).values.clamp_min(1e-9)).all(1)
 
 
 def _moment(frame: Frame) -> tuple[str, float]:

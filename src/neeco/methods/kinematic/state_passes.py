@@ -13,13 +13,13 @@ from neeco.capture.model import evenly_spaced
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.methods.kinematic.contradictions import CONTRADICTING, doubt_states
 from neeco.methods.kinematic.discovery import carve_again
+from neeco.methods.kinematic.state_registration import LARGE_ERRORS
 from neeco.methods.kinematic.state_search import LARGEST, StateSearch
 from neeco.training.session import GaussianSession
 
 # share of the run at which errors are sized and wrong states searched: later, the scene has learned from these
 DECIDED_AT = 0.12
 CARVED_AT = (0.2, 0.32, 0.45)  # shares at which states are fitted, and shapes carved anew from them
-SIZED_AT = (DECIDED_AT, CARVED_AT[0])  # some shapes form later, and their errors show only at the second
 FITTED_AT = (0.6, 0.75, 0.9)  # shares at which states are fitted
 MARKS = tuple(sorted({DECIDED_AT, *CARVED_AT, *FITTED_AT}))
 N_SAMPLED = 16  # frames by which errors are sized
@@ -31,21 +31,24 @@ FOUND = "scale_of_state_errors"  # of a scene's diagnostics
 @torch.no_grad()
 def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, mark: float) -> None:
     """Fit the states of all training frames at a mark of the run where their errors are larger than a tracker's, which
-    is found out at the first ones."""
+    is found out at the first.
+
+    Only where silhouettes showed large errors before training: where colours do not tell the instrument from the
+    tissue, shapes that are carved from wrong states take in shadows, and fits follow these."""
     scene, refinement = session.scene, session.refinement
     several = any(len(frames) > 1 for frames in refinement.frames_of_pose)
     if several or not (scene.instruments and session.config.refine.frame_poses):
         return  # gradients of several cameras' images determine an instant's state better than each image does
-    if mark in SIZED_AT and FOUND not in scene.diagnostics:
-        search = StateSearch.of(session, articulated)
-        scale = _size_of_errors(search)
+    if mark == DECIDED_AT:
+        search, scale = StateSearch.of(session, articulated), 0.0
+        if scene.diagnostics.get(LARGE_ERRORS, False):
+            scale = _size_of_errors(search)
         if scale > LARGE:
             scene.diagnostics[FOUND] = round(scale, 3)
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
             for (index,) in refinement.frames_of_pose:
                 refinement.set_deviations(index, search.deviations(index, SCALE))
-        if mark == DECIDED_AT:
-            doubt_states(search, SCALE if scale > LARGE else LARGE)
+        doubt_states(search, SCALE if scale > LARGE else LARGE)
     if FOUND not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, doubted = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
