@@ -201,11 +201,11 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
 
 
 def _shaft(reference: ReferenceMask | None, names: Mapping[int, str]) -> Tensor | None:
-    """Return the true shaft's pixels, bool [H, W]; None where the reference does not tell parts."""
-    number = next((number for number, part in names.items() if part == "shaft"), None)
-    if reference is None or reference.parts is None or number is None:
+    """Return the true pixels of all shafts, bool [H, W]; None where the reference does not tell them."""
+    numbers = [number for number, part in names.items() if part == "shaft"]
+    if reference is None or reference.parts is None or not numbers:
         return None
-    return reference.parts == number
+    return torch.isin(reference.parts, torch.tensor(numbers, dtype=reference.parts.dtype))
 
 
 def _scores(
