@@ -37,7 +37,7 @@ from neeco.files import read_json
 from neeco.fitting.refinement import Refinement
 from neeco.training.run import open_run, read_checkpoint, stored_config
 
-POSE_SD, JOINT_SD = "refinement/pose_sd", "refinement/joint_sd"  # of a checkpoint: [P, I, 6] and [instants, R]
+POSE_SD = "refinement/pose_sd"  # of a checkpoint; runs of older versions have none
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +87,15 @@ def of_run(path: Path) -> States:
         if POSE_SD not in tensors:
             return States(capture, states)
         sds = []
+        layout = refinement.layout
         for index in range(len(frames)):
-            pose = tensors[POSE_SD][refinement.pose_rows[index]].numpy()
-            joints = tensors[JOINT_SD][refinement.instants[index]].numpy()
-            own = {}
-            for number, item in enumerate(refinement.layout.instruments):
-                mine = [k for k, (name, _) in enumerate(refinement.readings) if name == item.name]
-                own[item.name] = np.append(pose[number], joints[mine])
-            sds.append(own)
+            own = refinement.deviations(index).numpy()
+            sds.append(
+                {
+                    item.name: np.append(own[pose], own[joints])
+                    for item, (pose, joints) in zip(layout.instruments, layout.rows, strict=True)
+                }
+            )
         return States(capture, states, sds)
 
 

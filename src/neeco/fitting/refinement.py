@@ -89,11 +89,10 @@ class Refinement:
             [place for place, (name, _) in enumerate(self.readings) if name in stated], dtype=torch.int64, device=device
         )
         self.instants, self.neighbours = _instants(frames, names)
-        self.pose_rows = self.instants
-        self.frames_of_pose = _members(self.pose_rows)
-        first = tuple(frames[shown[0]] for shown in self.frames_of_pose)
+        self.frames_of_instant = _members(self.instants)
+        first = tuple(frames[shown[0]] for shown in self.frames_of_instant)
         tissues = _members(_numbered([frame.state.tissue for frame in first]))
-        self.pose_rows_of_tissue = [torch.tensor(rows, device=device) for rows in tissues]
+        self.instants_of_tissue = [torch.tensor(rows, device=device) for rows in tissues]
         self.joints = torch.zeros(len(self.neighbours), len(self.readings), device=device)
         self.poses = torch.zeros(len(first), len(names), 6, device=device)
         self.cameras = torch.zeros(len(frames), 6, device=device)
@@ -143,15 +142,15 @@ class Refinement:
         config, instruments = self.config, self.layout.instruments
         if iteration < config.start:
             return self.state(index, state) if self.fitted[index] else state, camera, None
-        penalties, instant, row = [], self.instants[index], self.pose_rows[index]
+        penalties, instant = [], self.instants[index]
         if instruments and (config.frame_poses or config.latency or config.frame_joints):
             offset = self.latency.new_zeros(len(instruments), 6)
             if config.frame_poses:
-                leaf = self._leaf("poses", self.poses[row])
+                leaf = self._leaf("poses", self.poses[instant])
                 offset = offset + leaf
-                penalties.append(self._prior(leaf - self.pose_mean[row], self.pose_sd[row]))
+                penalties.append(self._prior(leaf - self.pose_mean[instant], self.pose_sd[instant]))
             if config.latency:
-                offset = offset + self.velocities[row] * self._leaf("latency", self.latency)
+                offset = offset + self.velocities[instant] * self._leaf("latency", self.latency)
             joints: Sequence[Sequence[Any]] | None = None
             if config.frame_joints and len(self.learned):
                 leaf = self._leaf("joints", self.joints[instant])
@@ -172,8 +171,9 @@ class Refinement:
     @torch.no_grad()
     def state(self, index: int, given: State) -> State:
         """Return the recorded state `given` of frame `index` as corrected so far, at any iteration."""
-        offset = self.poses[self.pose_rows[index]] + self.velocities[self.pose_rows[index]] * self.latency
-        parts = self._of_instruments(self.joints[self.instants[index]]) if self.readings else None
+        instant = self.instants[index]
+        offset = self.poses[instant] + self.velocities[instant] * self.latency
+        parts = self._of_instruments(self.joints[instant]) if self.readings else None
         joints = None if parts is None else [[float(change) for change in part] for part in parts]
         moved = self.layout.moved_by_parts(given, list(offset), joints)
         instruments = {
@@ -184,37 +184,39 @@ class Refinement:
 
     @torch.no_grad()
     def set_state(self, index: int, given: State, state: State, deviations: Tensor) -> None:
-        """Correct the recorded state `given` of frame `index` to `state`, from iteration 0 on, and of all frames that
-        share its pose or joints.
+        """Correct the recorded state `given` of frame `index`, and of all frames of its instant, to `state`, from
+        iteration 0 on.
 
         deviations [S] of `layout` (rad, mm): standard deviations of `state`, about which the prior is from now on.
         """
-        row, instant = self.pose_rows[index], self.instants[index]
+        instant = self.instants[index]
         pose, joints = self._parts(self.layout.increments_between(given, state))
-        self.poses[row] = pose - self.velocities[row] * self.latency
-        self.pose_mean[row] = self.poses[row]
+        self.poses[instant] = pose - self.velocities[instant] * self.latency
+        self.pose_mean[instant] = self.poses[instant]
         if self.readings:
             self.joints[instant] = self.joint_mean[instant] = joints
         self.set_deviations(index, deviations)
-        for name, place in (("poses", row), ("joints", instant)):
+        for name in ("poses", "joints"):
             for order in ("first", "second"):  # gradients at the former state
-                self.moments[f"{order}.{name}"][place] = 0
-        self.fitted[self.frames_of_pose[row]] = True
+                self.moments[f"{order}.{name}"][instant] = 0
+        self.fitted[self.frames_of_instant[instant]] = True
 
     @torch.no_grad()
     def set_deviations(self, index: int, deviations: Tensor) -> None:
         """Set the standard deviations [S] of `layout` (rad, mm) of the prior on the corrections of frame `index`."""
         pose, joints = self._parts(deviations.clamp(min=MIN_DEVIATION))
-        self.pose_sd[self.pose_rows[index]] = pose
+        instant = self.instants[index]
+        self.pose_sd[instant] = pose
         if self.readings:
-            self.joint_sd[self.instants[index]] = joints
+            self.joint_sd[instant] = joints
 
     def deviations(self, index: int) -> Tensor:
         """Return the standard deviations [S] float64 of `layout` of the prior on the corrections of frame `index`."""
         found = torch.empty(self.layout.size, dtype=torch.float64)
-        joints = self.joint_sd[self.instants[index]].split([len(item.joints) for item in self.layout.instruments])
+        instant = self.instants[index]
+        joints = self.joint_sd[instant].split([len(item.joints) for item in self.layout.instruments])
         for number, (rows, joint_rows) in enumerate(self.layout.rows):
-            found[rows] = self.pose_sd[self.pose_rows[index], number].cpu().double()
+            found[rows] = self.pose_sd[instant, number].cpu().double()
             found[joint_rows] = joints[number].cpu().double()
         return found
 
@@ -244,10 +246,10 @@ class Refinement:
             return
         self.frame_steps[index] += 1
         decay = log_linear(1.0, 0.1, progress)
-        pose, own = self.pose_rows[index], float(self.frame_steps[index])
+        instant, own = self.instants[index], float(self.frame_steps[index])
         rows: dict[str, tuple[Any, float]] = {
-            "poses": (pose, float(self.frame_steps[self.frames_of_pose[pose]].sum())),
-            "joints": (self.instants[index], own),
+            "poses": (instant, float(self.frame_steps[self.frames_of_instant[instant]].sum())),
+            "joints": (instant, own),
             "cameras": (index, own),
             "latency": (slice(None), float(self.frame_steps.sum())),  # shared by all frames
         }
@@ -273,9 +275,9 @@ class Refinement:
         `GaussianScene.registration`). The median where states were fitted, single ones of which were wrong."""
         used = (self.frame_steps > 0).nonzero()[:, 0]
         if len(used):
-            rows = torch.tensor(sorted({self.pose_rows[frame] for frame in used.tolist()}), device=self.poses.device)
-            for rows_of_tissue in self.pose_rows_of_tissue:
-                own = rows[torch.isin(rows, rows_of_tissue)]
+            instants = torch.tensor(sorted({self.instants[k] for k in used.tolist()}), device=self.poses.device)
+            for of_tissue in self.instants_of_tissue:
+                own = instants[torch.isin(instants, of_tissue)]
                 self.poses[own] -= self._middle(self.poses[own])
             self.joints -= torch.where(self.unrecorded, 0.0, self._middle(self.joints))
             used = used.to(self.cameras.device)

@@ -32,15 +32,14 @@ FITTED_ANEW, LEFT_OUT = "fitted anew", "left out"
 @torch.no_grad()
 def doubt_states(search: StateSearch, scale: float) -> None:
     """Fit states that leave their images unexplained from other starts, or leave them out; note them in the scene's
-    diagnostics. scale: of the errors of all states (see `StateSearch.fitted`). States that several cameras observe are
-    not doubted, nor those that place the instruments outside of the image."""
+    diagnostics. scale: of the errors of all states (see `StateSearch.fitted`). States that place the instruments
+    outside of the image are not doubted."""
     session, refinement = search.session, search.session.refinement
-    alone = [frames[0] for frames in refinement.frames_of_pose if len(frames) == 1]
-    found_misfits = {index: search.misfit(index, search.state(index)) for index in alone}
+    states = {index: search.state(index) for index in range(len(session.recorded.names))}
+    found_misfits = {index: search.misfit(index, state) for index, state in states.items()}
     first = [index for index, misfit in found_misfits.items() if math.isfinite(misfit)]
     if len(first) < MIN_FRAMES:
         return
-    states = {index: search.state(index) for index in first}
     misfits = torch.tensor([found_misfits[index] for index in first])
     logs = misfits.clamp(1e-3, 1e3).log()
     spread = max(1.4826 * float((logs - logs.median()).abs().median()), MIN_SPREAD)

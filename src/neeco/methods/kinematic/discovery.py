@@ -46,7 +46,7 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
 def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Replace the instruments' Gaussians by seeds on shapes carved anew, at the states as corrected so far: what the
     former states taught is forgotten. The session's views are those of searches."""
-    scene, refinement = session.scene, session.refinement
+    scene = session.scene
     tissue = scene.canonical.map(
         lambda tensor: tensor[scene.canonical.body(0)].detach().clone(), scene.canonical.counts[:1]
     )
@@ -54,13 +54,7 @@ def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -
     alone.background, alone.sh_degree = scene.background, scene.sh_degree
     linked = any(instrument.kinematics is not None for instrument in scene.instruments)
     evidence = gather_evidence(alone, session.views, session.config.deformation.carving, unshaded=linked)
-    places = {frame.name: place for place, frame in enumerate(session.views.frames)}
-    chosen = [row for row, frame in enumerate(evidence.frames) if refinement.weights[places[frame.name]] > 0]
-    evidence = evidence.subset(torch.tensor(chosen))
-    corrected = [scene.registered(refinement.state(places[frame.name], frame.state)) for frame in evidence.frames]
-    evidence = replace(
-        evidence, frames=tuple(replace(f, state=state) for f, state in zip(evidence.frames, corrected, strict=True))
-    )
+    evidence = corrected_evidence(session, evidence)
     with torch.no_grad():
         scene.canonical = tissue
         for articulation in articulated.articulations:

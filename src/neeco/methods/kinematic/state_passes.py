@@ -36,7 +36,7 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
     Only where silhouettes showed large errors before training: where colours do not tell the instrument from the
     tissue, shapes that are carved from wrong states take in shadows, and fits follow these."""
     scene, refinement = session.scene, session.refinement
-    several = any(len(frames) > 1 for frames in refinement.frames_of_pose)
+    several = any(len(frames) > 1 for frames in refinement.frames_of_instant)
     if several or not (scene.instruments and session.config.refine.frame_poses):
         return  # gradients of several cameras' images determine an instant's state better than each image does
     if mark == DECIDED_AT:
@@ -46,13 +46,13 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
         if scale > LARGE:
             scene.diagnostics[FOUND] = round(scale, 3)
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
-            for (index,) in refinement.frames_of_pose:
+            for (index,) in refinement.frames_of_instant:
                 refinement.set_deviations(index, search.deviations(index, SCALE))
         doubt_states(search, SCALE if scale > LARGE else LARGE)
     if FOUND not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, doubted = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
-    for (index,) in refinement.frames_of_pose:
+    for (index,) in refinement.frames_of_instant:
         known = search.state(index) if session.recorded.names[index] in doubted else None
         fit = search.fitted(index, SCALE, known) if refinement.weights[index] > 0 else None
         if fit is not None:

@@ -34,7 +34,7 @@ def register_states(session: GaussianSession, articulations: Sequence[object]) -
     (instrument,) = scene.instruments
     tree = instrument.kinematics
     sizes = {(frame.camera.width, frame.camera.height, frame.state.tissue) for frame in frames}
-    count = len(refinement.frames_of_pose)
+    count = len(refinement.frames_of_instant)
     if not all(frame.camera.is_pinhole for frame in frames):
         return None
     if tree is None or instrument.unrecorded or len(sizes) > 1 or count < MIN_STATES or not config.frame_poses:
@@ -42,17 +42,16 @@ def register_states(session: GaussianSession, articulations: Sequence[object]) -
     scale = min(1.0, WIDTH_PX / frames[0].camera.width)
     views = session.views if scale == 1.0 else session.views.scaled(scale)
     cameras = [frame.camera for frame in views.frames]
-    firsts = [frames[shown[0]].state.instruments[instrument.name] for shown in refinement.frames_of_pose]
-    images = np.stack([(views.target(index) * 255).round().byte().cpu().numpy() for index in range(len(views))])
-    masks = [views.mask(index) for index in range(len(views))]
-    usable = [np.ones(images.shape[1:3], bool) if mask is None else mask.bool().cpu().numpy() for mask in masks]
+    firsts = [frames[shown[0]].state.instruments[instrument.name] for shown in refinement.frames_of_instant]
+    images = np.stack([image.cpu().numpy() for image in views.images])
+    usable = [np.ones(images.shape[1:3], bool) if mask is None else mask.cpu().numpy() for mask in views.masks]
     given = LinkViews(
         tree=tree,
         images=images,
         usable=np.stack(usable),
         camera_from_world=np.stack([np.linalg.inv(camera.world_from_camera.double().numpy()) for camera in cameras]),
         intrinsics=np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras], np.float64),
-        state_of_view=np.array(refinement.pose_rows),
+        state_of_view=np.array(refinement.instants),
         poses=np.stack([state.pose.double().numpy() for state in firsts]),
         readings=np.array([[state.joints[reading] for reading in tree.readings] for state in firsts], np.float64),
     )
@@ -75,7 +74,7 @@ def _correct(session: GaussianSession, found: FoundStates) -> None:
     """Set the states that were found, and the weights of those that nothing explains to 0."""
     refinement, (instrument,) = session.refinement, session.scene.instruments
     assert instrument.kinematics is not None
-    for row, shown in enumerate(refinement.frames_of_pose):
+    for row, shown in enumerate(refinement.frames_of_instant):
         if found.inconsistent[row] and not found.refitted[row]:
             refinement.weights[shown] = 0
         elif found.inconsistent[row]:
@@ -94,23 +93,18 @@ def _note(session: GaussianSession, found: FoundStates) -> None:
     diagnostics: dict[str, Any] = session.scene.diagnostics
     noted: dict[str, str] = {}
     for row in np.flatnonzero(found.inconsistent).tolist():
-        for shown in session.refinement.frames_of_pose[row]:
+        for shown in session.refinement.frames_of_instant[row]:
             noted[session.views.frames[shown].name] = FITTED_ANEW if found.refitted[row] else LEFT_OUT
     if noted:
         diagnostics[CONTRADICTING] = noted
 
 
 def corrected_evidence(session: GaussianSession, evidence: Evidence) -> Evidence:
-    """Return the evidence with the states as corrected, without frames that were left out."""
-    index = {frame.name: number for number, frame in enumerate(session.views.frames)}
-    numbers = [index[frame.name] for frame in evidence.frames]
-    weights = session.refinement.weights
-    remaining = torch.tensor([place for place, number in enumerate(numbers) if weights[number] > 0])
-    frames = tuple(
-        replace(frame, state=session.refinement.state(number, frame.state))
-        if session.refinement.fitted[number]
-        else frame
-        for frame, number in zip(evidence.frames, numbers, strict=True)
-    )
-    evidence = replace(evidence, frames=frames)
-    return evidence.subset(remaining)
+    """Return the evidence with the states as corrected so far, without frames that were left out."""
+    places = {frame.name: place for place, frame in enumerate(session.views.frames)}
+    scene, refinement = session.scene, session.refinement
+    numbers = [places[frame.name] for frame in evidence.frames]
+    states = [scene.registered(refinement.state(k, f.state)) for k, f in zip(numbers, evidence.frames, strict=True)]
+    frames = tuple(replace(frame, state=state) for frame, state in zip(evidence.frames, states, strict=True))
+    remaining = [row for row, number in enumerate(numbers) if refinement.weights[number] > 0]
+    return replace(evidence, frames=frames).subset(torch.tensor(remaining))
