@@ -25,9 +25,9 @@ from neeco.fitting.link_states import (
     adjust,
     posterior,
 )
+from neeco.fitting.parameters import DEG
 from neeco.geometry.lines import unit
 
-DEG = np.pi / 180
 # standard deviations of errors that are tried: tilts, roll (rad), across, depth (mm), revolute (rad), prismatic (mm)
 TRIED = (2 * DEG, 6 * DEG, 0.4, 1.5, 4 * DEG, 1.5)
 # of a state that is wrong altogether, about each of its starts
@@ -60,8 +60,6 @@ class FoundStates:
     covariances: np.ndarray  # [S, 6 + R, 6 + R] of pose (rad, mm, the root's frame) and readings
     inconsistent: np.ndarray  # bool [S], whose states contradict the others
     refitted: np.ndarray  # bool [S], of those: explained from another start
-    ratios: np.ndarray  # [V, H, W] log likelihood ratios of the instrument to the tissue
-    misfits: np.ndarray  # [V]
 
 
 def sds_of(sizes: tuple[float, ...], slides: np.ndarray) -> np.ndarray:
@@ -87,7 +85,7 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
     sds = expected
     if large:  # parameters that make up for each other must not hold each other
         sds = np.maximum(np.maximum(found, MIN_SHARE * sds_of(TRIED, slides)), expected)
-    states = replace(_with_inconsistent(_fit(views, sds, first), sds, slides), large=large)
+    states = _with_inconsistent(_fit(views, sds, first), sds, slides, large=large)
     return states if large or states.inconsistent.any() else None
 
 
@@ -158,7 +156,7 @@ def _far(found: _Fitted) -> np.ndarray:
     return np.asarray(size > LARGE_SDS * max(1.0, 1.5 * float(np.median(size))))
 
 
-def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray) -> FoundStates:
+def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray, *, large: bool) -> FoundStates:
     """The states of a fit; those that are badly explained, from other starts."""
     problem, fit = found.problem, found.fit
     poses, readings = problem.corrected(fit)
@@ -189,15 +187,13 @@ def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray) -> F
         known = np.sqrt(np.diagonal(covariances[state])) < sds_of(SETTLED, slides)
         refitted[state] = trial.misfits[best] <= limit and bool(known.all())
     return FoundStates(
-        large=True,
+        large=large,
         sds=sds,
         poses=poses,
         readings=readings,
         covariances=to_root @ covariances @ to_root.transpose(0, 2, 1),
         inconsistent=inconsistent,
         refitted=refitted,
-        ratios=found.ratios,
-        misfits=found.misfits,
     )
 
 

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from neeco.capture.model import BaseUncertainty, Instrument, evenly_spaced
+from neeco.fitting.link_states import BASE_SD_MM, BASE_SD_RAD
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, rotation_from_vector, skew
@@ -32,9 +33,7 @@ EVIDENCE_SD = 0.3  # of a cell; beyond it, the cost is linear
 MIN_WEIGHT = 0.1  # of a residual; less where most frames have evidence, since the tissue's fit absorbed the instrument
 EDGE_CELLS = 0.6  # width over which a silhouette fades
 SHAFT_LENGTH_MM, NEAREST_MM = 150.0, 5.0  # of the shaft from its end; depth from which it is compared
-# standard deviations: of the base's error where the capture states none, and of the frame's about and along the shaft
-BASE_SD_RAD, BASE_SD_MM = 0.035, 3.0
-FRAME_SD = (0.035, 2.0)  # rad, mm
+FRAME_SD = (0.035, 2.0)  # rad, mm: standard deviations of the frame's error about and along the shaft
 # of the shape: tilts (rad) and shifts (mm) of the carved shaft, log radii, heading (rad) and log length of end links
 SHAFT_SD, LOG_RADIUS_SD, END_SD = (0.1, 0.1, 2.0, 2.0), 0.4, (0.15, 0.4)
 LINK_RADIUS, END_RADIUS, END_LENGTH = 0.8, 0.4, 3.0  # in carved radii
