@@ -64,7 +64,8 @@ class Settings:
     @property
     def options(self) -> str:
         """Those of the command line that make these settings, each after a blank."""
-        size = "" if (self.lens.width, self.lens.height) == (Lens.width, Lens.height) else f" --size {self.lens.width}x{self.lens.height}"
+        side = f"{self.lens.width}x{self.lens.height}"
+        size = "" if side == f"{Lens.width}x{Lens.height}" else f" --size {side}"
         given = [
             (self.detail and not size, " --detail"),
             (self.breathing_mm, f" --breathing {self.breathing_mm:g}"),

@@ -151,6 +151,9 @@ class Settings(ImageSettings):
     """Refuse images in which more of the instruments' pixels than this share shows what no training frame saw."""
     camera_effects: str | None = None
     """YAML file of blur, noise, smoke and the like, and the ranges they are sampled from (docs/synthesis.md)."""
+    backgrounds: str | None = None
+    """Folder of images without an instrument (of the next operation, or others): half of the set shows them instead of
+    the tissue, and instruments in more light (docs/synthesis.md)."""
     max_attempts: int = 50
     """How often to sample a state anew when it is refused."""
 
