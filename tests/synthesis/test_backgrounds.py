@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import pickle
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from ball_world import ball_scene
 from PIL import Image
 from rod_world import CAMERA, FakeRun, rod_state
 from torch import nn
@@ -21,6 +24,7 @@ from neeco.synthesis.backgrounds import Backgrounds, Layers, split
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import SampleGenerator
 from neeco.synthesis.settings import Settings
+from neeco.synthesis.torch_datasets import LabelledImages
 
 SETTINGS = Settings(count=3, seed=3, tissue_tolerance_mm=2.0)
 
@@ -129,3 +133,13 @@ def test_a_wrong_folder_is_told_in_a_line(tmp_path: Path) -> None:
         with pytest.raises(NeecoError, match=told) as error:
             Backgrounds.of(tmp_path / name)
         assert "\n" not in str(error.value)
+
+
+def test_another_process_gets_the_backgrounds_with_the_scene(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path / "plates", (0, 200, 0), (0, 0, 200))
+    ball = ball_scene("ball", [(-8, 0, 55), (4, 2, 60)])
+    images = LabelledImages(ball, 4, seed=3, tissue_tolerance_mm=2.0, backgrounds=folder)
+    sent, own = pickle.loads(pickle.dumps(images)), [images[k]["image"] for k in range(4)]
+    shutil.rmtree(folder)
+    assert all(torch.equal(sent[k]["image"], image) for k, image in enumerate(own))
+    assert len({float(image[1, 0, 0]) for image in own}) > 1

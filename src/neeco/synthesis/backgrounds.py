@@ -31,7 +31,7 @@ CACHED_IMAGES = 64  # decoded
 MIN_SHARE = 0.02  # of a pixel: of less, an instrument's colour is not known
 SHADOW_BLUR_PX = 1.5  # standard deviation, of the shadow that is found at the instrument's edge
 CLEAR_TISSUE = 0.5  # share of tissue in a pixel from which the shadow on it is measured
-REPLACED = 0.5  # share of the images over a background, and of those with instruments in other light
+REPLACED, RELIT = 0.5, 0.5  # shares of the images: over a background, with instruments in other light
 MAX_STOPS = 1.0  # of the instruments' exposure, either way
 MAX_TINT = 0.2  # natural logarithm of a colour gain, either way
 MAX_SATURATION = 0.3  # change of the saturation, either way
@@ -67,7 +67,7 @@ class Backgrounds:
     def draw(self, rng: Generator, width: int, height: int) -> Appearance:
         """Sample the appearance of an image. Raises NeecoError where a file cannot be read."""
         replaced, lit, number = rng.random(), rng.random(), int(rng.integers(len(self.files)))
-        tone = Tone.draw(rng) if lit < REPLACED else None
+        tone = Tone.draw(rng) if lit < RELIT else None
         if replaced >= REPLACED:
             return Appearance(tone=tone)
         background = torch.from_numpy(self.crop(number, rng, width, height))
@@ -116,7 +116,7 @@ class Tone:
 
 @dataclass(frozen=True)
 class Appearance:
-    """What replaces the tissue of an image, from which file, and the light on its instruments; None: as recorded."""
+    """A background, the name of its file, and the tone of the instruments over it; None: as recorded."""
 
     source: str | None = None
     background: Tensor | None = None  # [H, W, 3] in [0, 1]
