@@ -20,7 +20,7 @@ from neeco.errors import NeecoError
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene import GaussianScene
-from neeco.synthesis.backgrounds import Backgrounds, Layers, split
+from neeco.synthesis.backgrounds import Appearance, Backgrounds, Layers, split
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import SampleGenerator
 from neeco.synthesis.settings import Settings
@@ -73,7 +73,8 @@ def test_the_shadow_falls_on_the_background_and_nowhere_without_a_lamp(scene: Ga
 def test_half_of_the_images_show_a_background_and_half_other_light_and_labels_stay(
     scene: GaussianScene, tmp_path: Path
 ) -> None:
-    folder = folder_of(tmp_path / "green", (0, 255, 0))
+    grey = torch.tensor([100, 100, 100]) / 255
+    folder = folder_of(tmp_path / "grey", (100, 100, 100))
     plain, varied = (SampleGenerator.of(scene, replace(SETTINGS, backgrounds=given)) for given in (None, folder))
     kinds = set()
     for index in range(12):
@@ -85,11 +86,18 @@ def test_half_of_the_images_show_a_background_and_half_other_light_and_labels_st
         relit = (own.image - image)[inside].abs().max() > 0.06
         kinds.add((other.facts["background"], bool(relit)))
         if other.facts["background"]:
-            assert (image[outside] - torch.tensor([0.0, 1.0, 0.0])).abs().max() < 0.06
+            assert (image[outside] - grey).abs().max() < 0.06
             assert not other.drawing.depth[outside.numpy()].any()
         else:
             assert (own.image - image)[outside].abs().max() < 0.03
     assert kinds == {(source, relit) for source in ("0.png", None) for relit in (False, True)}
+
+
+def test_instruments_take_on_the_light_of_the_background(scene: GaussianScene) -> None:
+    layers, _, share = layers_of(scene)
+    dark, inside = layers.tissue * 0.5, share > 0.99
+    brightness = [Appearance("dark", dark, strength).of(layers)[inside].mean() for strength in (0.0, 0.5, 1.0)]
+    assert brightness[0] > 1.2 * brightness[1] > 1.4 * brightness[2]
 
 
 def test_crops_keep_the_shape_of_images_of_any_size(tmp_path: Path) -> None:

@@ -36,6 +36,8 @@ MAX_STOPS = 1.0  # of the instruments' exposure, either way
 MAX_TINT = 0.2  # natural logarithm of a colour gain, either way
 MAX_SATURATION = 0.3  # change of the saturation, either way
 MAX_CONTRAST = 0.3  # natural logarithm of the exponent on the stored image, either way
+DARK = 1e-3  # of white: no mean light is taken to be less
+ADAPTATION_RANGE = (0.25, 4.0)  # of the instruments' gains
 SHADOW_RANGE = (0.2, 1.1)  # of the light that a shadow leaves; above 1: errors of the renderings
 
 
@@ -67,11 +69,11 @@ class Backgrounds:
     def draw(self, rng: Generator, width: int, height: int) -> Appearance:
         """Sample the appearance of an image. Raises NeecoError where a file cannot be read."""
         replaced, lit, number = rng.random(), rng.random(), int(rng.integers(len(self.files)))
-        tone = Tone.draw(rng) if lit < RELIT else None
+        adaptation, tone = rng.random(), Tone.draw(rng) if lit < RELIT else None
         if replaced >= REPLACED:
             return Appearance(tone=tone)
         background = torch.from_numpy(self.crop(number, rng, width, height))
-        return Appearance(self.files[number].name, background, tone)
+        return Appearance(self.files[number].name, background, adaptation, tone)
 
     def crop(self, number: int, rng: Generator, width: int, height: int) -> np.ndarray:
         """Sample a background, float32 [height, width, 3] in [0, 1]: a random crop of an image, perhaps mirrored,
@@ -116,10 +118,15 @@ class Tone:
 
 @dataclass(frozen=True)
 class Appearance:
-    """A background, the name of its file, and the tone of the instruments over it; None: as recorded."""
+    """A background, the name of its file, and the light on the instruments over it; None: as recorded.
+
+    The background's mean light differs from that of the scene's tissue by its tissue, and by camera and lamps, which
+    change instruments as well: these are multiplied, in each colour channel, by the ratio to the power of `adaptation`.
+    """
 
     source: str | None = None
     background: Tensor | None = None  # [H, W, 3] in [0, 1]
+    adaptation: float = 0.0  # in [0, 1]
     tone: Tone | None = None
 
     @property
@@ -129,14 +136,17 @@ class Appearance:
 
     def of(self, layers: Layers) -> Tensor:
         """The image [H, W, 3] of these layers in this appearance."""
-        instruments = layers.instruments
+        share = layers.share.clamp(min=MIN_SHARE)[..., None].numpy()
+        alone, background = np.clip(layers.instruments.numpy() / share, 0, 1), layers.tissue
         if self.tone is not None:
-            share = layers.share.clamp(min=MIN_SHARE)[..., None].numpy()
-            alone = np.clip(instruments.numpy() / share, 0, 1)
-            instruments = torch.from_numpy((self.tone(alone) * share).astype(np.float32))
-        return replace(layers, instruments=instruments).over(
-            layers.tissue if self.background is None else self.background
-        )
+            alone = self.tone(alone)
+        if self.background is not None:
+            background = self.background
+            here, own = (srgb_to_linear(image.numpy()).mean((0, 1)) + DARK for image in (background, layers.tissue))
+            gains = np.clip((here / own) ** self.adaptation, *ADAPTATION_RANGE)
+            alone = linear_to_srgb(srgb_to_linear(alone) * gains)
+        instruments = torch.from_numpy((alone * share).astype(np.float32))
+        return replace(layers, instruments=instruments).over(background)
 
 
 AS_RECORDED = Appearance()

@@ -192,7 +192,7 @@ class SampleGenerator:
         facts: dict[str, Any] = {} if self.effects is None else {"camera_effects": effects}
         if self.backgrounds is not None:
             facts["background"] = appearance.source
-        return LabelledSample(index, self._through_camera(drawing, appearance, effects, rng), labels, refused, facts)
+        return LabelledSample(index, self._through_camera(drawing, effects, rng, appearance), labels, refused, facts)
 
     def _first_acceptable(self, index: int, effects: Mapping[str, float]) -> tuple[LayeredDrawing, Counter[str]]:
         settings = self.settings
@@ -240,7 +240,11 @@ class SampleGenerator:
         return appearance.of(split(gaussians, self.labeller.owners(state, gaussians), camera, image, share))
 
     def _through_camera(
-        self, drawing: LayeredDrawing, appearance: Appearance, effects: Mapping[str, float], rng: Generator
+        self,
+        drawing: LayeredDrawing,
+        effects: Mapping[str, float],
+        rng: Generator,
+        appearance: Appearance = AS_RECORDED,
     ) -> LayeredDrawing:
         """Apply the camera effects; labels stay those of the middle of the exposure."""
         if not effects:
