@@ -100,6 +100,16 @@ def test_instruments_take_on_the_light_of_the_background(scene: GaussianScene) -
     assert brightness[0] > 1.2 * brightness[1] > 1.4 * brightness[2]
 
 
+def test_instruments_are_relit_without_backgrounds_too_and_tissue_stays(scene: GaussianScene) -> None:
+    plain, relit = (SampleGenerator.of(scene, replace(SETTINGS, relight=share)) for share in (None, 1.0))
+    own, other = plain.draw(0).drawing, relit.draw(0).drawing
+    assert torch.equal(own.parts, other.parts)
+    assert (own.image - other.image)[own.share > 0.99].abs().max() > 0.06
+    assert (own.image - other.image)[own.share < 0.01].abs().max() < 0.03
+    with pytest.raises(NeecoError, match="--relight: .* is not a share"):
+        replace(SETTINGS, relight=2.0).check()
+
+
 def test_crops_keep_the_shape_of_images_of_any_size(tmp_path: Path) -> None:
     ramp = np.linspace(0, 255, 400).round().astype(np.uint8)
     folder = tmp_path / "wide"

@@ -1,7 +1,7 @@
 """Appearances of another operation: instruments over images of its tissue, in other light.
 
-Half of the images of a data set keep the scene's tissue, and another half its instruments' colours: what is rendered is
-learned as well as what replaces it.
+Half of the images of a data set keep the scene's tissue, and some its instruments' colours: what is rendered is learned
+as well as what replaces it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ CACHED_IMAGES = 64  # decoded
 MIN_SHARE = 0.02  # of a pixel: of less, an instrument's colour is not known
 SHADOW_BLUR_PX = 1.5  # standard deviation, of the shadow that is found at the instrument's edge
 CLEAR_TISSUE = 0.5  # share of tissue in a pixel from which the shadow on it is measured
-REPLACED, RELIT = 0.5, 0.5  # shares of the images: over a background, with instruments in other light
+REPLACED = 0.5  # share of the images that show a background
 MAX_STOPS = 1.0  # of the instruments' exposure, either way
 MAX_TINT = 0.2  # natural logarithm of a colour gain, either way
 MAX_SATURATION = 0.3  # change of the saturation, either way
@@ -43,7 +43,7 @@ SHADOW_RANGE = (0.2, 1.1)  # of the light that a shadow leaves; above 1: errors 
 
 @dataclass(frozen=True)
 class Backgrounds:
-    """Image files that show tissue without an instrument, and the appearances of data sets over them."""
+    """Image files that show tissue without an instrument."""
 
     files: tuple[Path, ...]
 
@@ -65,15 +65,6 @@ class Backgrounds:
         """SHA-256 of the files' content, in order."""
         content = b"".join(hashlib.sha256(file.read_bytes()).digest() for file in self.files)
         return hashlib.sha256(content).hexdigest()
-
-    def draw(self, rng: Generator, width: int, height: int) -> Appearance:
-        """Sample the appearance of an image. Raises NeecoError where a file cannot be read."""
-        replaced, lit, number = rng.random(), rng.random(), int(rng.integers(len(self.files)))
-        adaptation, tone = rng.random(), Tone.draw(rng) if lit < RELIT else None
-        if replaced >= REPLACED:
-            return Appearance(tone=tone)
-        background = torch.from_numpy(self.crop(number, rng, width, height))
-        return Appearance(self.files[number].name, background, adaptation, tone)
 
     def crop(self, number: int, rng: Generator, width: int, height: int) -> np.ndarray:
         """Sample a background, float32 [height, width, 3] in [0, 1]: a random crop of an image, perhaps mirrored,
@@ -150,6 +141,27 @@ class Appearance:
 
 
 AS_RECORDED = Appearance()
+
+
+@dataclass(frozen=True)
+class Appearances:
+    """The appearances of a data set. relit: share of its images whose instruments have another tone."""
+
+    backgrounds: Backgrounds | None
+    relit: float
+
+    def draw(self, rng: Generator, width: int, height: int) -> Appearance:
+        """Sample the appearance of an image. Raises NeecoError where a background cannot be read."""
+        replaced, lit, adaptation, place = rng.random(4)
+        tone = Tone.draw(rng) if lit < self.relit else None
+        if self.backgrounds is None or replaced >= REPLACED:
+            return Appearance(tone=tone)
+        number = int(place * len(self.backgrounds.files))
+        background = torch.from_numpy(self.backgrounds.crop(number, rng, width, height))
+        return Appearance(self.backgrounds.files[number].name, background, adaptation, tone)
+
+
+ALL_AS_RECORDED = Appearances(None, 0.0)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from neeco.labels.drawing import MAX_UNOBSERVED, LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.scene.io import load_gaussians
-from neeco.synthesis.backgrounds import AS_RECORDED, Appearance, Backgrounds, split
+from neeco.synthesis.backgrounds import ALL_AS_RECORDED, AS_RECORDED, Appearance, Appearances, Backgrounds, split
 from neeco.synthesis.camera_effects import (
     CameraEffects,
     MixedMotion,
@@ -130,7 +130,7 @@ class SampleGenerator:
     motion: RecordedMotion | MixedMotion | None = None  # where effects open a shutter
     gains: tuple[tuple[float, float, float], ...] = ()  # by which the colours of each instrument scene were multiplied
     cameras: DrawnCameras = RECORDED_CAMERAS
-    backgrounds: Backgrounds | None = None  # of another operation
+    appearances: Appearances = ALL_AS_RECORDED
 
     @classmethod
     def of(
@@ -159,6 +159,7 @@ class SampleGenerator:
         if settings.camera_effects is not None:
             effects = read_effects(Path(settings.camera_effects))
             motion = _motion(tissue, instrument_scenes, settings) if effects.moves else None
+        backgrounds = None if settings.backgrounds is None else Backgrounds.of(Path(settings.backgrounds))
         tolerance = settings.tissue_tolerance_mm if settings.tissue_check else None
         if settings.tissue_check and tolerance is None:
             tolerance = find_tolerance(scene, labeller)
@@ -173,7 +174,7 @@ class SampleGenerator:
             motion=motion,
             gains=gains,
             cameras=cameras,
-            backgrounds=None if settings.backgrounds is None else Backgrounds.of(Path(settings.backgrounds)),
+            appearances=Appearances(backgrounds, settings.relight_share),
         )
 
     def draw(self, index: int) -> LabelledSample:
@@ -190,7 +191,7 @@ class SampleGenerator:
             drawing = self._with(drawing, appearance)
         labels = annotate(self.scene, drawing, self.labeller.names)
         facts: dict[str, Any] = {} if self.effects is None else {"camera_effects": effects}
-        if self.backgrounds is not None:
+        if self.appearances.backgrounds is not None:
             facts["background"] = appearance.source
         return LabelledSample(index, self._through_camera(drawing, effects, rng, appearance), labels, refused, facts)
 
@@ -217,11 +218,9 @@ class SampleGenerator:
         )
 
     def _appearance(self, index: int, drawing: LayeredDrawing) -> Appearance:
-        if self.backgrounds is None:
-            return AS_RECORDED
         rng = np.random.default_rng(np.random.SeedSequence([self.settings.seed, index, APPEARANCE_STREAM]))
         height, width = drawing.depth.shape
-        return self.backgrounds.draw(rng, width, height)
+        return self.appearances.draw(rng, width, height)
 
     def _with(self, drawing: LayeredDrawing, appearance: Appearance) -> LayeredDrawing:
         """Return the drawing in another appearance; the depth of a background is unknown."""
