@@ -121,7 +121,6 @@ def test_ablate(verb: Call, capture: str) -> None:
 
 @slowly
 def test_downstream(verb: Call, capture: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("monai")
     monkeypatch.setattr("neeco.studies.downstream.models.unet.UNet.channels", (4, 4, 8, 8, 8))
     small = [
         "--steps",

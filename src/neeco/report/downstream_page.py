@@ -117,9 +117,7 @@ def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
     if not counts:
         sentences.append("No condition has synthetic images with labelled frames to compare with these frames alone.")
     elif set(counts) == {""}:
-        sentences.append(
-            "A single score each: whether synthetic images help cannot be distinguished from chance; give --folds 5."
-        )
+        sentences.append("One fold: whether synthetic images help cannot be distinguished from chance; give --folds 5.")
     else:
         verbs = {HELPS: "help", HURTS: "hurt", NONE_SHOWN: "show no difference"}
         parts = [f"{verb} in {counts[word]}" for word, verb in verbs.items() if counts[word]]

@@ -95,8 +95,8 @@ class Held:
     loads: list[str] = field(default_factory=list)
 
     @property
-    def key(self) -> int:
-        return id(self.example)
+    def key(self) -> tuple[object, ...]:
+        return tuple(None if array is None else array.tobytes() for array in vars(self.example).values())
 
     def load(self) -> Example:
         self.loads.append(self.name)

@@ -82,7 +82,7 @@ def test_the_seed_decides_the_order_whatever_the_batches() -> None:
 
 def test_images_are_read_once_unless_they_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     def reads(limit: int) -> list[int]:
-        monkeypatch.setattr(batches, "_images", LeastRecentlyUsed(limit))
+        monkeypatch.setattr(batches, "IMAGES", LeastRecentlyUsed(limit))
         source = [Held(sample.example, sample.name, []) for sample in squares(4, 0, 16)]
         for _ in range(3):
             for sample in source:

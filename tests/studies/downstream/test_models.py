@@ -146,11 +146,10 @@ def test_the_last_weights_are_the_model_and_are_kept_where_asked_for(tmp_path: P
         return loss(self, module, *given)
 
     monkeypatch.setattr(Pixels, "loss", watched)
-    monkeypatch.setattr(Pixels, "_rate", lambda self, step, steps: float(step < 7))  # the last steps change nothing
     Pixels().fit(task_of(tmp_path / "kept", steps=10))
     stored = load_file(tmp_path / "kept" / WEIGHTS_FILE)
-    assert all(torch.equal(value, states[9][name]) for name, value in stored.items())
-    assert not torch.equal(stored["weight"], states[5]["weight"])
+    near, far = ((stored["weight"] - states[step]["weight"]).abs().max() for step in (9, 3))
+    assert 0 < near < 0.1 * far  # one small step, as the learning rate ends at 0
     Pixels().fit(task_of(tmp_path / "not", keep_weights=False))
     assert not (tmp_path / "not").exists()
 

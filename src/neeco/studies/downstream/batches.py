@@ -71,17 +71,17 @@ class Batch:
     outlines: tuple[tuple[Outline, ...], ...]  # of each image, as `TrainingImage` has them
 
     def boxes(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Of each image the boxes [n, 4] (centre x, y, width, height; shares of its sides) and their classes [n]."""
+        """Return for each image its boxes [n, 4] (centre x, y, width, height; shares of its sides) and their classes [n]."""
         return [_boxes(outlines) for outlines in self.outlines]
 
 
-_images: LeastRecentlyUsed[Hashable, TrainingImage] = LeastRecentlyUsed()
+IMAGES: LeastRecentlyUsed[Hashable, TrainingImage] = LeastRecentlyUsed()
 
 
 def training_image(sample: Sample, size: tuple[int, int], classes: int, outlines: bool = False) -> TrainingImage:
     """The sample at this size (width, height), kept for as long as there is room. outlines: with them, for boxes."""
     key = (sample.key, size, classes, outlines)
-    return _images.get(key, lambda: shrink(sample.load(), size, classes, outlines), lambda image: image.bytes)
+    return IMAGES.get(key, lambda: shrink(sample.load(), size, classes, outlines), lambda image: image.bytes)
 
 
 def shrink(example: Example, size: tuple[int, int], classes: int, outlines: bool = False) -> TrainingImage:

@@ -50,7 +50,7 @@ class Scores:
         self._resampled: dict[Any, np.ndarray] = {}
 
     def by_fold(self, arm: Arm, test: str, metric: str) -> dict[int, float]:
-        """The score of every fold that has it."""
+        """Return the score of every fold that has it."""
         found = {fold: job["splits"].get(test, {}).get(metric) for fold, job in self.jobs.get(arm, {}).items()}
         return {fold: value for fold, value in sorted(found.items()) if value is not None}
 
@@ -65,8 +65,8 @@ class Scores:
         return self._ends(test, metric, folds, [arm]) if folds else (None, None)
 
     def difference(self, first: Arm, second: Arm, test: str, metric: str) -> tuple[int, float, Interval] | None:
-        """How many folds both finished, the mean difference of `first` and `second` over these, and its interval; None
-        where there is none."""
+        """Return the number of folds that both finished, the mean difference of `first` and `second` over these and its
+        interval; None where there is no such fold."""
         ours, theirs = (self.by_fold(arm, test, metric) for arm in (first, second))
         folds = tuple(fold for fold in ours if fold in theirs)
         if not folds:
@@ -75,7 +75,7 @@ class Scores:
         return len(folds), mean, self._ends(test, metric, folds, [first, second])
 
     def _ends(self, test: str, metric: str, folds: tuple[int, ...], arms: Sequence[Arm]) -> Interval:
-        """Of the mean of one arm, or of the difference of two."""
+        """Interval of the mean of one arm, or of the difference of two."""
         means = [self._means(arm, test, metric, folds) for arm in arms]
         if not any(len(values) for values in means):
             return None, None
@@ -103,8 +103,8 @@ class Scores:
 def seed_weights(seeds: int) -> np.ndarray:
     """[RESAMPLES, seeds]: how often each seed is drawn, in all one time fewer than there are seeds: as often would make
     the variance of few too small (Rao and Wu, "Resampling inference with complex survey data", 1988)."""
-    drawn = max(seeds - 1, 1)
-    return np.random.default_rng(1).multinomial(drawn, np.full(seeds, 1 / seeds), RESAMPLES).astype(np.float64)
+    times = max(seeds - 1, 1)
+    return np.random.default_rng(1).multinomial(times, np.full(seeds, 1 / seeds), RESAMPLES).astype(np.float64)
 
 
 @cache

@@ -11,7 +11,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import torch
 
 from neeco.capture import Capture, read_capture
 from neeco.evaluation.mask_metrics import iou
@@ -205,6 +207,7 @@ class DownstreamJob:
                 return stored
         report = progress or (lambda stage, share, text: None)
         report("training", 0.0, "")
+        cv2.setNumThreads(torch.get_num_threads())  # else every worker takes all cores
         capture = capture or _read(self.capture, self.settings.transforms)
         started, cpu_before = time.monotonic(), _cpu_seconds()
         task = replace(self.task(capture), progress=lambda share, text: report("training", share, text))

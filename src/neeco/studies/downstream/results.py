@@ -241,8 +241,8 @@ def real_curve(scores: FoldScores, key: tuple[str, int]) -> list[tuple[int, floa
 
 
 def verdict(row: Document) -> str:
-    """Return the verdict of a paired difference, one of VERDICTS; "" where there is no interval."""
-    if row["low"] is None:
+    """Return the verdict of a paired difference, one of VERDICTS; "" of one fold, whose interval is of frames alone."""
+    if row["low"] is None or row["folds"] < 2:
         return ""
     return HELPS if row["low"] > 0 else HURTS if row["high"] < 0 else NONE_SHOWN
 
@@ -250,6 +250,8 @@ def verdict(row: Document) -> str:
 def _interval(row: Document) -> str:
     if row["low"] is None:
         return f"({row['difference']:+.3f}; a single score has no interval)"
+    if row["folds"] < 2:
+        return f"({row['difference']:+.3f}; one fold gives no verdict)"
     return f"({row['difference']:+.3f}, {row['low']:+.3f} to {row['high']:+.3f})"
 
 
