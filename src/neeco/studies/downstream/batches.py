@@ -71,7 +71,7 @@ class Batch:
     outlines: tuple[tuple[Outline, ...], ...]  # of each image, as `TrainingImage` has them
 
     def boxes(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return for each image its boxes [n, 4] (centre x, y, width, height; shares of its sides) and their classes."""
+        """Return each image's boxes [n, 4] (centre x, y, width, height; shares of its sides) and their classes."""
         return [_boxes(outlines) for outlines in self.outlines]
 
 
