@@ -9,9 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
-from neeco.evaluation.mask_metrics import boundary_f, box_ious, dice, iou, mean_of
+from neeco.evaluation.mask_metrics import boundary_f, box_ious, dice, distances_to, iou, mean_of
 from neeco.studies.downstream.samples import Example
 
 MASK_SCORES = ("iou", "dice", "precision", "recall", "boundary_f")
@@ -63,7 +62,7 @@ def _class_scores(mask: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dic
 
 def near(pixels: np.ndarray, distance: float) -> np.ndarray:
     """bool [H, W]: within `distance` px of any of `pixels` [H, W]."""
-    return ndimage.distance_transform_edt(~pixels) <= distance if pixels.any() else np.zeros_like(pixels)
+    return distances_to(pixels) <= distance if pixels.any() else np.zeros_like(pixels)
 
 
 def mean_scores(frames: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
