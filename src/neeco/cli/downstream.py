@@ -43,7 +43,7 @@ class Downstream:
     folds: int = 5
     """Each takes other labelled frames and another seed; intervals are over folds and frames."""
     conditions: tuple[str, ...] = ()
-    """Training data; default: real, real+strong, real+paste, and SET, SET+real, SET+real+permuted of every set."""
+    """Training data; default: real, real+strong, real+paste, SET, SET+real, SET+real+strong, SET+real+permuted."""
     backgrounds: Path | None = None
     """Folder of images without an instrument to paste over; default: the labelled frames, instruments filled in."""
     labels: Path | None = None

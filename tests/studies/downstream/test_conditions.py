@@ -76,7 +76,9 @@ def test_conditions_that_say_nothing_are_refused(name: str, told: str) -> None:
 def test_usual_conditions_are_baselines_and_each_set_alone_beside_labelled_frames_and_with_wrong_labels() -> None:
     baselines = ["real", "real+strong", "real+paste"]
     assert default_conditions(()) == baselines
-    assert default_conditions(SETS[:1]) == [*baselines, "kin", "kin+real", "kin+real+permuted"]
+    assert default_conditions(SETS[:1]) == [
+        *baselines, "kin", "kin+real", "kin+real+strong", "kin+real+permuted"
+    ]  # fmt: skip
     assert [parse_condition(name, SETS).name for name in default_conditions(SETS)] == default_conditions(SETS)
 
 

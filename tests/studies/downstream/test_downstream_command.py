@@ -62,6 +62,7 @@ def test_it_prints_tables_answers_and_where_all_of_it_lies(words, tmp_path: Path
         "real+paste",
         "kin",
         "kin+real",
+        "kin+real+strong",
         "kin+real+permuted",
     ]
     assert {"downstream.csv", "downstream.md", "downstream.tex", "data", "jobs"} <= {p.name for p in output.iterdir()}
@@ -110,7 +111,7 @@ def test_ctrl_c_says_how_to_go_on(words, monkeypatch, capsys) -> None:
     monkeypatch.setattr(UNet, "loss", lambda *_: os.kill(os.getpid(), signal.SIGINT))
     assert main(words) == 130
     last = capsys.readouterr().err.strip().splitlines()[-1]
-    assert last.startswith("neeco: interrupted: job 1 of 6 (unet, real, 6 labelled, fold 0)")
+    assert last.startswith("neeco: interrupted: job 1 of 7 (unet, real, 6 labelled, fold 0)")
     assert "run the same command again to go on, nothing finished is lost" in last
 
 

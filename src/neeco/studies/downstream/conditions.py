@@ -74,9 +74,10 @@ def parse_condition(name: str, sets: Collection[str]) -> Condition:
 
 
 def default_conditions(sets: Sequence[str]) -> list[str]:
-    """The baselines, then each set alone, with labelled frames, and so with labels of other images."""
-    of_sets = (word for name in sets for word in (name, f"{name}+{REAL}", f"{name}+{REAL}+{PERMUTED}"))
-    return [*BASELINES, f"{REAL}+{PASTE}", *of_sets]
+    """The baselines and cut-and-paste; then each set alone, with labelled frames, and these strongly augmented or with
+    labels of other images."""
+    used = ("", f"+{REAL}", f"+{REAL}+{STRONG}", f"+{REAL}+{PERMUTED}")
+    return [*BASELINES, f"{REAL}+{PASTE}", *(name + words for name in sets for words in used)]
 
 
 def labelled_count(word: str, frames: int) -> int:

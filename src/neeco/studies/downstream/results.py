@@ -190,8 +190,23 @@ def findings(experiment: Document) -> list[str]:
 def findings_of(experiment: Document, model: Document, split: str) -> list[str]:
     """The sentences of one model and split; conditions are compared over the folds that both finished."""
     scores = scores_by_fold(experiment["jobs"], model["name"], split, MAIN[model["answers"]])
-    sentences = (_finding(key, scores, experiment, model, split) for key in scores)
+    sentences = [_finding(key, scores, experiment, model, split) for key in scores]
+    controls = dict.fromkeys(condition for condition, _ in scores if PERMUTED in condition.split("+"))
+    sentences += [_control(condition, experiment, model, split) for condition in controls]
     return [sentence for sentence in sentences if sentence]
+
+
+def _control(condition: str, experiment: Document, model: Document, split: str) -> str | None:
+    """Compare labels of other images with the right ones; None where these are missing."""
+    rows = [row for row in main_differences(experiment, model, split) if row["condition"] == condition]
+    if not rows:
+        return None
+    worse = sum(verdict(row) == HURTS for row in rows)
+    ends = sorted(row["difference"] for row in rows)
+    return (
+        f"{condition} against the right labels, {rows[0]['against']}: below by more than the interval at {worse} of "
+        f"{len(rows)} numbers of labelled frames ({ends[0]:+.3f} to {ends[-1]:+.3f})"
+    )
 
 
 def _finding(key: tuple[str, int], scores: FoldScores, experiment: Document, model: Document, split: str) -> str | None:
@@ -202,10 +217,9 @@ def _finding(key: tuple[str, int], scores: FoldScores, experiment: Document, mod
     rows = [
         row
         for row in main_differences(experiment, model, split)
-        if (row["condition"], row["real"]) == key
-        and row["against"] in (BASELINES if PERMUTED not in words else (condition_without(condition, PERMUTED),))
+        if (row["condition"], row["real"]) == key and row["against"] in BASELINES
     ]
-    if not sets or not rows:
+    if not sets or not rows or PERMUTED in words:
         return None
     used = [word for word in words if word not in (REAL, *(entry["name"] for entry in sets))]
     count = " and ".join(f"{entry['images']:,} synthetic ({', '.join([entry['name'], *used])})" for entry in sets)
@@ -218,14 +232,9 @@ def _finding(key: tuple[str, int], scores: FoldScores, experiment: Document, mod
         return f"{count} and no manual label: {metric} {value:.3f}{share}; {against}"
     sentence = f"{real} labelled frames and {count}: {metric} {value:.3f}"
     curve = real_curve(scores, key)
-    if len(curve) > 1 and verdict(row) != HURTS and PERMUTED not in words:
+    if len(curve) > 1 and verdict(row) != HURTS:
         sentence += f", {equivalent(curve, value)} labelled frames alone"
     return f"{sentence}; {against}"
-
-
-def condition_without(condition: str, word: str) -> str:
-    """The condition without one of its words."""
-    return "+".join(other for other in condition.split("+") if other != word)
 
 
 def real_curve(scores: FoldScores, key: tuple[str, int]) -> list[tuple[int, float]]:
