@@ -33,8 +33,8 @@ Key = tuple[str, int]  # condition, labelled frames
 
 
 def example_sections(experiment: Experiment, capture: Capture, output: Path) -> tuple[list[Section], str]:
-    """For every model and split the frames where synthetic images gain most and least over labelled frames alone; and
-    the scores of what is shown as CSV.
+    """For every model and test the frames where synthetic images gain most and least over the better of labelled frames
+    alone and augmented; and the scores of what is shown as CSV.
 
     Predictions are read from `output`, the study's folder; models and splits without them are left out. Raises
     NeecoError for a file that cannot be read.
@@ -52,8 +52,8 @@ def example_sections(experiment: Experiment, capture: Capture, output: Path) -> 
     swatch = Markup('<i style="background: {}"></i>{} ').format
     names = [*((part_color(part), name) for part, name in enumerate(experiment["classes"], 1)), ("#ff0", "truth")]
     text = Markup('{} <span class="key">{}</span>').format(
-        "Frames where synthetic images gain most over labelled frames alone, and where they gain least or lose, of one "
-        "fold; under each prediction its score.",
+        "Frames where synthetic images gain most over the better of labelled frames alone and augmented, and where "
+        "they gain least or lose, of one fold; under each prediction its score.",
         Markup().join(swatch(color, name) for color, name in names),
     )
     table = csv_text(["model", "split", "fold", "frame", "why", "condition", "real", "score"], rows)
