@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neeco.studies.downstream import batches
-from neeco.studies.downstream.batches import SCHEDULES, BatchSampler, LeastRecentlyUsed, training_image
-from neeco.studies.downstream.samples import Example
+from neeco.studies.downstream.batches import SCHEDULES, BatchSampler, training_image
+from neeco.studies.downstream.samples import Example, LeastRecentlyUsed
 
 REAL, SETS = squares(3, 0, 16), (squares(11, 10, 16), squares(1, 50, 16))
 SOURCES = (REAL, *SETS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,14 +68,17 @@ def test_a_hole_takes_what_is_behind_it_where_that_is_known() -> None:
 
 
 def test_a_still_cameras_background_is_the_median_of_frames_that_show_it(labelled) -> None:
-    still = [sample for sample in labelled if np.allclose(
-        sample.frame.camera.world_from_camera, labelled[0].frame.camera.world_from_camera)]  # fmt: skip
-    plate = Backgrounds(tuple(still))._plate
-    if len(still) < 2:
-        assert plate is None
-    else:
-        assert plate is not None
-        assert plate.shape == (40, 48, 3)
+    camera = labelled[0].frame.camera
+    still = tuple(replace(sample, frame=replace(sample.frame, camera=camera)) for sample in labelled)
+    examples = [sample.load() for sample in still]
+    shown = np.stack([~covered(example) for example in examples])
+    images = np.stack([example.image for example in examples]).astype(float)
+    made, hole = Backgrounds(still).image(0, (48, 40)), covered(examples[0])
+    row, column = np.argwhere(hole & shown.any(0))[0]
+    median = np.median(images[shown[:, row, column], row, column], axis=0)
+    assert made[row, column] == pytest.approx(median, abs=0.5)
+    moving = Backgrounds(labelled).image(0, (48, 40))
+    assert not np.array_equal(made[hole], moving[hole])
 
 
 def test_a_folder_without_images_is_refused(labelled, tmp_path: Path) -> None:

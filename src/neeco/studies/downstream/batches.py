@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Generic, Literal, TypeVar, get_args
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -13,36 +12,12 @@ import torch
 from torch import Tensor
 
 from neeco.studies.downstream.augmentation import Outline, augment, moved
-from neeco.studies.downstream.samples import Example, Sample
+from neeco.studies.downstream.samples import Example, LeastRecentlyUsed, Sample
 
 Schedule = Literal["balanced", "pool", "finetune", "blend"]
 SCHEDULES: tuple[Schedule, ...] = get_args(Schedule)
 DEFAULT_SCHEDULE: Schedule = "finetune"
 REAL_ALONE_FROM = {"finetune": 0.6, "blend": 0.7}  # of the steps: recorded frames alone from here on
-CACHE_BYTES = 1 << 30  # of decoded images of one kind that a process keeps
-
-K = TypeVar("K", bound=Hashable)
-V = TypeVar("V")
-
-
-class LeastRecentlyUsed(Generic[K, V]):
-    """Values by key, of at most `limit` bytes in all; those that were not used for longest go first."""
-
-    def __init__(self, limit: int = CACHE_BYTES) -> None:
-        self.limit, self.used = limit, 0
-        self._kept: OrderedDict[K, tuple[V, int]] = OrderedDict()
-
-    def get(self, key: K, make: Callable[[], V], size: Callable[[V], int]) -> V:
-        """The value of `key`, made where it is not kept. size: of a value, in bytes."""
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key][0]
-        value = make()
-        self._kept[key] = value, size(value)
-        self.used += self._kept[key][1]
-        while self.used > self.limit and len(self._kept) > 1:
-            self.used -= self._kept.popitem(last=False)[1][1]
-        return value
 
 
 @dataclass(frozen=True)

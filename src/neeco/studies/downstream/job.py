@@ -19,7 +19,7 @@ from neeco.capture import Capture, read_capture
 from neeco.evaluation.mask_metrics import iou
 from neeco.files import read_json, require_like, require_same, write_atomically, write_json
 from neeco.raster.devices import device_of
-from neeco.studies.downstream.batches import BatchSampler, LeastRecentlyUsed
+from neeco.studies.downstream.batches import BatchSampler
 from neeco.studies.downstream.conditions import Condition, FrameSelection, labelled_frames
 from neeco.studies.downstream.model import Model, TrainedModel, TrainingTask, input_size, model_class
 from neeco.studies.downstream.paste import PASTED_IMAGES, pasted_samples
@@ -27,6 +27,7 @@ from neeco.studies.downstream.samples import (
     ClassNames,
     Example,
     ImageSet,
+    LeastRecentlyUsed,
     OtherCapture,
     RecordedSample,
     Sample,
@@ -324,8 +325,7 @@ class _Truth:
 
     @property
     def bytes(self) -> int:
-        arrays = [*vars(self.example).values(), *self.regions.values()]
-        return sum(array.nbytes for array in arrays if array is not None)
+        return self.example.bytes + sum(region.nbytes for region in self.regions.values())
 
 
 _truths: LeastRecentlyUsed[Hashable, _Truth] = LeastRecentlyUsed()

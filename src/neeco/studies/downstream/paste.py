@@ -12,7 +12,7 @@ import numpy as np
 
 from neeco.capture.images import EXTENSIONS, read_image_bytes
 from neeco.errors import NeecoError
-from neeco.studies.downstream.samples import Example, RecordedSample
+from neeco.studies.downstream.samples import Example, RecordedSample, loaded
 
 PASTED_IMAGES = 400
 MARGIN = 0.02  # of the image's longer side: what is about an instrument (its shadow, its blur) is filled in, too
@@ -48,7 +48,7 @@ class Backgrounds:
     @cached_property
     def _covered(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Each frame with what its instruments cover."""
-        return [(example.image, covered(example)) for example in (sample.load() for sample in self.samples)]
+        return [(example.image, covered(example)) for example in map(loaded, self.samples)]
 
     @cached_property
     def _plate(self) -> np.ndarray | None:
@@ -109,7 +109,7 @@ class PastedSample:
     def load(self) -> Example:
         """Raises NeecoError where a frame cannot be read."""
         rng = np.random.default_rng(np.random.SeedSequence([self.seed, self.number]))
-        source = self.sources[rng.integers(len(self.sources))].load()
+        source = loaded(self.sources[rng.integers(len(self.sources))])
         size = source.classes.shape[::-1]
         background = self.backgrounds.image(int(rng.integers(len(self.backgrounds))), size)
         background = background[:, :: int(rng.choice([-1, 1]))]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Hashable, Mapping, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -22,7 +23,32 @@ from neeco.files import read_json, read_text, require_inside
 ClassNames = Literal["instrument", "parts"]
 Edges = Literal["hard", "soft", "ignore"]
 WHOLE = ("instrument",)  # the classes where an instrument is one
+CACHE_BYTES = 1 << 30  # of decoded images of one kind that a process keeps
 DATASET_FILE, STATES_FILE, IMAGE_FOLDER = "dataset.json", "states.jsonl", "images"
+
+
+K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
+
+
+class LeastRecentlyUsed(Generic[K, V]):
+    """Values by key, of at most `limit` bytes in all; those that were not used for longest go first."""
+
+    def __init__(self, limit: int = CACHE_BYTES) -> None:
+        self.limit, self.used = limit, 0
+        self._kept: OrderedDict[K, tuple[V, int]] = OrderedDict()
+
+    def get(self, key: K, make: Callable[[], V], size: Callable[[V], int]) -> V:
+        """The value of `key`, made where it is not kept. size: of a value, in bytes."""
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key][0]
+        value = make()
+        self._kept[key] = value, size(value)
+        self.used += self._kept[key][1]
+        while self.used > self.limit and len(self._kept) > 1:
+            self.used -= self._kept.popitem(last=False)[1][1]
+        return value
 
 
 @dataclass(frozen=True)
@@ -34,6 +60,11 @@ class Example:
     instruments: np.ndarray  # uint8 [H, W], 0 tissue, else the instrument, from 1
     valid: np.ndarray | None = None  # bool [H, W], False where pixels are neither learned nor scored; None: all valid
     coverage: np.ndarray | None = None  # float32 [H, W], instrument's share of each pixel; None: all or nothing
+
+    @property
+    def bytes(self) -> int:
+        """Its size in memory."""
+        return sum(array.nbytes for array in vars(self).values() if array is not None)
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """[n, 4] (x0, y0, x1, y1; px, x1 and y1 exclusive) about each class of each instrument, and the classes [n]."""
@@ -118,6 +149,14 @@ class Sample(Protocol):
 
     def load(self) -> Example:
         """Read it. Raises NeecoError."""
+
+
+EXAMPLES: LeastRecentlyUsed[Hashable, Example] = LeastRecentlyUsed()
+
+
+def loaded(sample: Sample) -> Example:
+    """The sample's example, kept for as long as there is room."""
+    return EXAMPLES.get(sample.key, sample.load, lambda example: example.bytes)
 
 
 @dataclass(frozen=True)
