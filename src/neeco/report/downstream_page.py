@@ -187,7 +187,7 @@ def _results(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
         "frames. A difference whose interval reaches 0 shows none, green is better than its reference, red is worse. "
         f"Of {FALSE_POSITIVES} comparisons that differ in nothing about one is called a difference all the same."
     )
-    listed = ("summary.csv", "scores.csv", "paired.csv", "frames.csv", "jobs.csv")
+    listed = ("summary.csv", "scores.csv", "paired.csv", "jobs.csv")  # data/frames.csv would outweigh the page
     return [Section(title="Results", text=text, files={name: files[name] for name in listed}), *sections]
 
 
