@@ -67,7 +67,7 @@ class UNet(TorchModel):
     predicts = "masks"
     image_size = 160
     multiple = 16
-    steps = 400
+    steps = 1000  # strong augmentation needs them; without it 400 are enough
     batch = 8
     learning_rate = 3e-3
     channels = (16, 32, 64, 128, 256)  # of the levels, each but the last half as large as the one before
