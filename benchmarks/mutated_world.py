@@ -25,7 +25,7 @@ def prepare(verbs: Sequence[str]) -> None:
 
     import_modules()
     if "downstream" in verbs:
-        for module in ("monai.networks.nets", "neeco.studies.downstream.models.unet"):
+        for module in ("neeco.studies.downstream.models.unet",):
             importlib.import_module(module)
     from neeco.studies import machine
 

@@ -26,9 +26,10 @@ from torch.utils.data import DataLoader, Dataset
 import neeco
 from neeco.capture import read_capture
 from neeco.cli import main as run_neeco
+from neeco.studies.downstream.batches import BatchSampler
 from neeco.studies.downstream.model import TrainingTask, input_size
 from neeco.studies.downstream.models.unet import UNet
-from neeco.studies.downstream.samples import BatchSampler, Example, has_labels, recorded_samples
+from neeco.studies.downstream.samples import Example, Sample, has_labels, recorded_samples
 from neeco.studies.downstream.scores import mask_scores, mean_scores
 from neeco.studies.machine import hardware_words, machine
 
@@ -89,17 +90,36 @@ def to_example(sample: dict[str, Any]) -> Example:
     return Example(np.ascontiguousarray(image), classes, classes)
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """An example in memory as a sample."""
+
+    number: int
+    example: Example
+
+    @property
+    def name(self) -> str:
+        return str(self.number)
+
+    @property
+    def key(self) -> int:
+        return self.number
+
+    def load(self) -> Example:
+        return self.example
+
+
 class DrawnBatches(BatchSampler):
     """Batches of examples in the order in which a DataLoader draws them; each is seen once."""
 
     def __init__(self, images: Dataset[Any], workers: int) -> None:
         super().__init__([], seed=0)
         loader = DataLoader(images, batch_size=None, num_workers=workers)
-        self._examples: Iterator[Example] = iter(loader)
+        self._examples: Iterator[tuple[int, Example]] = enumerate(loader)
 
-    def batch(self, count: int) -> list[Example]:
+    def draw(self, count: int, done: float) -> list[Sample]:
         """The next `count` examples."""
-        return list(islice(self._examples, count))
+        return [Drawn(*entry) for entry in islice(self._examples, count)]
 
 
 def train_on_the_fly(args: OnTheFly, capture_folder: Path, folder: Path) -> dict[str, Any]:
@@ -111,7 +131,6 @@ def train_on_the_fly(args: OnTheFly, capture_folder: Path, folder: Path) -> dict
     task = TrainingTask(
         classes=("instrument",),
         batches=DrawnBatches(images, workers),
-        validation=(),
         size=input_size((frame.width, frame.height), UNet.image_size, UNet.multiple),
         steps=args.steps,
         batch=args.batch,

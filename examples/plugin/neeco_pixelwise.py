@@ -4,7 +4,6 @@ import numpy as np
 from torch import nn
 
 from neeco.studies.downstream.model import TorchModel
-from neeco.studies.downstream.models.unet import targets
 
 
 class Pixelwise(TorchModel):
@@ -23,10 +22,9 @@ class Pixelwise(TorchModel):
     def build(self, classes):
         return nn.Sequential(nn.Conv2d(3, 8, 1), nn.ReLU(), nn.Conv2d(8, classes + 1, 1))
 
-    def loss(self, module, images, examples):
-        logits = module(images)
-        target, weight = (values.to(logits) for values in targets(examples, logits.shape[1], logits.shape[2:]))
-        return (nn.functional.cross_entropy(logits, target, reduction="none") * weight).mean()
+    def loss(self, module, batch):
+        logits = module(batch.images)
+        return (nn.functional.cross_entropy(logits, batch.shares, reduction="none") * batch.valid).mean()
 
     def predictions(self, module, images, sizes):
         shares = [

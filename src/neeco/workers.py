@@ -57,7 +57,8 @@ class Workers:
     """The number of workers that share the tasks, and the resources of each.
 
     threads: None: an equal share of the cluster's CPUs. fresh: every task has a process of its own, so that its peak
-    memory and settings are its own. gpu: every worker sees one GPU, which no other has. stop_s: time, in s, that an
+    memory and settings are its own. gpu: every worker sees one GPU, which no other has unless they share: shared_gpus,
+    how many this machine has for all (a cluster knows its own). stop_s: time, in s, that an
     interrupted task gets to finish what it must. writes, reads: folder and files that all nodes of a cluster must see.
     """
 
@@ -65,6 +66,7 @@ class Workers:
     threads: int | None
     fresh: bool = False
     gpu: bool = False
+    shared_gpus: int | None = None
     stop_s: float = 5.0
     writes: Path | None = None
     reads: frozenset[Path] = frozenset()
@@ -155,7 +157,7 @@ class Processes:
         context = multiprocessing.get_context("spawn")  # a forked one would share threads' locks
         here, there = context.Pipe()
         slot = self._slots.pop(0)
-        gpu = _visible_gpu(slot) if self._workers.gpu else None
+        gpu = _visible_gpu(slot % (self._workers.shared_gpus or self.capacity)) if self._workers.gpu else None
         process = context.Process(target=_serve, args=(*self._arguments, there, gpu), daemon=True)
         process.start()
         there.close()
@@ -253,10 +255,13 @@ class RayTasks:
             require_shared(ray, workers.writes, workers.reads)
         threads = workers.threads or cpu_share(ray.nodes(), workers.count)
         gpus = int(ray.cluster_resources().get("GPU", 0)) if workers.gpu else 0
-        if gpus:
+        share: float = min(gpus, 1)
+        if workers.shared_gpus is not None:
+            share = min(1.0, gpus / workers.count)
+        elif gpus:
             check_gpus(workers.count, gpus)
         # Ray would retry for ever where memory runs out: `run_tasks` does it
-        options: dict[str, Any] = {"num_cpus": threads, "num_gpus": min(gpus, 1), "max_retries": 0}
+        options: dict[str, Any] = {"num_cpus": threads, "num_gpus": share, "max_retries": 0}
         if workers.fresh:
             options["max_calls"] = 1
         self.capacity = workers.count * (1 if workers.fresh else TASKS_PER_WORKER)

@@ -9,10 +9,8 @@ import json
 
 import numpy as np
 import pytest
-import torch
 from html_page import HOSTILE, Page, check_hostile_names
 
-from neeco.capture.images import write_labels
 from neeco.report.charts import Level, Series, line_chart
 from neeco.report.downstream_examples import draw_boxes, example_sections
 from neeco.report.downstream_page import (
@@ -22,14 +20,15 @@ from neeco.report.downstream_page import (
     score_chart,
     write_downstream_report,
 )
-from neeco.studies.downstream.job import job_folder
+from neeco.studies.downstream.intervals import Scores
+from neeco.studies.downstream.job import MASK_PREFIX, PREDICTIONS_FILE, job_folder
 from neeco.studies.downstream.results import comparisons, findings, summarise_folds, verdict
 from neeco.studies.downstream.samples import class_names, recorded_samples
 
 VOID = {"meta", "img", "br", "path", "link", "wbr"}
-FILES = ("summary.csv", "scores.csv", "frames.csv", "jobs.csv", "validation.csv", "paired.csv", "examples.csv")
-CONDITIONS = ("real", "real+augment", "kinematic", "kinematic+real")
-GAIN = {"real": 0.0, "real+augment": 0.01, "kinematic": 0.05, "kinematic+real": 0.1}
+FILES = ("summary.csv", "scores.csv", "frames.csv", "jobs.csv", "paired.csv", "examples.csv")
+CONDITIONS = ("real", "real+strong", "kinematic", "kinematic+real")
+GAIN = {"real": 0.0, "real+strong": 0.01, "kinematic": 0.05, "kinematic+real": 0.1}
 ANSWERS = {"unet": "masks", "dfine": "boxes"}
 SPLITS = ("test", "unseen")
 
@@ -45,8 +44,7 @@ def job_of(capture, output, model, condition, real, fold, *, classes="instrument
     value = 0.5 + gain.get(condition, 0.0) + 0.001 * real + 0.004 * fold * (1 + len(condition) % 3)
     job = {
         "model": model, "condition": condition, "real": real, "fold": fold, "batch": 4, "input": [48, 32],
-        "iterations": 60, "best_step": 40, "still_learning": False, "seconds": 12.0, "processor_seconds": 11.0,
-        "validation": [] if 0 < real < 5 else [[20, 0.1], [40, value], [60, value - 0.01]], "splits": {},
+        "iterations": 60, "seconds": 12.0, "processor_seconds": 11.0, "splits": {},
     }  # fmt: skip
     for split in SPLITS:
         samples = recorded_samples(capture, split, classes)
@@ -54,9 +52,10 @@ def job_of(capture, output, model, condition, real, fold, *, classes="instrument
         if ANSWERS[model] == "masks":
             rows = [{"frame": sample.name, "iou": value + 0.01 * k} for k, sample in enumerate(samples)]
             scores = {"iou": value, "dice": value + 0.1, "per_frame": rows}
-            for sample in samples if kept else ():
-                moved = np.roll(sample.load().classes, round(10 * (1 - value)), axis=1)
-                write_labels(folder / f"{sample.name}.png", torch.from_numpy(moved))
+            if kept:
+                folder.mkdir(parents=True)
+                masks = {sample.name: np.roll(sample.load().classes, round(10 * (1 - value)), 1) for sample in samples}
+                np.savez(folder / PREDICTIONS_FILE, **{MASK_PREFIX + name: mask for name, mask in masks.items()})
         else:
             scores = {"ap": value, "ap50": value + 0.1}
             found = {}
@@ -76,7 +75,7 @@ def experiment_of(capture, jobs, *, folds=2, sets=("kinematic",), classes="instr
     answers = {name: ANSWERS[name] for name in names}
     done = [job for job in jobs if "error" not in job]
     made = {
-        "schema": "neeco-downstream/1", "version": "0.1.0", "complete": True, "capture": str(capture.root),
+        "schema": "neeco-downstream/2", "version": "0.1.0", "complete": True, "capture": str(capture.root),
         "command": f"neeco downstream --classes {classes}",
         "machine": {"cpu": "a <processor>", "cores": 2, "threads": 1, "torch_threads": 2, "workers": 1, "gpu": None,
                     "threads_per_worker": None, "python": "3.11", "torch": "2.13"},
@@ -84,7 +83,7 @@ def experiment_of(capture, jobs, *, folds=2, sets=("kinematic",), classes="instr
                      "classes": classes, "labels": None, "pick": "spread", "steps": 60, "side": None, "batch": None,
                      "transforms": "transforms.json", "device": "auto"},
         "classes": list(class_names(capture, classes)), "splits": list(SPLITS), "folds": folds, "labelled": labelled,
-        "held_back_every": 5,
+        "tests": {},
         "sets": [{"name": name, "path": f"/sets/{name}", "images": 1000,
                   "made_by": {"settings": {"states": "inside", "seed": 0}, "scene": "runs/k"}, "sha256": "ab" * 32}
                  for name in sets],
@@ -146,8 +145,8 @@ def test_every_figures_data_is_in_the_page_and_beside_it(output, experiment, cap
     inside = {base64.b64decode(link.partition(",")[2]).decode() for link in links}
     beside = {path.name: path.read_text(encoding="utf-8") for path in (output / "data").iterdir()}
     assert set(beside) == set(FILES)
-    assert set(beside.values()) == inside
-    assert all(f'download="{name}"' in text for name in FILES)
+    assert inside == {text for name, text in beside.items() if name != "frames.csv"}  # it would outweigh the page
+    assert all((f'download="{name}"' in text) == (name != "frames.csv") for name in FILES)
     assert len(beside["examples.csv"].splitlines()) == 1 + 2 * (3 + 2) * 4
 
 
@@ -155,7 +154,7 @@ def test_the_answer_comes_first(output, experiment, capture):
     text, _ = page_of(output, experiment, capture)
     body = text.partition("</header>")[2]
     assert body.index("synthetic images help in 8 of 8 comparisons") < body.index("<table")
-    assert text.count('<b class="yes">helps</b>') == 16  # against them alone and augmented, per model, split and count
+    assert text.count('<b class="yes">helps</b>') == 8 + 4  # with labelled frames per model, split and count; alone
     places = [body.index(f"<h2>{title}") for title in ("Results", "The same frame", "Training", "Notes")]
     assert places == sorted(places)
     assert "at least as good as 20" in body
@@ -180,7 +179,7 @@ def test_one_fold_is_no_answer(capture, output):
     text, _ = page_of(output, experiment, capture)
     assert "One fold: whether synthetic images help cannot be distinguished from chance" in text
     assert ">helps<" not in text
-    assert "one fold has no interval" in text
+    assert "one fold gives no verdict" in text
 
 
 def test_without_labelled_frames_sets_stand_alone(capture, output):
@@ -193,10 +192,10 @@ def test_without_labelled_frames_sets_stand_alone(capture, output):
     assert len(images(page)) == 2 * (3 + 2) * (1 + 2)
 
 
-def test_without_sets_classical_augmentation_is_compared(capture, output):
-    jobs = jobs_of(capture, output, conditions=("real", "real+augment"))
+def test_without_sets_strong_augmentation_is_compared(capture, output):
+    jobs = jobs_of(capture, output, conditions=("real", "real+strong"))
     text, page = page_of(output, experiment_of(capture, jobs, sets=()), capture)
-    assert "classical augmentation against none" in text
+    assert "strong augmentation against none" in text
     assert "The same frame" not in text
     assert not images(page)
     assert "--sets" not in text
@@ -254,11 +253,11 @@ def test_frames_that_gain_most_come_before_those_that_lose_most(capture, output,
     experiment["models"] = [model for model in experiment["models"] if model["name"] == "unet"]
     heading, *shown = example_sections(experiment, capture, output)[0][1:5]
     names = [frame.name for frame in capture.split("test")]
-    assert heading.text == "kinematic+real, 5 labelled against real, 5 labelled; fold 0; IoU."
+    assert heading.text == "kinematic+real, 5 labelled against real+strong, 5 labelled; fold 0; IoU."
     frames = [section.title.removeprefix("unet, test: ").split(", gain ") for section in shown]
     assert [name for name, _ in frames] == [names[1], names[2], names[0]]
     assert [gain[0] for _, gain in frames] == ["+", "-", "-"]
-    conditions = ("recorded image", "real, 5 labelled", "kinematic+real, 5 labelled", "kinematic")
+    conditions = ("recorded image", "real+strong, 5 labelled", "kinematic+real, 5 labelled", "kinematic")
     assert tuple(image.name for image in shown[0].images[:4]) == conditions
     assert shown[0].images[2].caption == "0.900"
 
@@ -294,24 +293,27 @@ def test_boxes_are_drawn_where_they_are():
 
 def test_differences_go_by_what_they_answer(experiment):
     asked = {question(row, experiment) for row in experiment["paired"]}
-    assert asked == {"beside", "augmented", "alone", "augmentation"}
+    assert asked == {"beside", "alone", "augmentation"}
     sets = experiment | {"sets": [{"name": "a"}, {"name": "b"}]}
     assert question({"condition": "a+real", "against": "b+real"}, sets) == "sets"
+    assert question({"condition": "a+real+permuted", "against": "a+real"}, sets) == "control"
+    assert question({"condition": "real+paste", "against": "real+strong"}, sets) == "paste"
+    assert verdict({"low": 0.1, "high": 0.2, "folds": 1}) == ""
     assert question({"condition": "a+soft+real", "against": "a+real"}, sets) == "use"
-    assert verdict({"low": 0.0, "high": 0.1}) == "no difference shown"
-    assert verdict({"low": -0.2, "high": -0.1}) == "hurts"
+    assert verdict({"low": 0.0, "high": 0.1, "folds": 2}) == "no difference shown"
+    assert verdict({"low": -0.2, "high": -0.1, "folds": 2}) == "hurts"
     chart = difference_chart(experiment, experiment["models"][0], "test")
     assert "var(--good)" in chart
-    asked = ("with labelled frames, against these", "with classical augmentation", "the most labelled frames alone")
+    asked = ("with labelled frames, against the better", "strong augmentation against none", "synthetic images alone")
     assert all(words in chart for words in asked)
 
 
 def test_a_set_has_one_colour_alone_and_beside_labelled_frames(experiment):
-    assert families(experiment) == ["real", "real+augment", "kinematic+real"]
-    chart = score_chart(experiment, experiment["models"][0], "test")
+    assert families(experiment) == ["real", "real+strong", "kinematic+real"]
+    chart = score_chart(experiment, experiment["models"][0], "test", Scores(experiment["jobs"]))
     assert chart.count('class="level"') == 1
     assert "var(--m2)" in chart.split('class="level"')[1].partition("/>")[0]
-    assert chart.count("stroke-width: 0.7") == 3 * 2  # a thin line per condition and fold
+    assert chart.count("opacity: 0.12") == 3  # the interval of each condition
 
 
 def test_a_logarithmic_axis_has_the_points_as_ticks():

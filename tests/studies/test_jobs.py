@@ -363,6 +363,18 @@ def test_tasks_here_see_a_gpu_each(visible: str, monkeypatch) -> None:
     assert set(found) == set((visible or "0,1").split(","))
 
 
+@pytest.mark.parametrize(("visible", "seen"), [("", {"0", "1"}), ("4,5", {"4", "5"})])
+def test_small_tasks_share_the_gpus(visible: str, seen: set[str], monkeypatch) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    check_workers(3, torch.device("cuda"), share_gpus=True)
+    how = workers.Workers(count=3, threads=1, fresh=True, gpu=True, shared_gpus=2)
+    found = [event.value for event in workers.run_tasks(seen_gpu, None, range(3), how) if event.stage == "done"]
+    assert len(found) == 3
+    assert set(found) == seen
+
+
 def test_gpus_are_asked_for_where_jobs_compute_on_them(make_job, monkeypatch) -> None:
     here, there = ([replace(make_job(), device=word)] for word in ("cpu", "auto"))
     monkeypatch.delenv("RAY_ADDRESS", raising=False)

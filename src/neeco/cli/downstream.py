@@ -13,7 +13,7 @@ from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
     from neeco.studies.downstream.job import DownstreamSettings
-    from neeco.studies.downstream.samples import ImageSet
+    from neeco.studies.downstream.samples import ImageSet, OtherCapture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,9 +21,11 @@ class Downstream:
     """Train detectors and segmenters on recorded and on synthetic images, and test them on recorded frames.
 
     Each model is trained from scratch in every condition, with as many steps, on the same labelled frames of a fold;
-    tests are frames of the other splits. Conditions are sums of words: `real`, names of sets, `augment`, and for the
-    edges of synthetic labels `hard`, `soft` or `ignore`. The same command continues interrupted work; with more models,
-    sets, conditions or folds it adds them. Needs neeco[downstream].
+    tests are frames of the other splits, and of other captures. Conditions are sums of words: `real`, names of sets,
+    `paste` (the labelled instruments over other backgrounds), `strong` (augmentation of everything), `permuted` (sets
+    with labels of other images, a control), and when what is learned: `finetune`, `balanced`, `pool` or `blend`; for
+    the edges of synthetic labels `hard`, `soft` or `ignore`. The same command continues interrupted work; with more
+    models, sets, conditions or folds it adds them. Needs neeco[downstream].
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
@@ -33,13 +35,17 @@ class Downstream:
     sets: tuple[str, ...] = ()
     """NAME=DATASET, folders that `neeco synthesize` wrote; NAME=DATASET:COUNT takes its first COUNT images."""
     models: tuple[str, ...] = ("unet",)
-    """unet (MONAI's U-Net, masks), dfine (a small D-FINE, boxes), yolo (your own ultralytics program, boxes)."""
-    num_real: tuple[str, ...] = ("0", "20", "all")
-    """How many recorded training frames are labelled: numbers or all; 0 trains on sets alone."""
+    """unet (a residual U-Net, masks), dfine (a small D-FINE, boxes), yolo (your own ultralytics program, boxes)."""
+    test: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """NAME=CAPTURE or CAPTURE, another recording with masks of the same kind of instrument to test on; repeatable."""
+    num_real: tuple[str, ...] = ()
+    """How many recorded training frames are labelled: numbers or all; 0: sets alone. Default: 0 5 10 20 50 all."""
     folds: int = 5
-    """Each takes other labelled frames and another seed; intervals are over folds."""
+    """Each takes other labelled frames and another seed; intervals are over folds and frames."""
     conditions: tuple[str, ...] = ()
-    """Training data, such as real, real+augment, SET, SET+real, SET+soft; default: these but the last."""
+    """Training data; default: real, real+strong, real+paste, SET, SET+real, SET+real+strong, SET+real+permuted."""
+    backgrounds: Path | None = None
+    """Folder of images without an instrument to paste over; default: the labelled frames, instruments filled in."""
     labels: Path | None = None
     """Folder of masks named as the frames, for the recorded training frames; default: the capture's truth."""
     classes: Literal["instrument", "parts"] = "instrument"
@@ -57,7 +63,7 @@ class Downstream:
     weights: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """MODEL=FILE.safetensors to begin from instead of from scratch; repeatable."""
     workers: int = 1
-    """Trainings at once; RAY_ADDRESS names a Ray cluster (install neeco[cluster])."""
+    """Trainings at once, which share the GPUs; RAY_ADDRESS names a Ray cluster (install neeco[cluster])."""
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     device: Device = "auto"
@@ -97,11 +103,23 @@ def _settings(args: Downstream) -> DownstreamSettings:
     given = vars(args) | {
         "sets": tuple(_data_set(word) for word in args.sets),
         "models": tuple(dict.fromkeys(args.models)),
-        "num_real": tuple(dict.fromkeys(args.num_real)),
+        "num_real": tuple(dict.fromkeys(args.num_real)) or None,
+        "tests": tuple(_test(word) for word in args.test),
         "conditions": args.conditions or None,
         "weights": {name: Path(file) for name, file in weights.items()},
     }
+    del given["test"]
     return DownstreamSettings(**given)
+
+
+def _test(word: str) -> OtherCapture:
+    """`NAME=CAPTURE`, or a capture that goes by its folder's name."""
+    from neeco.studies.downstream.samples import OtherCapture
+
+    name, equals, place = word.partition("=")
+    if not equals or Path(word).exists():
+        return OtherCapture(Path(word).resolve().name, Path(word))
+    return OtherCapture(name, Path(place))
 
 
 def _data_set(word: str) -> ImageSet:

@@ -80,6 +80,7 @@ class Series:
     main: tuple[Point, ...] = ()  # the line to read
     faint: tuple[tuple[Point, ...], ...] = ()  # thin lines, one per seed
     dots: tuple[Point, ...] = ()  # faint marks
+    band: tuple[tuple[float, float, float], ...] = ()  # x, low, high: an interval about the line
 
 
 @dataclass(frozen=True)
@@ -163,6 +164,9 @@ def line_chart(
     axes.margins(y=0.05)
     for item in series:
         axes.plot(*_columns(item.dots), alpha=0.45, **_mark(item.order))
+        if item.band:
+            across, low, high = np.array(item.band).T
+            axes.fill_between(across, low, high, color=_color(item.order), alpha=0.12, linewidth=0)
         for line in item.faint:
             _draw_line(axes, item.order, line, linewidth=0.7, alpha=0.55)
     for item in series:  # above all that is faint

@@ -10,16 +10,16 @@ import numpy as np
 from markupsafe import Markup
 from PIL import Image, ImageDraw, ImageFont
 
-from neeco.capture.images import read_labels
 from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline, overlay_parts, part_color
 from neeco.evaluation.mask_metrics import box_ious
 from neeco.files import read_json
 from neeco.report.page import MAX_WIDTH, jpeg
 from neeco.report.study_pages import Images, Section
-from neeco.studies.downstream.job import AUGMENT, REAL, job_folder, predictions_folder
+from neeco.studies.downstream.conditions import BASELINES, PERMUTED, REAL
+from neeco.studies.downstream.job import MASK_PREFIX, PREDICTIONS_FILE, job_folder, predictions_folder, test_samples
 from neeco.studies.downstream.results import MAIN, main_differences, models_and_splits, title_of
-from neeco.studies.downstream.samples import Example, RecordedSample, recorded_samples
+from neeco.studies.downstream.samples import Example, RecordedSample
 from neeco.studies.downstream.scores import MIN_SCORE
 from neeco.studies.tables import csv_text
 
@@ -33,8 +33,8 @@ Key = tuple[str, int]  # condition, labelled frames
 
 
 def example_sections(experiment: Experiment, capture: Capture, output: Path) -> tuple[list[Section], str]:
-    """For every model and split the frames where synthetic images gain most and least over labelled frames alone; and
-    the scores of what is shown as CSV.
+    """For every model and test the frames where synthetic images gain most and least over the better of labelled frames
+    alone and augmented; and the scores of what is shown as CSV.
 
     Predictions are read from `output`, the study's folder; models and splits without them are left out. Raises
     NeecoError for a file that cannot be read.
@@ -44,15 +44,16 @@ def example_sections(experiment: Experiment, capture: Capture, output: Path) -> 
     for model, split in models_and_splits(experiment):
         if jobs := _shown_jobs(experiment, model, split):
             if split not in samples:
-                samples[split] = recorded_samples(capture, split, experiment["teaching"]["classes"])
+                others = {name: Path(path) for name, path in experiment["tests"].items()}
+                samples[split] = test_samples(capture, split, others, experiment["teaching"]["classes"])
             shown, scores = _sections_of(model, split, jobs, samples[split], output)
             sections += shown
             rows += scores
     swatch = Markup('<i style="background: {}"></i>{} ').format
     names = [*((part_color(part), name) for part, name in enumerate(experiment["classes"], 1)), ("#ff0", "truth")]
     text = Markup('{} <span class="key">{}</span>').format(
-        "Frames where synthetic images gain most over labelled frames alone, and where they gain least or lose, of one "
-        "fold; under each prediction its score.",
+        "Frames where synthetic images gain most over the better of labelled frames alone and augmented, and where "
+        "they gain least or lose, of one fold; under each prediction its score.",
         Markup().join(swatch(color, name) for color, name in names),
     )
     table = csv_text(["model", "split", "fold", "frame", "why", "condition", "real", "score"], rows)
@@ -72,20 +73,22 @@ def _shown_jobs(experiment: Experiment, model: Mapping[str, Any], split: str) ->
             continue
         alone = "+".join(word for word in best[0].split("+") if word != REAL), 0
         others = [key for key in of_fold if key[1] in (best[1], 0) and names & set(key[0].split("+"))]
-        order = [reference, best, alone, (f"{REAL}+{AUGMENT}", best[1]), *others]
+        order = [reference, best, alone, *((name, best[1]) for name in BASELINES), *others]
         shown = [key for key in dict.fromkeys(order) if key in of_fold][:CONDITIONS]
         return [of_fold[key] for key in (best, reference, *shown)]
     return []
 
 
 def _compared(experiment: Experiment, model: Mapping[str, Any], split: str) -> tuple[Key | None, Key | None]:
-    """Return the arm that gains most by synthetic images, and the labelled frames alone as its reference. Where no
-    difference is known, the best condition with synthetic images, twice."""
+    """Return the arm that gains most by synthetic images, and the better of labelled frames alone and augmented as its
+    reference. Where no difference is known, the best condition with synthetic images, twice."""
     names = {entry["name"] for entry in experiment["sets"]}
     rows = [
         row
         for row in main_differences(experiment, model, split)
-        if names & set(row["condition"].split("+")) and row["against"] == REAL
+        if names & set(row["condition"].split("+"))
+        and row["against"] in BASELINES
+        and PERMUTED not in row["condition"].split("+")
     ]
     rows = [row for row in rows if REAL in row["condition"].split("+")] or rows
     if rows:
@@ -155,6 +158,8 @@ class _Predictions:
         self.boxes: Mapping[str, Any] | None = None
         if predicts == "masks":
             rows = job["splits"][split].get("per_frame", [])
+            file = self.folder / PREDICTIONS_FILE
+            self.masks = np.load(file, allow_pickle=False) if file.is_file() else {}
             self.scores: dict[str, float | None] = {row["frame"]: row["iou"] for row in rows}
         else:
             file = self.folder / "boxes.json"
@@ -168,11 +173,9 @@ class _Predictions:
             if frame not in self.boxes:
                 return None
             return draw_boxes(_with_truth(example, "boxes"), *_confident(self.boxes[frame]))
-        file = self.folder / f"{frame}.png"
-        if not file.is_file():
+        if f"{MASK_PREFIX}{frame}" not in self.masks:
             return None
-        height, width = example.classes.shape
-        ids = read_labels(file, (width, height)).numpy()
+        ids = self.masks[f"{MASK_PREFIX}{frame}"]
         return _outlined(overlay_parts(example.image / 255.0, ids), example)
 
 

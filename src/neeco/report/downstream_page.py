@@ -19,24 +19,23 @@ from neeco.report.charts import PALETTE, Level, Series, inline_svg, legend, line
 from neeco.report.downstream_examples import example_sections
 from neeco.report.page import REPORT_FILE, split_counts, write_page
 from neeco.report.study_pages import Figure, Section
-from neeco.studies.downstream.job import AUGMENT, REAL
+from neeco.studies.downstream.conditions import PASTE, PERMUTED, REAL
+from neeco.studies.downstream.intervals import CONFIDENCE, Scores, arms_of
 from neeco.studies.downstream.results import (
-    CONFIDENCE,
     HELPS,
     HURTS,
     MAIN,
     NONE_SHOWN,
     TITLES,
     VERDICTS,
-    arms_of,
     budget_text,
+    curve_table,
     data_files,
     differences_table,
     failed_jobs,
     findings_of,
     main_differences,
     models_and_splits,
-    scores_by_fold,
     scores_table,
     summary_text,
     title_of,
@@ -46,12 +45,13 @@ from neeco.studies.machine import machine_words
 
 FALSE_POSITIVES = round(1 / (1 - CONFIDENCE))  # of so many comparisons without a difference, one shows one
 QUESTIONS = {  # what a paired difference answers, as `question` finds it
-    "beside": "synthetic images with labelled frames, against these frames alone",
-    "augmented": "the same, against these frames with classical augmentation",
-    "alone": "synthetic images alone, against the most labelled frames alone",
+    "beside": "synthetic images with labelled frames, against the better of these frames alone and augmented",
+    "alone": "synthetic images alone, against the better of all labelled frames alone and augmented",
+    "control": "labels of other images, against the right ones: they must not help",
     "sets": "one set against another",
     "use": "one way of using a set against the plain one",
-    "augmentation": "classical augmentation against none",
+    "paste": "cut-and-paste, against the better of labelled frames alone and augmented",
+    "augmentation": "strong augmentation against none",
 }
 MAX_REACH = 3.0  # times the largest difference that an interval is shown to: those of two folds would hide the rest
 
@@ -90,7 +90,7 @@ def write_downstream_report(output: Path, experiment: Experiment, capture: Captu
         stamps=[machine_words(experiment["machine"], "torch_threads")],
         intro=[intro],
         findings=[*(("", line) for line in _headlines(experiment, failed)), *_findings(experiment)],
-        sections=[*_results(experiment, files), *images, *_trainings(experiment, files), *lists, made],
+        sections=[*_results(experiment, files), *images, *_trainings(experiment), *lists, made],
     )
 
 
@@ -99,13 +99,13 @@ def question(row: Row, experiment: Experiment) -> str:
     names = {entry["name"] for entry in experiment["sets"]}
     words, others = row["condition"].split("+"), row["against"].split("+")
     synthetic, reference = ([word for word in some if word in names] for some in (words, others))
+    if PERMUTED in words:
+        return "control"
     if not synthetic:
-        return "augmentation"
+        return "paste" if PASTE in words else "augmentation"
     if reference:
         return "use" if synthetic == reference else "sets"
-    if REAL not in words:
-        return "alone"
-    return "augmented" if AUGMENT in others else "beside"
+    return "beside" if REAL in words else "alone"
 
 
 def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
@@ -122,7 +122,9 @@ def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
         verbs = {HELPS: "help", HURTS: "hurt", NONE_SHOWN: "show no difference"}
         parts = [f"{verb} in {counts[word]}" for word, verb in verbs.items() if counts[word]]
         kind = {(True, False): "yes", (False, True): "no"}.get((counts[HELPS] > 0, counts[HURTS] > 0), "")
-        sentence = "Added to the same labelled frames, synthetic images {} of {} comparisons."
+        sentence = (
+            "Against the better of the same labelled frames alone and augmented, synthetic images {} of {} comparisons."
+        )
         text = Markup(f'<b class="{{}}">{sentence}</b>').format(kind, ", ".join(parts), sum(counts.values()))
         sentences.append(text)
     if failed:
@@ -166,43 +168,49 @@ def _results(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
     """For every model and split its scores, as a table and over labelled frames, and their differences."""
     known = families(experiment)
     key = legend(known, [name for name in known if REAL in name.split("+")])
-    sections = []
+    sections, known_scores = [], Scores(experiment["jobs"])
+    for model in experiment["models"]:
+        charts = [score_chart(experiment, model, split, known_scores) for split in experiment["splits"]]
+        if figures := [Figure(chart, key) for chart in charts if chart]:
+            title = f"{model['name']}: {TITLES[MAIN[model['answers']]]} by labelled frames"
+            sections.append(Section(title=title, level=3, figures=figures))
     for model, split in models_and_splits(experiment):
-        scores, differences = scores_table(experiment, model, split), differences_table(experiment, model, split)
-        figures = [Figure(chart, key)] if (chart := score_chart(experiment, model, split)) else []
-        if differences.rows:
-            figures.append(Figure(difference_chart(experiment, model, split), []))
-        title = f"{model['name']}, {split}"
-        sections.append(Section(title=title, split=split, level=3, results=scores, figures=figures))
-        if differences.rows:
-            sections.append(Section(title=differences.title, level=3, results=differences))
+        for make in (curve_table, differences_table, scores_table):
+            if (table := make(experiment, model, split)).rows:
+                chart = make is differences_table
+                figures = [Figure(difference_chart(experiment, model, split), [])] if chart else []
+                sections.append(Section(title=table.title, split=split, level=3, results=table, figures=figures))
     text = (
-        "Scores: mean ± standard deviation over folds; the best is bold. Curves: bold the mean over folds, thin each "
-        "fold, dashed from side to side a set alone, without any labelled frame, in the colour it has with labelled "
-        "frames. Differences are of the same folds, with the interval that holds their mean with 95 % confidence "
-        "(Student's t over folds): one that reaches 0 shows no difference, green is better than its reference, red is "
-        f"worse. Of {FALSE_POSITIVES} comparisons that differ in nothing about one is called a difference all the same."
+        "Curves: the mean over folds with its interval; dashed from side to side a set alone, without any labelled "
+        "frame, in the colour it has with labelled frames. Intervals hold the mean, or the difference on the same "
+        f"folds and frames, with {CONFIDENCE:.0%} confidence: a bootstrap over seeds and blocks of neighbouring "
+        "frames. A difference whose interval reaches 0 shows none, green is better than its reference, red is worse. "
+        f"Of {FALSE_POSITIVES} comparisons that differ in nothing about one is called a difference all the same."
     )
-    listed = ("summary.csv", "scores.csv", "paired.csv", "frames.csv", "jobs.csv")
+    listed = ("summary.csv", "scores.csv", "paired.csv", "jobs.csv")  # data/frames.csv would outweigh the page
     return [Section(title="Results", text=text, files={name: files[name] for name in listed}), *sections]
 
 
-def score_chart(experiment: Experiment, model: Row, split: str) -> str:
-    """The main score over the number of labelled frames; sets alone are levels."""
+def score_chart(experiment: Experiment, model: Row, split: str, scores: Scores) -> str:
+    """The main score over the number of labelled frames, with its intervals; sets alone are levels. The legend names
+    the lines: on a narrow page their names would take its width."""
     metric = MAIN[model["answers"]]
-    scores = scores_by_fold(experiment["jobs"], model["name"], split, metric)
-    series, levels = [], []
-    for condition in sorted(dict.fromkeys(name for name, _ in scores), key=lambda name: _order(name, experiment)):
-        counts = {float(real): folds for (name, real), folds in sorted(scores.items()) if name == condition}
-        means = tuple((count, mean_of(list(folds.values()))) for count, folds in counts.items())
-        order = _order(condition, experiment)
-        if REAL not in condition.split("+"):
-            levels.append(Level(condition, order, means[0][1]))
+    lines: dict[str, list[tuple[float, float, float, float]]] = {}
+    levels = []
+    for arm in sorted(scores.jobs, key=lambda arm: (_order(arm.condition, experiment), arm.real)):
+        if arm.model != model["name"] or (mean := scores.mean(arm, split, metric)) is None:
             continue
-        numbers = sorted({fold for folds in counts.values() for fold in folds})
-        lines = [tuple((count, folds[fold]) for count, folds in counts.items() if fold in folds) for fold in numbers]
-        faint = tuple(line for line in lines if len(line) > 1) if len(lines) > 1 else ()
-        series.append(Series(condition, order, means, faint, means))
+        if REAL not in arm.words:
+            levels.append(Level("", _order(arm.condition, experiment), mean))
+            continue
+        ends = scores.interval(arm, split, metric)
+        low, high = (mean if end is None else end for end in ends)
+        lines.setdefault(arm.condition, []).append((float(arm.real), mean, low, high))
+    series = []
+    for condition, points in lines.items():
+        main = tuple((count, mean) for count, mean, _, _ in points)
+        band = tuple((count, low, high) for count, _, low, high in points)
+        series.append(Series("", _order(condition, experiment), main, dots=main, band=band))
     title = f"{TITLES[metric]}: {model['name']}, {split}"
     return line_chart(title, "labelled frames", series, levels=levels, over_logarithmic=True)
 
@@ -221,7 +229,7 @@ def difference_chart(experiment: Experiment, model: Row, split: str) -> Markup:
     for y, (key, row) in enumerate(lines):
         name, color = QUESTIONS[key], "accent"
         if row is not None:
-            reference = f" − {row['against']}" if key in ("sets", "use") else ""
+            reference = f" − {row['against']}" if key in ("sets", "use", "control") else ""
             name = (title_of(row["condition"], row["real"]) + reference)[:45]
             color = {HELPS: "good", HURTS: "bad"}.get(verdict(row), "soft")
             _draw_interval(axes, y, row, reach, PALETTE[color])
@@ -240,8 +248,8 @@ def _draw_interval(axes: Axes, y: float, row: Row, reach: float, color: str) -> 
     axes.plot(row["difference"], y, color=color, marker="o", markersize=6)
 
 
-def _trainings(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
-    """Return the section on training: validation curves, and a line per arm, means over folds."""
+def _trainings(experiment: Experiment) -> list[Section]:
+    """Return the section on training: a line per arm, means over folds."""
     done = [job for job in experiment["jobs"] if "error" not in job]
     rows = []
     for arm in arms_of(done):
@@ -254,64 +262,21 @@ def _trainings(experiment: Experiment, files: Mapping[str, str]) -> list[Section
                 f"{same[0]['iterations']:,}",
                 f"{width}x{height}",
                 str(same[0]["batch"]),
-                f"{mean_of([job['best_step'] for job in same]):,.0f}",
-                f"{sum(job['still_learning'] for job in same)} of {len(same)}",
                 *(f"{mean_of([job[key] for job in same]):,.0f}" for key in ("seconds", "processor_seconds")),
             ]
         )
     if not rows:
         return []
-    head = [
-        "model, trained on",
-        "labelled frames",
-        "steps",
-        "input",
-        "batch",
-        "best step",
-        "still rising",
-        "s",
-        "CPU s",
-    ]
-    charts = [chart for model in experiment["models"] for chart in validation_charts(experiment, model)]
-    text = (
-        f"{budget_text(experiment)}. Each keeps the weights that scored best on held-out images, one in "
-        f"{experiment['held_back_every']} of what it learns from; where none can be held out, the last."
-    )
-    if charts:
-        text += (
-            " The curves are scores on these images over steps, of the first fold. The images differ between "
-            "conditions: read a curve by its shape. A set alone has the colour that it has with labelled frames."
-        )
-    key = legend(families(experiment), families(experiment))
-    figures = [Figure(chart, key) for chart in charts]
-    listed = {"validation.csv": files["validation.csv"]}
-    return [Section(title="Training", text=text, head=head, rows=rows, figures=figures, files=listed)]
-
-
-def validation_charts(experiment: Experiment, model: Row) -> list[str]:
-    """Validation score over steps, a chart per number of labelled frames; of the first fold that finished."""
-    done = [job for job in experiment["jobs"] if job["model"] == model["name"] and "error" not in job]
-    charts = []
-    for real in sorted({job["real"] for job in done}):
-        first: dict[str, Row] = {}
-        for job in sorted(done, key=lambda job: job["fold"]):
-            if job["real"] == real:
-                first.setdefault(job["condition"], job)
-        series = [
-            Series("", _order(name, experiment), tuple((float(step), score) for step, score in job["validation"]))
-            for name, job in sorted(first.items(), key=lambda entry: _order(entry[0], experiment))
-            if job["validation"]
-        ]
-        title = f"{model['name']}, {f'{real:,} labelled' if real else 'sets alone'}"
-        charts.append(line_chart(title, "steps", series, size=(340, 210)))
-    return [chart for chart in charts if chart]
+    head = ["model, trained on", "labelled frames", "steps", "input", "batch", "s", "CPU s"]
+    text = f"{budget_text(experiment)}. The weights after the last step are tested."
+    return [Section(title="Training", text=text, head=head, rows=rows)]
 
 
 def _tested(experiment: Experiment, capture: Capture) -> str:
     """`12 frames of test and 8 frames of unseen`."""
     scored = {split: row["frames"] for job in experiment["jobs"] for split, row in job["splits"].items() if row}
     counts = [f"{scored.get(split, len(capture.split(split)))} frames of {split}" for split in experiment["splits"]]
-    return " and ".join(counts)
+    return ", ".join(counts)
 
 
 def _facts(experiment: Experiment, capture: Capture) -> list[tuple[str, str]]:
@@ -324,6 +289,7 @@ def _facts(experiment: Experiment, capture: Capture) -> list[tuple[str, str]]:
         ("capture", experiment["capture"]),
         ("frames", split_counts(capture)),
         ("labelled frames", labelled),
+        *((f"other recording {name}", path) for name, path in experiment["tests"].items()),
         *((f"set {entry['name']}", _set_words(entry)) for entry in experiment["sets"]),
         ("classes", ", ".join(experiment["classes"])),
         ("machine", machine_words(machine, "torch_threads")),

@@ -106,6 +106,7 @@ def run_and_record(
     finished: Mapping[int, Result],
     progress: Callable[[JobEvent], None] | None = None,
     captures: Mapping[Path, Capture] | None = None,
+    light: bool = False,
 ) -> list[Result]:
     """`run_jobs`; after each job `record` gets all results known by then, in the order of the jobs.
 
@@ -120,7 +121,7 @@ def run_and_record(
         if progress:
             progress(event)
 
-    return run_jobs(jobs, workers, watch, captures)
+    return run_jobs(jobs, workers, watch, captures, light)
 
 
 def run_jobs(
@@ -128,21 +129,23 @@ def run_jobs(
     workers: int = 1,
     progress: Callable[[JobEvent], None] | None = None,
     captures: Mapping[Path, Capture] | None = None,
+    light: bool = False,
 ) -> list[Result]:
     """Run every job and return their results, in their order.
 
     workers 1: in this process, one after another; more, or where RAY_ADDRESS names a cluster: so many at once in
     processes of their own (so that a script needs `if __name__ == "__main__"`), a job whose worker dies again from its
-    checkpoint. captures: those of the jobs that are read already, by path, for this process; jobs read the others. A
-    failed job writes no job.json, so that the next start tries again. Raises NeecoError before any work when a job's
-    folder is another job's or the cluster does not answer, and KeyboardInterrupt saying which job was stopped.
+    checkpoint. captures: those of the jobs that are read already, by path, for this process; jobs read the others.
+    light: small jobs, which workers do one after another, sharing the GPUs. A failed job writes no job.json, so that
+    the next start tries again. Raises NeecoError before any work when a job's folder is another job's or the cluster
+    does not answer, and KeyboardInterrupt saying which job was stopped.
     """
-    check_workers(workers, _device_of(jobs))
+    check_workers(workers, _device_of(jobs), light)
     report = progress or (lambda event: None)
     for job in jobs:
         job.check()
     if workers > 1 or address():
-        return _run_in_workers(jobs, workers, report)
+        return _run_in_workers(jobs, workers, report, light)
     return [_run_here(place, jobs, (captures or {}).get(job.capture), report) for place, job in enumerate(jobs)]
 
 
@@ -162,14 +165,15 @@ def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture 
     return result
 
 
-def check_workers(workers: int, device: torch.device) -> None:
+def check_workers(workers: int, device: torch.device, share_gpus: bool = False) -> None:
     """Raises NeecoError for fewer than one, where a cluster is named and cannot be reached, or for more than have a GPU
-    of this machine each, where `device` is one."""
+    of this machine each, where `device` is one and they do not share them."""
     check_reachable(workers)
     if workers > 1 and device.type == "cuda" and not address():
         if device.index is not None:
             raise NeecoError(f"--device: {device}: of several --workers each has a GPU of its own; give --device cuda")
-        check_gpus(workers, torch.cuda.device_count())
+        if not share_gpus:
+            check_gpus(workers, torch.cuda.device_count())
 
 
 def spread(values: Iterable[float | None]) -> dict[str, Any]:
@@ -228,8 +232,10 @@ def wants_gpus(jobs: Sequence[Job]) -> bool:
     return bool(address()) or _device_of(jobs).type != "cpu"
 
 
-def _run_in_workers(jobs: Sequence[Job], workers: int, report: Callable[[JobEvent], None]) -> list[Result]:
-    """`run_jobs` with `workers` jobs at once, each in a process of its own.
+def _run_in_workers(
+    jobs: Sequence[Job], workers: int, report: Callable[[JobEvent], None], light: bool = False
+) -> list[Result]:
+    """`run_jobs` with `workers` jobs at once, each in a process of its own; light ones one after another in it.
 
     With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
     device is opened in its worker, who sees one GPU, that no other has.
@@ -238,8 +244,9 @@ def _run_in_workers(jobs: Sequence[Job], workers: int, report: Callable[[JobEven
     how = Workers(
         count=workers,
         threads=None if address() else threads_per_worker(workers),
-        fresh=True,
+        fresh=not light,
         gpu=wants_gpus(jobs),
+        shared_gpus=torch.cuda.device_count() if light else None,
         stop_s=CHECKPOINT_S,
         writes=Path(os.path.commonpath(folders)) / f"{TEMPORARY}probe" if folders else None,
         reads=frozenset(job.capture.absolute() for job in jobs),

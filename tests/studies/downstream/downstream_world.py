@@ -11,9 +11,10 @@ import torch
 from PIL import Image
 from torch import nn
 
+from neeco.studies.downstream.batches import Batch, BatchSampler, TrainingImage, collate, shrink
 from neeco.studies.downstream.model import TorchModel, TrainingTask
 from neeco.studies.downstream.models.unet import UNet
-from neeco.studies.downstream.samples import BatchSampler, Example
+from neeco.studies.downstream.samples import Example
 
 PARTS = (("bar", "shaft"), ("bar", "wrist"), ("bar", "jaw_left"), ("bar", "jaw_right"))
 
@@ -93,6 +94,10 @@ class Held:
     name: str = "held"
     loads: list[str] = field(default_factory=list)
 
+    @property
+    def key(self) -> tuple[object, ...]:
+        return tuple(None if array is None else array.tobytes() for array in vars(self.example).values())
+
     def load(self) -> Example:
         self.loads.append(self.name)
         return self.example
@@ -106,8 +111,7 @@ def task_of(folder: Path, **changes) -> TrainingTask:
     """To find bright rectangles, in a few steps."""
     given = {
         "classes": ("instrument",),
-        "batches": BatchSampler([squares(12)], 0),
-        "validation": squares(4, 100),
+        "batches": BatchSampler(squares(12), seed=0),
         "size": (64, 64),
         "steps": 4,
         "batch": 2,
@@ -116,6 +120,12 @@ def task_of(folder: Path, **changes) -> TrainingTask:
         "folder": folder,
     }
     return TrainingTask(**given | changes)
+
+
+def batch_of(examples: list[Example], size: tuple[int, int], classes: int = 1) -> Batch:
+    """The batch of these examples on the CPU."""
+    images: list[TrainingImage] = [shrink(example, size, classes, outlines=True) for example in examples]
+    return collate(images, torch.device("cpu"))
 
 
 class Pixels(TorchModel):

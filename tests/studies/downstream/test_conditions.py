@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -12,15 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neeco.errors import NeecoError
-from neeco.studies.downstream.job import (
+from neeco.studies.downstream.conditions import (
+    RESERVED,
     Condition,
-    DownstreamSettings,
     default_conditions,
     labelled_count,
     labelled_frames,
     parse_condition,
 )
-from neeco.studies.downstream.samples import ImageSet
+from neeco.studies.downstream.job import DownstreamSettings
+from neeco.studies.downstream.samples import ImageSet, OtherCapture
 
 SETS = ("kin", "other")
 SETTINGS = DownstreamSettings(capture=Path("capture"), output=Path("out"))
@@ -29,30 +31,40 @@ SETTINGS = DownstreamSettings(capture=Path("capture"), output=Path("out"))
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("real", Condition("real", (), True, False, "hard")),
-        ("real+augment", Condition("real+augment", (), True, True, "hard")),
-        ("kin", Condition("kin", ("kin",), False, False, "hard")),
-        ("kin+hard", Condition("kin+hard", ("kin",), False, False, "hard")),
-        ("kin+soft+real", Condition("kin+soft+real", ("kin",), True, False, "soft")),
-        ("kin+other+ignore", Condition("kin+other+ignore", ("kin", "other"), False, False, "ignore")),
-        ("other+augment", Condition("other+augment", ("other",), False, True, "hard")),
+        ("real", {"real": True}),
+        ("real+strong", {"real": True, "strong": True}),
+        ("real+paste", {"real": True, "paste": True}),
+        ("kin", {"sets": ("kin",)}),
+        ("kin+hard", {"sets": ("kin",)}),
+        ("kin+soft+real", {"sets": ("kin",), "real": True, "edges": "soft"}),
+        ("kin+other+ignore", {"sets": ("kin", "other"), "edges": "ignore"}),
+        ("other+strong", {"sets": ("other",), "strong": True}),
+        ("kin+real+permuted", {"sets": ("kin",), "real": True, "permuted": True}),
+        ("kin+real+pool", {"sets": ("kin",), "real": True, "schedule": "pool"}),
+        ("real+paste+balanced", {"real": True, "paste": True, "schedule": "balanced"}),
     ],
 )
-def test_a_condition_is_a_sum_of_words(name: str, expected: Condition) -> None:
-    assert parse_condition(name, SETS) == expected
+def test_a_condition_is_a_sum_of_words(name: str, expected: dict) -> None:
+    assert parse_condition(name, SETS) == Condition(name=name, **expected)
 
 
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("kin+reel", "'reel' is neither real, augment, hard, soft, ignore nor a set; name it in --sets"),
+        ("kin+reel", f"'reel' is neither {', '.join(RESERVED)} nor a set; name it in --sets"),
+        ("real+augment", "'augment' is neither real, strong, paste"),
         ("Real", "'Real' is neither"),
         ("", "'' is neither"),
         ("real+", "'' is neither"),
         ("real+real", "a word stands in it twice"),
         ("kin+soft+ignore", "one of hard, soft, ignore at most"),
         ("real+soft", "only together with a set"),
-        ("augment", "nothing to learn from; add real or a set"),
+        ("strong", "nothing to learn from; add real or a set"),
+        ("real+permuted", "permuted only together with a set"),
+        ("kin+paste", "paste only together with real"),
+        ("kin+pool", "only together with real and a set or paste"),
+        ("real+finetune", "only together with real and a set or paste"),
+        ("kin+real+pool+balanced", "one of balanced, pool, finetune, blend at most"),
     ],
 )
 def test_conditions_that_say_nothing_are_refused(name: str, told: str) -> None:
@@ -61,9 +73,12 @@ def test_conditions_that_say_nothing_are_refused(name: str, told: str) -> None:
     assert str(refused.value).startswith(f"--conditions {name}: ")
 
 
-def test_usual_conditions_are_each_set_alone_and_beside_labelled_frames() -> None:
-    assert default_conditions(()) == ["real", "real+augment"]
-    assert default_conditions(SETS) == ["real", "real+augment", "kin", "kin+real", "other", "other+real"]
+def test_usual_conditions_are_baselines_and_each_set_alone_beside_labelled_frames_and_with_wrong_labels() -> None:
+    baselines = ["real", "real+strong", "real+paste"]
+    assert default_conditions(()) == baselines
+    assert default_conditions(SETS[:1]) == [
+        *baselines, "kin", "kin+real", "kin+real+strong", "kin+real+permuted"
+    ]  # fmt: skip
     assert [parse_condition(name, SETS).name for name in default_conditions(SETS)] == default_conditions(SETS)
 
 
@@ -76,17 +91,24 @@ def test_counts_of_labelled_frames_are_numbers_or_all() -> None:
         labelled_count("31", 30)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=200)
 @given(st.data(), st.integers(1, 200), st.integers(0, 20))
-def test_spread_labels_as_many_frames_as_asked_one_in_each_stretch(data, frames: int, fold: int) -> None:
-    count = data.draw(st.integers(0, frames))
+def test_spread_labels_as_many_frames_as_asked_with_no_wide_gap(data, frames: int, fold: int) -> None:
+    count = data.draw(st.integers(1, frames))
     chosen = labelled_frames(frames, count, fold, "spread")
     assert len(chosen) == count
     assert chosen == sorted(set(chosen))
-    for index, frame in enumerate(chosen):  # frame k reaches from k to k + 1
-        assert index * frames / count < frame + 1
-        assert frame < (index + 1) * frames / count
+    assert set(chosen) <= set(range(frames))
+    gaps = [after - before for before, after in pairwise([*chosen, chosen[0] + frames])]
+    assert max(gaps) <= 2.7 * frames / count + 2
     assert chosen == labelled_frames(frames, count, fold, "spread")
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.integers(1, 120), st.integers(0, 9), st.sampled_from(["spread", "first"]))
+def test_frames_of_a_smaller_count_are_among_those_of_a_larger_one(frames: int, fold: int, selection) -> None:
+    nested = [set(labelled_frames(frames, count, fold, selection)) for count in range(frames + 1)]
+    assert all(some < more for some, more in pairwise(nested))
 
 
 def test_never_fewer_frames_than_asked() -> None:
@@ -103,24 +125,8 @@ def test_folds_label_other_frames_and_first_the_same() -> None:
     assert labelled_frames(6, 6, 3, "spread") == list(range(6))
 
 
-def test_whole_stretches_are_drawn_from() -> None:
-    drawn = {frame for fold in range(300) for frame in labelled_frames(12, 3, fold, "spread")}
-    assert drawn == set(range(12))
-
-
-@given(st.integers(0, 60), st.integers(0, 12))
-def test_what_is_held_back_is_not_learned_and_nothing_is_lost(count: int, fold: int) -> None:
-    learned, kept = SETTINGS.hold_out(range(count), fold)
-    assert sorted([*learned, *kept]) == list(range(count))
-    assert bool(kept) == (count >= SETTINGS.min_validated)
-    assert len(kept) <= -(-count // SETTINGS.validation_every)
-    assert learned or not count
-
-
-def test_each_fold_holds_back_other_images() -> None:
-    kept = [SETTINGS.hold_out(range(40), fold)[1] for fold in range(5)]
-    assert sorted(frame for fold in kept for frame in fold) == list(range(40))
-    assert SETTINGS.hold_out(range(40), 5) == SETTINGS.hold_out(range(40), 0)
+def test_every_frame_is_labelled_in_some_fold() -> None:
+    assert {frame for fold in range(300) for frame in labelled_frames(12, 3, fold, "spread")} == set(range(12))
 
 
 def test_the_command_makes_the_same_study() -> None:
@@ -132,9 +138,21 @@ def test_the_command_makes_the_same_study() -> None:
         frame_selection="first",
         weights={"unet": Path("/w.safetensors")},
         labels=Path("/labels"),
-        min_validated=10,
+        tests=(OtherCapture("far", Path("/captures/far")), OtherCapture("near", Path("/captures/near"))),
+        backgrounds=Path("/plates"),
+        pasted=10,
     )
     words = shlex.split(changed.command())[5:]
     sets = ["--sets", "kin=/sets/a b:5", "other=/sets/c"]
-    rest = ["--labels", "/labels", "--frame-selection", "first", "--weights", "unet=/w.safetensors"]
-    assert words == [*sets, "--num-real", "5", "all", *rest]
+    tests = ["--test", "far=/captures/far", "--test", "near=/captures/near"]
+    rest = [
+        "--backgrounds",
+        "/plates",
+        "--labels",
+        "/labels",
+        "--frame-selection",
+        "first",
+        "--weights",
+        "unet=/w.safetensors",
+    ]
+    assert words == [*sets, *tests, "--num-real", "5", "all", *rest]

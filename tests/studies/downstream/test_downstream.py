@@ -22,9 +22,9 @@ from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
 from neeco.studies.downstream import model as models_module
 from neeco.studies.downstream.experiment import plan_downstream, run_downstream
-from neeco.studies.downstream.job import DownstreamSettings, job_folder
+from neeco.studies.downstream.job import JOB_SCHEMA, DownstreamSettings, job_folder
 from neeco.studies.downstream.results import failed_jobs, tables_of, write_tables
-from neeco.studies.downstream.samples import ImageSet
+from neeco.studies.downstream.samples import ImageSet, OtherCapture
 from neeco.studies.downstream.scores import Detections
 
 TIMES = ("seconds", "processor_seconds", "machine")
@@ -59,7 +59,6 @@ def spec(recorded: Path, drawn: Path, tmp_path: Path) -> DownstreamSettings:
         folds=2,
         conditions=("real", "kin", "kin+real"),
         device="cpu",
-        min_validated=5,
     )
 
 
@@ -85,7 +84,7 @@ def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamSettings) -> Non
     stages = []
     result = trained(spec, lambda news: stages.append((news.index, news.stage)))
     assert result == json.loads((spec.output / "downstream.json").read_text())
-    assert result["schema"] == "neeco-downstream/1"
+    assert result["schema"] == "neeco-downstream/2"
     assert result["complete"]
     assert result["splits"] == ["test", "unseen"]
     assert result["labelled"] == 10
@@ -97,7 +96,9 @@ def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamSettings) -> Non
     for job in result["jobs"]:
         folder = job_folder(spec.output, job["model"], job["condition"], job["real"], job["fold"])
         assert json.loads((folder / "job.json").read_text()) == job
-        assert {"weights.safetensors", "predictions"} <= {path.name for path in folder.iterdir()}
+        kept = {"weights.safetensors", "predictions"} if job["fold"] == 0 else set()
+        assert {path.name for path in folder.iterdir()} == {"job.json"} | kept
+        assert len(job["labelled"]) == job["real"]
         assert job["iterations"] == 6
         assert job["splits"]["test"]["frames"] == 2
         assert job["splits"]["unseen"]["frames"] == 1
@@ -116,7 +117,8 @@ def test_a_jobs_scores_are_of_what_it_answered(spec: DownstreamSettings, recorde
     folder = job_folder(spec.output, "pixels", "real", 10, 0) / "predictions" / "test"
     values = []
     for row in job["splits"]["test"]["per_frame"]:
-        answer, truth = (read_grey(place / f"{row['frame']}.png") for place in (folder, recorded / "truth" / "masks"))
+        answer = np.load(folder / "masks.npz")[f"mask_{row['frame']}"]
+        truth = read_grey(recorded / "truth" / "masks" / f"{row['frame']}.png")
         values.append(iou(answer > 0, truth > 0))
         assert row["iou"] == pytest.approx(values[-1], abs=1e-5)
         assert row["iou_jaws"] is not None
@@ -125,11 +127,10 @@ def test_a_jobs_scores_are_of_what_it_answered(spec: DownstreamSettings, recorde
 
 
 def test_the_same_words_give_the_same_bits(spec: DownstreamSettings, tmp_path: Path) -> None:
-    small = replace(spec, conditions=("kin+real+augment",), num_real=("6",), folds=1)
-    pytest.importorskip("monai")
+    small = replace(spec, conditions=("kin+real+strong",), num_real=("6",), folds=1)
     first, second = (trained(replace(small, output=tmp_path / name)) for name in ("one", "two"))
     assert without_times(first) == without_times(second)
-    folders = [job_folder(tmp_path / name, "pixels", "kin+real+augment", 6, 0) for name in ("one", "two")]
+    folders = [job_folder(tmp_path / name, "pixels", "kin+real+strong", 6, 0) for name in ("one", "two")]
     assert len({(folder / "weights.safetensors").read_bytes() for folder in folders}) == 1
 
 
@@ -141,38 +142,93 @@ def test_every_condition_and_model_of_a_fold_has_the_same_labelled_frames(spec: 
     for job in plan.jobs:
         task = job.task(plan.capture)
         learned = tuple(sample.name for sample in task.batches.sources[0])
-        kept = tuple(sample.name for sample in task.validation)
-        assert len(learned) + len(kept) == 6
-        assert not set(learned) & set(kept)
-        assert {"006", "007", "012"}.isdisjoint({*learned, *kept})
+        assert len(learned) == 6
+        assert {"006", "007", "012"}.isdisjoint(learned)
+        assert list(learned) == job.labelled(plan.capture)
         assert len(task.batches.sources) == 1 + len(job.condition.sets)
-        chosen.setdefault(job.fold, set()).add((learned, kept))
+        chosen.setdefault(job.fold, set()).add(learned)
     assert [len(chosen[fold]) for fold in range(3)] == [1, 1, 1]
     assert len(set.union(*chosen.values())) == 3
 
 
-def test_of_few_labelled_frames_none_is_held_back(spec: DownstreamSettings) -> None:
-    plan = plan_downstream(replace(spec, num_real=("3",), conditions=("real", "kin+real")))
-    alone, beside = (job.task(plan.capture) for job in plan.jobs[:2])
-    assert len(alone.batches.sources[0]) == 3
-    assert alone.validation == ()
-    assert [sample.name for sample in beside.validation] == ["000004"]  # a drawn image, then
-    assert any("3 labelled frames: too few to hold some out" in note for note in plan.notes)
+def test_permuted_labels_are_all_of_other_images(spec: DownstreamSettings) -> None:
+    plan = plan_downstream(replace(spec, conditions=("kin+real", "kin+real+permuted"), num_real=("6",), folds=1))
+    right, wrong = (job.task(plan.capture).batches.sources[1] for job in plan.jobs)
+    assert [sample.image for sample in right] == [sample.image for sample in wrong]
+    assert {sample.labels for sample in right} == {sample.labels for sample in wrong}
+    assert all(one.labels != other.labels for one, other in zip(right, wrong, strict=True))
+    assert all(sample.labels.stem == sample.image.stem for sample in right)
 
 
-def test_the_last_steps_see_recorded_frames_alone(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
-    conditions = ("real", "kin", "kin+real")
+def test_pasted_images_are_of_the_labelled_frames_alone(spec: DownstreamSettings) -> None:
+    plan = plan_downstream(replace(spec, conditions=("real+paste",), num_real=("6",), folds=1, pasted=7))
+    (job,) = plan.jobs
+    labelled, pasted = job.task(plan.capture).batches.sources
+    assert len(pasted) == 7
+    assert {source.name for source in pasted[0].sources} == {sample.name for sample in labelled}
 
-    def finish(**changes) -> list[tuple[int | None, bool]]:
-        """Of each job: how many images are mixed, and whether its identity speaks of it."""
-        plan = plan_downstream(replace(spec, num_real=("0", "6"), folds=1, conditions=conditions, **changes))
-        return [(job.task(plan.capture).batches.mixed, job.identity()["finish"] is not None) for job in plan.jobs]
 
-    assert finish() == [(None, False), (None, False), ((6 - 2) * 2, True)]  # of six steps of two
-    assert finish(finetune_share=0.2)[2] == ((6 - 1) * 2, True)
-    assert finish(finetune_epochs=0)[2] == (6 * 2, True)
-    monkeypatch.setattr(Pixels, "keeps_order", False)
-    assert finish() == [(None, False)] * 3
+def test_by_default_counts_are_nested_and_as_many_as_there_are(spec: DownstreamSettings) -> None:
+    plan = plan_downstream(replace(spec, num_real=None, conditions=("real", "kin"), folds=1))
+    assert [job.real for job in plan.jobs] == [5, 10, 0]
+    few, every = (set(job.labelled(plan.capture)) for job in plan.jobs[:2])
+    assert few < every
+
+
+# another recording
+
+
+def test_another_recording_is_tested_on_all_its_frames(spec: DownstreamSettings, capture: Path) -> None:
+    far = replace(spec, tests=(OtherCapture("far", capture),), conditions=("real",), num_real=("6",), folds=2)
+    (capture / "truth" / "masks" / "003.png").unlink()
+    result = trained(far)
+    assert result["splits"] == ["test", "unseen", "far"]
+    assert result["tests"] == {"far": str(capture)}
+    scores = result["jobs"][0]["splits"]["far"]
+    assert [row["frame"] for row in scores["per_frame"]] == [f"{k:03d}" for k in range(13) if k != 3]
+    assert (spec.output / "jobs" / "pixels-real-real6-fold0" / "predictions" / "far" / "masks.npz").is_file()
+    assert {row["split"] for row in result["summary"]} == {"test", "unseen", "far"}
+    assert any(table.title.startswith("pixels, far") for table in tables_of(result))
+
+
+def test_a_recording_is_added_to_a_study_and_another_by_its_name_is_refused(
+    spec: DownstreamSettings, capture: Path, recorded: Path
+) -> None:
+    small = replace(spec, conditions=("kin",), folds=1)
+    one = trained(small)["jobs"][0]
+    both = trained(replace(small, tests=(OtherCapture("far", capture),)))["jobs"][0]
+    assert without_times(both["splits"]["test"]) == without_times(one["splits"]["test"])
+    with refused("job.json: --test far: capture: begun with", "give another --output"):
+        plan_downstream(replace(small, tests=(OtherCapture("far", recorded),)))
+
+
+@pytest.mark.parametrize(
+    ("name", "told"), [("test", "results go by this name"), ("a/b", "results go by this name"), ("", "name it")]
+)
+def test_names_of_recordings_that_mean_something_are_refused(
+    spec: DownstreamSettings, capture: Path, name: str, told: str
+) -> None:
+    with refused(f"--test {name}: ", told):
+        plan_downstream(replace(spec, tests=(OtherCapture(name, capture),)))
+
+
+def test_recordings_without_truth_or_with_other_parts_are_refused(spec: DownstreamSettings, capture: Path) -> None:
+    (capture / "truth" / "masks" / "parts.json").write_text(json.dumps({"ids": [{"id": 1, "part": "grip"}]}))
+    far = replace(spec, tests=(OtherCapture("far", capture),))
+    with refused("--test far: ", "has other parts than", "--classes instrument"):
+        plan_downstream(replace(far, classes="parts"))
+    shutil.rmtree(capture / "truth")
+    with refused("all frames: no frame has a label"):
+        plan_downstream(far)
+
+
+def test_jobs_of_an_older_protocol_are_refused_in_one_line(spec: DownstreamSettings) -> None:
+    small = replace(spec, conditions=("kin",), folds=1)
+    trained(small)
+    for file in spec.output.glob("jobs/*/job.json"):
+        file.write_text(file.read_text().replace(JOB_SCHEMA, "neeco-downstream-job/1"))
+    with refused("job.json: schema: begun with 'neeco-downstream-job/1'", "give another --output"):
+        plan_downstream(small)
 
 
 # going on and growing
@@ -288,8 +344,6 @@ def test_a_failure_that_nobody_foresaw_leaves_its_traceback(spec: DownstreamSett
     ("change", "told"),
     [
         ({"steps": 7}, "steps: begun with 6, now 7"),
-        ({"min_validated": 40}, "min_validated: begun with 5, now 40"),
-        ({"validation_every": 4}, "validation_every: begun with 5, now 4"),
         ({"batch": 3}, "batch: begun with 2, now 3"),
         ({"size": 24}, "side: begun with 48, now 24"),
         ({"frame_selection": "first"}, "pick: begun with 'spread', now 'first'"),
@@ -334,7 +388,7 @@ def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSettings, capture:
         (spec.output / "downstream.json").write_text(text)
         with refused(f"downstream.json: {reason}"):
             plan_downstream(small)
-    (spec.output / "downstream.json").write_text('{"schema": "neeco-downstream/1"}')
+    (spec.output / "downstream.json").write_text('{"schema": "neeco-downstream/2"}')
     with refused("downstream.json: capture", "give another --output"):
         plan_downstream(small)
 
@@ -382,7 +436,7 @@ def test_what_cannot_be_taught_is_refused(spec: DownstreamSettings, change, told
         plan_downstream(replace(spec, **change))
 
 
-@pytest.mark.parametrize("name", ["real", "augment", "soft", "a+b", "", "../up", "a/b"])
+@pytest.mark.parametrize("name", ["real", "strong", "pool", "soft", "a+b", "", "../up", "a/b"])
 def test_names_of_sets_that_mean_something_are_refused(spec: DownstreamSettings, name: str) -> None:
     data = replace(spec.sets[0], name=name)
     with refused(f"--sets {name}: ", "call the set"):
@@ -489,7 +543,7 @@ def test_parts_are_scored_apart_and_take_more_steps(spec: DownstreamSettings) ->
     assert result["classes"] == ["shaft", "wrist", "jaws"]
     scores = result["jobs"][0]["splits"]["test"]
     assert {"iou", "shaft.iou", "wrist.iou", "jaws.iou", "iou_jaws"} <= set(scores)
-    titles = [column.title for column in tables_of(result)[0].columns]
+    titles = [column.title for table in tables_of(result) for column in table.columns]
     assert "jaws IoU" in titles
 
 
@@ -501,21 +555,6 @@ def test_a_wrong_file_in_a_set_fails_its_jobs_alone(spec: DownstreamSettings, dr
     failed = [job["condition"] for job in result["jobs"] if "error" in job]
     assert failed == ["kin", "kin+real"]
     assert "000003.png: id 77 has no class" in result["jobs"][1]["error"]
-
-
-def test_a_course_that_still_rises_is_noted(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
-    from neeco.studies.downstream import model as torch_training
-
-    score = [0.0]
-
-    def rising(*_) -> float:
-        score[0] += 0.01
-        return score[0]
-
-    monkeypatch.setattr(torch_training, "validation_score", rising)
-    result = trained(replace(spec, conditions=("kin",), folds=1))
-    assert result["jobs"][0]["still_learning"]
-    assert "still getting better at the last step: pixels, kin; give more --steps" in result["notes"]
 
 
 # files
@@ -539,7 +578,7 @@ def test_tables_hold_the_numbers(spec: DownstreamSettings) -> None:
     assert f"{mean:.3f}" in latex
     assert "pixels: 6 steps of 2 images of 48x40; 2 folds" in markdown
     assert all(sentence.split(":")[0] in markdown for sentence in result["answers"])
-    assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == len(tables_of(result)) == 4
+    assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == len(tables_of(result)) == 6
     counts = {}
     for file in (spec.output / "data").glob("*.csv"):
         with file.open(newline="") as stream:
@@ -548,7 +587,6 @@ def test_tables_hold_the_numbers(spec: DownstreamSettings) -> None:
     assert counts["frames.csv"] == 30
     assert counts["jobs.csv"] == 10
     assert counts["paired.csv"] == len(result["paired"]) > 0
-    assert counts["validation.csv"] == sum(len(job["validation"]) for job in result["jobs"]) > 0
 
 
 def test_jobs_are_handed_the_capture(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,9 +16,6 @@ from downstream_world import read_grey, save_grey
 
 from neeco.cli import main
 from neeco.errors import NeecoError
-
-pytest.importorskip("monai")
-
 from neeco.studies.downstream.models.unet import UNet
 
 SHORT = ["--steps", "2", "--batch", "2", "--size", "48", "--folds", "1", "--device", "cpu"]
@@ -59,10 +56,18 @@ def test_it_prints_tables_answers_and_where_all_of_it_lies(words, tmp_path: Path
     output = tmp_path / "out"
     result = json.loads((output / "downstream.json").read_text())
     assert result["complete"]
-    assert [job["condition"] for job in result["jobs"]] == ["real", "real+augment", "kin", "kin+real"]
+    assert [job["condition"] for job in result["jobs"]] == [
+        "real",
+        "real+strong",
+        "real+paste",
+        "kin",
+        "kin+real",
+        "kin+real+strong",
+        "kin+real+permuted",
+    ]
     assert {"downstream.csv", "downstream.md", "downstream.tex", "data", "jobs"} <= {p.name for p in output.iterdir()}
     assert all(sentence in shown for sentence in result["answers"])
-    assert "unet, split test" in shown
+    assert "unet, test: IoU by labelled frames" in shown
     assert f"{output}/: downstream.json, data/" in shown
     before = {file: file.stat().st_mtime_ns for file in output.glob("jobs/*/job.json")}
     assert main(words) == 0
@@ -75,6 +80,14 @@ def test_a_count_behind_a_set_takes_so_many(words, drawn: Path, tmp_path: Path) 
     result = json.loads((tmp_path / "out" / "downstream.json").read_text())
     assert result["sets"][0]["images"] == 4
     assert result["sets"][0]["path"] == str(drawn)
+
+
+def test_another_recording_goes_by_its_name_or_its_folders(words, capture: Path, tmp_path: Path) -> None:
+    more = ["--conditions", "kin", "--test", str(capture), "--test", f"far={capture}"]
+    assert main([*words, *more]) == 0
+    result = json.loads((tmp_path / "out" / "downstream.json").read_text())
+    assert result["tests"] == {"capture": str(capture), "far": str(capture)}
+    assert "--test capture=" in result["command"]
 
 
 def test_a_failing_training_is_told_and_is_exit_1(words, tmp_path: Path, monkeypatch, capsys) -> None:
@@ -98,7 +111,7 @@ def test_ctrl_c_says_how_to_go_on(words, monkeypatch, capsys) -> None:
     monkeypatch.setattr(UNet, "loss", lambda *_: os.kill(os.getpid(), signal.SIGINT))
     assert main(words) == 130
     last = capsys.readouterr().err.strip().splitlines()[-1]
-    assert last.startswith("neeco: interrupted: job 1 of 4 (unet, real, 6 labelled, fold 0)")
+    assert last.startswith("neeco: interrupted: job 1 of 7 (unet, real, 6 labelled, fold 0)")
     assert "run the same command again to go on, nothing finished is lost" in last
 
 
@@ -135,6 +148,8 @@ def test_weights_of_one_experiment_begin_another(words, recorded: Path, tmp_path
         (["--steps", "0"], "--steps: 0 is none at all"),
         (["--size", "0"], "--size: 0 is none at all"),
         (["--batch", "-1"], "--batch: -1 is none at all"),
+        (["--test", "nowhere"], "nowhere"),
+        (["--backgrounds", "nowhere"], "--backgrounds nowhere: no such folder"),
         (["--splits", "tset"], "has no split 'tset'; it has train, test, unseen"),
         (["--labels", "nowhere"], "nowhere: no such folder; give a folder of masks"),
         (["--weights", "unet"], "--weights: 'unet' is not NAME=VALUE; write such as unet=unet.safetensors"),

@@ -1,41 +1,70 @@
-"""Batches: equal shares, every image in its turn, the same order for the same seed."""
+"""Batches: every image in its turn, each source when its schedule says so, the same order for the same seed."""
 
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
-from downstream_world import Held, squares
+import pytest
+import torch
+from downstream_world import Held, batch_of, square, squares
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neeco.studies.downstream.samples import BatchSampler
+from neeco.studies.downstream import batches
+from neeco.studies.downstream.batches import SCHEDULES, BatchSampler, training_image
+from neeco.studies.downstream.samples import Example, LeastRecentlyUsed
 
-SOURCES = [squares(3, 0, 16), squares(11, 10, 16), squares(1, 50, 16)]
-NAMES = {id(sample.example): sample.name for source in SOURCES for sample in source}
+REAL, SETS = squares(3, 0, 16), (squares(11, 10, 16), squares(1, 50, 16))
+SOURCES = (REAL, *SETS)
 
 
-def names(feed: BatchSampler, count: int) -> list[str]:
-    return [NAMES[id(example)] for example in feed.batch(count)]
+def names(feed: BatchSampler, count: int, done: float = 0.0) -> list[str]:
+    return [sample.name for sample in feed.draw(count, done)]
 
 
 def source_of(name: str) -> int:
     return next(k for k, source in enumerate(SOURCES) if name in {sample.name for sample in source})
 
 
-@settings(deadline=None, max_examples=50)
+def shares(feed: BatchSampler, count: int, done: float) -> list[float]:
+    """Of recorded frames and of each set."""
+    found = Counter(source_of(name) for name in names(feed, count, done))
+    return [found[k] / count for k in range(3)]
+
+
+@settings(deadline=None, max_examples=30)
 @given(st.integers(0, 99), st.lists(st.integers(1, 9), min_size=1, max_size=8))
-def test_sources_have_equal_shares_of_all_batches_and_each(seed: int, sizes: list[int]) -> None:
-    feed, total = BatchSampler(SOURCES, seed), Counter()
+def test_half_of_a_balanced_batch_is_recorded_whatever_there_are(seed: int, sizes: list[int]) -> None:
+    feed, total = BatchSampler(REAL, SETS, seed=seed, schedule="balanced"), Counter()
     for size in sizes:
-        batch = Counter(source_of(name) for name in names(feed, size))
-        total += batch
-        assert all(size // 3 <= batch[k] <= -(-size // 3) for k in range(3))
-    assert max(total[k] for k in range(3)) - min(total[k] for k in range(3)) <= 1
+        total += Counter(source_of(name) for name in names(feed, size))
+    assert 0 <= total[0] - (total[1] + total[2]) <= 1
+    assert abs(total[1] - total[2]) <= 1
+
+
+def test_each_schedule_has_its_shares_at_the_start_and_at_the_end() -> None:
+    found = {}
+    for schedule in SCHEDULES:
+        feed = BatchSampler(REAL, SETS, seed=0, schedule=schedule)
+        found[schedule] = [shares(feed, 60, done) for done in (0.0, 0.59, 0.61, 0.71, 0.99)]
+    alone, mixed, none = [1.0, 0.0, 0.0], [0.5, 0.25, 0.25], [0.0, 0.5, 0.5]
+    assert found["balanced"] == [mixed] * 5
+    assert found["finetune"] == [none, none, alone, alone, alone]
+    assert found["blend"] == [mixed, mixed, mixed, alone, alone]
+    assert found["pool"] == [[3 / 15, 11 / 15, 1 / 15]] * 5  # every image as often
+
+
+def test_where_there_is_one_kind_it_is_all_there_is() -> None:
+    for schedule in SCHEDULES:
+        assert shares(BatchSampler(REAL, seed=0, schedule=schedule), 9, 0.0) == [1, 0, 0]
+        assert shares(BatchSampler((), SETS, seed=0, schedule=schedule), 8, 0.9) == [0, 0.5, 0.5]
+    assert BatchSampler((), [(), SETS[0]], seed=0).sources == [SETS[0]]
 
 
 def test_every_image_is_seen_once_a_round() -> None:
-    seen = names(BatchSampler(SOURCES, 4), 3 * 22)
+    seen = names(BatchSampler((), SOURCES, seed=4), 3 * 22)
     for k, source in enumerate(SOURCES):
         own = [name for name in seen if source_of(name) == k]
         everything = sorted(sample.name for sample in source)
@@ -46,45 +75,59 @@ def test_every_image_is_seen_once_a_round() -> None:
 
 
 def test_the_seed_decides_the_order_whatever_the_batches() -> None:
-    feed = BatchSampler(SOURCES, 1)
-    assert names(BatchSampler(SOURCES, 1), 30) == [name for _ in range(10) for name in names(feed, 3)]
-    assert names(BatchSampler(SOURCES, 1), 30) != names(BatchSampler(SOURCES, 2), 30)
+    feed = BatchSampler(REAL, SETS, seed=1)
+    assert names(BatchSampler(REAL, SETS, seed=1), 30) == [name for _ in range(10) for name in names(feed, 3)]
+    assert names(BatchSampler(REAL, SETS, seed=1), 30) != names(BatchSampler(REAL, SETS, seed=2), 30)
 
 
-@settings(deadline=None, max_examples=30)
-@given(st.integers(0, 40), st.lists(st.integers(1, 9), min_size=1, max_size=8))
-def test_after_the_mixed_ones_only_the_first_source_is_seen(mixed: int, sizes: list[int]) -> None:
-    feed = BatchSampler(SOURCES, 2, mixed=mixed)
-    seen = [name for size in sizes for name in names(feed, size)]
-    assert seen[:mixed] == names(BatchSampler(SOURCES, 2), len(seen))[:mixed]
-    assert {source_of(name) for name in seen[mixed:]} <= {0}
-
-
-def test_empty_sources_take_no_share() -> None:
-    assert {source_of(name) for name in names(BatchSampler([(), SOURCES[0]], 0), 12)} == {0}
-
-
-def test_augmentation_sees_every_example_and_repeats_with_the_seed() -> None:
-    def noisy(example, random):
-        drawn.append(random.random())
-        return example
-
-    drawn: list[float] = []
-    BatchSampler(SOURCES, 3, noisy).batch(9)
-    first, drawn = drawn, []
-    BatchSampler(SOURCES, 3, noisy).batch(9)
-    assert first == drawn
-    assert len(set(first)) == 9
-
-
-def test_images_are_read_once_unless_they_do_not_fit() -> None:
-    def read_twice(**limit: int) -> list[int]:
+def test_images_are_read_once_unless_they_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    def reads(limit: int) -> list[int]:
+        monkeypatch.setattr(batches, "IMAGES", LeastRecentlyUsed(limit))
         source = [Held(sample.example, sample.name, []) for sample in squares(4, 0, 16)]
-        feed = BatchSampler([source], 0, **limit)
-        again = [feed.batch(4) for _ in range(3)]
-        assert all(any(np.array_equal(example.image, s.example.image) for s in source) for b in again for example in b)
-        return sorted(len(sample.loads) for sample in source)
+        for _ in range(3):
+            for sample in source:
+                training_image(sample, (16, 16), 1)
+        return [len(sample.loads) for sample in source]
 
-    assert read_twice() == [1, 1, 1, 1]
-    two = 2 * (3 + 1 + 1) * 16**2  # image, classes and instruments of two
-    assert read_twice(cache_bytes=two) == [1, 1, 3, 3]
+    one = (3 + 1 + 1) * 16**2  # image, shares, valid
+    assert reads(4 * one) == [1] * 4
+    assert reads(2 * one) == [3] * 4  # the ones wanted next are gone
+
+
+def test_targets_are_shares_of_area() -> None:
+    classes = np.zeros((4, 8), np.uint8)
+    classes[:2, :1], classes[:, 4:6] = 1, 2
+    counted = np.ones((4, 8), bool)
+    counted[2:, 6:] = False
+    example = Example(np.full((4, 8, 3), 51, np.uint8), classes, classes, counted)
+    batch = batch_of([example], (4, 2), 2)
+    assert batch.images.shape == (1, 3, 2, 4)
+    assert batch.images.numpy() == pytest.approx(np.full((1, 3, 2, 4), 0.2), abs=1e-6)
+    half = 128 / 255
+    assert batch.shares[0, 1].numpy() == pytest.approx(np.array([[half, 0, 0, 0], [0, 0, 0, 0]]))
+    assert batch.shares[0, 2].tolist() == [[0, 0, 1, 0], [0, 0, 1, 0]]
+    assert batch.shares[0].sum(0).numpy() == pytest.approx(np.ones((2, 4)))
+    assert batch.valid[0].tolist() == [[1, 1, 1, 1], [1, 1, 1, 0]]
+
+
+def test_soft_targets_are_the_share_of_instrument() -> None:
+    soft = replace(square(0), coverage=np.full((64, 64), 0.4, np.float32))
+    batch = batch_of([soft, square(0)], (16, 16))
+    assert batch.shares[0, 1].numpy() == pytest.approx(np.full((16, 16), 0.4), abs=2e-3)
+    assert batch.shares[1, 1].max() == 1
+    assert batch.valid.min() == 1
+
+
+def test_boxes_of_a_batch_are_those_of_its_examples() -> None:
+    classes = np.zeros((40, 80), np.uint8)
+    classes[10:20, 20:60], classes[25:26, 3:4] = 2, 1
+    example = Example(np.zeros((40, 80, 3), np.uint8), classes, (classes > 0).astype(np.uint8))
+    (boxes, numbers), (nothing, none) = batch_of(
+        [example, Example(example.image, classes * 0, classes * 0)], (20, 20)
+    ).boxes()
+    expected, classes_expected = example.relative_boxes()
+    assert boxes == pytest.approx(expected, abs=1e-6)
+    assert numbers.tolist() == classes_expected.tolist() == [1, 2]
+    assert nothing.shape == (0, 4)
+    assert none.shape == (0,)
+    assert torch.equal(batch_of([example], (20, 20)).images, torch.zeros(1, 3, 20, 20))

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import statistics
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 
 from neeco.studies.downstream.results import (
-    Arm,
     comparisons,
+    curve_table,
     equivalent,
     findings,
     metrics_of,
-    paired,
     summarise_folds,
 )
 
@@ -28,7 +25,8 @@ def job(condition: str, real: int, fold: int, iou: float | None, model: str = "u
     made = {"model": model, "condition": condition, "real": real, "fold": fold}
     if iou is None:
         return made | {"error": "the loss became nan", "splits": {}}
-    return made | {"splits": {"test": {"frames": 3, "iou": iou, **scores}}}
+    frames = [{"frame": str(k), "iou": iou + shift} for k, shift in enumerate((-0.01, 0.0, 0.01))]
+    return made | {"splits": {"test": {"frames": 3, "iou": iou, "per_frame": frames, **scores}}}
 
 
 def jobs(**means: tuple[float, ...]) -> list[dict]:
@@ -57,68 +55,63 @@ def pairs(results: list[dict], sets=("kin", "other")) -> set[tuple]:
     return {(row["condition"], row["real"], row["against"], row["against_real"]) for row in rows}
 
 
-def test_a_paired_difference_and_its_interval_are_a_t_tests() -> None:
-    first, second = (0.71, 0.74, 0.69, 0.77), (0.65, 0.7, 0.68, 0.7)
-    row = paired(
-        jobs(kin_real_20=first, real_20=second), Arm("unet", "kin+real", 20), Arm("unet", "real", 20), "test", "iou"
-    )
-    assert row is not None
-    test = stats.ttest_rel(first, second)
-    interval = test.confidence_interval(0.95)
-    assert row["folds"] == 4
-    assert row["difference"] == pytest.approx(statistics.fmean(np.subtract(first, second)))
-    assert (row["low"], row["high"]) == (pytest.approx(interval.low), pytest.approx(interval.high))
-
-
 def test_folds_are_paired_by_their_number_and_missing_ones_left_out() -> None:
     results = [job("kin+real", 20, fold, value) for fold, value in ((2, 0.9), (0, 0.5), (1, None))]
     results += [job("real", 20, fold, value) for fold, value in ((0, 0.4), (1, 0.1), (2, 0.7))]
-    row = paired(results, Arm("unet", "kin+real", 20), Arm("unet", "real", 20), "test", "iou")
-    assert row is not None
+    (row,) = comparisons(results, MASKS, ["test"], ["kin"])
     assert row["folds"] == 2
     assert row["difference"] == pytest.approx(0.15)
-    lone = paired(results[1:], Arm("unet", "kin+real", 20), Arm("unet", "real", 20), "test", "iou")
-    assert lone is not None
-    assert (lone["folds"], lone["low"], lone["high"]) == (1, None, None)
-    assert paired(results, Arm("unet", "kin", 0), Arm("unet", "real", 20), "test", "iou") is None
-    assert paired(results, Arm("unet", "kin+real", 20), Arm("unet", "real", 20), "test", "nothing") is None
+    assert row["low"] < 0.15 < row["high"]
 
 
 def test_what_is_compared_with_what() -> None:
-    one = (0.5, 0.6)
+    one, more = (0.5, 0.6), (0.7, 0.8)
     results = jobs(
-        real_10=one, real_50=one, real_augment_10=one, kin=one, kin_real_10=one, other=one, other_real_10=one,
-        kin_soft=one, kin_real_augment_10=one,
+        real_10=one, real_50=one, real_strong_10=more, real_paste_10=one, kin=one, kin_real_10=one, other=one,
+        other_real_10=one, kin_soft=one, kin_real_strong_10=one, kin_real_permuted_10=one, kin_real_pool_10=one,
     )  # fmt: skip
+    better = ("real+strong", 10)
     assert pairs(results) == {
-        ("real+augment", 10, "real", 10),
-        ("kin", 0, "real", 50),
+        ("real+strong", 10, "real", 10),
+        ("real+paste", 10, *better),
+        ("kin", 0, "real", 50),  # nothing else has so many labelled frames
         ("kin", 0, "other", 0),
-        ("kin+real", 10, "real", 10),
-        ("kin+real", 10, "real+augment", 10),
+        ("kin+real", 10, *better),
         ("kin+real", 10, "other+real", 10),
         ("other", 0, "real", 50),
-        ("other+real", 10, "real", 10),
-        ("other+real", 10, "real+augment", 10),
+        ("other+real", 10, *better),
         ("kin+soft", 0, "real", 50),
         ("kin+soft", 0, "kin", 0),
-        ("kin+real+augment", 10, "real", 10),
-        ("kin+real+augment", 10, "real+augment", 10),
-        ("kin+real+augment", 10, "kin+real", 10),
+        ("kin+real+strong", 10, *better),
+        ("kin+real+strong", 10, "kin+real", 10),
+        ("kin+real+permuted", 10, "kin+real", 10),
+        ("kin+real+pool", 10, *better),
+        ("kin+real+pool", 10, "kin+real", 10),
     }
 
 
+def test_the_reference_is_the_better_baseline_of_each_test() -> None:
+    def both(condition: str, near: float, far: float) -> dict:
+        made = job(condition, 10, 0, near)
+        made["splits"]["far"] = job(condition, 10, 0, far)["splits"]["test"]
+        return made
+
+    results = [both("real", 0.8, 0.5), both("real+strong", 0.7, 0.6), both("kin+real", 0.9, 0.9)]
+    rows = comparisons(results, MASKS, ["test", "far"], ["kin"])
+    against = {row["split"]: row["against"] for row in rows if row["condition"] == "kin+real"}
+    assert against == {"test": "real", "far": "real+strong"}
+
+
 def test_without_a_set_augmentation_alone_is_compared() -> None:
-    assert pairs(jobs(real_10=(0.5,), real_augment_10=(0.6,)), sets=()) == {("real+augment", 10, "real", 10)}
+    assert pairs(jobs(real_10=(0.5,), real_strong_10=(0.6,)), sets=()) == {("real+strong", 10, "real", 10)}
 
 
 def test_the_order_of_words_does_not_matter_to_comparisons() -> None:
     one = (0.5, 0.6)
-    results = jobs(real_10=one, augment_real_10=one, real_kin_10=one, soft_kin=one, kin=one, real_other_10=one)
+    results = jobs(real_10=one, strong_real_10=(0.7, 0.8), real_kin_10=one, soft_kin=one, kin=one, real_other_10=one)
     assert {
-        ("augment+real", 10, "real", 10),
-        ("real+kin", 10, "real", 10),
-        ("real+kin", 10, "augment+real", 10),
+        ("strong+real", 10, "real", 10),
+        ("real+kin", 10, "strong+real", 10),
         ("real+kin", 10, "real+other", 10),
         ("soft+kin", 0, "kin", 0),
     } <= pairs(results)
@@ -147,9 +140,21 @@ def test_a_summary_has_means_over_the_folds_that_finished() -> None:
         ("kin", "unseen"),
     ]
     assert rows[0]["failed"] == 1
+    ends = {key: rows[0]["iou"].pop(key) for key in ("low", "high")}
     assert rows[0]["iou"] == {"mean": pytest.approx(0.6), "std": pytest.approx(statistics.stdev([0.5, 0.7])), "n": 2}
-    assert rows[1]["iou"] == {"mean": None, "std": None, "n": 0}
-    assert rows[2]["iou"] == {"mean": 0.4, "std": None, "n": 1}
+    assert 0.48 < ends["low"] < 0.6 < ends["high"] < 0.72
+    assert rows[1]["iou"] == {"mean": None, "std": None, "n": 0, "low": None, "high": None}
+    assert (rows[2]["iou"]["mean"], rows[2]["iou"]["std"], rows[2]["iou"]["n"]) == (0.4, None, 1)
+
+
+def test_the_main_score_stands_by_condition_and_labelled_frames_the_best_of_each_marked() -> None:
+    made = documented(jobs(real_10=(0.5, 0.5), real_50=(0.8, 0.8), kin=(0.6, 0.6), kin_real_10=(0.7, 0.7)))
+    table = curve_table(made, made["models"][0], "test")
+    assert [column.title for column in table.columns] == ["none", "10", "50"]
+    shown = {row.keys[0]: [(str(cell)[:5], cell.best) for cell in row.cells] for row in table.rows}
+    assert shown["real"] == [("-", False), ("0.500", False), ("0.800", False)]
+    assert shown["kin+real"] == [("-", False), ("0.700", True), ("-", False)]
+    assert str(table.rows[0].cells[1]) == "0.500 (0.490–0.510)"
 
 
 def test_metrics_are_the_usual_ones_then_those_of_classes() -> None:
@@ -169,10 +174,10 @@ def sentence(*starts: str, of: list[dict]) -> str:
 @pytest.mark.parametrize(
     ("with_set", "verdict"),
     [
-        ((0.80, 0.82, 0.81), "; helps against them alone (+0.210, "),
-        ((0.30, 0.32, 0.31), "; hurts against them alone (-0.290, "),
-        ((0.55, 0.75, 0.56), "; no difference shown against them alone (+0.020, "),
-        ((0.60, 0.61, 0.59), "; no difference shown against them alone (+0.000, +0.000 to +0.000)"),
+        ((0.80, 0.82, 0.81), "; helps against real, 20 labelled (+0.210, "),
+        ((0.30, 0.32, 0.31), "; hurts against real, 20 labelled (-0.290, "),
+        ((0.55, 0.75, 0.56), "; no difference shown against real, 20 labelled (+0.020, "),
+        ((0.60, 0.61, 0.59), "; no difference shown against real, 20 labelled (+0.000, +0.000 to +0.000)"),
     ],
 )
 def test_a_verdict_is_as_sure_as_its_interval(with_set, verdict: str) -> None:
@@ -184,32 +189,41 @@ def test_a_verdict_is_as_sure_as_its_interval(with_set, verdict: str) -> None:
 
 def test_one_fold_gives_no_verdict() -> None:
     told = sentence("20 labelled frames and", of=jobs(real_20=(0.6,), kin_real_20=(0.7,)))
-    assert "; against them alone (+0.100; one fold has no interval)" in told
+    assert told.endswith("; against real, 20 labelled (+0.100; one fold gives no verdict)")
+
+
+def test_a_single_score_gives_no_verdict() -> None:
+    results = [{**made, "splits": {"test": {"iou": made["splits"]["test"]["iou"]}}} for made in
+               jobs(real_20=(0.6,), kin_real_20=(0.7,))]  # fmt: skip
+    told = sentence("20 labelled frames and", of=results)
+    assert "; against real, 20 labelled (+0.100; a single score has no interval)" in told
     assert "helps" not in told
 
 
-def test_sets_alone_are_a_share_of_the_most_labelled_frames() -> None:
+def test_sets_alone_are_a_share_of_the_better_at_the_most_labelled_frames() -> None:
     told = sentence("no manual label", of=jobs(real_20=(0.5, 0.5), real_80=(0.8, 0.8), kin=(0.6, 0.6)))
-    assert told == (
-        "unet, test: 1,200 synthetic (kin) and no manual label: IoU 0.600, 75.0 % of what 80 labelled frames alone "
-        "reach (0.800)"
-    )
+    start = "unet, test: 1,200 synthetic (kin) and no manual label: IoU 0.600, 75.0 % of 0.800; hurts against real, 80"
+    assert told.startswith(start)
 
 
-def test_sentences_are_of_drawn_images_with_something_to_compare() -> None:
+def test_sentences_are_of_synthetic_images_with_something_to_compare() -> None:
     assert documented(jobs(kin=(0.6,)))["answers"] == []
-    assert documented(jobs(real_20=(0.6,), real_augment_20=(0.7,)))["answers"] == []
-    (told,) = documented(jobs(real_20=(0.6,), real_augment_20=(0.7,), kin_soft=(0.5,)))["answers"]
+    assert documented(jobs(real_20=(0.6,), real_strong_20=(0.7,)))["answers"] == []
+    (told,) = documented(jobs(real_20=(0.6,), real_strong_20=(0.7,), kin_soft=(0.5,)))["answers"]
     assert "1,200 synthetic (kin, soft) and no manual label: IoU 0.500" in told
     several = sentence("synthetic (kin) and 1,200 synthetic (other)", of=jobs(real_20=(0.6,), kin_other_real_20=(0.6,)))
     assert "20 labelled frames and 1,200 synthetic (kin) and 1,200 synthetic (other)" in several
 
 
-def test_drawn_images_are_judged_against_augmentation_too() -> None:
-    results = jobs(real_20=(0.6, 0.61, 0.6), real_augment_20=(0.9, 0.91, 0.9), kin_real_20=(0.7, 0.71, 0.71))
-    told = sentence("20 labelled frames and 1,200 synthetic (kin)", of=results)
-    assert "; helps against them alone (+0.103, " in told
-    assert "; hurts against them augmented (-0.197, " in told
+def test_synthetic_images_are_judged_against_the_better_baseline_and_wrong_labels_against_right_ones() -> None:
+    results = jobs(
+        real_20=(0.6, 0.61, 0.6), real_strong_20=(0.9, 0.91, 0.9), kin_real_20=(0.7, 0.71, 0.71),
+        kin_real_permuted_20=(0.3, 0.3, 0.3),
+    )  # fmt: skip
+    told = sentence("20 labelled frames and 1,200 synthetic (kin):", of=results)
+    assert "; hurts against real+strong, 20 labelled (-0.197, " in told
+    wrong = sentence("kin+real+permuted against the right labels, kin+real", of=results)
+    assert wrong.endswith("below by more than the interval at 1 of 1 numbers of labelled frames (-0.407 to -0.407)")
 
 
 def test_as_good_as_is_over_the_folds_that_both_finished() -> None:

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from downstream_world import square
 
 from neeco.studies.downstream.samples import Example
 from neeco.studies.downstream.scores import (
@@ -17,7 +16,6 @@ from neeco.studies.downstream.scores import (
     mask_scores,
     mean_scores,
     near,
-    validation_score,
 )
 
 ONE = ("instrument",)
@@ -202,15 +200,3 @@ def test_of_several_classes_those_in_the_truth_are_scored() -> None:
 
 
 # the number that weights are chosen by
-
-
-def test_validation_is_by_iou_of_masks_or_ap_of_boxes() -> None:
-    example = square(0)
-    (box,), _ = example.boxes()
-    assert validation_score([example.classes], [example], 1) == 1
-    assert validation_score([example.classes * 0], [example], 1) == 0
-    assert validation_score([boxes_of((*box, 0.9))], [example], 1) == pytest.approx(1)
-    assert validation_score([boxes_of()], [example], 1) == 0
-    empty = truth_of(example.classes * 0)
-    assert validation_score([example.classes * 0], [empty], 1) == 0  # nothing to say, and no failure
-    assert validation_score([boxes_of()], [empty], 1) == 0

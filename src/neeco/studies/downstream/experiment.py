@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,20 +13,18 @@ from neeco.capture.checks import read_checked
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
-from neeco.studies.downstream.job import (
+from neeco.studies.downstream.conditions import (
     DEFAULT_EDGES,
-    JOB_FILE,
     REAL,
     RESERVED,
     Condition,
-    DownstreamJob,
-    DownstreamSettings,
-    absolute,
     default_conditions,
     labelled_count,
     parse_condition,
 )
+from neeco.studies.downstream.job import JOB_FILE, DownstreamJob, DownstreamSettings, absolute
 from neeco.studies.downstream.model import model_class
+from neeco.studies.downstream.paste import background_files
 from neeco.studies.downstream.results import comparisons, failed_jobs, findings, summarise_folds
 from neeco.studies.downstream.samples import (
     ImageSet,
@@ -38,8 +37,10 @@ from neeco.studies.downstream.samples import (
 from neeco.studies.machine import machine, threads_per_worker
 from neeco.studies.study import JobEvent, check_output, check_workers, run_and_record
 
-SCHEMA = "neeco-downstream/1"
+SCHEMA = "neeco-downstream/2"
 FILE = "downstream.json"
+DEFAULT_COUNTS = (5, 10, 20, 50)  # of labelled frames, besides all
+WRITE_EVERY_S = 30.0  # the results so far are written no more often: they are thousands of frames' scores
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,11 +62,14 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
         value = getattr(settings, option)
         if value is not None and value < 1:
             raise NeecoError(f"--{option}: {value} is none at all; give at least 1")
-    check_workers(settings.workers, device_of(settings.device, drawing=False))
+    check_workers(settings.workers, device_of(settings.device, drawing=False), share_gpus=True)
     _check_models(settings)
     conditions = _conditions(settings)
     capture = read_checked(settings.capture, settings.transforms)
     settings = replace(settings, splits=_splits(capture, settings.splits))
+    _check_tests(settings, capture)
+    if settings.backgrounds is not None:
+        background_files(settings.backgrounds)
     size = frame_size(recorded_samples(capture, settings.splits[0], settings.classes))
     images = {}
     for data in settings.sets:
@@ -91,7 +95,7 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
         images=images,
         labelled=labelled,
         frame_size=size,
-        notes=tuple(_notes(settings, counts)),
+        notes=tuple(_notes(settings)),
     )
 
 
@@ -148,13 +152,29 @@ def _splits(capture: Capture, requested: Sequence[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
+def _check_tests(settings: DownstreamSettings, capture: Capture) -> None:
+    """Raises NeecoError for other captures that cannot be tested on, or whose names mean something else."""
+    names = [test.name for test in settings.tests]
+    for test in settings.tests:
+        if test.name in (*capture.splits, "") or names.count(test.name) > 1 or {*test.name} & {"/", "\\"}:
+            raise NeecoError(f"--test {test.name}: results go by this name; name it otherwise: --test NAME={test.path}")
+        other = read_checked(test.path, "transforms.json")
+        if class_names(other, settings.classes) != class_names(capture, settings.classes):
+            raise NeecoError(
+                f"--test {test.name}: {test.path} has other parts than {capture.root}; use --classes instrument"
+            )
+        recorded_samples(other, None, settings.classes)
+
+
 def _counts(settings: DownstreamSettings, capture: Capture, conditions: Sequence[Condition]) -> tuple[list[int], int]:
     """The counts of labelled frames, and how many there are."""
-    for word in settings.num_real:
+    for word in settings.num_real or ():
         labelled_count(word, 10**9)
-    if not any(condition.real for condition in conditions) or set(settings.num_real) <= {"0"}:
-        return [0] if "0" in settings.num_real else [], 0
+    if not any(condition.real for condition in conditions) or set(settings.num_real or "all") <= {"0"}:
+        return [0] if "0" in (settings.num_real or "0") else [], 0
     labelled = len(recorded_samples(capture, "train", settings.classes, settings.labels))
+    if settings.num_real is None:
+        return [0, *(count for count in DEFAULT_COUNTS if count < labelled), labelled], labelled
     return sorted({labelled_count(word, labelled) for word in settings.num_real}), labelled
 
 
@@ -190,15 +210,10 @@ def _jobs(
     )
 
 
-def _notes(settings: DownstreamSettings, counts: Sequence[int]) -> list[str]:
+def _notes(settings: DownstreamSettings) -> list[str]:
     notes = []
     if settings.folds < 3:
-        notes.append("intervals of fewer than three folds are wide or absent; give --folds 5 before concluding")
-    if few := [count for count in counts if 0 < count < settings.min_validated]:
-        notes.append(
-            f"{', '.join(map(str, few))} labelled frames: too few to hold some out; trained on them alone the last "
-            "weights are taken, together with a set those that do best on synthetic images"
-        )
+        notes.append("intervals of fewer than three folds hardly cover other seeds; give --folds 5 before concluding")
     if settings.labels is not None:
         notes.append(f"labels of recorded training frames: {settings.labels}; tests are scored by the capture's truth")
     return notes
@@ -215,11 +230,21 @@ def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | 
         paths = {index: job.folder / JOB_FILE for index, job in enumerate(jobs)}
         finished = {index: read_json(path) for index, path in paths.items() if path.exists()}
         captures = {plan.settings.capture: plan.capture}
+        written, known = 0.0, list[Mapping[str, Any]]()
 
         def record(results: Sequence[Mapping[str, Any]]) -> None:
-            write_json(file, document(plan, results))
+            nonlocal written
+            known[:] = results
+            if time.monotonic() > written + WRITE_EVERY_S:
+                write_json(file, document(plan, results))
+                written = time.monotonic()
 
-        results = run_and_record(jobs, plan.settings.workers, record, finished, progress, captures)
+        try:
+            results = run_and_record(jobs, plan.settings.workers, record, finished, progress, captures, light=True)
+        except KeyboardInterrupt:
+            if known:
+                write_json(file, document(plan, known))
+            raise
         result = document(plan, results) | {"complete": True}
         write_json(file, result)
     return result
@@ -231,6 +256,7 @@ def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict
     kinds = {name: model_class(name) for name in settings.models}
     predicts = {name: kind.predicts for name, kind in kinds.items()}
     threads = threads_per_worker(settings.workers) if settings.workers > 1 else None
+    tests = [*settings.splits, *(test.name for test in settings.tests)]
     made: dict[str, Any] = {
         "schema": SCHEMA,
         "version": __version__,
@@ -253,10 +279,10 @@ def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict
             "device": settings.device,
         },
         "classes": list(class_names(plan.capture, settings.classes)),
-        "splits": list(settings.splits),
+        "splits": tests,
+        "tests": {test.name: str(test.path.absolute()) for test in settings.tests},
         "folds": settings.folds,
         "labelled": plan.labelled,
-        "held_back_every": settings.validation_every,
         "sets": [
             data.described() | {"images": plan.images[data.name], "made_by": _made_by(data)} for data in settings.sets
         ],
@@ -272,8 +298,8 @@ def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict
             for name, kind in kinds.items()
         ],
         "jobs": list(results),
-        "summary": summarise_folds(results, predicts, settings.splits),
-        "paired": comparisons(results, predicts, settings.splits, [data.name for data in settings.sets]),
+        "summary": summarise_folds(results, predicts, tests),
+        "paired": comparisons(results, predicts, tests, [data.name for data in settings.sets]),
         "notes": [*plan.notes, *_result_notes(results)],
     }
     return made | {"answers": findings(made)}
@@ -286,12 +312,9 @@ def _made_by(data: ImageSet) -> dict[str, Any] | None:
 
 
 def _result_notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return notes on failures, on trainings that were too short, and on biased models."""
+    """Return notes on failures and on biased models."""
     notes = [f"failed: {line}" for line in failed_jobs({"jobs": results})]
     done = [job for job in results if "error" not in job]
-    late = sorted({f"{job['model']}, {job['condition']}" for job in done if job["still_learning"]})
-    if late:
-        notes.append(f"still getting better at the last step: {'; '.join(late)}; give more --steps")
     for model in dict.fromkeys(job["model"] for job in done):
         alone = [job for job in done if job["model"] == model and job["condition"] == REAL]
         most = max((job["real"] for job in alone), default=0)  # fewer frames miss what they do not show

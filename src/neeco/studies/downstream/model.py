@@ -6,7 +6,7 @@ import importlib.util
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -18,15 +18,13 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.files import placeholder, write_atomically
 from neeco.registry import plugins
-from neeco.studies.downstream.samples import BatchSampler, Example, Sample
-from neeco.studies.downstream.scores import Prediction, validation_score
+from neeco.studies.downstream.batches import Batch, BatchSampler, collate, training_image
+from neeco.studies.downstream.scores import Prediction
 
 WEIGHTS_FILE = "weights.safetensors"
-VALIDATION_IMAGES = 60  # at most: a spread of the held-out images that weights are chosen by
 PREDICTION_BATCH = 16  # images
 REPORT_EVERY = 10  # steps
 
@@ -37,7 +35,6 @@ class TrainingTask:
 
     classes: tuple[str, ...]
     batches: BatchSampler
-    validation: tuple[Sample, ...]  # may be empty
     size: tuple[int, int]  # width, height of input images
     steps: int
     batch: int
@@ -45,19 +42,15 @@ class TrainingTask:
     device: torch.device
     folder: Path  # the job's, for what training writes
     weights: Path | None = None  # to start from; None: from scratch
+    keep_weights: bool = True  # write those that it ends with to the folder
     progress: Callable[[float, str], None] = lambda share, text: None
 
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """`predict` maps uint8 images [H, W, 3] to predictions at their size.
-
-    best_step: the step whose weights are kept. validation: (step, score in [0, 1]) during training.
-    """
+    """`predict` maps uint8 images [H, W, 3] to predictions at their size."""
 
     predict: Callable[[Sequence[np.ndarray]], list[Prediction]]
-    best_step: int
-    validation: list[tuple[int, float]] = field(default_factory=list)
 
 
 class Model(ABC):
@@ -121,24 +114,23 @@ def input_size(frame: tuple[int, int], longer_side: int, multiple: int) -> tuple
 class TorchModel(Model):
     """A model given as a module, a loss and its predictions; `fit` is the same for all.
 
-    AdamW, the same number of steps in every condition; the learning rate rises over the first steps and falls as a
-    cosine (Loshchilov and Hutter, "SGDR", 2017). Of several checkpoints the weights with the best score on the held-out
-    images are kept.
+    AdamW, the same number of steps in every condition; the learning rate rises over the first steps and falls to 0 as
+    a cosine (Loshchilov and Hutter, "SGDR", 2017). The weights after the last step are the model: nothing is chosen, so
+    that no label is spent on a choice.
     """
 
     learning_rate: ClassVar[float]
     weight_decay: ClassVar[float] = 1e-4
     gradient_clip: ClassVar[float] = 0.1  # norm, as in D-FINE
     warmup: ClassVar[float] = 0.1  # of the steps: the learning rate rises
-    checkpoints: ClassVar[int] = 10  # at which the held-out images are scored
 
     @abstractmethod
     def build(self, classes: int) -> nn.Module:
         """The untrained module, from torch's random numbers."""
 
     @abstractmethod
-    def loss(self, module: Any, images: Tensor, examples: Sequence[Example]) -> Tensor:
-        """Return the loss of a batch: input images [B, 3, h, w] in [0, 1], and the examples they were made from."""
+    def loss(self, module: Any, batch: Batch) -> Tensor:
+        """Return the loss of a batch."""
 
     @abstractmethod
     def predictions(self, module: Any, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Prediction]:
@@ -155,44 +147,38 @@ class TorchModel(Model):
             module = module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # faster on a CPU
             if task.weights is not None:
                 load_weights(module, task.weights)
-            curve, best_step = self._train(module, task)
-        state = {name: value.detach().contiguous().cpu() for name, value in module.state_dict().items()}
-        write_atomically(task.folder / WEIGHTS_FILE, lambda path: save_file(_without_aliases(state), path))
-        return TrainedModel(lambda images: self._predict(module, images, task), best_step, curve)
+            self._train(module, task)
+        if task.keep_weights:
+            state = {name: value.detach().contiguous().cpu() for name, value in module.state_dict().items()}
+            write_atomically(task.folder / WEIGHTS_FILE, lambda path: save_file(_without_aliases(state), path))
+        return TrainedModel(lambda images: self._predict(module, images, task))
 
-    def _train(self, module: nn.Module, task: TrainingTask) -> tuple[list[tuple[int, float]], int]:
-        optimizer = torch.optim.AdamW(module.parameters(), self.learning_rate, weight_decay=self.weight_decay)
+    def _train(self, module: nn.Module, task: TrainingTask) -> None:
+        fused = task.device.type == "cuda"
+        optimizer = torch.optim.AdamW(
+            module.parameters(), self.learning_rate, weight_decay=self.weight_decay, fused=fused
+        )
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self._rate(step, task.steps))
-        chosen = evenly_spaced(len(task.validation), VALIDATION_IMAGES)
-        truth = [task.validation[index].load() for index in chosen]
-        checkpoints = {round(task.steps * (k + 1) / self.checkpoints) for k in range(self.checkpoints)}
-        curve: list[tuple[int, float]] = []
-        best_weights, best_step, best = None, task.steps, -1.0
+        rng = torch.Generator(task.device).manual_seed(task.seed) if task.batches.augmented else None
+        with_boxes = self.predicts == "boxes"
         module.train()
         for step in range(1, task.steps + 1):
-            examples = task.batches.batch(task.batch)
-            loss = self.loss(module, to_input([example.image for example in examples], task), examples)
-            if not torch.isfinite(loss):
-                raise NeecoError(
-                    f"{self.model}: its loss is not finite at step {step}; train with more images or other --weights"
-                )
+            samples = task.batches.draw(task.batch, (step - 1) / task.steps)
+            images = [training_image(sample, task.size, len(task.classes), with_boxes) for sample in samples]
+            loss = self.loss(module, collate(images, task.device, rng))
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(module.parameters(), self.gradient_clip)
             optimizer.step()
             schedule.step()
-            if step % REPORT_EVERY == 0 or step == task.steps:
-                score = f"  validation {curve[-1][1]:.3f}" if curve else ""
-                task.progress(step / task.steps, f"step {step}  loss {loss.item():.3f}{score}")
-            if truth and step in checkpoints:
-                predictions = self._predict(module, [example.image for example in truth], task)
-                curve.append((step, validation_score(predictions, truth, len(task.classes))))
-                if curve[-1][1] >= best:
-                    best, best_step = curve[-1][1], step
-                    best_weights = {name: value.clone() for name, value in module.state_dict().items()}
-        if best_weights is not None:
-            module.load_state_dict(best_weights)
-        return curve, best_step
+            if step % REPORT_EVERY == 0 or step == task.steps:  # a GPU waits here for its numbers
+                value = loss.item()
+                if not math.isfinite(value):
+                    raise NeecoError(
+                        f"{self.model}: its loss is not finite at step {step}; "
+                        "train with more images or other --weights"
+                    )
+                task.progress(step / task.steps, f"step {step}  loss {value:.3f}")
 
     def _rate(self, step: int, steps: int) -> float:
         """The learning rate at a step, as a share of the highest."""

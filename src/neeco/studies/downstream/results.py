@@ -1,21 +1,19 @@
 """Results of jobs: means over folds, paired differences with intervals, findings in words, tables.
 
 A study's results are one document, that of downstream.json, of plain values: "jobs" as they wrote them, "summary",
-"paired" and "answers" from here. An arm is what is averaged over folds: a model, a condition and a number of labelled
-frames.
+"paired" and "answers" from here.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy import stats
 
-from neeco.studies.downstream.job import AUGMENT, REAL
+from neeco.studies.downstream.conditions import BASELINES, PERMUTED, REAL
+from neeco.studies.downstream.intervals import Arm, Scores, arms_of
 from neeco.studies.downstream.scores import BOX_SCORES, MASK_SCORES
 from neeco.studies.study import spread
 from neeco.studies.tables import (
@@ -47,7 +45,6 @@ TITLES = {
     "box_recall": "recall",
 }
 NEAR = "iou_"  # begins the score near a pair of parts: iou_jaws
-CONFIDENCE = 0.95  # of intervals
 HELPS, HURTS, NONE_SHOWN = "helps", "hurts", "no difference shown"
 VERDICTS = (HELPS, HURTS, NONE_SHOWN)
 JOB_KEYS = ("model", "condition", "real", "fold")
@@ -56,25 +53,7 @@ PAIRED_KEYS = ("model", "split", "metric", "condition", "real", "against", "agai
 PAIRED_COLUMNS = (*PAIRED_KEYS, "folds", "difference", "low", "high")
 
 Document = Mapping[str, Any]
-Scores = Mapping[tuple[str, int], Mapping[int, float]]  # by (condition, labelled frames): the score by fold
-
-
-class Arm(NamedTuple):
-    """A model in a condition with so many labelled frames."""
-
-    model: str
-    condition: str
-    real: int
-
-    @property
-    def words(self) -> list[str]:
-        """The words of its condition."""
-        return self.condition.split("+")
-
-
-def arms_of(jobs: Sequence[Document]) -> list[Arm]:
-    """The arms of these jobs, in their order."""
-    return list(dict.fromkeys(Arm(job["model"], job["condition"], job["real"]) for job in jobs))
+FoldScores = Mapping[tuple[str, int], Mapping[int, float]]  # by (condition, labelled frames): the score by fold
 
 
 def title_of(condition: str, real: int) -> str:
@@ -100,96 +79,85 @@ def metrics_of(jobs: Sequence[Document], predicts: str) -> list[str]:
     return [*(key for key in usual if key in found), *of_pairs, *(key for key in found if "." in key)]
 
 
+def compared_metrics(jobs: Sequence[Document], predicts: str) -> list[str]:
+    """The scores that have intervals: the main one, near pairs of parts, and of every class."""
+    main = MAIN[predicts]
+    found = metrics_of(jobs, predicts)
+    return [key for key in found if key == main or key.startswith(NEAR) or key.endswith(f".{main}")]
+
+
 def summarise_folds(jobs: Sequence[Document], models: Mapping[str, str], splits: Sequence[str]) -> list[dict[str, Any]]:
-    """A row per arm and split; every score as {"mean", "std", "n"} over folds.
+    """A row per arm and split; every score as {"mean", "std", "n"} over folds, compared ones with their interval's
+    "low" and "high".
 
     models: what each predicts, by name. `failed` counts the folds that did not finish.
     """
-    rows = []
+    rows, scores = [], Scores(jobs)
     for arm in arms_of(jobs):
-        same = [job for job in jobs if _is_of(job, arm)]
-        done = [job for job in same if "error" not in job]
-        metrics = metrics_of([job for job in jobs if job["model"] == arm.model], models[arm.model])
+        of_model = [job for job in jobs if job["model"] == arm.model]
+        metrics, compared = (take(of_model, models[arm.model]) for take in (metrics_of, compared_metrics))
+        known = scores.jobs.get(arm, {}).values()
+        count = sum((job["condition"], job["real"]) == arm[1:] for job in of_model)
         for split in splits:
-            scores = {metric: spread(job["splits"].get(split, {}).get(metric) for job in done) for metric in metrics}
-            rows.append({**arm._asdict(), "split": split, "failed": len(same) - len(done), **scores})
+            row = {**arm._asdict(), "split": split, "failed": count - len(known)}
+            for metric in metrics:
+                row[metric] = spread(job["splits"].get(split, {}).get(metric) for job in known)
+                if metric in compared:
+                    low, high = scores.interval(arm, split, metric)
+                    row[metric] |= {"low": low, "high": high}
+            rows.append(row)
     return rows
-
-
-def _is_of(row: Document, arm: Arm) -> bool:
-    return (row["model"], row["condition"], row["real"]) == arm
-
-
-def scores_by_fold(jobs: Sequence[Document], model: str, split: str, metric: str) -> Scores:
-    """One model's scores on one split; folds that failed or lack it are left out."""
-    scores: dict[tuple[str, int], dict[int, float]] = {}
-    for job in jobs:
-        value = job["splits"].get(split, {}).get(metric)
-        if job["model"] == model and value is not None:
-            scores.setdefault((job["condition"], job["real"]), {})[job["fold"]] = value
-    return scores
-
-
-def paired(jobs: Sequence[Document], first: Arm, second: Arm, split: str, metric: str) -> dict[str, Any] | None:
-    """Compare `first` with `second` (of one model) on the folds that both finished: the mean difference of scores,
-    and the interval that holds the mean with 95 % confidence (Student's t; None for a single fold)."""
-    scores = scores_by_fold(jobs, first.model, split, metric)
-    ours, theirs = (scores.get(arm[1:], {}) for arm in (first, second))
-    differences = np.array([ours[fold] - theirs[fold] for fold in ours if fold in theirs])
-    folds = len(differences)
-    if not folds:
-        return None
-    mean, low, high = float(differences.mean()), None, None
-    if folds > 1:
-        reach = stats.t.ppf((1 + CONFIDENCE) / 2, folds - 1) * differences.std(ddof=1) / math.sqrt(folds)
-        low, high = mean - float(reach), mean + float(reach)
-    keys = (first.model, split, metric, first.condition, first.real, second.condition, second.real)
-    return dict(zip(PAIRED_COLUMNS, (*keys, folds, mean, low, high), strict=True))
 
 
 def comparisons(
     jobs: Sequence[Document], models: Mapping[str, str], splits: Sequence[str], sets: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """The differences that the study is about, over the jobs that finished.
+    """The differences that the study is about, over the folds that both finished, with their intervals.
 
-    With synthetic images against without, at every number of labelled frames; synthetic images alone against the most
-    labelled frames; the first set against each other set, alone and with labelled frames; every condition that does
-    something to a set (`set+soft`) against the set as it is.
+    Every condition against the better of labelled frames alone and strongly augmented, at as many labelled frames (sets
+    alone: at the most); strong augmentation against none; a set with a word that changes how it is used against the set
+    as it is; the first set against each other set.
     """
-    done = [job for job in jobs if "error" not in job]
+    scores = Scores(jobs)
+    arms = list(scores.jobs)
     metrics = {
-        name: metrics_of([job for job in done if job["model"] == name], predicts) for name, predicts in models.items()
+        name: compared_metrics([job for job in jobs if job["model"] == name and "error" not in job], predicts)
+        for name, predicts in models.items()
     }
-    arms = arms_of(done)
-    rows = (
-        paired(done, first, second, split, metric)
-        for first in arms
-        for second in _references(first, arms, sets)
-        for split in splits
-        for metric in metrics[first.model]
-    )
-    return [row for row in rows if row is not None]
+    rows = []
+    for first in arms:
+        for split in splits:
+            for second in _references(first, split, scores, MAIN[models[first.model]], sets):
+                for metric in metrics[first.model]:
+                    if (found := scores.difference(first, second, split, metric)) is None:
+                        continue
+                    folds, mean, ends = found
+                    keys = (first.model, split, metric, *first[1:], *second[1:])
+                    rows.append(dict(zip(PAIRED_COLUMNS, (*keys, folds, mean, *ends), strict=True)))
+    return rows
 
 
-def _references(first: Arm, arms: Sequence[Arm], sets: Sequence[str]) -> list[Arm]:
-    """The arms that `first` is compared with, in whatever order their conditions' words stand."""
+def _references(first: Arm, split: str, scores: Scores, metric: str, sets: Sequence[str]) -> list[Arm]:
+    """The arms that `first` is compared with on a split, in whatever order their conditions' words stand."""
+    words, arms = set(first.words), [arm for arm in scores.jobs if arm.model == first.model]
     synthetic = [word for word in first.words if word in sets]
-    wanted: list[tuple[set[str], int]] = [({REAL}, first.real)]
-    if synthetic and REAL in first.words:
-        wanted += [({REAL, AUGMENT}, first.real)]
-    elif synthetic:
-        most = max((arm.real for arm in arms if arm[:2] == (first.model, REAL)), default=0)
-        wanted = [({REAL}, most)]
-    if synthetic:  # how the set is used
-        wanted += [({word for word in first.words if word in sets or word == REAL}, first.real)]
+
+    def of(wanted: set[str], real: int = first.real) -> list[Arm]:
+        return [arm for arm in arms if (set(arm.words), arm.real) == (wanted, real)]
+
+    if PERMUTED in words:
+        return of(words - {PERMUTED})
+    baselines = [set(name.split("+")) for name in BASELINES]
+    if words in baselines:
+        return [arm for wanted in baselines[: baselines.index(words)] for arm in of(wanted)]
+    most = max((arm.real for arm in arms if arm.condition == REAL), default=0)
+    rivals = [arm for wanted in baselines for arm in of(wanted, first.real if REAL in words else most)]
+    known = [(value, arm) for arm in rivals if (value := scores.mean(arm, split, metric)) is not None]
+    found = [max(known, key=lambda pair: pair[0])[1]] if known else []
+    if synthetic:
+        found += of({word for word in words if word in sets or word == REAL})  # how the set is used
     if synthetic and synthetic == [sets[0]]:
-        wanted += [({other if word == sets[0] else word for word in first.words}, first.real) for other in sets[1:]]
-    found = [
-        arm
-        for words, real in wanted
-        for arm in arms
-        if (arm.model, set(arm.words), arm.real) == (first.model, words, real)
-    ]
+        found += [arm for other in sets[1:] for arm in of(words - {sets[0]} | {other})]
     return [arm for arm in dict.fromkeys(found) if arm != first]
 
 
@@ -204,6 +172,12 @@ def main_differences(experiment: Document, model: Document, split: str) -> list[
     return [row for row in experiment["paired"] if (row["model"], row["split"], row["metric"]) == wanted]
 
 
+def scores_by_fold(jobs: Sequence[Document], model: str, split: str, metric: str) -> FoldScores:
+    """One model's scores on one split; folds that failed or lack it are left out."""
+    scores = Scores([job for job in jobs if job["model"] == model])
+    return {arm[1:]: values for arm in scores.jobs if (values := scores.by_fold(arm, split, metric))}
+
+
 def findings(experiment: Document) -> list[str]:
     """Return the findings: a sentence for every model, split and condition with synthetic images."""
     return [
@@ -216,45 +190,54 @@ def findings(experiment: Document) -> list[str]:
 def findings_of(experiment: Document, model: Document, split: str) -> list[str]:
     """The sentences of one model and split; conditions are compared over the folds that both finished."""
     scores = scores_by_fold(experiment["jobs"], model["name"], split, MAIN[model["answers"]])
-    sentences = (_finding(key, scores, experiment, model, split) for key in scores)
+    sentences = [_finding(key, scores, experiment, model, split) for key in scores]
+    controls = dict.fromkeys(condition for condition, _ in scores if PERMUTED in condition.split("+"))
+    sentences += [_control(condition, experiment, model, split) for condition in controls]
     return [sentence for sentence in sentences if sentence]
 
 
-def _finding(key: tuple[str, int], scores: Scores, experiment: Document, model: Document, split: str) -> str | None:
+def _control(condition: str, experiment: Document, model: Document, split: str) -> str | None:
+    """Compare labels of other images with the right ones; None where these are missing."""
+    rows = [row for row in main_differences(experiment, model, split) if row["condition"] == condition]
+    if not rows:
+        return None
+    worse = sum(verdict(row) == HURTS for row in rows)
+    ends = sorted(row["difference"] for row in rows)
+    return (
+        f"{condition} against the right labels, {rows[0]['against']}: below by more than the interval at {worse} of "
+        f"{len(rows)} numbers of labelled frames ({ends[0]:+.3f} to {ends[-1]:+.3f})"
+    )
+
+
+def _finding(key: tuple[str, int], scores: FoldScores, experiment: Document, model: Document, split: str) -> str | None:
     """Compare one condition with labelled frames alone; None where there is nothing to compare."""
     (condition, real), metric = key, TITLES[MAIN[model["answers"]]]
     words = condition.split("+")
     sets = [entry for entry in experiment["sets"] if entry["name"] in words]
-    curve = real_curve(scores, key)
-    if not sets or not curve:
+    rows = [
+        row
+        for row in main_differences(experiment, model, split)
+        if (row["condition"], row["real"]) == key and row["against"] in BASELINES
+    ]
+    if not sets or not rows or PERMUTED in words:
         return None
     used = [word for word in words if word not in (REAL, *(entry["name"] for entry in sets))]
     count = " and ".join(f"{entry['images']:,} synthetic ({', '.join([entry['name'], *used])})" for entry in sets)
     value = float(np.mean(list(scores[key].values())))
+    row = rows[0]
+    against = f"{verdict(row)} against {title_of(row['against'], row['against_real'])} {_interval(row)}".lstrip()
     if REAL not in words:
-        most, best = curve[-1]
-        share = f"{100 * value / best:.1f} % of what" if best else "where"
-        reference = f"{share} {most} labelled frames alone reach ({best:.3f})"
-        return f"{count} and no manual label: {metric} {value:.3f}, {reference}"
-    rows = {
-        row["against"]: row
-        for row in main_differences(experiment, model, split)
-        if (row["condition"], row["real"], row["against_real"]) == (condition, real, real)
-    }
-    judged = [
-        (verdict(rows[against]), f"against {title} {_interval(rows[against])}")
-        for against, title in ((REAL, "them alone"), (f"{REAL}+{AUGMENT}", "them augmented"))
-        if against in rows
-    ]
-    if not judged:
-        return None
+        best = value - row["difference"]
+        share = f", {100 * value / best:.1f} % of {best:.3f}" if best else ""
+        return f"{count} and no manual label: {metric} {value:.3f}{share}; {against}"
     sentence = f"{real} labelled frames and {count}: {metric} {value:.3f}"
-    if len(curve) > 1 and judged[0][0] != HURTS:
+    curve = real_curve(scores, key)
+    if len(curve) > 1 and verdict(row) != HURTS:
         sentence += f", {equivalent(curve, value)} labelled frames alone"
-    return "; ".join([sentence, *(f"{word} {how}".lstrip() for word, how in judged)])
+    return f"{sentence}; {against}"
 
 
-def real_curve(scores: Scores, key: tuple[str, int]) -> list[tuple[int, float]]:
+def real_curve(scores: FoldScores, key: tuple[str, int]) -> list[tuple[int, float]]:
     """(labelled frames, score) of labelled frames alone, each set off from the score of `key` by their difference over
     the folds that both finished."""
     own = scores[key]
@@ -267,15 +250,17 @@ def real_curve(scores: Scores, key: tuple[str, int]) -> list[tuple[int, float]]:
 
 
 def verdict(row: Document) -> str:
-    """Return the verdict of a paired difference, one of VERDICTS; "" where there is no interval."""
-    if row["low"] is None:
+    """Return the verdict of a paired difference, one of VERDICTS; "" of one fold, whose interval is of frames alone."""
+    if row["low"] is None or row["folds"] < 2:
         return ""
     return HELPS if row["low"] > 0 else HURTS if row["high"] < 0 else NONE_SHOWN
 
 
 def _interval(row: Document) -> str:
     if row["low"] is None:
-        return f"({row['difference']:+.3f}; one fold has no interval)"
+        return f"({row['difference']:+.3f}; a single score has no interval)"
+    if row["folds"] < 2:
+        return f"({row['difference']:+.3f}; one fold gives no verdict)"
     return f"({row['difference']:+.3f}, {row['low']:+.3f} to {row['high']:+.3f})"
 
 
@@ -294,10 +279,34 @@ def equivalent(curve: Sequence[tuple[int, float]], value: float) -> str:
 
 
 def tables_of(experiment: Document) -> list[ResultTable]:
-    """For every model and split the scores of each condition, then the differences of its main score."""
-    pairs = models_and_splits(experiment)
-    tables = [table(experiment, model, split) for model, split in pairs for table in (scores_table, differences_table)]
+    """For every model and split the main score over labelled frames, its differences, then all scores."""
+    makers = (curve_table, differences_table, scores_table)
+    tables = [make(experiment, model, split) for model, split in models_and_splits(experiment) for make in makers]
     return [table for table in tables if table.rows]
+
+
+def curve_table(experiment: Document, model: Document, split: str) -> ResultTable:
+    """The main score by condition and number of labelled frames, with its interval."""
+    metric = MAIN[model["answers"]]
+    rows = [row for row in experiment["summary"] if (row["model"], row["split"]) == (model["name"], split)]
+    found = {(row["condition"], row["real"]): row.get(metric) for row in rows}
+    counts = sorted({real for _, real in found})
+    means = {key: value["mean"] for key, value in found.items() if value and value["n"]}
+
+    def cell(key: tuple[str, int]) -> Cell:
+        if key not in means:
+            return Cell(UNKNOWN)
+        low, high = found[key].get("low"), found[key].get("high")
+        text = f"{means[key]:.3f}" + ("" if low is None else f" ({low:.3f}–{high:.3f})")
+        column = [value for (_, real), value in means.items() if real == key[1]]
+        return Cell(text, best=len(column) > 1 and means[key] == max(column))
+
+    entries = [
+        Row((name,), tuple(cell((name, real)) for real in counts)) for name in dict.fromkeys(name for name, _ in found)
+    ]
+    columns = tuple(Column(str(real), f"{real:,}" if real else "none") for real in counts)
+    title = f"{model['name']}, {split}: {TITLES[metric]} by labelled frames"
+    return ResultTable(title, KEYS[:1], columns, tuple(entries))
 
 
 def scores_table(experiment: Document, model: Document, split: str) -> ResultTable:
@@ -312,7 +321,7 @@ def scores_table(experiment: Document, model: Document, split: str) -> ResultTab
         same = [job for job in jobs if (job["condition"], job["real"]) == (row["condition"], row["real"])]
         failed = same[0]["error"] if all("error" in job for job in same) else None
         entries.append(SummaryRow(_keys(row), row, failed))
-    return summary_table(f"{name}, split {split}", KEYS, columns, entries)
+    return summary_table(f"{name}, {split}: all scores", KEYS, columns, entries)
 
 
 def differences_table(experiment: Document, model: Document, split: str) -> ResultTable:
@@ -323,7 +332,7 @@ def differences_table(experiment: Document, model: Document, split: str) -> Resu
         texts = [UNKNOWN if row[column.key] is None else f"{row[column.key]:+.3f}" for column in columns]
         against = title_of(row["against"], row["against_real"])
         rows.append(Row((*_keys(row), against), tuple(map(Cell, [*texts, str(row["folds"])]))))
-    title = f"{model['name']}, split {split}: differences of {TITLES[MAIN[model['answers']]]}"
+    title = f"{model['name']}, {split}: differences of {TITLES[MAIN[model['answers']]]}"
     return ResultTable(title, (*KEYS, "against"), (*columns, Column("folds", "folds")), tuple(rows))
 
 
@@ -340,7 +349,7 @@ def _metric_title(metric: str) -> str:
 
 
 def budget_text(experiment: Document) -> str:
-    """Return the budget of every training and the number of folds, in words."""
+    """Return the budget of every training and the number of seeds, in words."""
     models = [
         f"{model['name']}: {model['steps']} steps of {model['batch']} images of {model['input'][0]}x{model['input'][1]}"
         for model in experiment["models"]
@@ -357,15 +366,13 @@ def data_files(experiment: Document) -> dict[str, str]:
     frames = [
         {key: row[key] for key in (*keys, "split")} | frame for row in scores for frame in row.get("per_frame", [])
     ]
-    curves = [own | {"step": step, "score": score} for own, job in of_job for step, score in job.get("validation", [])]
     columns = {
         "scores.csv": [key for key in _all_keys([*keys, "split"], scores) if key != "per_frame"],
         "frames.csv": _all_keys([*keys, "split", "frame"], frames),
-        "jobs.csv": [*keys, "iterations", "best_step", "seconds", "processor_seconds", "error"],
-        "validation.csv": [*keys, "step", "score"],
+        "jobs.csv": [*keys, "iterations", "seconds", "processor_seconds", "error"],
         "paired.csv": PAIRED_COLUMNS,
     }
-    rows = (scores, frames, jobs, curves, experiment["paired"])
+    rows = (scores, frames, jobs, experiment["paired"])
     return {name: csv_text(columns[name], some) for name, some in zip(columns, rows, strict=True)}
 
 

@@ -1,15 +1,16 @@
-"""Labelled images to train on and to test on: recorded frames, and data sets of synthetic images; batches of both."""
+"""Labelled images to train on and to test on: recorded frames, and data sets of synthetic images."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
+import cv2
 import numpy as np
 
 from neeco.capture.images import EXTENSIONS, image_size, open_image, read_image_bytes, read_labels
@@ -22,7 +23,32 @@ from neeco.files import read_json, read_text, require_inside
 ClassNames = Literal["instrument", "parts"]
 Edges = Literal["hard", "soft", "ignore"]
 WHOLE = ("instrument",)  # the classes where an instrument is one
+CACHE_BYTES = 1 << 30  # of decoded images of one kind that a process keeps
 DATASET_FILE, STATES_FILE, IMAGE_FOLDER = "dataset.json", "states.jsonl", "images"
+
+
+K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
+
+
+class LeastRecentlyUsed(Generic[K, V]):
+    """Values by key, of at most `limit` bytes in all; those that were not used for longest go first."""
+
+    def __init__(self, limit: int = CACHE_BYTES) -> None:
+        self.limit, self.used = limit, 0
+        self._kept: OrderedDict[K, tuple[V, int]] = OrderedDict()
+
+    def get(self, key: K, make: Callable[[], V], size: Callable[[V], int]) -> V:
+        """The value of `key`, made where it is not kept. size: of a value, in bytes."""
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key][0]
+        value = make()
+        self._kept[key] = value, size(value)
+        self.used += self._kept[key][1]
+        while self.used > self.limit and len(self._kept) > 1:
+            self.used -= self._kept.popitem(last=False)[1][1]
+        return value
 
 
 @dataclass(frozen=True)
@@ -35,6 +61,11 @@ class Example:
     valid: np.ndarray | None = None  # bool [H, W], False where pixels are neither learned nor scored; None: all valid
     coverage: np.ndarray | None = None  # float32 [H, W], instrument's share of each pixel; None: all or nothing
 
+    @property
+    def bytes(self) -> int:
+        """Its size in memory."""
+        return sum(array.nbytes for array in vars(self).values() if array is not None)
+
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """[n, 4] (x0, y0, x1, y1; px, x1 and y1 exclusive) about each class of each instrument, and the classes [n]."""
         codes = self.instruments.astype(np.int64) * 256 + self.classes
@@ -44,6 +75,21 @@ class Example:
             boxes.append((columns.min(), rows.min(), columns.max() + 1, rows.max() + 1))
             classes.append(code % 256)
         return np.array(boxes, np.float64).reshape(-1, 4), np.array(classes, np.int64)
+
+    def outlines(self) -> list[tuple[int, np.ndarray]]:
+        """Each class of each instrument with the corners [n, 2] (x, y, shares of the image's sides; float32) of the
+        pixels at its border: what a box is about, wherever the image is moved."""
+        height, width = self.classes.shape
+        codes = self.instruments.astype(np.int64) * 256 + self.classes
+        found = []
+        for code in np.unique(codes[self.classes > 0]):
+            inside = (codes == code).astype(np.uint8)
+            rows, columns = np.nonzero(inside - cv2.erode(inside, np.ones((3, 3), np.uint8), borderValue=0))
+            corners = [np.stack([columns + x, rows + y], 1) for x in (0, 1) for y in (0, 1)]
+            found.append(
+                (int(code % 256), np.concatenate(corners).astype(np.float32) / np.array([width, height], np.float32))
+            )
+        return found
 
     def relative_boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """`boxes` as [n, 4] centre x, y, width, height, shares of the image's sides; and the classes [n]."""
@@ -78,11 +124,39 @@ class LabelMap:
             self.classes[number] = classes.index(name) + 1 if name in classes else 0
             self.instruments[number] = instrument
 
+    @property
+    def key(self) -> Hashable:
+        """Equal for maps that are."""
+        return self.classes.tobytes(), self.instruments.tobytes()
+
     def check(self, ids: np.ndarray, file: Path, remedy: str) -> None:
         """Raises NeecoError where one of `ids` (uint8) has no class: it would be learned as tissue."""
         unknown = (self.classes[ids] == 0) & (ids > 0)
         if unknown.any():
             raise NeecoError(f"{file}: id {ids[unknown].min()} has no class; {remedy}")
+
+
+class Sample(Protocol):
+    """An image with labels that is read when it is needed."""
+
+    @property
+    def name(self) -> str:
+        """Its name in messages and tables."""
+
+    @property
+    def key(self) -> Hashable:
+        """Equal for samples that load the same."""
+
+    def load(self) -> Example:
+        """Read it. Raises NeecoError."""
+
+
+EXAMPLES: LeastRecentlyUsed[Hashable, Example] = LeastRecentlyUsed()
+
+
+def loaded(sample: Sample) -> Example:
+    """The sample's example, kept for as long as there is room."""
+    return EXAMPLES.get(sample.key, sample.load, lambda example: example.bytes)
 
 
 @dataclass(frozen=True)
@@ -96,6 +170,10 @@ class RecordedSample:
     @property
     def name(self) -> str:
         return self.frame.name
+
+    @property
+    def key(self) -> Hashable:
+        return self.frame.image_path, self.masks.files[self.name], self.label_map.key
 
     def load(self) -> Example:
         """Raises NeecoError where the labels differ from the image in size, or have an id without a class."""
@@ -135,6 +213,10 @@ class SyntheticSample:
     def name(self) -> str:
         return self.image.stem
 
+    @property
+    def key(self) -> Hashable:
+        return self.image, self.labels, self.label_map.key, self.soft, self.ignore
+
     def load(self) -> Example:
         """Raises NeecoError where a file is of another size, or has an id without a class."""
         size = image_size(self.image)
@@ -146,7 +228,15 @@ class SyntheticSample:
         return Example(pixels, self.label_map.classes[ids], self.label_map.instruments[ids], valid, coverage)
 
 
-Sample = RecordedSample | SyntheticSample
+def permuted(samples: Sequence[SyntheticSample]) -> tuple[SyntheticSample, ...]:
+    """The same images, each with the labels of another, by a fixed cyclic permutation in random order."""
+    order = np.random.default_rng(0).permutation(len(samples))
+    source = dict(zip(order.tolist(), np.roll(order, 1).tolist(), strict=True))
+    others = [samples[source[index]] for index in range(len(samples))]
+    return tuple(
+        replace(sample, labels=other.labels, soft=other.soft, ignore=other.ignore)
+        for sample, other in zip(samples, others, strict=True)
+    )
 
 
 @dataclass(frozen=True)
@@ -188,20 +278,38 @@ class ImageSet:
         return NeecoError(f"--sets {self.name}: {problem}")
 
 
+@dataclass(frozen=True)
+class OtherCapture:
+    """Another recording whose frames with truth a model is tested on, all together."""
+
+    name: str
+    path: Path
+
+    def __str__(self) -> str:
+        """Return the word of the command line."""
+        return f"{self.name}={self.path.absolute()}"
+
+
 def recorded_samples(
-    capture: Capture, split: str, classes: ClassNames, labels: Path | None = None
+    capture: Capture, split: str | None, classes: ClassNames, labels: Path | None = None
 ) -> tuple[RecordedSample, ...]:
-    """The labelled frames of a split: by the capture's truth, or by a folder of masks named as the frames.
+    """The labelled frames of a split (None: of all): by the capture's truth, or by a folder of masks named as the
+    frames.
 
     Frames without a label are left out. Raises NeecoError where there is none at all, or where parts are requested and
     the labels have none.
     """
     masks = None if labels is None else open_masks(labels, option=f"{labels / PARTS_FILE}:")
-    if masks is None and any(truth_file(capture.root, frame.name) for frame in capture.split(split)):
-        masks = open_truth(capture, splits=[split])
-    frames = [] if masks is None else [frame for frame in capture.split(split) if frame.name in masks.files]
+    chosen = capture.frames if split is None else capture.split(split)
+    if masks is None and any(truth_file(capture.root, frame.name) for frame in chosen):
+        masks = open_truth(capture, splits=None if split is None else [split])
+    frames = [] if masks is None else [frame for frame in chosen if frame.name in masks.files]
     if masks is None or not frames:
-        where = f"{capture.root}: split {split}" if labels is None else f"--labels {labels}"
+        where = (
+            f"{capture.root}: {'all frames' if split is None else f'split {split}'}"
+            if labels is None
+            else f"--labels {labels}"
+        )
         raise NeecoError(f"{where}: no frame has a label; give --labels FOLDER with masks named as the frames")
     wanted = class_names(capture, classes)
     if classes == "parts" and not set(_paired(masks.names or {}).values()) & set(wanted):
@@ -311,110 +419,3 @@ def _labels_of(data: ImageSet, classes: Sequence[str]) -> tuple[str, LabelMap]:
 def _read_grey(file: Path, size: tuple[int, int]) -> np.ndarray:
     """uint8 [H, W] of an 8-bit grey image."""
     return np.asarray(open_image(file, size).convert("L"))
-
-
-Augmentation = Callable[[Example, np.random.Generator], Example]
-
-
-class BatchSampler:
-    """Samples examples from sources without end. A source is shuffled anew after each pass.
-
-    sources: recorded frames, each data set. A batch takes as many from each, whatever their sizes: a few labelled
-    frames are not outnumbered by a thousand synthetic ones. mixed: how many examples are sampled so; those after them
-    are of the first source. The seed decides the order, whatever the batches and the augmentation. cache_bytes: of
-    decoded images that are kept; others are read again.
-    """
-
-    def __init__(
-        self,
-        sources: Sequence[Sequence[Sample]],
-        seed: int,
-        augment: Augmentation | None = None,
-        mixed: int | None = None,
-        cache_bytes: int = 1 << 30,
-    ) -> None:
-        self.sources = [source for source in sources if source]
-        self.mixed, self.augment, self.cache_bytes = mixed, augment, cache_bytes
-        self.rng, self.augment_rng = (np.random.default_rng(np.random.SeedSequence([seed, k])) for k in (1, 2))
-        self._orders = [self._shuffled(len(source)) for source in self.sources]
-        self._drawn = 0
-        self._cache: dict[tuple[int, int], Example] = {}
-        self._cached = 0
-
-    def batch(self, count: int) -> list[Example]:
-        """Return the next `count` examples, augmented where there is an augmentation."""
-        return [self._next() for _ in range(count)]
-
-    def _next(self) -> Example:
-        alone = self.mixed is not None and self._drawn >= self.mixed
-        source = 0 if alone else self._drawn % len(self.sources)
-        self._drawn += 1
-        example = self._load(source, next(self._orders[source]))
-        return example if self.augment is None else self.augment(example, self.augment_rng)
-
-    def _shuffled(self, count: int) -> Iterator[int]:
-        while True:
-            yield from self.rng.permutation(count).tolist()
-
-    def _load(self, source: int, index: int) -> Example:
-        key = source, index
-        if key not in self._cache:
-            example = self.sources[source][index].load()
-            size = sum(array.nbytes for array in vars(example).values() if array is not None)
-            if self._cached + size > self.cache_bytes:
-                return example
-            self._cache[key] = example
-            self._cached += size
-        return self._cache[key]
-
-
-def augment(example: Example, rng: np.random.Generator) -> Example:
-    """The example flipped, turned, scaled, shifted, and its colours, sharpness and noise changed at random (MONAI).
-
-    This is the classical augmentation of the condition `augment`. Labels move with the image; pixels from outside the
-    image are black and not valid.
-    """
-    shape = example.classes.shape
-    valid = np.ones(shape) if example.valid is None else example.valid
-    coverage = np.zeros(shape) if example.coverage is None else example.coverage
-    labels = np.stack([example.classes, example.instruments, valid, coverage]).astype(np.float32)  # [4, H, W]
-    transform = _augmentation(shape)
-    transform.set_random_state(int(rng.integers(2**31)))
-    image = np.moveaxis(example.image, 2, 0).astype(np.float32) / 255
-    made = {name: np.asarray(value) for name, value in transform({"image": image, "labels": labels}).items()}
-    gain = 1 + 0.1 * rng.uniform(-1, 1, (3, 1, 1))  # of each colour channel
-    pixels = np.moveaxis((made["image"] * gain).clip(0, 1) * 255, 0, 2).round().astype(np.uint8)
-    classes, instruments, valid, coverage = made["labels"]
-    return Example(
-        np.ascontiguousarray(pixels),
-        classes.round().astype(np.uint8),
-        instruments.round().astype(np.uint8),
-        valid > 0.5,
-        None if example.coverage is None else coverage,
-    )
-
-
-@cache
-def _augmentation(shape: tuple[int, int]) -> Any:
-    """The MONAI transform of images of this (height, width)."""
-    from monai import transforms
-
-    names = ["image", "labels"]
-    return transforms.Compose(
-        [
-            transforms.RandFlipd(names, prob=0.5, spatial_axis=1),
-            transforms.RandAffined(
-                names,
-                prob=1.0,
-                rotate_range=0.35,  # rad
-                scale_range=(0.2, 0.2),
-                translate_range=[0.1 * side for side in shape],  # px
-                mode=["bilinear", "nearest"],
-                padding_mode="zeros",
-            ),
-            transforms.RandScaleIntensityd(["image"], factors=0.25, prob=1.0),
-            transforms.RandAdjustContrastd(["image"], prob=0.3, gamma=(0.7, 1.4)),
-            transforms.RandGaussianSmoothd(["image"], sigma_x=(0.25, 1.5), sigma_y=(0.25, 1.5), prob=0.3),  # px
-            transforms.RandGaussianNoised(["image"], prob=0.3, std=0.04),
-        ]
-    )

@@ -9,9 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
-from neeco.evaluation.mask_metrics import boundary_f, box_ious, dice, iou, mean_of
+from neeco.evaluation.mask_metrics import boundary_f, box_ious, dice, distances_to, iou, mean_of
 from neeco.studies.downstream.samples import Example
 
 MASK_SCORES = ("iou", "dice", "precision", "recall", "boundary_f")
@@ -63,7 +62,7 @@ def _class_scores(mask: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dic
 
 def near(pixels: np.ndarray, distance: float) -> np.ndarray:
     """bool [H, W]: within `distance` px of any of `pixels` [H, W]."""
-    return ndimage.distance_transform_edt(~pixels) <= distance if pixels.any() else np.zeros_like(pixels)
+    return distances_to(pixels) <= distance if pixels.any() else np.zeros_like(pixels)
 
 
 def mean_scores(frames: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
@@ -149,14 +148,3 @@ def _coco_box(image: int, box: np.ndarray) -> dict[str, object]:
     x0, y0, x1, y1 = map(float, box)
     bbox = [x0, y0, x1 - x0, y1 - y0]
     return {"image_id": image, "bbox": bbox, "area": bbox[2] * bbox[3], "category_id": 1}
-
-
-def validation_score(predictions: Sequence[Prediction], truth: Sequence[Example], classes: int) -> float:
-    """Return a number in [0, 1] to choose weights by: mean IoU of masks, or AP of boxes."""
-    names = [str(number) for number in range(classes)]
-    boxes = [found for found in predictions if isinstance(found, Detections)]
-    if boxes:
-        return box_scores(boxes, truth, names)["ap"] or 0.0
-    masks = [found for found in predictions if isinstance(found, np.ndarray)]
-    frames = [mask_scores(mask, example, names) for mask, example in zip(masks, truth, strict=True)]
-    return mean_scores(frames)["iou"] or 0.0

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neeco.studies.downstream.batches import Batch
 from neeco.studies.downstream.model import TorchModel, missing_packages
-from neeco.studies.downstream.samples import Example
 from neeco.studies.downstream.scores import Detections, Prediction
 
 STRIDES = (16, 32)  # px, of the backbone's last two stages, which it detects on
@@ -33,7 +33,7 @@ class DFine(TorchModel):
 
     @classmethod
     def missing_requirement(cls) -> str | None:
-        return missing_packages("transformers", "pycocotools", "monai")
+        return missing_packages("transformers", "pycocotools")
 
     @classmethod
     def is_too_small(cls, size: tuple[int, int]) -> bool:
@@ -82,9 +82,9 @@ class DFine(TorchModel):
         )
         return DFineForObjectDetection(config)
 
-    def loss(self, module: Any, images: Tensor, examples: Sequence[Example]) -> Tensor:
-        labels = [detection_labels(example, images.device) for example in examples]
-        return module(pixel_values=images, labels=labels).loss
+    def loss(self, module: Any, batch: Batch) -> Tensor:
+        labels = [detection_labels(*boxes, batch.images.device) for boxes in batch.boxes()]
+        return module(pixel_values=batch.images, labels=labels).loss
 
     def predictions(self, module: Any, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Prediction]:
         output = module(pixel_values=images)
@@ -99,9 +99,9 @@ class DFine(TorchModel):
         return found
 
 
-def detection_labels(example: Example, device: torch.device) -> dict[str, Tensor]:
-    """Return one image's labels as transformers takes them: classes from 0, boxes relative to the image's size."""
-    boxes, classes = example.relative_boxes()
+def detection_labels(boxes: np.ndarray, classes: np.ndarray, device: torch.device) -> dict[str, Tensor]:
+    """One image's labels as transformers takes them, from its boxes [n, 4] (centre x, y, width, height; shares of the
+    image's sides) and their classes [n], from 1."""
     return {
         "class_labels": torch.from_numpy(classes - 1).to(device),
         "boxes": torch.from_numpy(boxes.astype(np.float32)).to(device),

@@ -33,7 +33,7 @@ ERROR_LINES = 3  # last lines of the program's error that are passed on
 
 
 class Yolo(Model):
-    """Detects a box for each class of each instrument. Its own augmentation is on in conditions with `augment` only."""
+    """Detects a box for each class of each instrument. Its own augmentation is on in conditions with `strong` only."""
 
     model = "yolo"
     predicts = "boxes"
@@ -56,12 +56,9 @@ class Yolo(Model):
         shutil.rmtree(work, ignore_errors=True)
         sources = task.batches.sources
         training = _write_images(work / "data", "train", sources)
-        validation = _write_images(work / "data", "val", [task.validation] if task.validation else sources[:1])
         most = max(map(len, training))  # every source's images as often as the largest's, as in `BatchSampler`
-        lists = {
-            "train": [path for paths in training for path in islice(cycle(paths), most)],
-            "val": [path for paths in validation for path in paths],
-        }
+        every = [path for paths in training for path in islice(cycle(paths), most)]
+        lists = {"train": every, "val": training[0]}  # it wants some to validate with; the last weights are taken
         for name, paths in lists.items():
             write_text(work / f"{name}.txt", "".join(f"{path}\n" for path in paths))
         described = {name: str(work / f"{name}.txt") for name in lists} | {"names": dict(enumerate(task.classes))}
@@ -70,13 +67,13 @@ class Yolo(Model):
         task.progress(0.0, f"yolo: {epochs} epochs of {len(lists['train'])} images")
         settings = [f"epochs={epochs}", f"batch={task.batch}", f"imgsz={max(task.size)}", f"seed={task.seed}"]
         settings += [f"device={_device(task)}", f"project={work}", "name=train", "workers=0", "plots=False"]
-        settings += [] if task.batches.augment else NO_AUGMENTATION
+        settings += [] if task.batches.augmented else NO_AUGMENTATION
         _run(work, ["detect", "train", f"data={work / 'data.yaml'}", f"model={ARCHITECTURE}", *settings])
-        weights = work / "train" / "weights" / "best.pt"
+        weights = work / "train" / "weights" / "last.pt"
         if not weights.is_file():
             raise NeecoError(f"{weights}: {PROGRAM} wrote no weights; see {work / 'train'}")
         shutil.rmtree(work / "data")
-        return TrainedModel(lambda images: _predict(work, weights, images, task), task.steps)
+        return TrainedModel(lambda images: _predict(work, weights, images, task))
 
 
 def _write_images(folder: Path, split: str, sources: Sequence[Sequence[Sample]]) -> list[list[Path]]:

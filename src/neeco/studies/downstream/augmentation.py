@@ -1,0 +1,133 @@
+"""Strong augmentation of a batch: other geometry, light, colours, sharpness and noise, and a part cut out.
+
+The usual recipe of segmentation (Isensee et al., "nnU-Net", 2021), with cut-out (DeVries and Taylor, 2017).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+MAX_TURN = 0.5  # rad
+MAX_ZOOM = 1.4  # larger or smaller
+MAX_SHIFT = 0.15  # of a side
+MAX_EXPOSURE = 0.7  # octaves
+MAX_GAMMA = 0.6  # octaves
+MAX_TINT = 0.2  # of each colour channel
+MAX_SATURATION = 0.5
+MAX_SLOPE = 0.4  # of the brightness from one border to the other: lamps elsewhere
+MAX_BLUR = 1.5  # px
+BLUR_RADIUS = 3  # px
+MAX_NOISE = 0.06
+MAX_CUT = 0.35  # of a side
+PLACED, RELIT = 0.5, 0.7  # of the images: turned, zoomed and shifted; with other light and colours
+
+Outline = tuple[int, np.ndarray]
+
+
+def augment(planes: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Augment every image of a batch by itself.
+
+    planes [B, 3 + C + 1, h, w] in [0, 1]: colours, shares of classes, valid share. Labels move with the image; pixels
+    from outside of it are black, those cut out of one colour, and neither valid. Returns the planes, and [B, 2, 3] that
+    maps places x, y in the image made to those in the image given, both in [-1, 1] from side to side. rng: on the
+    planes' device.
+    """
+    count, _, height, width = planes.shape
+    random = _Random(rng, count, planes.device)
+    given_from_made = _placements(random, width / height)
+    grid = functional.affine_grid(given_from_made, [count, 1, height, width], align_corners=False)
+    planes = functional.grid_sample(planes, grid, align_corners=False)
+    colors, labels = planes[:, :3], planes[:, 3:]
+    colors = torch.where(random.some(RELIT)[:, None, None, None] > 0, _relight(colors, random), colors)
+    colors = _blur(colors, random.some(0.3) * random.uniform(0.2, MAX_BLUR))
+    noise = torch.randn(colors.shape, generator=rng, device=planes.device)
+    strength = random.some(0.5) * random.uniform(0, MAX_NOISE)
+    colors = (colors + noise * strength[:, None, None, None]).clamp(0, 1)
+    cut = _rectangles(random, height, width)
+    colors = torch.where(cut, random.uniform(0, 1, 3)[..., None, None], colors)
+    valid = labels[:, -1:] * ~cut
+    return torch.cat([colors, labels[:, :-1], valid], 1), given_from_made
+
+
+def moved(outlines: Sequence[Outline], given_from_made: np.ndarray) -> tuple[Outline, ...]:
+    """Outlines (class, [n, 2] places in [0, 1]) in an augmented image, by its [2, 3]; what leaves it is left out."""
+    linear = np.linalg.inv(given_from_made[:, :2])
+    shift = (1 - linear @ (1 + given_from_made[:, 2])) / 2
+    found = []
+    for number, points in outlines:
+        placed = points @ linear.T + shift
+        inside = placed[((placed >= 0) & (placed <= 1)).all(1)]
+        if len(inside):
+            found.append((number, inside))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Random:
+    """Random numbers of each image of a batch."""
+
+    rng: torch.Generator
+    count: int
+    device: torch.device
+
+    def uniform(self, low: float, high: float, *shape: int) -> Tensor:
+        """[B, *shape] in [low, high)."""
+        return low + (high - low) * torch.rand((self.count, *shape), generator=self.rng, device=self.device)
+
+    def some(self, chance: float) -> Tensor:
+        """[B]: 1 with this chance, else 0."""
+        return (self.uniform(0, 1) < chance).float()
+
+
+def _placements(random: _Random, aspect: float) -> Tensor:
+    """[B, 2, 3]: flips, turns, zooms and shifts, as `augment` returns them. aspect: width over height."""
+    placed, flip = random.some(PLACED), 1 - 2 * random.some(0.5)
+    turn, zoom = placed * random.uniform(-MAX_TURN, MAX_TURN), MAX_ZOOM ** (placed * random.uniform(-1, 1))
+    cosine, sine = turn.cos() / zoom, turn.sin() / zoom
+    shift = placed[:, None] * random.uniform(-2 * MAX_SHIFT, 2 * MAX_SHIFT, 2)
+    rows = [
+        torch.stack([cosine * flip, -sine / aspect, shift[:, 0]], 1),
+        torch.stack([sine * aspect * flip, cosine, shift[:, 1]], 1),
+    ]
+    return torch.stack(rows, 1)
+
+
+def _relight(colors: Tensor, random: _Random) -> Tensor:
+    """Other exposure, gamma, tint, saturation and lamps."""
+    height, width = colors.shape[2:]
+    angle, slope = random.uniform(-math.pi, math.pi), random.some(0.5) * random.uniform(0, MAX_SLOPE)
+    across, down = (torch.linspace(-0.5, 0.5, side, device=colors.device) for side in (width, height))
+    ramp = (slope * angle.cos())[:, None, None] * across + (slope * angle.sin())[:, None, None] * down[:, None]
+    gain = 2 ** random.uniform(-MAX_EXPOSURE, MAX_EXPOSURE)
+    tint = random.uniform(1 - MAX_TINT, 1 + MAX_TINT, 3) * gain[:, None]
+    grey = colors.mean(1, keepdim=True)
+    colors = grey + (colors - grey) * random.uniform(1 - MAX_SATURATION, 1 + MAX_SATURATION)[:, None, None, None]
+    colors = (colors * tint[..., None, None] * (1 + ramp[:, None])).clamp(1e-4, 1)
+    return colors ** (2 ** random.uniform(-MAX_GAMMA, MAX_GAMMA))[:, None, None, None]
+
+
+def _blur(colors: Tensor, deviations: Tensor) -> Tensor:
+    """Blur each image [B, 3, h, w] by a Gaussian of its own standard deviation [B] px; 0: not at all."""
+    count = len(colors)
+    offsets = torch.arange(-BLUR_RADIUS, BLUR_RADIUS + 1, device=colors.device)
+    kernels = torch.exp(-0.5 * (offsets / deviations.clamp(min=1e-3)[:, None]) ** 2)  # [B, 7]
+    kernels = (kernels / kernels.sum(1, keepdim=True)).repeat_interleave(3, 0)[:, None]  # [3 B, 1, 7]
+    flat = functional.pad(colors.reshape(1, 3 * count, *colors.shape[2:]), (BLUR_RADIUS,) * 4, mode="replicate")
+    flat = functional.conv2d(flat, kernels[:, :, None], groups=3 * count)
+    return functional.conv2d(flat, kernels[..., None], groups=3 * count).reshape(colors.shape)
+
+
+def _rectangles(random: _Random, height: int, width: int) -> Tensor:
+    """bool [B, 1, h, w]: True inside a rectangle, of every second image."""
+    inside, chosen = [], random.some(0.5) > 0
+    for side in (height, width):
+        places = (torch.arange(side, device=random.device) + 0.5) / side
+        inside.append((places - random.uniform(0, 1, 1)).abs() < random.uniform(0.1, MAX_CUT, 1) / 2)
+    return (inside[0][:, :, None] & inside[1][:, None] & chosen[:, None, None])[:, None]

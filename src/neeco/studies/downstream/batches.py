@@ -1,0 +1,150 @@
+"""Batches of training images at a model's input size: which images, when, and as tensors with their targets."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from neeco.studies.downstream.augmentation import Outline, augment, moved
+from neeco.studies.downstream.samples import Example, LeastRecentlyUsed, Sample
+
+Schedule = Literal["balanced", "pool", "finetune", "blend"]
+SCHEDULES: tuple[Schedule, ...] = get_args(Schedule)
+DEFAULT_SCHEDULE: Schedule = "finetune"
+REAL_ALONE_FROM = {"finetune": 0.6, "blend": 0.7}  # of the steps: recorded frames alone from here on
+
+
+@dataclass(frozen=True)
+class TrainingImage:
+    """One image at a model's input size, with its targets. Shrunk by area: a pixel on an edge belongs to both sides."""
+
+    image: np.ndarray  # uint8 [3, h, w]
+    shares: np.ndarray  # uint8 [C, h, w], of 255: each class's share of the pixel's valid area
+    valid: np.ndarray  # uint8 [1, h, w], of 255: the share of the pixel that is learned
+    outlines: tuple[Outline, ...]  # class and float32 [n, 2] corners x, y of its border pixels in [0, 1]
+
+    @property
+    def bytes(self) -> int:
+        """Its size in memory."""
+        arrays = (self.image, self.shares, self.valid, *(points for _, points in self.outlines))
+        return sum(array.nbytes for array in arrays)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Images of one step with their targets, on the model's device."""
+
+    images: Tensor  # [B, 3, h, w] float32 in [0, 1]
+    shares: Tensor  # [B, C + 1, h, w]: of each class, 0 tissue, in each pixel
+    valid: Tensor  # [B, h, w] in [0, 1]: the share of the pixel that is learned
+    outlines: tuple[tuple[Outline, ...], ...]  # of each image, as `TrainingImage` has them
+
+    def boxes(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return each image's boxes [n, 4] (centre x, y, width, height; shares of its sides) and their classes."""
+        return [_boxes(outlines) for outlines in self.outlines]
+
+
+IMAGES: LeastRecentlyUsed[Hashable, TrainingImage] = LeastRecentlyUsed()
+
+
+def training_image(sample: Sample, size: tuple[int, int], classes: int, outlines: bool = False) -> TrainingImage:
+    """The sample at this size (width, height), kept for as long as there is room. outlines: with them, for boxes."""
+    key = (sample.key, size, classes, outlines)
+    return IMAGES.get(key, lambda: shrink(sample.load(), size, classes, outlines), lambda image: image.bytes)
+
+
+def shrink(example: Example, size: tuple[int, int], classes: int, outlines: bool = False) -> TrainingImage:
+    """An example at a model's input size (width, height). classes: how many there are. outlines: with them."""
+    whole = np.stack([example.classes == k + 1 for k in range(classes)], 2).astype(np.float32)  # [H, W, C]
+    if example.coverage is not None:
+        whole = example.coverage[..., None]
+    weight = np.ones(whole.shape[:2], np.float32) if example.valid is None else example.valid.astype(np.float32)
+    shares = cv2.resize(whole * weight[..., None], size, interpolation=cv2.INTER_AREA).reshape(*size[::-1], classes)
+    valid = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+    shares = shares / np.maximum(valid, 1e-6)[..., None]
+    return TrainingImage(
+        np.ascontiguousarray(cv2.resize(example.image, size, interpolation=cv2.INTER_AREA).transpose(2, 0, 1)),
+        np.ascontiguousarray((shares.clip(0, 1) * 255).round().astype(np.uint8).transpose(2, 0, 1)),
+        (valid * 255).round().astype(np.uint8)[None],
+        tuple(example.outlines()) if outlines else (),
+    )
+
+
+def collate(images: Sequence[TrainingImage], device: torch.device, rng: torch.Generator | None = None) -> Batch:
+    """The batch of these images; rng (of that device): strongly augmented at random by it."""
+    fields = ("image", "shares", "valid")
+    arrays = [np.stack([getattr(item, name) for item in images]) for name in fields]
+    count = arrays[1].shape[1]
+    planes = torch.from_numpy(np.concatenate(arrays, 1)).to(device).float() / 255  # [B, 3 + C + 1, h, w]
+    outlines = [item.outlines for item in images]
+    if rng is not None:
+        planes, matrices = augment(planes, rng)
+        if any(outlines):
+            placed = zip(outlines, matrices.double().cpu().numpy(), strict=True)
+            outlines = [moved(some, matrix) for some, matrix in placed]
+    shares = planes[:, 3 : 3 + count]
+    tissue = 1 - shares.sum(1, keepdim=True)
+    colors = planes[:, :3].contiguous(memory_format=torch.channels_last)
+    return Batch(colors, torch.cat([tissue, shares], 1), planes[:, -1], tuple(outlines))
+
+
+def _boxes(outlines: Sequence[Outline]) -> tuple[np.ndarray, np.ndarray]:
+    ends = np.array([(*points.min(0), *points.max(0)) for _, points in outlines], np.float64).reshape(-1, 4)
+    boxes = np.concatenate([(ends[:, :2] + ends[:, 2:]) / 2, ends[:, 2:] - ends[:, :2]], 1)
+    return boxes, np.array([number for number, _ in outlines], np.int64)
+
+
+class BatchSampler:
+    """Draws samples from sources without end. A source is shuffled anew after each pass.
+
+    sources: recorded frames where there are any, then the synthetic ones, of whom each has an equal share. schedule:
+    when which are drawn, where there are both. `balanced`: recorded and synthetic ones in turn. `pool`: all from one
+    pool. `finetune`: synthetic ones, then recorded ones alone. `blend`: in turn, then recorded ones alone. The seed
+    decides the order. augmented: whether a batch is to be strongly augmented.
+    """
+
+    def __init__(
+        self,
+        real: Sequence[Sample],
+        synthetic: Sequence[Sequence[Sample]] = (),
+        *,
+        seed: int,
+        schedule: Schedule = DEFAULT_SCHEDULE,
+        augmented: bool = False,
+    ) -> None:
+        self.sources = [source for source in (real, *synthetic) if source]
+        self.schedule = schedule if real and len(self.sources) > 1 else None
+        self.augmented = augmented
+        self.rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
+        self._orders = [self._shuffled(source) for source in self.sources]
+        self._pool = self._shuffled([sample for source in self.sources for sample in source])
+        self._drawn = [0, 0]  # from all, from the synthetic ones
+
+    def draw(self, count: int, done: float) -> list[Sample]:
+        """Return the next `count` samples. done: share of the training that is done, in [0, 1]."""
+        return [next(self._next_source(done)) for _ in range(count)]
+
+    def _next_source(self, done: float) -> Iterator[Sample]:
+        """The source whose turn it is."""
+        turn = self._drawn[0]
+        self._drawn[0] += 1
+        if self.schedule is None:
+            return self._orders[turn % len(self._orders)]
+        if self.schedule == "pool":
+            return self._pool
+        alone = done >= REAL_ALONE_FROM.get(self.schedule, 2.0)
+        if alone or (self.schedule != "finetune" and turn % 2 == 0):
+            return self._orders[0]
+        self._drawn[1] += 1
+        return self._orders[1 + self._drawn[1] % (len(self._orders) - 1)]
+
+    def _shuffled(self, source: Sequence[Sample]) -> Iterator[Sample]:
+        while True:
+            for index in self.rng.permutation(len(source)).tolist():
+                yield source[index]

@@ -1,0 +1,89 @@
+"""Cut-and-paste: whole instruments with their labels over images without one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from downstream_world import save_rgb
+
+from neeco.capture import read_capture
+from neeco.errors import NeecoError
+from neeco.studies.downstream.paste import Backgrounds, covered, filled, pasted_samples
+from neeco.studies.downstream.samples import RecordedSample, recorded_samples
+
+
+@pytest.fixture(scope="module")
+def labelled(recorded: Path) -> tuple[RecordedSample, ...]:
+    return recorded_samples(read_capture(recorded), "train", "parts")
+
+
+def test_pasted_instruments_are_whole_frames_labels_over_other_pixels(labelled, tmp_path: Path) -> None:
+    save_rgb(tmp_path / "plain" / "a.png", np.full((20, 30, 3), (7, 200, 7)))  # of another size than the frames
+    for sample in pasted_samples(labelled, tmp_path / "plain", 0, 12):
+        example = sample.load()
+        assert example.image.shape == (40, 48, 3)
+        assert set(np.unique(example.classes)) <= {0, 1, 2, 3}
+        assert np.array_equal(example.classes > 0, example.instruments > 0)
+        away = ~covered(example)
+        away[:, [0, -1]] = away[[0, -1]] = False
+        assert away.any()
+        assert (
+            np.abs(example.image[away].astype(int) - (7, 200, 7)).max() <= 45
+        )  # the soft edge reaches a little further
+
+
+def test_the_same_number_gives_the_same_pixels_others_differ_and_so_do_seeds(labelled) -> None:
+    one, again, other = (pasted_samples(labelled, None, seed, 3) for seed in (0, 0, 1))
+    images = [sample.load().image for sample in one]
+    assert all(np.array_equal(image, sample.load().image) for image, sample in zip(images, again, strict=True))
+    assert not np.array_equal(images[0], images[1])
+    assert not np.array_equal(images[0], other[0].load().image)
+    assert one[0].key == again[0].key
+    assert len({one[0].key, one[1].key, other[0].key, pasted_samples(labelled[:3], None, 0, 1)[0].key}) == 4
+
+
+def test_without_backgrounds_instruments_are_filled_in(labelled) -> None:
+    backgrounds = Backgrounds(labelled)
+    for index, sample in enumerate(labelled):
+        example = sample.load()
+        made, hole = backgrounds.image(index, (48, 40)), covered(example)
+        assert np.array_equal(made[~hole], example.image[~hole])
+        assert not np.array_equal(made[hole], example.image[hole])
+
+
+def test_a_hole_takes_what_is_behind_it_where_that_is_known() -> None:
+    image, hole = np.full((30, 40, 3), 90, np.uint8), np.zeros((30, 40), bool)
+    hole[5:20, 10:30] = True
+    image[hole] = 250
+    plate = np.full((30, 40, 3), 40, np.uint8)
+    plate[:12] = 0  # never seen
+    made = filled(image, hole, plate)
+    assert (made[hole & plate.any(2)] == 40).all()
+    assert (made[6:10, 12:28] < 120).all()  # inpainted from around it
+    assert np.array_equal(filled(image, ~hole & False), image)
+    assert np.abs(filled(image, hole)[hole].astype(int) - 90).max() < 5
+
+
+def test_a_still_cameras_background_is_the_median_of_frames_that_show_it(labelled) -> None:
+    camera = labelled[0].frame.camera
+    still = tuple(replace(sample, frame=replace(sample.frame, camera=camera)) for sample in labelled)
+    examples = [sample.load() for sample in still]
+    shown = np.stack([~covered(example) for example in examples])
+    images = np.stack([example.image for example in examples]).astype(float)
+    made, hole = Backgrounds(still).image(0, (48, 40)), covered(examples[0])
+    row, column = np.argwhere(hole & shown.any(0))[0]
+    median = np.median(images[shown[:, row, column], row, column], axis=0)
+    assert made[row, column] == pytest.approx(median, abs=0.5)
+    moving = Backgrounds(labelled).image(0, (48, 40))
+    assert not np.array_equal(made[hole], moving[hole])
+
+
+def test_a_folder_without_images_is_refused(labelled, tmp_path: Path) -> None:
+    with pytest.raises(NeecoError, match=r"--backgrounds .*nowhere: no such folder"):
+        pasted_samples(labelled, tmp_path / "nowhere", 0)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(NeecoError, match=r"--backgrounds .*empty: has no image"):
+        pasted_samples(labelled, tmp_path / "empty", 0)
