@@ -128,16 +128,14 @@ class Appearance:
     def of(self, layers: Layers) -> Tensor:
         """The image [H, W, 3] of these layers in this appearance."""
         share = layers.share.clamp(min=MIN_SHARE)[..., None].numpy()
-        alone, background = np.clip(layers.instruments.numpy() / share, 0, 1), layers.tissue
+        alone = np.clip(layers.instruments.numpy() / share, 0, 1)
         if self.tone is not None:
             alone = self.tone(alone)
         if self.background is not None:
-            background = self.background
-            here, own = (srgb_to_linear(image.numpy()).mean((0, 1)) + DARK for image in (background, layers.tissue))
+            here, own = (srgb_to_linear(x.numpy()).mean((0, 1)) + DARK for x in (self.background, layers.tissue))
             gains = np.clip((here / own) ** self.adaptation, *ADAPTATION_RANGE)
             alone = linear_to_srgb(srgb_to_linear(alone) * gains)
-        instruments = torch.from_numpy((alone * share).astype(np.float32))
-        return replace(layers, instruments=instruments).over(background)
+        return replace(layers, instruments=torch.from_numpy((alone * share).astype(np.float32))).over(self.background)
 
 
 AS_RECORDED = Appearance()
@@ -166,15 +164,18 @@ ALL_AS_RECORDED = Appearances(None, 0.0)
 
 @dataclass(frozen=True)
 class Layers:
-    """A rendering taken apart: image = instruments + (1 - share) * shadow * tissue, but for light that is clipped."""
+    """A rendering taken apart: image = instruments + behind; behind is about (1 - share) * shadow * tissue."""
 
     instruments: Tensor  # [H, W, 3] in [0, 1], times their share of the pixel
     share: Tensor  # [H, W] in [0, 1], of instruments in a pixel
     shadow: Tensor  # [H, W] share of the light that the instruments' shadow leaves on the tissue
-    tissue: Tensor  # [H, W, 3] in [0, 1], without shadow
+    behind: Tensor  # [H, W, 3] in [0, 1], what the pixels show beside instruments
+    tissue: Tensor  # [H, W, 3] in [0, 1], without instruments and shadow
 
-    def over(self, background: Tensor) -> Tensor:
-        """The image [H, W, 3] over another `background` [H, W, 3]."""
+    def over(self, background: Tensor | None) -> Tensor:
+        """The image [H, W, 3] over a `background` [H, W, 3]; None: over the tissue, as rendered."""
+        if background is None:
+            return (self.instruments + self.behind).clamp(0, 1)
         return (self.instruments + ((1 - self.share) * self.shadow)[..., None] * background).clamp(0, 1)
 
 
@@ -190,12 +191,14 @@ def split(gaussians: Gaussians, owners: Tensor, camera: Camera, image: Tensor, s
     black[of_tissue] = 0
     black[of_tissue, 0] = -0.5 / SH_C0
     instruments = rasterize(replace(gaussians, sh=black, background=None), camera).color.clamp(0, 1).cpu()
+    instruments = instruments * (share > 0)[..., None]  # components that are not labelled stay behind
     tissue = rasterize(gaussians.select(of_tissue), camera).color.clamp(0, 1).cpu()
     clear = ((1 - share) * (share < CLEAR_TISSUE)).numpy()
-    shadowed = (image - instruments).clamp(0, 1).mean(2).numpy() * (clear > 0)
+    behind = (image - instruments).clamp(0, 1)
     lit = tissue.mean(2).numpy() * clear
-    ratio = (_smoothed(shadowed) + 1e-3) / (_smoothed(lit) + 1e-3)
-    return Layers(instruments, share, torch.from_numpy(np.clip(ratio, *SHADOW_RANGE).astype(np.float32)), tissue)
+    ratio = (_smoothed(behind.mean(2).numpy() * (clear > 0)) + DARK) / (_smoothed(lit) + DARK)
+    shadow = torch.from_numpy(np.clip(ratio, *SHADOW_RANGE).astype(np.float32))
+    return Layers(instruments, share, shadow, behind, tissue)
 
 
 def _smoothed(plane: np.ndarray) -> np.ndarray:
