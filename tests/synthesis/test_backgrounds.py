@@ -20,7 +20,7 @@ from neeco.errors import NeecoError
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene import GaussianScene
-from neeco.synthesis.backgrounds import Appearance, Backgrounds, Layers, split
+from neeco.synthesis.backgrounds import Appearance, ImageFolder, Layers, split
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import SampleGenerator
 from neeco.synthesis.settings import Settings
@@ -93,6 +93,27 @@ def test_half_of_the_images_show_a_background_and_half_other_light_and_labels_st
     assert kinds == {(source, relit) for source in ("0.png", None) for relit in (False, True)}
 
 
+def test_half_of_the_images_take_on_the_colours_of_other_frames_and_labels_stay(
+    scene: GaussianScene, tmp_path: Path
+) -> None:
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    colors = np.random.default_rng(0).uniform([0.1, 0.3, 0.2], [0.3, 0.9, 0.4], (60, 80, 3))
+    colors[:, :20] = 0  # a border
+    Image.fromarray((colors * 255).astype(np.uint8)).save(folder / "a.png")
+    plain, matched = (SampleGenerator.of(scene, replace(SETTINGS, match_colors=given)) for given in (None, str(folder)))
+    changed = 0
+    for index in range(10):
+        own, other = plain.draw(index).drawing, matched.draw(index).drawing
+        assert torch.equal(own.parts, other.parts)
+        if torch.equal(own.image, other.image):
+            continue
+        changed += 1
+        assert other.image.mean((0, 1)).numpy() == pytest.approx(np.array([0.2, 0.6, 0.3]), abs=0.05)
+        assert float(other.image[..., 1].std()) == pytest.approx(0.17, abs=0.05)
+    assert 0 < changed < 10
+
+
 def test_instruments_take_on_the_light_of_the_background(scene: GaussianScene) -> None:
     layers, _, share = layers_of(scene)
     dark, inside = layers.tissue * 0.5, share > 0.99
@@ -115,7 +136,7 @@ def test_crops_keep_the_shape_of_images_of_any_size(tmp_path: Path) -> None:
     folder = tmp_path / "wide"
     folder.mkdir()
     Image.fromarray(np.repeat(np.tile(ramp, (50, 1))[..., None], 3, 2)).save(folder / "a.png")
-    backgrounds = Backgrounds.of(folder)
+    backgrounds = ImageFolder.of(str(folder), "backgrounds")
     for width, height in ((40, 40), (200, 100), (20, 10)):
         image = backgrounds.crop(0, np.random.default_rng(1), width, height)
         assert image.shape == (height, width, 3)
@@ -149,14 +170,14 @@ def test_a_wrong_folder_is_told_in_a_line(tmp_path: Path) -> None:
         ("broken", "a.png"),
     ):
         with pytest.raises(NeecoError, match=told) as error:
-            Backgrounds.of(tmp_path / name)
+            ImageFolder.of(str(tmp_path / name), "backgrounds")
         assert "\n" not in str(error.value)
 
 
 def test_another_process_gets_the_backgrounds_with_the_scene(tmp_path: Path) -> None:
     folder = folder_of(tmp_path / "plates", (0, 200, 0), (0, 0, 200))
     ball = ball_scene("ball", [(-8, 0, 55), (4, 2, 60)])
-    images = LabelledImages(ball, 4, seed=3, tissue_tolerance_mm=2.0, backgrounds=folder)
+    images = LabelledImages(ball, 4, seed=3, tissue_tolerance_mm=2.0, backgrounds=folder, match_colors=folder)
     sent, own = pickle.loads(pickle.dumps(images)), [images[k]["image"] for k in range(4)]
     shutil.rmtree(folder)
     assert all(torch.equal(sent[k]["image"], image) for k, image in enumerate(own))

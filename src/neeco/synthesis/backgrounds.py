@@ -1,7 +1,7 @@
-"""Appearances of another operation: instruments over images of its tissue, in other light.
+"""Appearances of another operation: instruments over images of its tissue, in other light, in its frames' colours.
 
-Half of the images of a data set keep the scene's tissue, and some its instruments' colours: what is rendered is learned
-as well as what replaces it.
+Half of the images of a data set keep the scene's tissue, half its colours, and some its instruments' light: what is
+rendered is learned as well as what replaces it.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from neeco.raster import rasterize
 from neeco.raster.reference import SH_C0
 from neeco.raster.types import Gaussians
 from neeco.synthesis.camera_effects import linear_to_srgb, srgb_to_linear
+from neeco.synthesis.settings import Settings
 
 MIN_CROP = 0.7  # of the largest crop of the wanted shape: sides of the smallest
 MIN_SIDE_PX = 32  # of an image: smaller ones are icons
@@ -31,40 +32,46 @@ CACHED_IMAGES = 64  # decoded
 MIN_SHARE = 0.02  # of a pixel: of less, an instrument's colour is not known
 SHADOW_BLUR_PX = 1.5  # standard deviation, of the shadow that is found at the instrument's edge
 CLEAR_TISSUE = 0.5  # share of tissue in a pixel from which the shadow on it is measured
-REPLACED = 0.5  # share of the images that show a background
+REPLACED = 0.5  # share of the images that show a background, and of those with the colours of other frames
+BORDER = 12 / 255  # brightest channel of an endoscope's black border
 MAX_STOPS = 1.0  # of the instruments' exposure, either way
 MAX_TINT = 0.2  # natural logarithm of a colour gain, either way
 MAX_SATURATION = 0.3  # change of the saturation, either way
 MAX_CONTRAST = 0.3  # natural logarithm of the exponent on the stored image, either way
 DARK = 1e-3  # of white: no mean light is taken to be less
-ADAPTATION_RANGE = (0.25, 4.0)  # of the instruments' gains
+ADAPTATION_RANGE = (0.25, 4.0)  # of gains that follow from other images
 SHADOW_RANGE = (0.2, 1.1)  # of the light that a shadow leaves; above 1: errors of the renderings
 
 
 @dataclass(frozen=True)
-class Backgrounds:
-    """Image files that show tissue without an instrument."""
+class ImageFolder:
+    """Images of another operation."""
 
     files: tuple[Path, ...]
 
     @classmethod
-    def of(cls, folder: Path) -> Backgrounds:
-        """The images in a folder, in the order of their names. Raises NeecoError where there is none, or one is too
-        small or cannot be read."""
-        if not folder.is_dir():
-            raise NeecoError(f"--backgrounds: {folder}: no such folder; give one with images without an instrument")
-        files = tuple(file for file in sorted(folder.iterdir()) if file.suffix in EXTENSIONS and file.name[0] != ".")
+    def of(cls, folder: str, option: str) -> ImageFolder:
+        """The images in a folder that a command line's option names, in the order of their names. Raises NeecoError
+        where there is none, or one is too small or cannot be read."""
+        place = Path(folder)
+        if not place.is_dir():
+            raise NeecoError(f"--{option}: {folder}: no such folder; give one with images of another operation")
+        files = tuple(file for file in sorted(place.iterdir()) if file.suffix in EXTENSIONS and file.name[0] != ".")
         if not files:
-            raise NeecoError(f"--backgrounds: {folder}: has no image; give .png or .jpg files without an instrument")
+            raise NeecoError(f"--{option}: {folder}: has no image; give .png or .jpg files")
         for file in files:
             if min(image_size(file)) < MIN_SIDE_PX:
-                raise NeecoError(f"--backgrounds: {file}: is smaller than {MIN_SIDE_PX} px; leave it out")
+                raise NeecoError(f"--{option}: {file}: is smaller than {MIN_SIDE_PX} px; leave it out")
         return cls(files)
 
     def digest(self) -> str:
         """SHA-256 of the files' content, in order."""
         content = b"".join(hashlib.sha256(file.read_bytes()).digest() for file in self.files)
         return hashlib.sha256(content).hexdigest()
+
+    def colors(self, number: int) -> Colors:
+        """The colours of an image. Raises NeecoError where the file cannot be read."""
+        return _colors_of_file(self.files[number])
 
     def crop(self, number: int, rng: Generator, width: int, height: int) -> np.ndarray:
         """Sample a background, float32 [height, width, 3] in [0, 1]: a random crop of an image, perhaps mirrored,
@@ -83,6 +90,33 @@ class Backgrounds:
 @lru_cache(maxsize=CACHED_IMAGES)
 def _decoded(file: Path) -> np.ndarray:
     return read_image_bytes(file).numpy()
+
+
+@dataclass(frozen=True)
+class Colors:
+    """Mean [3] and standard deviation [3] of the stored colours of an image, without its black border."""
+
+    mean: np.ndarray
+    deviation: np.ndarray
+
+    @classmethod
+    def of(cls, image: np.ndarray) -> Colors:
+        """Those of an image [H, W, 3] in [0, 1]."""
+        shown = image[image.max(2) > BORDER]
+        if not len(shown):
+            shown = image.reshape(-1, 3)
+        return cls(shown.mean(0), shown.std(0))
+
+    def given_to(self, image: np.ndarray) -> np.ndarray:
+        """An image [H, W, 3] with these colours (Reinhard et al., "Color transfer between images", 2001, in RGB)."""
+        own = Colors.of(image)
+        gains = np.clip(self.deviation / np.maximum(own.deviation, DARK), *ADAPTATION_RANGE)
+        return np.clip((image - own.mean) * gains + self.mean, 0, 1).astype(np.float32)
+
+
+@lru_cache(maxsize=4096)
+def _colors_of_file(file: Path) -> Colors:
+    return Colors.of(read_image_bytes(file).numpy().astype(np.float32) / 255)
 
 
 @dataclass(frozen=True)
@@ -109,7 +143,7 @@ class Tone:
 
 @dataclass(frozen=True)
 class Appearance:
-    """A background, the name of its file, and the light on the instruments over it; None: as recorded.
+    """A background, the name of its file, the light on the instruments over it, and colours; None: as recorded.
 
     The background's mean light differs from that of the scene's tissue by its tissue, and by camera and lamps, which
     change instruments as well: these are multiplied, in each colour channel, by the ratio to the power of `adaptation`.
@@ -119,11 +153,16 @@ class Appearance:
     background: Tensor | None = None  # [H, W, 3] in [0, 1]
     adaptation: float = 0.0  # in [0, 1]
     tone: Tone | None = None
+    colors: Colors | None = None
 
     @property
-    def as_recorded(self) -> bool:
-        """Whether nothing is replaced."""
-        return self.background is None and self.tone is None
+    def of_layers(self) -> bool:
+        """Whether tissue or instruments change apart from each other."""
+        return self.background is not None or self.tone is not None
+
+    def matched(self, image: Tensor) -> Tensor:
+        """The image [H, W, 3] in the colours."""
+        return image if self.colors is None else torch.from_numpy(self.colors.given_to(image.numpy()))
 
     def of(self, layers: Layers) -> Tensor:
         """The image [H, W, 3] of these layers in this appearance."""
@@ -145,21 +184,34 @@ AS_RECORDED = Appearance()
 class Appearances:
     """The appearances of a data set. relit: share of its images whose instruments have another tone."""
 
-    backgrounds: Backgrounds | None
-    relit: float
+    backgrounds: ImageFolder | None = None
+    relit: float = 0.0
+    frames: ImageFolder | None = None  # whose colours half of the images take on
+
+    @classmethod
+    def of(cls, settings: Settings) -> Appearances:
+        """Those that settings describe. Raises NeecoError for a folder without images."""
+        folders = {
+            option: None if folder is None else ImageFolder.of(folder, option)
+            for option, folder in settings.image_folders().items()
+        }
+        return cls(folders["backgrounds"], settings.relight_share, folders["match-colors"])
 
     def draw(self, rng: Generator, width: int, height: int) -> Appearance:
         """Sample the appearance of an image. Raises NeecoError where a background cannot be read."""
-        replaced, lit, adaptation, place = rng.random(4)
-        tone = Tone.draw(rng) if lit < self.relit else None
+        replaced, lit, adaptation, place, matched, frame = rng.random(6)
+        found = Appearance(tone=Tone.draw(rng) if lit < self.relit else None)
+        if self.frames is not None and matched < REPLACED:
+            found = replace(found, colors=self.frames.colors(int(frame * len(self.frames.files))))
         if self.backgrounds is None or replaced >= REPLACED:
-            return Appearance(tone=tone)
+            return found
         number = int(place * len(self.backgrounds.files))
         background = torch.from_numpy(self.backgrounds.crop(number, rng, width, height))
-        return Appearance(self.backgrounds.files[number].name, background, adaptation, tone)
+        source = self.backgrounds.files[number].name
+        return replace(found, source=source, background=background, adaptation=adaptation)
 
 
-ALL_AS_RECORDED = Appearances(None, 0.0)
+ALL_AS_RECORDED = Appearances()
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from neeco.labels.drawing import MAX_UNOBSERVED, LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.scene.io import load_gaussians
-from neeco.synthesis.backgrounds import ALL_AS_RECORDED, AS_RECORDED, Appearance, Appearances, Backgrounds, split
+from neeco.synthesis.backgrounds import ALL_AS_RECORDED, AS_RECORDED, Appearance, Appearances, split
 from neeco.synthesis.camera_effects import (
     CameraEffects,
     MixedMotion,
@@ -159,7 +159,6 @@ class SampleGenerator:
         if settings.camera_effects is not None:
             effects = read_effects(Path(settings.camera_effects))
             motion = _motion(tissue, instrument_scenes, settings) if effects.moves else None
-        backgrounds = None if settings.backgrounds is None else Backgrounds.of(Path(settings.backgrounds))
         tolerance = settings.tissue_tolerance_mm if settings.tissue_check else None
         if settings.tissue_check and tolerance is None:
             tolerance = find_tolerance(scene, labeller)
@@ -174,7 +173,7 @@ class SampleGenerator:
             motion=motion,
             gains=gains,
             cameras=cameras,
-            appearances=Appearances(backgrounds, settings.relight_share),
+            appearances=Appearances.of(settings),
         )
 
     def draw(self, index: int) -> LabelledSample:
@@ -187,8 +186,7 @@ class SampleGenerator:
         effects = {} if self.effects is None else self.effects.draw(rng)
         drawing, refused = self._first_acceptable(index, effects)
         appearance = self._appearance(index, drawing)
-        if not appearance.as_recorded:
-            drawing = self._with(drawing, appearance)
+        drawing = self._with(drawing, appearance)
         labels = annotate(self.scene, drawing, self.labeller.names)
         facts: dict[str, Any] = {} if self.effects is None else {"camera_effects": effects}
         if self.appearances.backgrounds is not None:
@@ -233,10 +231,11 @@ class SampleGenerator:
     @torch.no_grad()
     def _image(self, state: State, camera: Camera, image: Tensor, share: Tensor, appearance: Appearance) -> Tensor:
         """The rendered `image` of a state, with its share of instruments, in an appearance."""
-        if appearance.as_recorded:
-            return image
-        gaussians = self.scene.at(state)
-        return appearance.of(split(gaussians, self.labeller.owners(state, gaussians), camera, image, share))
+        if appearance.of_layers:
+            gaussians = self.scene.at(state)
+            owners = self.labeller.owners(state, gaussians)
+            image = appearance.of(split(gaussians, owners, camera, image, share))
+        return appearance.matched(image)
 
     def _through_camera(
         self,

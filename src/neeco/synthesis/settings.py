@@ -158,6 +158,8 @@ class Settings(ImageSettings):
     relight: float | None = None
     """Share of the images whose instruments have another exposure, colour, saturation and contrast; 0.5 with
     --backgrounds, else 0, when not given."""
+    match_colors: str | None = None
+    """Folder of frames of the next operation, with instruments or without: half of the set takes on their colours."""
     max_attempts: int = 50
     """How often to sample a state anew when it is refused."""
 
@@ -203,6 +205,10 @@ class Settings(ImageSettings):
     def relight_share(self) -> float:
         """`relight`, or its default."""
         return self.relight if self.relight is not None else RELIGHT_SHARE if self.backgrounds else 0.0
+
+    def image_folders(self) -> dict[str, str | None]:
+        """Return the folders of images of another operation, by option."""
+        return {"backgrounds": self.backgrounds, "match-colors": self.match_colors}
 
     def identity(self) -> dict[str, Any]:
         """Return the settings that must stay the same for a data set to be continued, other than `image_identity`: all
