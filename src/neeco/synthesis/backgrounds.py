@@ -1,0 +1,202 @@
+"""Appearances of another operation: instruments over images of its tissue, in other light.
+
+Half of the images of a data set keep the scene's tissue, and some its instruments' colours: what is rendered is learned
+as well as what replaces it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.random import Generator
+from torch import Tensor
+
+from neeco.capture.images import EXTENSIONS, image_size, read_image_bytes
+from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
+from neeco.raster import rasterize
+from neeco.raster.reference import SH_C0
+from neeco.raster.types import Gaussians
+from neeco.synthesis.camera_effects import linear_to_srgb, srgb_to_linear
+
+MIN_CROP = 0.7  # of the largest crop of the wanted shape: sides of the smallest
+MIN_SIDE_PX = 32  # of an image: smaller ones are icons
+CACHED_IMAGES = 64  # decoded
+MIN_SHARE = 0.02  # of a pixel: of less, an instrument's colour is not known
+SHADOW_BLUR_PX = 1.5  # standard deviation, of the shadow that is found at the instrument's edge
+CLEAR_TISSUE = 0.5  # share of tissue in a pixel from which the shadow on it is measured
+REPLACED = 0.5  # share of the images that show a background
+MAX_STOPS = 1.0  # of the instruments' exposure, either way
+MAX_TINT = 0.2  # natural logarithm of a colour gain, either way
+MAX_SATURATION = 0.3  # change of the saturation, either way
+MAX_CONTRAST = 0.3  # natural logarithm of the exponent on the stored image, either way
+DARK = 1e-3  # of white: no mean light is taken to be less
+ADAPTATION_RANGE = (0.25, 4.0)  # of the instruments' gains
+SHADOW_RANGE = (0.2, 1.1)  # of the light that a shadow leaves; above 1: errors of the renderings
+
+
+@dataclass(frozen=True)
+class Backgrounds:
+    """Image files that show tissue without an instrument."""
+
+    files: tuple[Path, ...]
+
+    @classmethod
+    def of(cls, folder: Path) -> Backgrounds:
+        """The images in a folder, in the order of their names. Raises NeecoError where there is none, or one is too
+        small or cannot be read."""
+        if not folder.is_dir():
+            raise NeecoError(f"--backgrounds: {folder}: no such folder; give one with images without an instrument")
+        files = tuple(file for file in sorted(folder.iterdir()) if file.suffix in EXTENSIONS and file.name[0] != ".")
+        if not files:
+            raise NeecoError(f"--backgrounds: {folder}: has no image; give .png or .jpg files without an instrument")
+        for file in files:
+            if min(image_size(file)) < MIN_SIDE_PX:
+                raise NeecoError(f"--backgrounds: {file}: is smaller than {MIN_SIDE_PX} px; leave it out")
+        return cls(files)
+
+    def digest(self) -> str:
+        """SHA-256 of the files' content, in order."""
+        content = b"".join(hashlib.sha256(file.read_bytes()).digest() for file in self.files)
+        return hashlib.sha256(content).hexdigest()
+
+    def crop(self, number: int, rng: Generator, width: int, height: int) -> np.ndarray:
+        """Sample a background, float32 [height, width, 3] in [0, 1]: a random crop of an image, perhaps mirrored,
+        resized. Raises NeecoError where the file cannot be read."""
+        image = _decoded(self.files[number])
+        rows, columns = image.shape[:2]
+        scale = rng.uniform(MIN_CROP, 1) * min(columns / width, rows / height)
+        size = max(1, int(scale * width)), max(1, int(scale * height))
+        left, top = (int(rng.integers(whole - part + 1)) for whole, part in zip((columns, rows), size, strict=True))
+        crop = image[top : top + size[1], left : left + size[0]]
+        crop = crop[:: rng.choice((1, -1)), :: rng.choice((1, -1))]
+        way = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
+        return cv2.resize(np.ascontiguousarray(crop), (width, height), interpolation=way).astype(np.float32) / 255
+
+
+@lru_cache(maxsize=CACHED_IMAGES)
+def _decoded(file: Path) -> np.ndarray:
+    return read_image_bytes(file).numpy()
+
+
+@dataclass(frozen=True)
+class Tone:
+    """Other light and camera: gains [3] of linear light, saturation, and exponent on the stored image."""
+
+    gains: np.ndarray
+    saturation: float
+    exponent: float
+
+    @classmethod
+    def draw(cls, rng: Generator) -> Tone:
+        """Sample one."""
+        gains = 2 ** rng.uniform(-MAX_STOPS, MAX_STOPS) * np.exp(rng.uniform(-MAX_TINT, MAX_TINT, 3))
+        saturation = 1 + rng.uniform(-MAX_SATURATION, MAX_SATURATION)
+        return cls(gains, saturation, float(np.exp(rng.uniform(-MAX_CONTRAST, MAX_CONTRAST))))
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """Stored image [H, W, 3] as this camera stores it."""
+        stored = linear_to_srgb(srgb_to_linear(image) * self.gains)
+        grey = stored.mean(2, keepdims=True)
+        return np.clip(grey + self.saturation * (stored - grey), 0, 1) ** np.float32(self.exponent)
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """A background, the name of its file, and the light on the instruments over it; None: as recorded.
+
+    The background's mean light differs from that of the scene's tissue by its tissue, and by camera and lamps, which
+    change instruments as well: these are multiplied, in each colour channel, by the ratio to the power of `adaptation`.
+    """
+
+    source: str | None = None
+    background: Tensor | None = None  # [H, W, 3] in [0, 1]
+    adaptation: float = 0.0  # in [0, 1]
+    tone: Tone | None = None
+
+    @property
+    def as_recorded(self) -> bool:
+        """Whether nothing is replaced."""
+        return self.background is None and self.tone is None
+
+    def of(self, layers: Layers) -> Tensor:
+        """The image [H, W, 3] of these layers in this appearance."""
+        share = layers.share.clamp(min=MIN_SHARE)[..., None].numpy()
+        alone, background = np.clip(layers.instruments.numpy() / share, 0, 1), layers.tissue
+        if self.tone is not None:
+            alone = self.tone(alone)
+        if self.background is not None:
+            background = self.background
+            here, own = (srgb_to_linear(image.numpy()).mean((0, 1)) + DARK for image in (background, layers.tissue))
+            gains = np.clip((here / own) ** self.adaptation, *ADAPTATION_RANGE)
+            alone = linear_to_srgb(srgb_to_linear(alone) * gains)
+        instruments = torch.from_numpy((alone * share).astype(np.float32))
+        return replace(layers, instruments=instruments).over(background)
+
+
+AS_RECORDED = Appearance()
+
+
+@dataclass(frozen=True)
+class Appearances:
+    """The appearances of a data set. relit: share of its images whose instruments have another tone."""
+
+    backgrounds: Backgrounds | None
+    relit: float
+
+    def draw(self, rng: Generator, width: int, height: int) -> Appearance:
+        """Sample the appearance of an image. Raises NeecoError where a background cannot be read."""
+        replaced, lit, adaptation, place = rng.random(4)
+        tone = Tone.draw(rng) if lit < self.relit else None
+        if self.backgrounds is None or replaced >= REPLACED:
+            return Appearance(tone=tone)
+        number = int(place * len(self.backgrounds.files))
+        background = torch.from_numpy(self.backgrounds.crop(number, rng, width, height))
+        return Appearance(self.backgrounds.files[number].name, background, adaptation, tone)
+
+
+ALL_AS_RECORDED = Appearances(None, 0.0)
+
+
+@dataclass(frozen=True)
+class Layers:
+    """A rendering taken apart: image = instruments + (1 - share) * shadow * tissue, but for light that is clipped."""
+
+    instruments: Tensor  # [H, W, 3] in [0, 1], times their share of the pixel
+    share: Tensor  # [H, W] in [0, 1], of instruments in a pixel
+    shadow: Tensor  # [H, W] share of the light that the instruments' shadow leaves on the tissue
+    tissue: Tensor  # [H, W, 3] in [0, 1], without shadow
+
+    def over(self, background: Tensor) -> Tensor:
+        """The image [H, W, 3] over another `background` [H, W, 3]."""
+        return (self.instruments + ((1 - self.share) * self.shadow)[..., None] * background).clamp(0, 1)
+
+
+@torch.no_grad()
+def split(gaussians: Gaussians, owners: Tensor, camera: Camera, image: Tensor, share: Tensor) -> Layers:
+    """Take the rendering `image` [H, W, 3] of posed Gaussians apart, on the CPU.
+
+    owners [N]: -1 tissue, else an instrument; share [H, W]: of instruments in each pixel. The shadow is the smoothed
+    ratio of tissue with the instruments to tissue without them; below these, that of the nearest tissue counts.
+    """
+    of_tissue = owners < 0
+    black = gaussians.sh.clone()
+    black[of_tissue] = 0
+    black[of_tissue, 0] = -0.5 / SH_C0
+    instruments = rasterize(replace(gaussians, sh=black, background=None), camera).color.clamp(0, 1).cpu()
+    tissue = rasterize(gaussians.select(of_tissue), camera).color.clamp(0, 1).cpu()
+    clear = ((1 - share) * (share < CLEAR_TISSUE)).numpy()
+    shadowed = (image - instruments).clamp(0, 1).mean(2).numpy() * (clear > 0)
+    lit = tissue.mean(2).numpy() * clear
+    ratio = (_smoothed(shadowed) + 1e-3) / (_smoothed(lit) + 1e-3)
+    return Layers(instruments, share, torch.from_numpy(np.clip(ratio, *SHADOW_RANGE).astype(np.float32)), tissue)
+
+
+def _smoothed(plane: np.ndarray) -> np.ndarray:
+    return cv2.GaussianBlur(plane, (0, 0), SHADOW_BLUR_PX)
