@@ -37,6 +37,9 @@ of `ingest`). The same command gives the same pixels on the same machine, with a
                      `neeco ingest OUT/recording/plus/recording.yaml`; brings --video
     --lerobot        also recording/lerobot/: the recording as LeRobot data sets v2.1 and v3.0 (needs pyarrow, too),
                      each with a recording.yaml; brings --video
+    --processor P    another endoscope's camera, for tests across recordings: bright (wide, over-exposed, sharpened) or
+                     warm (narrow, dark, soft, noisy); rendered/processor.py has their numbers
+    --plates         also plates/: the training frames without the instrument, backgrounds for `neeco synthesize`
     --still          the scope stands still at the middle of its path; the world is its camera's frame, in which poses
                      are logged, and cameras have no errors
     --base-error MMxDEG
@@ -88,12 +91,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import torch
 from rendered.frames import Settings
 from rendered.motion import THINNINGS
+from rendered.processor import PROCESSORS
 from rendered.render import Lens
 from rendered.scenes import SCENES, SceneSpec
 from rendered.wristed import SlidingDesign
@@ -139,6 +144,8 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
     parser.add_argument("--still", action="store_true", help="the scope stands still")
     parser.add_argument("--base-error", type=_base_error, metavar="MMxDEG", help="of the base that poses are stated in")
     parser.add_argument("--stereo", action="store_true", help="a still scope with two cameras")
+    parser.add_argument("--plates", action="store_true", help="also plates/: frames without the instrument")
+    parser.add_argument("--processor", choices=sorted(PROCESSORS), help="another endoscope's camera")
     parser.add_argument("--workers", type=_count, default=1, metavar="N", help="processes that draw")
     arguments = parser.parse_args(words)
     spec = SCENES[arguments.scene]
@@ -157,8 +164,11 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
     still = arguments.still or arguments.stereo or arguments.base_error is not None
     if still and (arguments.bag or arguments.plus or arguments.lerobot):
         parser.error("--still: bags, PLUS and LeRobot files are of a scope that moves; leave out one of the two")
+    lens = arguments.size
+    if arguments.processor is not None:
+        lens = replace(lens, focal=lens.focal * PROCESSORS[arguments.processor].focal)
     settings = Settings(
-        arguments.size,
+        lens,
         every=arguments.every,
         frames=arguments.frames,
         exact=arguments.exact,
@@ -174,6 +184,8 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
         still=still,
         base_error=arguments.base_error,
         stereo=arguments.stereo,
+        processor=arguments.processor,
+        plates=arguments.plates,
         workers=arguments.workers,
     )
     if still:

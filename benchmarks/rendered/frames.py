@@ -24,6 +24,7 @@ from rendered.detail import Detail, make_detail
 from rendered.hinge import truth_ids
 from rendered.motion import Array, Moment, Trajectory, is_unseen, rigid
 from rendered.optics import Optics
+from rendered.processor import PROCESSORS, Processor
 from rendered.render import Drawing, Lens, Place, draw, shadowed, view_of
 from rendered.scenes import SceneSpec
 from rendered.tissue import ORGANS
@@ -31,6 +32,7 @@ from rendered.tissue import ORGANS
 DEPTH_UNIT_MM, DEPTH_STRIDE, DEPTH_EVERY = 0.05, 2, 4
 # the right camera of a stereo scope: 4.6 mm beside the left one, turned towards what it looks at
 RIGHT_FROM_LEFT = rigid(Rotation.from_rotvec([0.003, -0.035, 0.004]).as_matrix(), np.array([-4.6, 0.05, 0.08]))
+AWAY_MM = 1e3
 Gains = dict[int, tuple[float, float, float]]
 
 
@@ -55,12 +57,15 @@ class Settings:
     still: bool = False  # the scope stands still
     base_error: tuple[float, float] | None = None  # mm and degrees that recording/ is off about a robot's base
     stereo: bool = False  # right/: the images of a second camera beside it
+    plates: bool = False  # plates/: training frames without the instrument
+    processor: str | None = None  # of another endoscope: one of PROCESSORS
     workers: int = 1
 
     @property
     def options(self) -> str:
         """Those of the command line that make these settings, each after a blank."""
-        size = "" if self.lens == Lens() else f" --size {self.lens.width}x{self.lens.height}"
+        side = f"{self.lens.width}x{self.lens.height}"
+        size = "" if side == f"{Lens.width}x{Lens.height}" else f" --size {side}"
         given = [
             (self.detail and not size, " --detail"),
             (self.breathing_mm, f" --breathing {self.breathing_mm:g}"),
@@ -74,11 +79,18 @@ class Settings:
             (self.still and not (self.stereo or self.base_error), " --still"),
             (self.base_error, " --base-error {:g}x{:g}".format(*(self.base_error or (0, 0)))),
             (self.stereo, " --stereo"),
+            (self.plates, " --plates"),
+            (self.processor, f" --processor {self.processor}"),
             (self.every > 1, f" --every {self.every}"),
             (self.frames, f" --frames {self.frames}"),
             (self.exact, " --exact"),
         ]
         return size + "".join(option for wanted, option in given if wanted)
+
+    @property
+    def developing(self) -> Processor:
+        """The processor of the images."""
+        return Processor() if self.processor is None else PROCESSORS[self.processor]
 
     def modes(self, spec: SceneSpec) -> tuple[Mode, ...]:
         """How the tissue moves."""
@@ -141,19 +153,26 @@ class Renderer:
         """Render a frame and write its image, its masks of parts and of the shadow, and its depth."""
         place = moved(self.place, self.settings.modes(self.spec), shot.time)
         drawing = self._draw(place, shot)
-        pixels = _add_noise(drawing.color, np.random.default_rng((self.spec.seed, shot.number)))
+        pixels = self._stored(drawing.color, np.random.default_rng((self.spec.seed, shot.number)))
         _write_jpeg(self.path / image_name(shot), pixels)
         self._write_truth(shot, drawing, shadowed(place, view_of(shot.moment), drawing))
         if self.settings.optics:
             optics = Optics.of(self.settings.lens)
             color = optics.add_border(self._draw(replace(place, lens=optics), shot).color)
-            raw = _add_noise(color, np.random.default_rng((self.spec.seed, shot.number, 1)))
+            raw = self._stored(color, np.random.default_rng((self.spec.seed, shot.number, 1)))
             _write_jpeg(self.path / "raw" / Path(image_name(shot)).name, raw)
+        if self.settings.plates and shot.split == "train":
+            plate = self._stored(self._draw(place, without_instrument(shot)).color, np.random.default_rng(shot.number))
+            _write_jpeg(self.path / "plates" / Path(image_name(shot)).name, plate)
         if self.settings.stereo:
             color = self._draw(seen_from_right(place), beside(shot)).color
-            right = _add_noise(color, np.random.default_rng((self.spec.seed, shot.number, 2)))
+            right = self._stored(color, np.random.default_rng((self.spec.seed, shot.number, 2)))
             _write_jpeg(self.path / right_name(shot), right)
         return Rendered(pixels, drawing)
+
+    def _stored(self, color: Tensor, generator: np.random.Generator) -> Array:
+        processor = self.settings.developing
+        return _add_noise(processor.develop(color) if processor != Processor() else color, processor.noise, generator)
 
     def _draw(self, place: Place, shot: Shot) -> Drawing:
         view, gain = view_of(shot.moment), self.gains.get(shot.number)
@@ -180,6 +199,14 @@ def beside(shot: Shot) -> Shot:
     """A shot as the right camera takes it."""
     camera = shot.moment.scene_from_camera @ np.linalg.inv(RIGHT_FROM_LEFT)
     return replace(shot, moment=replace(shot.moment, scene_from_camera=camera))
+
+
+def without_instrument(shot: Shot) -> Shot:
+    """A shot whose instrument is far behind the camera."""
+    camera = shot.moment.scene_from_camera
+    away = shot.moment.scene_from_mechanical.copy()
+    away[:3, 3] = camera[:3, 3] - AWAY_MM * camera[:3, 2]
+    return replace(shot, moment=replace(shot.moment, scene_from_mechanical=away))
 
 
 def moved(place: Place, modes: tuple[Mode, ...], time: float) -> Place:
@@ -211,10 +238,11 @@ def _render(shot: Shot) -> Rendered:
     return _renderers[0].render(shot)
 
 
-def _add_noise(color: Tensor, generator: np.random.Generator) -> Array:
-    """uint8 [H, W, 3] with the sensor's noise (about 1.5/255, mostly luminance)."""
+def _add_noise(color: Tensor, factor: float, generator: np.random.Generator) -> Array:
+    """uint8 [H, W, 3] with `factor` times the default sensor's noise (about 1.5/255, mostly luminance)."""
     noisy = color.numpy().astype(np.float64)
-    noisy = noisy + generator.normal(0, 1.4 / 255, (*noisy.shape[:2], 1)) + generator.normal(0, 0.6 / 255, noisy.shape)
+    noisy = noisy + generator.normal(0, factor * 1.4 / 255, (*noisy.shape[:2], 1))
+    noisy = noisy + generator.normal(0, factor * 0.6 / 255, noisy.shape)
     return np.clip(np.rint(noisy * 255), 0, 255).astype(np.uint8)
 
 

@@ -32,6 +32,7 @@ from rendered.truth import JOINT, World, truth_document
 
 SEEN, UNSEEN = 230, 45
 Report = Callable[[str], None]
+Gain = tuple[float, float, float]
 
 
 def write_recording(spec: SceneSpec, path: Path, settings: Settings, report: Report) -> None:
@@ -46,6 +47,9 @@ def write_recording(spec: SceneSpec, path: Path, settings: Settings, report: Rep
     exposure = meter(place, trajectory) if settings.exposure else None
     modes = settings.modes(spec)
     gains = {shot.number: exposure.of(shot.number) for shot in shots} if exposure else {}
+    if settings.processor is not None:
+        own = settings.developing.gains
+        gains = {shot.number: _product(gains.get(shot.number, (1.0, 1.0, 1.0)), own) for shot in shots}
     generator = np.random.default_rng(spec.seed + 1)
     sampler = PointSampler(len(shots), generator)
     renderer = Renderer.of(spec, settings, path, place, gains)
@@ -88,6 +92,10 @@ def write_thinned(path: Path) -> None:
         left_out = set(train) - set(kept)
         frames = [frame for frame in document["frames"] if frame["file_path"] not in left_out]
         write_json(path / f"transforms-{len(kept)}.json", document | {"frames": frames})
+
+
+def _product(a: Gain, b: Gain) -> Gain:
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
 def _cpu_seconds() -> float:

@@ -291,3 +291,25 @@ def test_what_cannot_be_slowed_is_refused(benchmarks: ModuleType, options: str) 
         benchmarks.parse(["bowel", "OUT", *options.split()])
     with pytest.raises(SystemExit):
         benchmarks.parse(["bowel-wristed", "OUT", "--exact"])
+
+
+def test_another_processor_gives_other_pixels_of_the_same_frames_and_plates_lack_the_instrument(
+    benchmarks: ModuleType, tmp_path: Path
+) -> None:
+    from rendered.frames import Settings
+    from rendered.scenes import SCENES
+    from rendered.writing import write_recording
+
+    settings = benchmarks.parse(["stomach", "OUT", "--processor", "bright", "--plates"])[2]
+    assert settings.lens.focal < Settings().lens.focal
+    small = Settings(replace(settings.lens, width=WIDTH, height=HEIGHT, focal=54.0), RESOLUTION, every=100, plates=True)
+    for name, processor in (("own", None), ("other", "bright")):
+        write_recording(SCENES["stomach"], tmp_path / name, replace(small, processor=processor), lambda line: None)
+    own, other = (pixels(tmp_path / name / "images/000000.jpg") for name in ("own", "other"))
+    assert other.mean() > 1.15 * own.mean()
+    masks = [(tmp_path / name / "truth/masks/000000.png").read_bytes() for name in ("own", "other")]
+    assert masks[0] == masks[1]
+    instrument = pixels(tmp_path / "own/truth/masks/000000.png") > 0
+    change = np.abs(own - pixels(tmp_path / "own/plates/000000.jpg")).mean(2)
+    assert change[instrument].mean() > 30
+    assert np.median(change[~instrument]) < 4

@@ -22,6 +22,7 @@ from neeco.labels.annotation import keypoint_names
 from neeco.labels.drawing import EDGE_WIDTH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels
 from neeco.registry import plugins
+from neeco.synthesis.backgrounds import ImageFolder
 from neeco.synthesis.camera_effects import read_effects
 from neeco.synthesis.card import write_card
 from neeco.synthesis.generator import (
@@ -105,6 +106,10 @@ def synthesize(
     runs = (run, *instrument_runs)
     scene, *instrument_scenes = (given.scene for given in runs)
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
+    folders = {
+        option.replace("-", "_"): None if folder is None else ImageFolder.of(folder, option).digest()
+        for option, folder in settings.image_folders().items()
+    }
     check_formats(formats, settings)
     recorded = scene.recorded.cameras[0]
     identity = settings.identity() | {
@@ -112,6 +117,7 @@ def synthesize(
         "states_sha256": states_fingerprint(settings.states),
         "similar_views": N_SIMILAR,
         "camera_effects": effects,
+        **folders,
     }
     info = description(run, identity, instrument_runs)
     begun = check_output(output, info, resume)

@@ -16,14 +16,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.random import Generator
+from torch import Tensor
 
-from neeco.capture.model import evenly_spaced
+from neeco.capture.model import State, evenly_spaced
 from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
 from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends
 from neeco.labels.drawing import MAX_UNOBSERVED, LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.scene.io import load_gaussians
+from neeco.synthesis.backgrounds import ALL_AS_RECORDED, AS_RECORDED, Appearance, Appearances, split
 from neeco.synthesis.camera_effects import (
     CameraEffects,
     MixedMotion,
@@ -44,7 +47,8 @@ if TYPE_CHECKING:
     from neeco.scene import GaussianScene
 
 VERB = "synthesize"
-EFFECTS_STREAM = 1  # of an image's random numbers: camera effects do not change which state and view are sampled
+# of an image's random numbers: camera effects and appearances do not change which state and view are sampled
+EFFECTS_STREAM, APPEARANCE_STREAM = 1, 2
 BURIED_SHARE = 0.05  # of an instrument's pixels that may lie deeper than the tolerance: edges are uncertain
 TOLERANCE_RANGE_MM = (2.0, 5.0)  # range of tolerances found from the recording
 N_TOLERANCE_STATES = 12  # recorded states from which the tolerance is found
@@ -126,6 +130,7 @@ class SampleGenerator:
     motion: RecordedMotion | MixedMotion | None = None  # where effects open a shutter
     gains: tuple[tuple[float, float, float], ...] = ()  # by which the colours of each instrument scene were multiplied
     cameras: DrawnCameras = RECORDED_CAMERAS
+    appearances: Appearances = ALL_AS_RECORDED
 
     @classmethod
     def of(
@@ -168,6 +173,7 @@ class SampleGenerator:
             motion=motion,
             gains=gains,
             cameras=cameras,
+            appearances=Appearances.of(settings),
         )
 
     def draw(self, index: int) -> LabelledSample:
@@ -179,9 +185,13 @@ class SampleGenerator:
         rng = np.random.default_rng(np.random.SeedSequence([self.settings.seed, index, EFFECTS_STREAM]))
         effects = {} if self.effects is None else self.effects.draw(rng)
         drawing, refused = self._first_acceptable(index, effects)
+        appearance = self._appearance(index, drawing)
+        drawing = self._with(drawing, appearance)
         labels = annotate(self.scene, drawing, self.labeller.names)
-        facts = {} if self.effects is None else {"camera_effects": effects}
-        return LabelledSample(index, self._through_camera(drawing, effects, rng), labels, refused, facts)
+        facts: dict[str, Any] = {} if self.effects is None else {"camera_effects": effects}
+        if self.appearances.backgrounds is not None:
+            facts["background"] = appearance.source
+        return LabelledSample(index, self._through_camera(drawing, effects, rng, appearance), labels, refused, facts)
 
     def _first_acceptable(self, index: int, effects: Mapping[str, float]) -> tuple[LayeredDrawing, Counter[str]]:
         settings = self.settings
@@ -205,18 +215,48 @@ class SampleGenerator:
             refused,
         )
 
-    def _through_camera(self, drawing: LayeredDrawing, effects: Mapping[str, float], rng: Generator) -> LayeredDrawing:
+    def _appearance(self, index: int, drawing: LayeredDrawing) -> Appearance:
+        rng = np.random.default_rng(np.random.SeedSequence([self.settings.seed, index, APPEARANCE_STREAM]))
+        height, width = drawing.depth.shape
+        return self.appearances.draw(rng, width, height)
+
+    def _with(self, drawing: LayeredDrawing, appearance: Appearance) -> LayeredDrawing:
+        """Return the drawing in another appearance; the depth of a background is unknown."""
+        image = self._image(drawing.state, drawing.camera, drawing.image, drawing.share, appearance)
+        if appearance.background is None:
+            return replace(drawing, image=image)
+        depth = np.where(drawing.parts.numpy() > 0, drawing.depth, 0.0)
+        return replace(drawing, image=image, depth=depth, unobserved=drawing.unobserved * drawing.share)
+
+    @torch.no_grad()
+    def _image(self, state: State, camera: Camera, image: Tensor, share: Tensor, appearance: Appearance) -> Tensor:
+        """The rendered `image` of a state, with its share of instruments, in an appearance."""
+        if appearance.of_layers:
+            gaussians = self.scene.at(state)
+            owners = self.labeller.owners(state, gaussians)
+            image = appearance.of(split(gaussians, owners, camera, image, share))
+        return appearance.matched(image)
+
+    def _through_camera(
+        self,
+        drawing: LayeredDrawing,
+        effects: Mapping[str, float],
+        rng: Generator,
+        appearance: Appearance = AS_RECORDED,
+    ) -> LayeredDrawing:
         """Apply the camera effects; labels stay those of the middle of the exposure."""
         if not effects:
             return drawing
-        drawing = self._motion_blurred(drawing, effects.get("shutter_s", 0.0), rng)
+        drawing = self._motion_blurred(drawing, appearance, effects.get("shutter_s", 0.0), rng)
         if "field_of_view" in effects:
             drawing = _within_circle(drawing, effects["field_of_view"])
         image = apply_effects(drawing.image.numpy(), drawing.depth, effects, rng)
         return replace(drawing, image=torch.from_numpy(np.ascontiguousarray(image)))
 
     @torch.no_grad()
-    def _motion_blurred(self, drawing: LayeredDrawing, shutter_s: float, rng: Generator) -> LayeredDrawing:
+    def _motion_blurred(
+        self, drawing: LayeredDrawing, appearance: Appearance, shutter_s: float, rng: Generator
+    ) -> LayeredDrawing:
         if self.motion is None or shutter_s <= 0:
             return drawing
         assert self.effects is not None
@@ -224,8 +264,11 @@ class SampleGenerator:
         for state, camera in subframes(self.scene, drawing, self.motion(drawing.state, rng), shutter_s):
             gaussians = self.scene.at(state)
             rendering, _, share = self.labeller.draw(gaussians, camera, self.labeller.owners(state, gaussians))
-            images.append(rendering.color.clamp(0, 1).cpu().numpy())
             shares.append(share.clamp(0, 1).cpu())
+            image = rendering.color.clamp(0, 1).cpu()
+            images.append(
+                self._image(state, camera, image, shares[-1], appearance).numpy()
+            )  # a background stands still
         drawing = replace(drawing, image=torch.from_numpy(average_exposure(images)))
         return drawing if self.effects.soft_masks == "mid" else replace(drawing, share=torch.stack(shares).mean(0))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import tempfile
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -19,6 +20,7 @@ from neeco.errors import NeecoError
 from neeco.files import read_bytes, sweep_unfinished, write_atomically
 from neeco.raster.devices import readable_failures
 from neeco.raster.native import threads
+from neeco.synthesis.backgrounds import ImageFolder
 from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_to_folder, limit_threads
 from neeco.synthesis.samplers import states_file
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS
@@ -44,22 +46,32 @@ class PackedSpec:
             paths["effects.yaml"] = Path(spec.settings.camera_effects)
         if spec.settings.states not in SAMPLERS:
             paths["states.jsonl"] = states_file(spec.settings.states)
+        for option, given in spec.settings.image_folders().items():
+            for file in () if given is None else ImageFolder.of(given, option).files:
+                paths[f"{option}/{file.name}"] = file
         files = {name: read_bytes(path, "a scene or settings file") for name, path in paths.items()}
         content = b"".join(hashlib.sha256(files[name]).digest() for name in sorted(files))
         return cls(spec, files, hashlib.sha256(content + repr(spec.settings).encode()).hexdigest())
 
     def open(self) -> SampleGenerator:
         """The generator, from the files' content."""
-        with tempfile.TemporaryDirectory() as folder:
-            return self._unpacked(Path(folder)).open()
+        folder = tempfile.TemporaryDirectory()
+        generator = self._unpacked(Path(folder.name)).open()
+        weakref.finalize(generator, folder.cleanup)  # backgrounds are read when they are needed
+        return generator
 
     def _unpacked(self, folder: Path) -> GeneratorSpec:
         """The same spec, its files in `folder`."""
         for name, content in self.files.items():
+            (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(content)
         settings = self.spec.settings
         if "effects.yaml" in self.files:
             settings = replace(settings, camera_effects=str(folder / "effects.yaml"))
+        if settings.backgrounds is not None:
+            settings = replace(settings, backgrounds=str(folder / "backgrounds"))
+        if settings.match_colors is not None:
+            settings = replace(settings, match_colors=str(folder / "match-colors"))
         if "states.jsonl" in self.files:
             prefix = PATH_PREFIX if settings.states.startswith(PATH_PREFIX) else ""
             settings = replace(settings, states=f"{prefix}{folder / 'states.jsonl'}")

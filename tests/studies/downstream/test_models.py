@@ -103,7 +103,7 @@ def test_dfines_answers_are_boxes_of_each_image_best_first() -> None:
 def test_a_dfine_repeats_bit_for_bit_and_bears_images_without_an_instrument(small_dfine, tmp_path: Path) -> None:
     empty = replace(square(0), classes=np.zeros((64, 64), np.uint8), instruments=np.zeros((64, 64), np.uint8))
     for name in ("one", "two"):
-        feed = BatchSampler([Held(empty), Held(empty), *squares(1)], seed=0)
+        feed = BatchSampler([Held(empty), Held(empty), *squares(1)], seed=0, augmented=True)
         DFine().fit(task_of(tmp_path / name, batches=feed, steps=3))
     first, second = ((tmp_path / name / WEIGHTS_FILE).read_bytes() for name in ("one", "two"))
     assert first == second

@@ -26,6 +26,7 @@ MAX_BLUR = 1.5  # px
 BLUR_RADIUS = 3  # px
 MAX_NOISE = 0.06
 MAX_CUT = 0.35  # of a side
+PLACED, RELIT = 0.5, 0.7  # of the images: turned, zoomed and shifted; with other light and colours
 
 Outline = tuple[int, np.ndarray]
 
@@ -44,7 +45,7 @@ def augment(planes: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
     grid = functional.affine_grid(given_from_made, [count, 1, height, width], align_corners=False)
     planes = functional.grid_sample(planes, grid, align_corners=False)
     colors, labels = planes[:, :3], planes[:, 3:]
-    colors = _relight(colors, random)
+    colors = torch.where(random.some(RELIT)[:, None, None, None] > 0, _relight(colors, random), colors)
     colors = _blur(colors, random.some(0.3) * random.uniform(0.2, MAX_BLUR))
     noise = torch.randn(colors.shape, generator=rng, device=planes.device)
     strength = random.some(0.5) * random.uniform(0, MAX_NOISE)
@@ -87,10 +88,10 @@ class _Random:
 
 def _placements(random: _Random, aspect: float) -> Tensor:
     """[B, 2, 3]: flips, turns, zooms and shifts, as `augment` returns them. aspect: width over height."""
-    turn, zoom = random.uniform(-MAX_TURN, MAX_TURN), MAX_ZOOM ** random.uniform(-1, 1)
-    flip = 1 - 2 * random.some(0.5)
+    placed, flip = random.some(PLACED), 1 - 2 * random.some(0.5)
+    turn, zoom = placed * random.uniform(-MAX_TURN, MAX_TURN), MAX_ZOOM ** (placed * random.uniform(-1, 1))
     cosine, sine = turn.cos() / zoom, turn.sin() / zoom
-    shift = random.uniform(-2 * MAX_SHIFT, 2 * MAX_SHIFT, 2)
+    shift = placed[:, None] * random.uniform(-2 * MAX_SHIFT, 2 * MAX_SHIFT, 2)
     rows = [
         torch.stack([cosine * flip, -sine / aspect, shift[:, 0]], 1),
         torch.stack([sine * aspect * flip, cosine, shift[:, 1]], 1),

@@ -1,0 +1,257 @@
+"""Appearances of another operation: instruments over images of its tissue, in other light, in its frames' colours.
+
+Half of the images of a data set keep the scene's tissue, half its colours, and some its instruments' light: what is
+rendered is learned as well as what replaces it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.random import Generator
+from torch import Tensor
+
+from neeco.capture.images import EXTENSIONS, image_size, read_image_bytes
+from neeco.errors import NeecoError
+from neeco.geometry.camera import Camera
+from neeco.raster import rasterize
+from neeco.raster.reference import SH_C0
+from neeco.raster.types import Gaussians
+from neeco.synthesis.camera_effects import linear_to_srgb, srgb_to_linear
+from neeco.synthesis.settings import Settings
+
+MIN_CROP = 0.7  # of the largest crop of the wanted shape: sides of the smallest
+MIN_SIDE_PX = 32  # of an image: smaller ones are icons
+CACHED_IMAGES = 64  # decoded
+MIN_SHARE = 0.02  # of a pixel: of less, an instrument's colour is not known
+SHADOW_BLUR_PX = 1.5  # standard deviation, of the shadow that is found at the instrument's edge
+CLEAR_TISSUE = 0.5  # share of tissue in a pixel from which the shadow on it is measured
+REPLACED = 0.5  # share of the images that show a background, and of those with the colours of other frames
+BORDER = 12 / 255  # brightest channel of an endoscope's black border
+MAX_STOPS = 1.0  # of the instruments' exposure, either way
+MAX_TINT = 0.2  # natural logarithm of a colour gain, either way
+MAX_SATURATION = 0.3  # change of the saturation, either way
+MAX_CONTRAST = 0.3  # natural logarithm of the exponent on the stored image, either way
+DARK = 1e-3  # of white: no mean light is taken to be less
+ADAPTATION_RANGE = (0.25, 4.0)  # of gains that follow from other images
+SHADOW_RANGE = (0.2, 1.1)  # of the light that a shadow leaves; above 1: errors of the renderings
+
+
+@dataclass(frozen=True)
+class ImageFolder:
+    """Images of another operation."""
+
+    files: tuple[Path, ...]
+
+    @classmethod
+    def of(cls, folder: str, option: str) -> ImageFolder:
+        """The images in a folder that a command line's option names, in the order of their names. Raises NeecoError
+        where there is none, or one is too small or cannot be read."""
+        place = Path(folder)
+        if not place.is_dir():
+            raise NeecoError(f"--{option}: {folder}: no such folder; give one with images of another operation")
+        files = tuple(file for file in sorted(place.iterdir()) if file.suffix in EXTENSIONS and file.name[0] != ".")
+        if not files:
+            raise NeecoError(f"--{option}: {folder}: has no image; give .png or .jpg files")
+        for file in files:
+            if min(image_size(file)) < MIN_SIDE_PX:
+                raise NeecoError(f"--{option}: {file}: is smaller than {MIN_SIDE_PX} px; leave it out")
+        return cls(files)
+
+    def digest(self) -> str:
+        """SHA-256 of the files' content, in order."""
+        content = b"".join(hashlib.sha256(file.read_bytes()).digest() for file in self.files)
+        return hashlib.sha256(content).hexdigest()
+
+    def colors(self, number: int) -> Colors:
+        """The colours of an image. Raises NeecoError where the file cannot be read."""
+        return _colors_of_file(self.files[number])
+
+    def crop(self, number: int, rng: Generator, width: int, height: int) -> np.ndarray:
+        """Sample a background, float32 [height, width, 3] in [0, 1]: a random crop of an image, perhaps mirrored,
+        resized. Raises NeecoError where the file cannot be read."""
+        image = _decoded(self.files[number])
+        rows, columns = image.shape[:2]
+        scale = rng.uniform(MIN_CROP, 1) * min(columns / width, rows / height)
+        size = max(1, int(scale * width)), max(1, int(scale * height))
+        left, top = (int(rng.integers(whole - part + 1)) for whole, part in zip((columns, rows), size, strict=True))
+        crop = image[top : top + size[1], left : left + size[0]]
+        crop = crop[:: rng.choice((1, -1)), :: rng.choice((1, -1))]
+        way = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
+        return cv2.resize(np.ascontiguousarray(crop), (width, height), interpolation=way).astype(np.float32) / 255
+
+
+@lru_cache(maxsize=CACHED_IMAGES)
+def _decoded(file: Path) -> np.ndarray:
+    return read_image_bytes(file).numpy()
+
+
+@dataclass(frozen=True)
+class Colors:
+    """Mean [3] and standard deviation [3] of the stored colours of an image, without its black border."""
+
+    mean: np.ndarray
+    deviation: np.ndarray
+
+    @classmethod
+    def of(cls, image: np.ndarray) -> Colors:
+        """Those of an image [H, W, 3] in [0, 1]."""
+        shown = image[image.max(2) > BORDER]
+        if not len(shown):
+            shown = image.reshape(-1, 3)
+        return cls(shown.mean(0), shown.std(0))
+
+    def given_to(self, image: np.ndarray) -> np.ndarray:
+        """An image [H, W, 3] with these colours (Reinhard et al., "Color transfer between images", 2001, in RGB)."""
+        own = Colors.of(image)
+        gains = np.clip(self.deviation / np.maximum(own.deviation, DARK), *ADAPTATION_RANGE)
+        return np.clip((image - own.mean) * gains + self.mean, 0, 1).astype(np.float32)
+
+
+@lru_cache(maxsize=4096)
+def _colors_of_file(file: Path) -> Colors:
+    return Colors.of(read_image_bytes(file).numpy().astype(np.float32) / 255)
+
+
+@dataclass(frozen=True)
+class Tone:
+    """Other light and camera: gains [3] of linear light, saturation, and exponent on the stored image."""
+
+    gains: np.ndarray
+    saturation: float
+    exponent: float
+
+    @classmethod
+    def draw(cls, rng: Generator) -> Tone:
+        """Sample one."""
+        gains = 2 ** rng.uniform(-MAX_STOPS, MAX_STOPS) * np.exp(rng.uniform(-MAX_TINT, MAX_TINT, 3))
+        saturation = 1 + rng.uniform(-MAX_SATURATION, MAX_SATURATION)
+        return cls(gains, saturation, float(np.exp(rng.uniform(-MAX_CONTRAST, MAX_CONTRAST))))
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """Stored image [H, W, 3] as this camera stores it."""
+        stored = linear_to_srgb(srgb_to_linear(image) * self.gains)
+        grey = stored.mean(2, keepdims=True)
+        return np.clip(grey + self.saturation * (stored - grey), 0, 1) ** np.float32(self.exponent)
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """A background, the name of its file, the light on the instruments over it, and colours; None: as recorded.
+
+    The background's mean light differs from that of the scene's tissue by its tissue, and by camera and lamps, which
+    change instruments as well: these are multiplied, in each colour channel, by the ratio to the power of `adaptation`.
+    """
+
+    source: str | None = None
+    background: Tensor | None = None  # [H, W, 3] in [0, 1]
+    adaptation: float = 0.0  # in [0, 1]
+    tone: Tone | None = None
+    colors: Colors | None = None
+
+    @property
+    def of_layers(self) -> bool:
+        """Whether tissue or instruments change apart from each other."""
+        return self.background is not None or self.tone is not None
+
+    def matched(self, image: Tensor) -> Tensor:
+        """The image [H, W, 3] in the colours."""
+        return image if self.colors is None else torch.from_numpy(self.colors.given_to(image.numpy()))
+
+    def of(self, layers: Layers) -> Tensor:
+        """The image [H, W, 3] of these layers in this appearance."""
+        share = layers.share.clamp(min=MIN_SHARE)[..., None].numpy()
+        alone = np.clip(layers.instruments.numpy() / share, 0, 1)
+        if self.tone is not None:
+            alone = self.tone(alone)
+        if self.background is not None:
+            here, own = (srgb_to_linear(x.numpy()).mean((0, 1)) + DARK for x in (self.background, layers.tissue))
+            gains = np.clip((here / own) ** self.adaptation, *ADAPTATION_RANGE)
+            alone = linear_to_srgb(srgb_to_linear(alone) * gains)
+        return replace(layers, instruments=torch.from_numpy((alone * share).astype(np.float32))).over(self.background)
+
+
+AS_RECORDED = Appearance()
+
+
+@dataclass(frozen=True)
+class Appearances:
+    """The appearances of a data set. relit: share of its images whose instruments have another tone."""
+
+    backgrounds: ImageFolder | None = None
+    relit: float = 0.0
+    frames: ImageFolder | None = None  # whose colours half of the images take on
+
+    @classmethod
+    def of(cls, settings: Settings) -> Appearances:
+        """Those that settings describe. Raises NeecoError for a folder without images."""
+        folders = {
+            option: None if folder is None else ImageFolder.of(folder, option)
+            for option, folder in settings.image_folders().items()
+        }
+        return cls(folders["backgrounds"], settings.relight_share, folders["match-colors"])
+
+    def draw(self, rng: Generator, width: int, height: int) -> Appearance:
+        """Sample the appearance of an image. Raises NeecoError where a background cannot be read."""
+        replaced, lit, adaptation, place, matched, frame = rng.random(6)
+        found = Appearance(tone=Tone.draw(rng) if lit < self.relit else None)
+        if self.frames is not None and matched < REPLACED:
+            found = replace(found, colors=self.frames.colors(int(frame * len(self.frames.files))))
+        if self.backgrounds is None or replaced >= REPLACED:
+            return found
+        number = int(place * len(self.backgrounds.files))
+        background = torch.from_numpy(self.backgrounds.crop(number, rng, width, height))
+        source = self.backgrounds.files[number].name
+        return replace(found, source=source, background=background, adaptation=adaptation)
+
+
+ALL_AS_RECORDED = Appearances()
+
+
+@dataclass(frozen=True)
+class Layers:
+    """A rendering taken apart: image = instruments + behind; behind is about (1 - share) * shadow * tissue."""
+
+    instruments: Tensor  # [H, W, 3] in [0, 1], times their share of the pixel
+    share: Tensor  # [H, W] in [0, 1], of instruments in a pixel
+    shadow: Tensor  # [H, W] share of the light that the instruments' shadow leaves on the tissue
+    behind: Tensor  # [H, W, 3] in [0, 1], what the pixels show beside instruments
+    tissue: Tensor  # [H, W, 3] in [0, 1], without instruments and shadow
+
+    def over(self, background: Tensor | None) -> Tensor:
+        """The image [H, W, 3] over a `background` [H, W, 3]; None: over the tissue, as rendered."""
+        if background is None:
+            return (self.instruments + self.behind).clamp(0, 1)
+        return (self.instruments + ((1 - self.share) * self.shadow)[..., None] * background).clamp(0, 1)
+
+
+@torch.no_grad()
+def split(gaussians: Gaussians, owners: Tensor, camera: Camera, image: Tensor, share: Tensor) -> Layers:
+    """Take the rendering `image` [H, W, 3] of posed Gaussians apart, on the CPU.
+
+    owners [N]: -1 tissue, else an instrument; share [H, W]: of instruments in each pixel. The shadow is the smoothed
+    ratio of tissue with the instruments to tissue without them; below these, that of the nearest tissue counts.
+    """
+    of_tissue = owners < 0
+    black = gaussians.sh.clone()
+    black[of_tissue] = 0
+    black[of_tissue, 0] = -0.5 / SH_C0
+    instruments = rasterize(replace(gaussians, sh=black, background=None), camera).color.clamp(0, 1).cpu()
+    instruments = instruments * (share > 0)[..., None]  # components that are not labelled stay behind
+    tissue = rasterize(gaussians.select(of_tissue), camera).color.clamp(0, 1).cpu()
+    clear = ((1 - share) * (share < CLEAR_TISSUE)).numpy()
+    behind = (image - instruments).clamp(0, 1)
+    lit = tissue.mean(2).numpy() * clear
+    ratio = (_smoothed(behind.mean(2).numpy() * (clear > 0)) + DARK) / (_smoothed(lit) + DARK)
+    shadow = torch.from_numpy(np.clip(ratio, *SHADOW_RANGE).astype(np.float32))
+    return Layers(instruments, share, shadow, behind, tissue)
+
+
+def _smoothed(plane: np.ndarray) -> np.ndarray:
+    return cv2.GaussianBlur(plane, (0, 0), SHADOW_BLUR_PX)
