@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,11 +11,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from neeco.capture import read_capture
 from neeco.geometry.camera import Camera
 from neeco.methods.kinematic.silhouette_evidence import observe_silhouettes
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
+from neeco.scene.training_views import TrainingViews
+from neeco.training.config import training_config
+from neeco.training.initial import begin_session
 from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
 
 TISSUE, METAL = (0.6, 0.25, 0.2), (0.55, 0.57, 0.6)
@@ -110,6 +115,13 @@ def test_the_loss_asks_for_labels_where_instruments_are_and_for_none_where_tissu
     assert bool((gradient[:4, 4:] == 0).all())
 
 
+def test_many_frames_count_less_each() -> None:
+    values = torch.full((4, 4), INSTRUMENT, dtype=torch.uint8)
+    label = torch.full((4, 4), 0.5)
+    few, many = (float(Silhouettes((values,) * count, 0.0).loss(0, label)) for count in (30, 60))
+    assert few == pytest.approx(2 * many, rel=1e-6)
+
+
 @pytest.mark.parametrize("size", [(4, 6), (8, 12), (16, 24)])
 def test_the_loss_takes_labels_of_any_size(size: tuple[int, int]) -> None:
     values = torch.zeros(8, 12, dtype=torch.uint8)
@@ -120,8 +132,20 @@ def test_the_loss_takes_labels_of_any_size(size: tuple[int, int]) -> None:
     assert float(silhouettes.loss(0, right)) < 1e-4 < float(silhouettes.loss(0, 1 - right))
 
 
-def test_a_checkpoint_brings_them_back() -> None:
+def test_a_checkpoint_brings_them_back(capture: Path) -> None:
+    views = TrainingViews.read(read_capture(capture).split("train"))
+    first, second = (
+        begin_session(
+            read_capture(capture), views, training_config("neeco", {"iterations": 20}, ["deformation.width=16"]), print
+        )
+        for _ in range(2)
+    )
     frames = (torch.arange(6, dtype=torch.uint8).view(2, 3), torch.arange(8, dtype=torch.uint8).view(4, 2))
-    back = Silhouettes.of_tensors(Silhouettes(frames, 0.0125).tensors())
+    second.restore(*first.pack())
+    assert second.silhouettes is None
+    first.silhouettes = Silhouettes(frames, 0.0125)
+    second.restore(*first.pack())
+    back = second.silhouettes
+    assert back is not None
     assert back.noise == 0.0125
     assert all(torch.equal(a, b) for a, b in zip(back.values, frames, strict=True))

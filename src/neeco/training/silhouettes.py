@@ -13,6 +13,7 @@ from torch import Tensor
 
 UNKNOWN, INSTRUMENT = 128, 255  # of stored values; tissue is 0
 WEIGHT = 0.1  # of the loss, beside the photometric one
+FEW = 30  # frames, from which on it falls with their number: many frames show for themselves what is instrument
 MIN_SHARE = 1e-4  # of rendered labels, in logarithms
 
 
@@ -35,7 +36,8 @@ class Silhouettes:
             self._resized[key] = certain.clamp(0, 1), (-certain).clamp(0, 1)
         instrument, tissue = self._resized[key]
         label = label.clamp(MIN_SHARE, 1 - MIN_SHARE)
-        return -WEIGHT * (instrument * label.log() + tissue * (1 - label).log()).mean()
+        weight = WEIGHT * min(1.0, FEW / len(self.values))
+        return -weight * (instrument * label.log() + tissue * (1 - label).log()).mean()
 
     def tensors(self) -> dict[str, Tensor]:
         """Return what a checkpoint holds of them."""
