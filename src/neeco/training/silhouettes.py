@@ -19,8 +19,8 @@ MIN_SHARE = 1e-4  # of rendered labels, in logarithms
 
 @dataclass(eq=False)
 class Silhouettes:
-    """Of all training frames: values [H, W] uint8 each, UNKNOWN where images do not tell; `noise` of the tissue that
-    they were compared with."""
+    """Silhouettes of all training frames: values [H, W] uint8 each, UNKNOWN where images do not tell; `noise` of the
+    tissue that they were compared with."""
 
     values: tuple[Tensor, ...]
     noise: float
