@@ -156,7 +156,8 @@ def with_errors(
             joints = {}
             for error, (joint, value) in zip(moved[row], given.joints.items(), strict=True):
                 unit = 1.0 if instrument.slides(joint) else math.pi / 180
-                joints[joint] = value + joint_size * unit * error
+                low, high = instrument.joints[joint] or (-math.inf, math.inf)  # no robot reports more
+                joints[joint] = min(max(value + joint_size * unit * error, low), high)
             uncertainty = None
             if stated:
                 of_joints = dict.fromkeys(given.joints, joint_size)

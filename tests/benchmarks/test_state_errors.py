@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -79,6 +80,16 @@ def test_errors_have_the_sizes_asked_for(state_errors: ModuleType, smooth_s: flo
     np.testing.assert_allclose(np.concatenate(found), expected, rtol=0.1)
     neighbours = np.mean(np.abs(np.diff(shifts, axis=0)), axis=0) / np.std(shifts, axis=0)
     assert (neighbours < 0.3).all() == (smooth_s > 0)
+
+
+def test_readings_stay_within_the_joints_limits(state_errors: ModuleType) -> None:
+    exact = recorded(50)
+    (instrument,) = exact.instruments
+    limited = replace(exact, instruments=(replace(instrument, joints=dict.fromkeys(instrument.joints, (-0.5, 0.5))),))
+    given = state_errors.with_errors(limited, (2.0, 6.0, 0.3, 1.5, 20.0), 0.0, False, np.random.default_rng(1))
+    readings = [value for frame in given.frames for value in frame.state.instruments[NAME].joints.values()]
+    assert min(readings) == -0.5
+    assert max(readings) == 0.5
 
 
 def test_a_mirrored_state_looks_alike_from_afar(state_errors: ModuleType) -> None:

@@ -30,6 +30,7 @@ from neeco.training.config import TrainConfig
 from neeco.training.density import GradientStatistics, control_density, reset_opacity
 from neeco.training.resolution import Resolution
 from neeco.training.schedule import Schedule, due, order_by_pose
+from neeco.training.silhouettes import Silhouettes
 
 
 @dataclass(kw_only=True)
@@ -50,6 +51,7 @@ class GaussianSession(GaussianTraining):
     recorded: Recorded = field(init=False)  # as it was before training
     given: list[tuple[State, Camera]] = field(init=False)  # of every frame of `views`, as recorded, on their device
     statistics: GradientStatistics = field(init=False)
+    silhouettes: Silhouettes | None = None  # of the instruments, once a method has observed them
     queue: list[int] = field(default_factory=list)
     queue_phase: int = 1
 
@@ -160,13 +162,18 @@ class GaussianSession(GaussianTraining):
         scene, views = self.scene, self.batch_size
         state, camera, penalty = self.refinement.apply(index, *self.given[index], self.iteration)
         channels = scene.deformation.training_channels(scene.canonical, self.iteration)
+        if channels is None and self.silhouettes is not None:
+            channels = scene.canonical.of_instruments.to(scene.canonical.means.dtype)[:, None]
         rendering = rasterize(scene.at(state, self._perturbation(progress)), camera, channels=channels)
         target, mask = self.views.target(index), self.views.mask(index)
         if following is not None:
             self.views.prefetch(following)
         loss = photometric_loss(rendering.color, target, mask, ssim_weight=self.config.ssim_weight)
+        fitted = loss
+        if self.silhouettes is not None and rendering.channels is not None:
+            fitted = loss + self.silhouettes.loss(index, rendering.channels[..., 0])
         weight = trust_of(self.given[index][0]) * float(self.refinement.weights[index])
-        total = weight * loss + self._regularisation(rendering, penalty)
+        total = weight * fitted + self._regularisation(rendering, penalty)
         with tf32_products(self.views.device) if scene.deformation.large_operations else nullcontext():
             (total / views).backward()  # given the gradient instead, torch would import sympy: 2 s of every training
         gradient = rendering.center_offsets.grad
@@ -299,7 +306,9 @@ class GaussianSession(GaussianTraining):
         """Return what a checkpoint needs besides scene, optimiser and random numbers."""
         statistics = {"statistics/total": self.statistics.total, "statistics/seen": self.statistics.seen}
         refinement = {f"refinement/{name}": tensor for name, tensor in self.refinement.tensors().items()}
-        return refinement | statistics, {
+        observed = {} if self.silhouettes is None else self.silhouettes.tensors()
+        silhouettes = {f"silhouettes/{name}": tensor for name, tensor in observed.items()}
+        return refinement | statistics | silhouettes, {
             "schedule": self.schedule.state_dict(),
             "rng": self.rng.bit_generator.state,
             "queue": self.queue,
@@ -309,6 +318,8 @@ class GaussianSession(GaussianTraining):
     def restore(self, tensors: Mapping[str, Tensor], fields: Mapping[str, Any]) -> None:
         """Restore what `pack` returned."""
         self.refinement.restore(members(tensors, "refinement"))
+        observed = members(tensors, "silhouettes")
+        self.silhouettes = Silhouettes.of_tensors(observed) if observed else None
         self.statistics.total, self.statistics.seen = tensors["statistics/total"], tensors["statistics/seen"]
         self.schedule.load_state_dict(fields["schedule"])
         self.rng.bit_generator.state = fields["rng"]

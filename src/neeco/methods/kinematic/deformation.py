@@ -35,6 +35,7 @@ from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.interiors import fade_interior_tissue
 from neeco.methods.kinematic.label_shares import store_label_shares
 from neeco.methods.kinematic.lamp_search import find_shadow
+from neeco.methods.kinematic.silhouette_evidence import OBSERVED_AT, observe_silhouettes
 from neeco.methods.kinematic.state_passes import MARKS, fit_states
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.kinematic.wrist import place_wrists, refine_wrists
@@ -279,7 +280,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             terms += [settings.part_sharpness * self._part_mixing(canonical, k) for k in range(len(self.instruments))]
         priors = [articulation.prior() for articulation in self.articulations]
         terms += [PRIOR_WEIGHT * prior for prior in priors if prior is not None]
-        if rendering.channels is not None and settings.label_sharpness > 0:
+        if rendering.channels is not None and iteration > settings.label_sharpness_start:
             label = rendering.channels[..., 0]
             terms.append(settings.label_sharpness * (label * (1 - label)).mean())
         return sum(terms[1:], terms[0]) if terms else None
@@ -302,6 +303,10 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         if self.settings.shadow and (passed or any(map(session.reached, self.settings.shadow_at))):
             with session.searching(as_learned=True):
                 find_shadow(session)
+        for mark in OBSERVED_AT:
+            if before < mark <= session.progress:
+                with session.searching():
+                    observe_silhouettes(session)
         for mark in MARKS:
             if before < mark <= session.progress:
                 fit_states(session, self, mark)

@@ -62,8 +62,7 @@ def store_label_shares(session: GaussianSession) -> None:
     instrument = scene.canonical.of_instruments
     frames = session.frames_along_poses(N_LABEL_FRAMES)
     views = [_view(session, index) for index in frames]
-    colors = _color_density(views)
-    probable = [_probability(view, colors) for view in views]
+    probable = _probabilities(views)
     known = np.concatenate([p[view.inside] for p, view in zip(probable, views, strict=True)])
     inside = float(known.mean()) if len(known) else 0.0
     scene.diagnostics["label_shares"] = {"inside": round(inside, 3)}
@@ -75,8 +74,7 @@ def store_label_shares(session: GaussianSession) -> None:
     else:  # colours of the others are the tissue's, too
         known_parts[:] = False
         views = [replace(view, inside=view.inside & separable[view.parts]) for view in views]
-        colors = _color_density(views)
-        probable = [_probability(view, colors) for view in views]
+        probable = _probabilities(views)
     probable = [np.where(view.inside, 1.0, p) for p, view in zip(probable, views, strict=True)]
     share, fringe = _label_shares(session, views, probable)
     part = scene.label_channels().argmax(1)
@@ -164,26 +162,44 @@ def _bins(colors: np.ndarray) -> tuple[np.ndarray, ...]:
     return found[..., 0], found[..., 1], found[..., 2]
 
 
-def _color_density(views: list[_View]) -> np.ndarray:
-    """[N_BINS, N_BINS, N_BINS] density of the colours inside the instruments, per unit of the colour cube."""
+def _probabilities(views: list[_View]) -> list[np.ndarray]:
+    """Return the probability [P] that each pixel of the views shows an instrument, by the colours inside them."""
+    density = _color_density(np.concatenate([view.image[view.inside] for view in views]))
+    return [_instrument_probability(view.image, view.tissue, density) for view in views]
+
+
+def share_of_colors(images: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """Return the share [...] of colours [M, 3] that are like each pixel of the images [..., 3]."""
+    shares: np.ndarray = _color_density(colors)[_bins(images)] / N_BINS**3
+    return shares
+
+
+def _color_density(colors: np.ndarray) -> np.ndarray:
+    """[N_BINS, N_BINS, N_BINS] density of colours [M, 3] in [0, 1], per unit of the colour cube."""
     counts = np.zeros((N_BINS,) * 3)
-    for view in views:
-        np.add.at(counts, _bins(view.image[view.inside]), 1)
+    np.add.at(counts, _bins(colors), 1)
     smooth = gaussian_filter(counts, SMOOTHING)
     return smooth / max(smooth.sum(), 1e-9) * N_BINS**3
 
 
-def _probability(view: _View, colors: np.ndarray) -> np.ndarray:
-    """Return the probability [P] in (0, 1) that a pixel shows an instrument, with equal priors.
+def shades_of(images: np.ndarray, tissue: np.ndarray) -> np.ndarray:
+    """Return the shade [...] of SHADES in which the rendered tissue [..., 3] is most like the images [..., 3]."""
+    squared = (tissue**2).sum(-1)
+    return np.clip((images * tissue).sum(-1) / np.maximum(squared, 1e-6), *SHADES)
+
+
+def _instrument_probability(images: np.ndarray, tissue: np.ndarray, density: np.ndarray) -> np.ndarray:
+    """Return the probability [...] in (0, 1) that a pixel [..., 3] shows an instrument whose colours have this density,
+    with equal priors.
 
     Tissue in an unknown shade: uniform along the segment of its colour's shades, normal across it.
     """
-    squared = (view.tissue**2).sum(-1)
-    shade = np.clip((view.image * view.tissue).sum(-1) / np.maximum(squared, 1e-6), *SHADES)
-    across = ((view.image - shade[..., None] * view.tissue) ** 2).sum(-1)
+    squared = (tissue**2).sum(-1)
+    shade = shades_of(images, tissue)
+    across = ((images - shade[..., None] * tissue) ** 2).sum(-1)
     variance = (COLOR_ERROR[0] + COLOR_ERROR[1] * shade * np.sqrt(squared)) ** 2
     length = np.maximum((SHADES[1] - SHADES[0]) * np.sqrt(squared), MIN_SHADE_LENGTH)
-    tissue = np.exp(-across / (2 * variance)) / (2 * math.pi * variance * length)
-    instrument = colors[_bins(view.image)]
-    found: np.ndarray = (instrument + OTHER_DENSITY) / (instrument + tissue + 2 * OTHER_DENSITY)
+    of_tissue = np.exp(-across / (2 * variance)) / (2 * math.pi * variance * length)
+    of_instrument = density[_bins(images)]
+    found: np.ndarray = (of_instrument + OTHER_DENSITY) / (of_instrument + of_tissue + 2 * OTHER_DENSITY)
     return found

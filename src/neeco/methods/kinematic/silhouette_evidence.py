@@ -1,0 +1,94 @@
+"""Silhouettes of instruments by what the learned tissue does not explain in the training images.
+
+The scene's own tissue, rendered without instruments, is each image's background. A shadow only dims it: a pixel that no
+shade of the tissue explains shows an instrument, near where one is rendered; one that a shade explains shows tissue,
+unless much of an instrument has its colour. Wrong states and fringes learned from them do not change what the
+images show. Only a tissue learned well enough tells: elsewhere nothing is said.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import torch
+from scipy.ndimage import uniform_filter
+
+from neeco.capture.model import evenly_spaced
+from neeco.methods.kinematic.label_shares import shades_of, share_of_colors
+from neeco.raster import rasterize
+from neeco.training.session import GaussianSession
+from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
+
+OBSERVED_AT = (0.1, 0.32, 0.6)  # shares of the run
+N_SAMPLED = 20  # frames by which the tissue's noise and the instruments' colours are known
+MAX_NOISE = 0.02  # residual that nearly all of the tissue is below, above which nothing is said
+NOISE_QUANTILE = 0.98
+TISSUE, NOT_TISSUE = (0.02, 1.5), (0.05, 3.0)  # residuals (images in [0, 1]), and times the noise: the larger counts
+WINDOW_PX = 3  # over which residuals and probabilities are averaged
+LEAST_LABEL, LABEL = 0.1, 0.7  # rendered shares of a pixel from which an instrument may be near, and is there
+FAR, NEAR = (
+    0.04,
+    0.075,
+)  # of the images' width: no tissue within it of an instrument counts for noise; none farther shows
+ALIKE = 0.05  # share of the instruments' colours that are a pixel's, from which it may show one like its tissue
+
+
+@torch.no_grad()
+def observe_silhouettes(session: GaussianSession) -> None:
+    """Set the session's silhouettes from its scene as learned so far, where its tissue explains the images better than
+    when they were last observed, and well enough."""
+    scene = session.scene
+    if not scene.instruments:
+        return
+    count = len(session.views.frames)
+    sample = [_View(session, index) for index in evenly_spaced(count, N_SAMPLED)]
+    noise, known = _noise(sample), session.silhouettes
+    if noise > MAX_NOISE or (known is not None and noise >= known.noise):
+        return
+    lower, upper = (max(least, factor * noise) for least, factor in (TISSUE, NOT_TISSUE))
+    shown = [view.image[view.usable & (view.residual > upper) & (view.label > LABEL)] for view in sample]
+    colors = np.concatenate(shown)
+    values = tuple(_View(session, index).silhouette(lower, upper, colors) for index in range(count))
+    session.silhouettes = Silhouettes(values, noise)
+
+
+class _View:
+    """A training image beside the scene's tissue: residual [H, W] after the best shade, label [H, W] as rendered."""
+
+    def __init__(self, session: GaussianSession, index: int) -> None:
+        scene = session.scene
+        state, camera = session.corrected(index)
+        instrument = scene.canonical.of_instruments
+        posed = scene.at(state)
+        channels = rasterize(posed, camera, channels=instrument.float()[:, None]).channels
+        assert channels is not None
+        self.label = channels[..., 0].cpu().numpy()
+        self.tissue = rasterize(posed.select(~instrument), camera).color.clamp(0, 1).cpu().numpy()
+        self.image = session.views.target(index).cpu().numpy()
+        mask = session.views.mask(index)
+        self.usable = np.ones(self.label.shape, bool) if mask is None else mask.cpu().numpy()
+        off = np.abs(self.image - shades_of(self.image, self.tissue)[..., None] * self.tissue).mean(-1)
+        self.residual = uniform_filter(off, WINDOW_PX)
+
+    def within(self, share: float) -> np.ndarray:
+        """bool [H, W]: pixels within `share` of the width of a rendered instrument."""
+        reach = 2 * math.ceil(share * self.label.shape[1]) + 1
+        return cv2.dilate((self.label > LEAST_LABEL).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+
+    def silhouette(self, lower: float, upper: float, colors: np.ndarray) -> torch.Tensor:
+        """Return the frame's values [H, W] uint8 of `Silhouettes`: residuals above `upper` are instrument, those below
+        `lower` tissue where instruments, whose colours are [M, 3], rarely look like it."""
+        off = np.clip((self.residual - lower) / (upper - lower), 0, 1)
+        instrument = np.where(self.within(NEAR), 2 * off - 1, 0).clip(0, 1)
+        tissue = np.where(share_of_colors(self.image, colors) < ALIKE, 1 - 2 * off, 0).clip(0, 1)
+        certain = np.where(self.usable, instrument - tissue, 0)
+        return torch.from_numpy((UNKNOWN + certain * (INSTRUMENT - UNKNOWN)).round().clip(0, 255).astype(np.uint8))
+
+
+def _noise(views: list[_View]) -> float:
+    """Return the residual below which nearly all tissue far from instruments is; infinite where there is none."""
+    far = [view.residual[view.usable & ~view.within(FAR)] for view in views]
+    residuals = np.concatenate(far)
+    return float(np.quantile(residuals, NOISE_QUANTILE)) if len(residuals) else math.inf

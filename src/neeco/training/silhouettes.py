@@ -1,0 +1,53 @@
+"""Silhouettes of instruments in the training images: where a pixel shows an instrument, where tissue, where it is not
+known; and the loss of rendered labels against them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+UNKNOWN, INSTRUMENT = 128, 255  # of stored values; tissue is 0
+WEIGHT = 0.1  # of the loss, beside the photometric one
+FEW = 30  # frames, from which on it falls with their number: many frames show for themselves what is instrument
+MIN_SHARE = 1e-4  # of rendered labels, in logarithms
+
+
+@dataclass(eq=False)
+class Silhouettes:
+    """Silhouettes of all training frames: values [H, W] uint8 each, UNKNOWN where images do not tell; `noise` of the
+    tissue that they were compared with."""
+
+    values: tuple[Tensor, ...]
+    noise: float
+    _resized: dict[tuple[int, int, int], tuple[Tensor, Tensor]] = field(default_factory=dict, repr=False)
+
+    def loss(self, index: int, label: Tensor) -> Tensor:
+        """Return the weighted cross entropy [] of the rendered label [h, w] of frame `index` against its silhouette."""
+        height, width = label.shape
+        if (key := (index, height, width)) not in self._resized:
+            values = self.values[index].cpu().numpy().astype(np.float32)
+            small = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
+            certain = torch.from_numpy((small - UNKNOWN) / (INSTRUMENT - UNKNOWN)).to(label)
+            self._resized[key] = certain.clamp(0, 1), (-certain).clamp(0, 1)
+        instrument, tissue = self._resized[key]
+        label = label.clamp(MIN_SHARE, 1 - MIN_SHARE)
+        weight = WEIGHT * min(1.0, FEW / len(self.values))
+        return -weight * (instrument * label.log() + tissue * (1 - label).log()).mean()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return what a checkpoint holds of them."""
+        sizes = torch.tensor([list(values.shape) for values in self.values])
+        flat = torch.cat([values.flatten().cpu() for values in self.values])
+        return {"values": flat, "sizes": sizes, "noise": torch.tensor(self.noise, dtype=torch.float64)}
+
+    @classmethod
+    def of_tensors(cls, tensors: dict[str, Tensor]) -> Silhouettes:
+        """Return what `tensors` returned."""
+        sizes: Sequence[Sequence[int]] = tensors["sizes"].tolist()
+        parts = tensors["values"].cpu().split([height * width for height, width in sizes])
+        return cls(tuple(part.view(*size) for part, size in zip(parts, sizes, strict=True)), float(tensors["noise"]))

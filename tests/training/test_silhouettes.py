@@ -1,0 +1,151 @@
+"""What the learned tissue does not explain is an instrument, whatever the scene takes for one; shadows are tissue."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from neeco.capture import read_capture
+from neeco.geometry.camera import Camera
+from neeco.methods.kinematic.silhouette_evidence import observe_silhouettes
+from neeco.raster import rasterize
+from neeco.raster.types import Gaussians
+from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
+from neeco.scene.training_views import TrainingViews
+from neeco.training.config import training_config
+from neeco.training.initial import begin_session
+from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
+
+TISSUE, METAL = (0.6, 0.25, 0.2), (0.55, 0.57, 0.6)
+SIDE = 96
+CAMERA = Camera(np.eye(4), 90.0, 90.0, 48.0, 48.0, SIDE, SIDE)
+
+
+def plane(x: tuple[float, float], depth: float, color: tuple[float, float, float]) -> CanonicalGaussians:
+    """Opaque Gaussians over the columns x [mm] of a plane before the camera."""
+    across, down = torch.meshgrid(torch.arange(*x, 1.0), torch.arange(-36.0, 36.0, 1.0), indexing="ij")
+    points = torch.stack([across, down, torch.full_like(across, depth)], -1).reshape(-1, 3)
+    count = len(points)
+    return seed_gaussians(points, torch.tensor(color).expand(count, 3), torch.full((count,), 0.7), opacity=0.99)
+
+
+class Scene:
+    """A scene that takes columns -10 .. 10 mm for the instrument."""
+
+    instruments = ("tool",)
+
+    def __init__(self, metal: tuple[float, float, float] = METAL) -> None:
+        self.canonical = join_bodies([plane((-36.0, 36.0), 60.0, TISSUE), plane((-10.0, 10.0), 58.0, metal)])
+
+    def at(self, state: object) -> Gaussians:
+        canonical = self.canonical
+        opacities = torch.sigmoid(canonical.opacity_logits)
+        return Gaussians(canonical.means, canonical.quats, canonical.log_scales.exp(), opacities, canonical.sh_dc)
+
+
+def session_of(scene: Scene, noise: float = 0.0, metal: tuple[float, float, float] = METAL) -> Any:
+    """A session whose image shows metal in columns 36 .. 54 px, which are fewer, and a shadow in 54 .. 66 px."""
+    posed = scene.at(None)
+    with torch.no_grad():
+        image: Tensor = rasterize(posed.select(~scene.canonical.of_instruments), CAMERA).color.clamp(0, 1).clone()
+    image[:, 54:66] *= 0.7
+    image[:, 36:54] = torch.tensor(metal)
+    image += noise * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+    frames = (SimpleNamespace(name="a"),)
+    views = SimpleNamespace(frames=frames, target=lambda index: image, mask=lambda index: None)
+    return SimpleNamespace(scene=scene, views=views, corrected=lambda index: (None, CAMERA), silhouettes=None)
+
+
+def test_images_tell_instrument_from_shadow_and_tissue_where_the_scene_is_wrong() -> None:
+    session = session_of(Scene())
+    observe_silhouettes(session)
+    (values,) = session.silhouettes.values
+    middle = values[20:76]
+    assert bool((middle[:, 38:52] == INSTRUMENT).all())
+    assert int(middle[:, 56:64].max()) < 20  # its shadow, which the scene takes for the instrument
+    assert int(middle[:, :33].max()) < 20
+
+
+def test_a_tissue_that_explains_the_images_badly_tells_nothing() -> None:
+    session = session_of(Scene(), noise=0.08)
+    observe_silhouettes(session)
+    assert session.silhouettes is None
+
+
+def test_a_dark_shaft_before_dark_tissue_is_not_taken_for_tissue() -> None:
+    dark = (0.06, 0.05, 0.05)
+    scene = Scene(dark)
+    tissue = scene.canonical.body(0)
+    below = scene.canonical.means[tissue][:, 1] > 0
+    scene.canonical.sh_dc[tissue][below] = plane((0.0, 1.0), 60.0, dark).sh_dc[0]
+    session = session_of(scene, metal=dark)
+    observe_silhouettes(session)
+    (values,) = session.silhouettes.values
+    assert bool((values[20:44, 38:52] == INSTRUMENT).all())
+    assert int(values[54:76, 38:52].min()) >= UNKNOWN - 30
+    assert int(values[20:44, :30].max()) < 20
+
+
+def test_later_observations_replace_earlier_ones_only_where_the_tissue_is_better() -> None:
+    session = session_of(Scene())
+    observe_silhouettes(session)
+    first = session.silhouettes
+    observe_silhouettes(session)
+    assert session.silhouettes is first
+    first.noise = 1.0
+    observe_silhouettes(session)
+    assert session.silhouettes is not first
+
+
+def test_the_loss_asks_for_labels_where_instruments_are_and_for_none_where_tissue_is() -> None:
+    values = torch.full((8, 8), UNKNOWN, dtype=torch.uint8)
+    values[:4, :4], values[4:, 4:] = INSTRUMENT, 0
+    label = torch.full((8, 8), 0.5, requires_grad=True)
+    Silhouettes((values,), 0.0).loss(0, label).backward()
+    gradient = label.grad
+    assert gradient is not None
+    assert bool((gradient[:4, :4] < 0).all())
+    assert bool((gradient[4:, 4:] > 0).all())
+    assert bool((gradient[:4, 4:] == 0).all())
+
+
+def test_many_frames_count_less_each() -> None:
+    values = torch.full((4, 4), INSTRUMENT, dtype=torch.uint8)
+    label = torch.full((4, 4), 0.5)
+    few, many = (float(Silhouettes((values,) * count, 0.0).loss(0, label)) for count in (30, 60))
+    assert few == pytest.approx(2 * many, rel=1e-6)
+
+
+@pytest.mark.parametrize("size", [(4, 6), (8, 12), (16, 24)])
+def test_the_loss_takes_labels_of_any_size(size: tuple[int, int]) -> None:
+    values = torch.zeros(8, 12, dtype=torch.uint8)
+    values[:, :6] = INSTRUMENT
+    right = torch.zeros(size)
+    right[:, : size[1] // 2] = 1
+    silhouettes = Silhouettes((values,), 0.0)
+    assert float(silhouettes.loss(0, right)) < 1e-4 < float(silhouettes.loss(0, 1 - right))
+
+
+def test_a_checkpoint_brings_them_back(capture: Path) -> None:
+    views = TrainingViews.read(read_capture(capture).split("train"))
+    first, second = (
+        begin_session(
+            read_capture(capture), views, training_config("neeco", {"iterations": 20}, ["deformation.width=16"]), print
+        )
+        for _ in range(2)
+    )
+    frames = (torch.arange(6, dtype=torch.uint8).view(2, 3), torch.arange(8, dtype=torch.uint8).view(4, 2))
+    second.restore(*first.pack())
+    assert second.silhouettes is None
+    first.silhouettes = Silhouettes(frames, 0.0125)
+    second.restore(*first.pack())
+    back = second.silhouettes
+    assert back is not None
+    assert back.noise == 0.0125
+    assert all(torch.equal(a, b) for a, b in zip(back.values, frames, strict=True))
