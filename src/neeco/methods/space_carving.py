@@ -151,16 +151,16 @@ def gather_evidence(
         depths.append(torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)))
     cameras, device = [frames[i].camera for i in picked], views.device
     return Evidence(
-        _pad_and_stack(hits, 0.0),
-        _pad_and_stack(depths, torch.inf),
+        pad_and_stack(hits, 0.0),
+        pad_and_stack(depths, torch.inf),
         torch.stack([torch.linalg.inv(camera.world_from_camera.double()).float() for camera in cameras]).to(device),
         torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras], device=device),
         tuple(frames[i] for i in picked),
-        _pad_and_stack(without_shadows, 0.0) if unshaded else None,
+        pad_and_stack(without_shadows, 0.0) if unshaded else None,
     )
 
 
-def _pad_and_stack(images: list[Tensor], padding: float) -> Tensor:
+def pad_and_stack(images: list[Tensor], padding: float) -> Tensor:
     """Stack images [H_i, W_i] of any sizes as [F, H, W], padded at the right and below."""
     height, width = max(image.shape[0] for image in images), max(image.shape[1] for image in images)
     margins = [(0, width - image.shape[1], 0, height - image.shape[0]) for image in images]

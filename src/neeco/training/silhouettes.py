@@ -26,6 +26,10 @@ class Silhouettes:
     noise: float
     _resized: dict[tuple[int, int, int], tuple[Tensor, Tensor]] = field(default_factory=dict, repr=False)
 
+    def instrument(self, index: int) -> Tensor:
+        """Return how certainly each pixel of frame `index` shows an instrument [H, W], in [0, 1]."""
+        return ((self.values[index].float() - UNKNOWN) / (INSTRUMENT - UNKNOWN)).clamp(0, 1)
+
     def loss(self, index: int, label: Tensor) -> Tensor:
         """Return the weighted cross entropy [] of the rendered label [h, w] of frame `index` against its silhouette."""
         height, width = label.shape

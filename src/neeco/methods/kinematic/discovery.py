@@ -14,7 +14,7 @@ from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.state_registration import corrected_evidence, register_states
 from neeco.methods.kinematic.stated_links import StatedLinks
-from neeco.methods.space_carving import Evidence, carved_shape, gather_evidence
+from neeco.methods.space_carving import Evidence, carved_shape, gather_evidence, pad_and_stack
 from neeco.methods.static import Static
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
@@ -54,6 +54,10 @@ def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -
     alone.background, alone.sh_degree = scene.background, scene.sh_degree
     linked = any(instrument.kinematics is not None for instrument in scene.instruments)
     evidence = gather_evidence(alone, session.views, session.config.deformation.carving, unshaded=linked)
+    if session.silhouettes is not None:
+        numbers = {frame.name: number for number, frame in enumerate(session.views.frames)}
+        hits = [session.silhouettes.instrument(numbers[frame.name]) for frame in evidence.frames]
+        evidence = replace(evidence, hits=pad_and_stack(hits, 0.0).to(evidence.hits))
     evidence = corrected_evidence(session, evidence)
     with torch.no_grad():
         scene.canonical = tissue

@@ -24,6 +24,7 @@ FITTED_AT = (0.6, 0.75, 0.9)  # shares at which states are fitted
 MARKS = tuple(sorted({DECIDED_AT, *CARVED_AT, *FITTED_AT}))
 N_SAMPLED = 16  # frames by which errors are sized
 LARGE = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
+LARGE_OVER_KNOWN = 0.1  # the same over a tissue that is known well: fits are sharper there
 SCALE = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
 FOUND = "scale_of_state_errors"  # of a scene's diagnostics
 
@@ -33,22 +34,24 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
     """Fit the states of all training frames at a mark of the run where their errors are larger than a tracker's, which
     is found out at the first.
 
-    Only where silhouettes showed large errors before training: where colours do not tell the instrument from the
-    tissue, shapes that are carved from wrong states take in shadows, and fits follow these."""
+    Only where silhouettes showed large errors before training, or the learned tissue shows silhouettes: elsewhere
+    shapes that are carved from wrong states take in shadows, and fits follow these."""
     scene, refinement = session.scene, session.refinement
     several = any(len(frames) > 1 for frames in refinement.frames_of_instant)
     if several or not (scene.instruments and session.config.refine.frame_poses):
         return  # gradients of several cameras' images determine an instant's state better than each image does
     if mark == DECIDED_AT:
         search, scale = StateSearch.of(session, articulated), 0.0
-        if scene.diagnostics.get(LARGE_ERRORS, False):
+        expected = scene.diagnostics.get(LARGE_ERRORS, False)
+        if expected or session.silhouettes is not None:
             scale = _size_of_errors(search)
-        if scale > LARGE:
+        large = scale > (LARGE if expected else LARGE_OVER_KNOWN)
+        if large:
             scene.diagnostics[FOUND] = round(scale, 3)
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
             for (index,) in refinement.frames_of_instant:
                 refinement.set_deviations(index, search.deviations(index, SCALE))
-        doubt_states(search, SCALE if scale > LARGE else LARGE)
+        doubt_states(search, SCALE if large else LARGE)
     if FOUND not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, doubted = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
