@@ -36,7 +36,7 @@ def test_errors_are_large_by_what_images_can_tell(
 ) -> None:
     search = SimpleNamespace(deviations=lambda index, scale: None)
     monkeypatch.setattr(module.StateSearch, "of", lambda session, articulated: search)
-    monkeypatch.setattr(module, "_size_of_errors", lambda search: size)
+    monkeypatch.setattr(module, "size_of_errors", lambda search: size)
     monkeypatch.setattr(module, "doubt_states", lambda search, scale: None)
     session = session_of(Silhouettes((), 0.0) if observed else None, expected=expected)
     module.fit_states(session, None, module.DECIDED_AT)  # type: ignore[arg-type]

@@ -44,7 +44,7 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
         search, scale = StateSearch.of(session, articulated), 0.0
         expected = scene.diagnostics.get(LARGE_ERRORS, False)
         if expected or session.silhouettes is not None:
-            scale = _size_of_errors(search)
+            scale = size_of_errors(search)
         large = scale > (LARGE if expected else LARGE_OVER_KNOWN)
         if large:
             scene.diagnostics[FOUND] = round(scale, 3)
@@ -68,7 +68,7 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
             carve_again(session, articulated)
 
 
-def _size_of_errors(search: StateSearch) -> float:
+def size_of_errors(search: StateSearch) -> float:
     """Return how large the errors of a sample of states are, times the usual ones of a robot."""
     refinement = search.session.refinement
     fits = []
