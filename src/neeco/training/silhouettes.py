@@ -4,7 +4,7 @@ known; and the loss of rendered labels against them."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -24,7 +24,6 @@ class Silhouettes:
 
     values: tuple[Tensor, ...]
     noise: float
-    _resized: dict[tuple[int, int, int], tuple[Tensor, Tensor]] = field(default_factory=dict, repr=False)
 
     def instrument(self, index: int) -> Tensor:
         """Return how certainly each pixel of frame `index` shows an instrument [H, W], in [0, 1]."""
@@ -33,12 +32,10 @@ class Silhouettes:
     def loss(self, index: int, label: Tensor) -> Tensor:
         """Return the weighted cross entropy [] of the rendered label [h, w] of frame `index` against its silhouette."""
         height, width = label.shape
-        if (key := (index, height, width)) not in self._resized:
-            values = self.values[index].cpu().numpy().astype(np.float32)
-            small = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
-            certain = torch.from_numpy((small - UNKNOWN) / (INSTRUMENT - UNKNOWN)).to(label)
-            self._resized[key] = certain.clamp(0, 1), (-certain).clamp(0, 1)
-        instrument, tissue = self._resized[key]
+        values = self.values[index].cpu().numpy().astype(np.float32)
+        resized = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
+        certain = torch.from_numpy((resized - UNKNOWN) / (INSTRUMENT - UNKNOWN)).to(label)
+        instrument, tissue = certain.clamp(0, 1), (-certain).clamp(0, 1)
         label = label.clamp(MIN_SHARE, 1 - MIN_SHARE)
         weight = WEIGHT * min(1.0, FEW / len(self.values))
         return -weight * (instrument * label.log() + tissue * (1 - label).log()).mean()
