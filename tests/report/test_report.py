@@ -53,6 +53,8 @@ def test_the_page_says_the_numbers_and_the_notes(reported):
     text = path.read_text()
     for kind in ("given", "aligned"):
         assert f"<td>{evaluation[kind]['test']['psnr']:.2f}</td>" in text
+        assert f"<td>{evaluation[kind]['test']['mask_precision']:.3f}</td>" in text
+        assert f"<td>{evaluation[kind]['test']['mask_recall']:.3f}</td>" in text
     assert "phase 2" in text
     assert "0.4 min" in text
 
