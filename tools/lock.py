@@ -126,6 +126,8 @@ def lock(options: Sequence[str]) -> dict[str, list[Locked]]:
     roots = [root for group in named.values() for root in group.roots]
     every = resolve((extra for group in named.values() for extra in group.extras or ()), roots, before, options)
     full = {entry.name: entry for entry in every}
+    if newer := sorted(entry.name for entry in every if "python_full_version >=" in (entry.marker or "")):
+        raise SystemExit(f"tools/lock.py: {', '.join(newer)}: not for every Python that neeco runs on; bound it")
     result: dict[str, list[Locked]] = {}
     for name, group in named.items():
         needed = {entry.name for entry in resolve(group.extras, group.roots, every, ())}

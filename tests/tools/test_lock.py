@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from packaging.markers import Marker
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -76,6 +77,15 @@ def test_every_locked_version_has_a_hash_and_is_the_same_everywhere(lock: Module
     assert all(len(each) == 1 for each in versions.values())
     assert all(entry.hashes for entry in lock.locked(lock.TORCH_CPU))
     assert {entry.version.partition("+")[0] for entry in lock.locked(lock.TORCH_CPU)} <= versions["torch"]
+
+
+def test_the_oldest_python_gets_all_of_it(lock: ModuleType) -> None:
+    """Debian 12 has 3.11.2; a package that wants a newer one would be missing there."""
+    for group in lock.groups():
+        for entry in lock.locked(group):
+            oldest = {"python_full_version": "3.11.0", "python_version": "3.11", "sys_platform": "linux"}
+            if "python" in (entry.marker or ""):
+                assert Marker(entry.marker).evaluate(oldest), f"{group}: {entry.pin}"
 
 
 def test_constraints_are_those_of_the_lock(lock: ModuleType) -> None:
