@@ -27,6 +27,11 @@ VISIBLE_MM, VISIBLE_RAD = 1.0, 0.03  # changes that a picture shows: of a positi
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
+def image_files(folder: Path) -> tuple[Path, ...]:
+    """The images in a folder by name, without hidden ones."""
+    return tuple(file for file in sorted(folder.iterdir()) if file.suffix in EXTENSIONS and file.name[0] != ".")
+
+
 def read_image(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> Tensor:
     """An image as float32 [H, W, 3] in [0, 1], sRGB as stored (EXIF orientation is not applied).
 

@@ -37,22 +37,24 @@ class Score(NamedTuple):
     meaning: str
 
 
-SCORES = (
+IMAGE_SCORES = (
     Score("psnr", "PSNR dB", "{:.2f}", "Similarity of the rendered pixels to the recorded; 30 is close, 20 is rough."),
     Score("ssim", "SSIM", "{:.3f}", "Structural similarity, 1 is equal (11x11 Gaussian window, as 3DGS scores it)."),
     Score("lpips", "LPIPS", "{:.3f}", "Perceptual distance by AlexNet features (Zhang et al. 2018); 0 is equal."),
     Score("lpips_vgg", "LPIPS VGG", "{:.3f}", "The same by VGG16 features."),
     Score("psnr_instrument", "PSNR instr.", "{:.2f}", "PSNR over the pixels where the instrument truly is."),
-    Score("mask_iou", "mask IoU", "{:.3f}", "Label mask against true mask: shared area over joint area; 1 is perfect."),
-    Score("mask_precision", "precision", "{:.3f}", "How much of the label mask is truly instrument."),
-    Score("mask_recall", "recall", "{:.3f}", "How much of the true mask is labelled."),
-    Score("shaft_recall", "recall, shafts", "{:.3f}", "How much of the true shafts is labelled instrument."),
-    Score("shadow_labelled", "shadow labelled", "{:.1%}", "How much of the instruments' shadow on tissue is labelled."),
     Score("psnr_covered", "PSNR covered", "{:.2f}", "PSNR without the tissue that no training frame saw."),
     Score("covered_fraction", "covered", "{:.1%}", "How much of the visible tissue at least one training frame saw."),
     Score("fps", "FPS", "{:.1f}", "Posed images rendered per second on the machine that evaluated."),
     Score("num_gaussians", "Gaussians", "{:,}", "Gaussians used by one rendering."),
     Score("frames", "frames", "{}", "How many frames were scored."),
+)  # fmt: skip
+LABEL_SCORES = (
+    Score("mask_iou", "mask IoU", "{:.3f}", "Label mask against true mask: shared area over joint area; 1 is perfect."),
+    Score("mask_precision", "precision", "{:.3f}", "How much of the label mask is truly instrument."),
+    Score("mask_recall", "recall", "{:.3f}", "How much of the true mask is labelled."),
+    Score("shaft_recall", "recall, shafts", "{:.3f}", "How much of the true shafts is labelled instrument."),
+    Score("shadow_labelled", "shadow labelled", "{:.1%}", "How much of the instruments' shadow on tissue is labelled."),
 )  # fmt: skip
 KINDS = {
     "given": "As given: rendered at the poses the capture states, tracker errors included",
@@ -195,18 +197,26 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
 
 
 def _numbers(evaluation: dict[str, Any]) -> dict[str, Any]:
-    """The columns of the table of numbers that anything is known for, and its rows: (title of the kind, its splits)."""
+    """The tables of numbers, of images and of labels: columns that anything is known for, and rows."""
     kinds = {kind: evaluation[kind] for kind in KINDS if kind in evaluation}
+    tables = [_table(kinds, scores) for scores in (IMAGE_SCORES, LABEL_SCORES)]
+    return {"tables": [(columns, rows) for columns, rows in tables if columns]}
+
+
+def _table(
+    kinds: dict[str, Any], scores: tuple[Score, ...]
+) -> tuple[list[Score], list[tuple[str, list[tuple[str, list[str]]]]]]:
+    """Columns and rows (title of the kind, its splits) of one table."""
     known = [numbers for splits in kinds.values() for numbers in splits.values()]
-    columns = [score for score in SCORES if any(numbers.get(score.key) is not None for numbers in known)]
-    scores = []
+    columns = [score for score in scores if any(numbers.get(score.key) is not None for numbers in known)]
+    groups = []
     for kind, splits in kinds.items():
         rows = [
             (split, [_written(numbers.get(score.key), score.form) for score in columns])
             for split, numbers in splits.items()
         ]
-        scores.append((KINDS[kind], rows))
-    return {"columns": columns, "scores": scores}
+        groups.append((KINDS[kind], rows))
+    return columns, groups
 
 
 def _parts(evaluation: dict[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import torch
 from numpy.random import Generator
 from torch import Tensor
 
-from neeco.capture.images import EXTENSIONS, image_size, read_image_bytes
+from neeco.capture.images import image_files, image_size, read_image_bytes
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.raster import rasterize
@@ -50,13 +50,13 @@ class ImageFolder:
     files: tuple[Path, ...]
 
     @classmethod
-    def of(cls, folder: str, option: str) -> ImageFolder:
-        """The images in a folder that a command line's option names, in the order of their names. Raises NeecoError
-        where there is none, or one is too small or cannot be read."""
-        place = Path(folder)
+    def of(cls, folder: str | Path, setting: str) -> ImageFolder:
+        """The images in a folder that a setting names, in the order of their names. Raises NeecoError where there is
+        none, or one is too small or cannot be read."""
+        place, option = Path(folder), setting.replace("_", "-")
         if not place.is_dir():
             raise NeecoError(f"--{option}: {folder}: no such folder; give one with images of another operation")
-        files = tuple(file for file in sorted(place.iterdir()) if file.suffix in EXTENSIONS and file.name[0] != ".")
+        files = image_files(place)
         if not files:
             raise NeecoError(f"--{option}: {folder}: has no image; give .png or .jpg files")
         for file in files:
@@ -192,10 +192,10 @@ class Appearances:
     def of(cls, settings: Settings) -> Appearances:
         """Those that settings describe. Raises NeecoError for a folder without images."""
         folders = {
-            option: None if folder is None else ImageFolder.of(folder, option)
-            for option, folder in settings.image_folders().items()
+            name: None if folder is None else ImageFolder.of(folder, name)
+            for name, folder in settings.image_folders().items()
         }
-        return cls(folders["backgrounds"], settings.relight_share, folders["match-colors"])
+        return cls(folders["backgrounds"], settings.relight_share, folders["match_colors"])
 
     def draw(self, rng: Generator, width: int, height: int) -> Appearance:
         """Sample the appearance of an image. Raises NeecoError where a background cannot be read."""

@@ -107,8 +107,8 @@ def synthesize(
     scene, *instrument_scenes = (given.scene for given in runs)
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
     folders = {
-        option.replace("-", "_"): None if folder is None else ImageFolder.of(folder, option).digest()
-        for option, folder in settings.image_folders().items()
+        name: None if folder is None else ImageFolder.of(folder, name).digest()
+        for name, folder in settings.image_folders().items()
     }
     check_formats(formats, settings)
     recorded = scene.recorded.cameras[0]

@@ -266,9 +266,8 @@ class SampleGenerator:
             rendering, _, share = self.labeller.draw(gaussians, camera, self.labeller.owners(state, gaussians))
             shares.append(share.clamp(0, 1).cpu())
             image = rendering.color.clamp(0, 1).cpu()
-            images.append(
-                self._image(state, camera, image, shares[-1], appearance).numpy()
-            )  # a background stands still
+            image = self._image(state, camera, image, shares[-1], appearance)  # a background stands still
+            images.append(image.numpy())
         drawing = replace(drawing, image=torch.from_numpy(average_exposure(images)))
         return drawing if self.effects.soft_masks == "mid" else replace(drawing, share=torch.stack(shares).mean(0))
 

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 from neeco.errors import NeecoError
 from neeco.files import read_bytes, sweep_unfinished, write_atomically
@@ -46,9 +47,9 @@ class PackedSpec:
             paths["effects.yaml"] = Path(spec.settings.camera_effects)
         if spec.settings.states not in SAMPLERS:
             paths["states.jsonl"] = states_file(spec.settings.states)
-        for option, given in spec.settings.image_folders().items():
-            for file in () if given is None else ImageFolder.of(given, option).files:
-                paths[f"{option}/{file.name}"] = file
+        for name, given in spec.settings.image_folders().items():
+            for file in () if given is None else ImageFolder.of(given, name).files:
+                paths[f"{name}/{file.name}"] = file
         files = {name: read_bytes(path, "a scene or settings file") for name, path in paths.items()}
         content = b"".join(hashlib.sha256(files[name]).digest() for name in sorted(files))
         return cls(spec, files, hashlib.sha256(content + repr(spec.settings).encode()).hexdigest())
@@ -68,10 +69,9 @@ class PackedSpec:
         settings = self.spec.settings
         if "effects.yaml" in self.files:
             settings = replace(settings, camera_effects=str(folder / "effects.yaml"))
-        if settings.backgrounds is not None:
-            settings = replace(settings, backgrounds=str(folder / "backgrounds"))
-        if settings.match_colors is not None:
-            settings = replace(settings, match_colors=str(folder / "match-colors"))
+        given = [name for name, images in settings.image_folders().items() if images is not None]
+        moved: dict[str, Any] = {name: str(folder / name) for name in given}
+        settings = replace(settings, **moved)
         if "states.jsonl" in self.files:
             prefix = PATH_PREFIX if settings.states.startswith(PATH_PREFIX) else ""
             settings = replace(settings, states=f"{prefix}{folder / 'states.jsonl'}")

@@ -207,8 +207,8 @@ class Settings(ImageSettings):
         return self.relight if self.relight is not None else RELIGHT_SHARE if self.backgrounds else 0.0
 
     def image_folders(self) -> dict[str, str | None]:
-        """Return the folders of images of another operation, by option."""
-        return {"backgrounds": self.backgrounds, "match-colors": self.match_colors}
+        """Return the folders of images of another operation, by setting."""
+        return {"backgrounds": self.backgrounds, "match_colors": self.match_colors}
 
     def identity(self) -> dict[str, Any]:
         """Return the settings that must stay the same for a data set to be continued, other than `image_identity`: all

@@ -170,7 +170,8 @@ class GaussianSession(GaussianTraining):
             self.views.prefetch(following)
         loss = photometric_loss(rendering.color, target, mask, ssim_weight=self.config.ssim_weight)
         fitted = loss
-        if self.silhouettes is not None and rendering.channels is not None:
+        if self.silhouettes is not None:
+            assert rendering.channels is not None
             fitted = loss + self.silhouettes.loss(index, rendering.channels[..., 0])
         weight = trust_of(self.given[index][0]) * float(self.refinement.weights[index])
         total = weight * fitted + self._regularisation(rendering, penalty)

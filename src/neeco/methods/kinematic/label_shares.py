@@ -132,16 +132,11 @@ def _label_shares(session: GaussianSession, views: list[_View], probable: list[n
 @torch.no_grad()
 def _view(session: GaussianSession, index: int) -> _View:
     scene = session.scene
-    state, camera = session.corrected(index)
-    instrument = scene.canonical.of_instruments
-    posed = scene.at(state)
-    columns = torch.cat([instrument.float()[:, None], scene.label_channels()], 1)
-    channels = rasterize(posed, camera, channels=columns).channels
-    assert channels is not None
+    columns = torch.cat([scene.canonical.of_instruments.float()[:, None], scene.label_channels()], 1)
+    channels, tissue = channels_and_tissue(session, index, columns)
     share, parts = channels[..., 0].cpu().numpy(), channels[..., 1:].argmax(-1).cpu().numpy()
     reach = 2 * max(1, math.ceil(EDGE * min(share.shape))) + 1
     inside = cv2.erode((share > INSIDE).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
-    tissue = rasterize(posed.select(~instrument), camera).color.clamp(0, 1).cpu().numpy()
     image, mask = session.views.target(index).cpu().numpy(), session.views.mask(index)
     if mask is not None:
         inside &= mask.cpu().numpy()
@@ -156,6 +151,19 @@ def _view(session: GaussianSession, index: int) -> _View:
     )
 
 
+@torch.no_grad()
+def channels_and_tissue(session: GaussianSession, index: int, columns: Tensor) -> tuple[Tensor, np.ndarray]:
+    """Return, for training frame `index`, the scene's channels [H, W, C] of `columns` [N, C], and its tissue rendered
+    without instruments [H, W, 3] in [0, 1]."""
+    scene = session.scene
+    state, camera = session.corrected(index)
+    posed = scene.at(state)
+    channels = rasterize(posed, camera, channels=columns).channels
+    assert channels is not None
+    tissue = rasterize(posed.select(~scene.canonical.of_instruments), camera).color.clamp(0, 1)
+    return channels, tissue.cpu().numpy()
+
+
 def _bins(colors: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the bins of colours [..., 3] in [0, 1], one array per channel."""
     found = np.clip((colors * N_BINS).astype(int), 0, N_BINS - 1)
@@ -164,17 +172,17 @@ def _bins(colors: np.ndarray) -> tuple[np.ndarray, ...]:
 
 def _probabilities(views: list[_View]) -> list[np.ndarray]:
     """Return the probability [P] that each pixel of the views shows an instrument, by the colours inside them."""
-    density = _color_density(np.concatenate([view.image[view.inside] for view in views]))
+    density = color_density(np.concatenate([view.image[view.inside] for view in views]))
     return [_instrument_probability(view.image, view.tissue, density) for view in views]
 
 
-def share_of_colors(images: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Return the share [...] of colours [M, 3] that are like each pixel of the images [..., 3]."""
-    shares: np.ndarray = _color_density(colors)[_bins(images)] / N_BINS**3
+def share_of_colors(images: np.ndarray, density: np.ndarray) -> np.ndarray:
+    """Return the share [...] of the colours with this density that are like each pixel of the images [..., 3]."""
+    shares: np.ndarray = density[_bins(images)] / N_BINS**3
     return shares
 
 
-def _color_density(colors: np.ndarray) -> np.ndarray:
+def color_density(colors: np.ndarray) -> np.ndarray:
     """[N_BINS, N_BINS, N_BINS] density of colours [M, 3] in [0, 1], per unit of the colour cube."""
     counts = np.zeros((N_BINS,) * 3)
     np.add.at(counts, _bins(colors), 1)

@@ -16,8 +16,7 @@ import torch
 from scipy.ndimage import uniform_filter
 
 from neeco.capture.model import evenly_spaced
-from neeco.methods.kinematic.label_shares import shades_of, share_of_colors
-from neeco.raster import rasterize
+from neeco.methods.kinematic.label_shares import channels_and_tissue, color_density, shades_of, share_of_colors
 from neeco.training.session import GaussianSession
 from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
 
@@ -43,33 +42,29 @@ def observe_silhouettes(session: GaussianSession) -> None:
     if not scene.instruments:
         return
     count = len(session.views.frames)
-    sample = [_View(session, index) for index in evenly_spaced(count, N_SAMPLED)]
+    sampled = {index: _View(session, index) for index in evenly_spaced(count, N_SAMPLED)}
+    sample = list(sampled.values())
     noise, known = _noise(sample), session.silhouettes
     if noise > MAX_NOISE or (known is not None and noise >= known.noise):
         return
     lower, upper = (max(least, factor * noise) for least, factor in (TISSUE, NOT_TISSUE))
     shown = [view.image[view.usable & (view.residual > upper) & (view.label > LABEL)] for view in sample]
-    colors = np.concatenate(shown)
-    values = tuple(_View(session, index).silhouette(lower, upper, colors) for index in range(count))
-    session.silhouettes = Silhouettes(values, noise)
+    density = color_density(np.concatenate(shown))
+    views = (sampled[index] if index in sampled else _View(session, index) for index in range(count))
+    session.silhouettes = Silhouettes(tuple(view.silhouette(lower, upper, density) for view in views), noise)
 
 
 class _View:
     """A training image beside the scene's tissue: residual [H, W] after the best shade, label [H, W] as rendered."""
 
     def __init__(self, session: GaussianSession, index: int) -> None:
-        scene = session.scene
-        state, camera = session.corrected(index)
-        instrument = scene.canonical.of_instruments
-        posed = scene.at(state)
-        channels = rasterize(posed, camera, channels=instrument.float()[:, None]).channels
-        assert channels is not None
+        columns = session.scene.canonical.of_instruments.float()[:, None]
+        channels, tissue = channels_and_tissue(session, index, columns)
         self.label = channels[..., 0].cpu().numpy()
-        self.tissue = rasterize(posed.select(~instrument), camera).color.clamp(0, 1).cpu().numpy()
         self.image = session.views.target(index).cpu().numpy()
         mask = session.views.mask(index)
         self.usable = np.ones(self.label.shape, bool) if mask is None else mask.cpu().numpy()
-        off = np.abs(self.image - shades_of(self.image, self.tissue)[..., None] * self.tissue).mean(-1)
+        off = np.abs(self.image - shades_of(self.image, tissue)[..., None] * tissue).mean(-1)
         self.residual = uniform_filter(off, WINDOW_PX)
 
     def within(self, share: float) -> np.ndarray:
@@ -77,12 +72,12 @@ class _View:
         reach = 2 * math.ceil(share * self.label.shape[1]) + 1
         return cv2.dilate((self.label > LEAST_LABEL).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
 
-    def silhouette(self, lower: float, upper: float, colors: np.ndarray) -> torch.Tensor:
+    def silhouette(self, lower: float, upper: float, density: np.ndarray) -> torch.Tensor:
         """Return the frame's values [H, W] uint8 of `Silhouettes`: residuals above `upper` are instrument, those below
-        `lower` tissue where instruments, whose colours are [M, 3], rarely look like it."""
+        `lower` tissue where instruments, whose colours have this density, rarely look like it."""
         off = np.clip((self.residual - lower) / (upper - lower), 0, 1)
         instrument = np.where(self.within(NEAR), 2 * off - 1, 0).clip(0, 1)
-        tissue = np.where(share_of_colors(self.image, colors) < ALIKE, 1 - 2 * off, 0).clip(0, 1)
+        tissue = np.where(share_of_colors(self.image, density) < ALIKE, 1 - 2 * off, 0).clip(0, 1)
         certain = np.where(self.usable, instrument - tissue, 0)
         return torch.from_numpy((UNKNOWN + certain * (INSTRUMENT - UNKNOWN)).round().clip(0, 255).astype(np.uint8))
 

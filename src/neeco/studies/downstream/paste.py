@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from neeco.capture.images import EXTENSIONS, read_image_bytes
+from neeco.capture.images import image_files, read_image_bytes
 from neeco.errors import NeecoError
 from neeco.studies.downstream.samples import Example, RecordedSample, loaded
 
@@ -149,7 +149,7 @@ def background_files(folder: Path) -> tuple[Path, ...]:
     """The images of a folder. Raises NeecoError where it has none."""
     if not folder.is_dir():
         raise NeecoError(f"--backgrounds {folder}: no such folder; give a folder of images without an instrument")
-    files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in EXTENSIONS]
+    files = image_files(folder)
     if not files:
         raise NeecoError(f"--backgrounds {folder}: has no image; give a folder of images without an instrument")
-    return tuple(files)
+    return files

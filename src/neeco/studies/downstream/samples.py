@@ -13,7 +13,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 import cv2
 import numpy as np
 
-from neeco.capture.images import EXTENSIONS, image_size, open_image, read_image_bytes, read_labels
+from neeco.capture.images import image_files, image_size, open_image, read_image_bytes, read_labels
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth, truth_file, truth_names
@@ -348,7 +348,7 @@ def synthetic_samples(
     folder = data.file(IMAGE_FOLDER)
     if not folder.is_dir():
         raise data.error(f"{data.path}: no folder {IMAGE_FOLDER}/; give what `neeco synthesize` wrote")
-    images = [file for file in sorted(folder.iterdir()) if file.suffix in EXTENSIONS and not file.name.startswith(".")]
+    images = list(image_files(folder))
     if not images:
         raise data.error(f"{folder}: has no image; give what `neeco synthesize` wrote")
     images = _training_images(data, images)
