@@ -3,6 +3,7 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 
 #include <optional>
 #include <stdexcept>
@@ -13,6 +14,7 @@ namespace neeco {
 namespace nb = nanobind;
 using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using MaybeArray = std::optional<Array>;
+using Flags = nb::ndarray<bool, nb::c_contig, nb::device::cpu>;
 
 inline float* data_of(const MaybeArray& a) { return a ? a->data() : nullptr; }
 

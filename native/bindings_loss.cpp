@@ -1,5 +1,4 @@
 // neeco._native: the photometric loss and Adam.
-#include <nanobind/stl/optional.h>
 
 #include <cmath>
 

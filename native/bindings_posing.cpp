@@ -1,5 +1,4 @@
 // neeco._native: posing bodies of links that joints move.
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 

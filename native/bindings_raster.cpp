@@ -1,5 +1,4 @@
 // neeco._native: drawing and its gradient. Python holds a Drawing between the two.
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -138,6 +137,17 @@ public:
         latest().take(*frame_);
     }
 
+    // Alpha and depth [H, W] of the chosen Gaussians [N] without the others, after forward, whose alpha and depth are given.
+    void alone(Flags chosen, Array drawn_alpha, Array drawn_depth, Array alpha, Array depth) {
+        const size_t p = pixels();
+        if (chosen.size() != static_cast<size_t>(in_.count)) throw std::invalid_argument("alone: one flag for every Gaussian expected");
+        const float *from_alpha = sized(drawn_alpha, p, "alpha"), *from_depth = sized(drawn_depth, p, "depth");
+        float *to_alpha = sized(alpha, p, "alpha"), *to_depth = sized(depth, p, "depth");
+        if (!kernels_) throw std::runtime_error("alone before forward");
+        nb::gil_scoped_release release;
+        kernels_->composite_alone(*frame_, chosen.data(), from_alpha, from_depth, to_alpha, to_depth);
+    }
+
     // Gradients of the images in the order of forward, then where the gradients of the Gaussians go.
     void backward(MaybeArray color, MaybeArray alpha, MaybeArray depth, MaybeArray channels, Array drawn_alpha, Array drawn_depth,
                   const std::vector<MaybeArray>& to) {
@@ -176,6 +186,7 @@ void bind_raster(nb::module_& m) {
              nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg().none(),
              nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg())
         .def("forward", &Drawing::forward, nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg(), nb::arg())
+        .def("alone", &Drawing::alone)
         .def("backward", &Drawing::backward, nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg(),
              nb::arg());
     m.def("last_statistics", &last_statistics);

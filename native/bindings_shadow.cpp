@@ -1,4 +1,4 @@
-// neeco._native: what of a lamp's light Gaussians miss.
+// neeco._native: what of a lamp's light Gaussians miss, and what of them no training frame saw.
 #include <cstring>
 
 #include "arrays.hpp"
@@ -7,7 +7,6 @@
 namespace neeco {
 namespace {
 
-using Flags = nb::ndarray<bool, nb::c_contig, nb::device::cpu>;
 using Places = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
 
 // maps [3, H, W] and where they lie, int [4]: what `cast` leaves for the gradient. numbers [21]: rotation [9] and centre [3] of the camera, offset [3], fx, fy, cx,
@@ -56,11 +55,29 @@ void cast_backward(Array means, Flags casters, Array numbers, Array maps, Places
     k.cast_backward(in, m, found, from, partial, to);
 }
 
+// numbers [4]: the camera's centre, and the visibility of what is half unobserved.
+void unobserved(Array means, MaybeArray frames, Array visibility, Array directions, Array numbers, Array shares) {
+    const size_t n = shares.size();
+    ViewInputs in{};
+    in.count = static_cast<int>(n);
+    in.means = sized(means, 3 * n, "means");
+    in.frames = sized(frames, 4 * n, "frames");
+    in.visibility = sized(visibility, kViewDirections * n, "visibility");
+    in.directions = sized(directions, 3 * kViewDirections, "directions");
+    const float* from = sized(numbers, 4, "numbers");
+    std::memcpy(in.centre, from, sizeof in.centre);
+    in.half = from[3];
+    const Kernels& k = kernels();
+    nb::gil_scoped_release release;
+    k.unobserved(in, shares.data());
+}
+
 }  // namespace
 
 void bind_shadow(nb::module_& m) {
     m.def("cast", &cast);
     m.def("cast_backward", &cast_backward);
+    m.def("unobserved", &unobserved, nb::arg(), nb::arg().none(), nb::arg(), nb::arg(), nb::arg(), nb::arg());
 }
 
 }  // namespace neeco

@@ -70,6 +70,18 @@ struct PosedRows {
     float* logits;              // gradients only
 };
 
+// Gaussians from a camera, and how much of each the training frames saw from each of some directions.
+constexpr int kViewDirections = 12;
+struct ViewInputs {
+    int count;
+    const float* means;         // [N, 3] mm, world
+    const float* frames;        // [N, 4] unit, world_from_sh, or null
+    const float* visibility;    // [N, 12]
+    const float* directions;    // [12, 3] unit, in the frames
+    float centre[3];            // of the camera, world, mm
+    float half;                 // visibility of what is half unobserved
+};
+
 struct Kernels {
     const char* name;
     int width;                  // floats per vector
@@ -86,6 +98,9 @@ struct Kernels {
                           float* to);
     void (*pose)(const Body&, const PosedRows&);
     void (*pose_backward)(const Body&, const PosedRows& from, const PosedRows& to, Buffer<double>& partial, float* to_numbers);
+    // chosen: [N]; of the frame that was drawn last, whose alpha and depth [H, W] are given
+    void (*composite_alone)(Frame&, const bool* chosen, const float* drawn_alpha, const float* drawn_depth, float* alpha, float* depth);
+    void (*unobserved)(const ViewInputs&, float* to);  // [N]
 };
 
 // The table for this machine, or the one NEECO_SIMD asks for; throws std::runtime_error when that cannot run here.
@@ -98,7 +113,7 @@ std::vector<const char*> runnable_kernels();
 void select_kernels(const char* name);
 
 // Numbers of composited values that the kernels are compiled for: colour, depth and 0, 1, 2, 4, 8, 16, 32 channels.
-#define NEECO_VALUES(X) X(4) X(5) X(6) X(8) X(12) X(20) X(36)
+#define NEECO_VALUES(X) X(4) X(5) X(6) X(8) X(9) X(12) X(20) X(36)
 constexpr int kMostChannels = 32;
 
 // Groups the pieces of a chunk that was just projected by band.

@@ -352,3 +352,37 @@ def test_image_and_gradients_are_the_references_on_the_backends_device(
             assert error(image * seen, wanted * seen) < 5e-3, name
     for name in ("means", "quats", "scales", "opacities", "sh", "background", "world_from_camera"):
         assert error(gradients[name], expected_gradients[name]) < 2e-2, f"gradient of {name}"
+
+
+@pytest.mark.parametrize("size", [1.0, 12.0])
+@pytest.mark.parametrize("learned_fx", [None, 120.0, 30.0])
+def test_gaussians_alone_in_a_rendering_are_those_rendered_without_the_others(
+    simd: str, size: float, learned_fx: float | None
+) -> None:
+    scene = make_scene(400, 4, 5, seed=3, width=131, height=97, size=size)
+    _, gaussians, camera = leaves(scene, torch.float32)
+    camera = replace(camera, learned_fx=learned_fx)
+    right = gaussians.means[:, 0] > 10  # some tiles show both, some one of them
+    sets = [right, ~right, torch.zeros_like(right), torch.ones_like(right)]
+    channels = scene.tensors["channels"]
+    for backend in ("cpu", "reference"):
+        with torch.no_grad():
+            found = rasterize(gaussians, camera, channels=channels, alone=sets, backend=backend).alone
+            for layer, chosen in zip(found, sets, strict=True):
+                expected = rasterize(gaussians.select(chosen), camera, backend=backend)
+                assert torch.equal(layer.alpha, expected.alpha)
+                assert torch.equal(layer.depth, expected.depth)
+        if learned_fx is not None or size > 1:
+            break  # the reference is slow
+
+
+def test_gaussians_alone_pass_no_gradient_and_change_none() -> None:
+    scene = make_scene(60, 1, 1, seed=4)
+    gradients = []
+    for alone in ((), [torch.arange(60) % 2 == 0]):
+        t, gaussians, camera = leaves(scene, torch.float32)
+        rendering = rasterize(gaussians, camera, channels=t["channels"], alone=alone)
+        assert not any(layer.alpha.requires_grad or layer.depth.requires_grad for layer in rendering.alone)
+        rendering.color.sum().backward()
+        gradients.append(t["means"].grad)
+    assert torch.equal(*gradients)

@@ -5,18 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from scene_worlds import GRASPER, SURE, grasper_state, pose_of
 from torch import Tensor
 
 from neeco.capture.model import State
 from neeco.geometry.camera import Camera
-from neeco.raster import rasterize
+from neeco.raster import Gaussians, rasterize
+from neeco.raster.native import kernels
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.method_registry import make_deformation, method_settings
-from neeco.scene.visibility import DIRECTIONS, EXTRAPOLATED, measure_visibility
+from neeco.scene.visibility import DIRECTIONS, EXTRAPOLATED, measure_visibility, unobserved_share
 
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=80.0, fy=80.0, cx=32.0, cy=24.0, width=64, height=48)
 FRONT = pose_of(0, 0, 0, 0, 0, 0)  # both in the camera's frame: an instrument is moved, the camera stays
@@ -120,3 +122,23 @@ def test_what_stands_behind_is_unobserved_and_what_was_marked_stays_so() -> None
 def test_without_recorded_frames_everything_is_unobserved() -> None:
     scene = still(ball(), ())
     assert bool((scene.unobserved(scene.at(State()), CAMERA) == 1).all())
+
+
+@pytest.mark.parametrize("count", [1, 17, 5000])
+@pytest.mark.parametrize("framed", [False, True])
+def test_the_kernel_finds_the_share_that_torch_defines(count: int, framed: bool) -> None:
+    g = torch.Generator().manual_seed(count)
+    means = 30 * torch.randn(count, 3, generator=g) + torch.tensor([0.0, 0.0, 100.0])
+    frames = torch.nn.functional.normalize(torch.randn(count, 4, generator=g), dim=1) if framed else None
+    ones = torch.ones(count)
+    posed = Gaussians(
+        means, frames if framed else means.new_ones(count, 4), means, ones, means[:, None], sh_frames=frames
+    )
+    visibility = torch.rand(count, 12, generator=g) ** 8
+    with torch.no_grad():
+        found = unobserved_share(visibility, posed, CAMERA)
+        with kernels("torch"):
+            defined = unobserved_share(visibility, posed, CAMERA)
+    assert float(defined.min()) > 0
+    assert float(defined.max()) <= 1
+    torch.testing.assert_close(found, defined, rtol=1e-5, atol=1e-7)

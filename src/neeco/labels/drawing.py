@@ -19,7 +19,7 @@ from neeco.capture.model import State
 from neeco.geometry.camera import Camera
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, composited_parts, instruments_of, threshold_of
 from neeco.raster import rasterize
-from neeco.raster.types import Rendering
+from neeco.raster.types import Layer, Rendering
 
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene, GaussianScene
@@ -96,16 +96,17 @@ def draw_layers(
     gaussians = scene.at(state)
     owners = labeller.owners(state, gaussians)
     unobserved = scene.unobserved(gaussians, camera)
-    rendering, parts, share = labeller.draw(gaussians, camera, owners, unobserved)
+    shown = {k: name for k, name in enumerate(instruments_of(labeller.names)) if name in state.instruments}
+    alone = [owners == k for k in shown] + [owners < 0]
+    rendering, parts, share = labeller.draw(gaussians, camera, owners, unobserved, alone)
     assert rendering.channels is not None
     parts, share = _drop_small_components(parts.cpu(), share.clamp(0, 1).cpu(), labeller.names, min_component)
-    colorless = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None)  # depth needs no colour, which takes time
-    layers = {}
-    for k, name in enumerate(instruments_of(labeller.names)):
-        if name in state.instruments:
-            single = rasterize(colorless.select(owners == k), camera)
-            layers[name] = InstrumentLayer((single.alpha > threshold_of(scene)).cpu().numpy(), surface_depth(single))
-    tissue = rasterize((gaussians if tissue_image else colorless).select(owners < 0), camera)
+    threshold = threshold_of(scene)
+    layers = {
+        name: InstrumentLayer((single.alpha > threshold).cpu().numpy(), surface_depth(single))
+        for name, single in zip(shown.values(), rendering.alone, strict=False)
+    }
+    tissue = rasterize(gaussians.select(owners < 0), camera).color.clamp(0, 1).cpu() if tissue_image else None
     return LayeredDrawing(
         image=rendering.color.clamp(0, 1).cpu(),
         parts=parts,
@@ -113,8 +114,8 @@ def draw_layers(
         state=state,
         camera=camera,
         depth=surface_depth(rendering),
-        tissue_depth=surface_depth(tissue),
-        tissue_image=tissue.color.clamp(0, 1).cpu() if tissue_image else None,
+        tissue_depth=surface_depth(rendering.alone[-1]),
+        tissue_image=tissue,
         layers=layers,
         unobserved=rendering.channels[..., -1].cpu(),
         keypoints=keypoint_arrays(scene, state),
@@ -140,7 +141,7 @@ def extended_silhouettes(
     }
 
 
-def surface_depth(rendering: Rendering) -> np.ndarray:
+def surface_depth(rendering: Rendering | Layer) -> np.ndarray:
     """Return the expected depth [H, W] mm where the rendering is opaque, 0 elsewhere."""
     return to_numpy(rendering.depth * (rendering.alpha > SURFACE_ALPHA))
 

@@ -7,6 +7,7 @@ moves is the instrument, without parts and occlusion.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -101,14 +102,19 @@ class CompositedLabels:
         return self._owners
 
     def draw(
-        self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        owners: Tensor,
+        unobserved: Tensor | None = None,
+        alone: Sequence[Tensor] = (),
     ) -> tuple[Rendering, Tensor, Tensor]:
         """Render the whole scene in one pass; return it, part ids [H, W] uint8 and shares of instrument [H, W].
 
-        unobserved [N]: becomes the rendering's last channel.
+        unobserved [N]: becomes the rendering's last channel. alone: as `rasterize` takes it.
         """
         channels = self.channels if unobserved is None else torch.cat([self.channels, unobserved[:, None]], 1)
-        rendering = rasterize(gaussians, camera, channels=channels)
+        rendering = rasterize(gaussians, camera, channels=channels, alone=alone)
         assert rendering.channels is not None
         labels = replace(rendering, channels=rendering.channels[..., : len(self.names)])
         return rendering, *composited_labels(labels, self.threshold)
@@ -158,17 +164,23 @@ class ThresholdLabels:
         return torch.where(moved, torch.cdist(means, origins).argmin(dim=1), -1)
 
     def draw(
-        self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        owners: Tensor,
+        unobserved: Tensor | None = None,
+        alone: Sequence[Tensor] = (),
     ) -> tuple[Rendering, Tensor, Tensor]:
         """Render as `CompositedLabels` does; ids and share (the alpha) are from the moved Gaussians alone."""
         moved = owners >= 0
         shares = torch.nn.functional.one_hot(owners[moved], len(self.names)).to(gaussians.means)
-        alone = rasterize(gaussians.select(moved), camera, channels=shares)
-        assert alone.channels is not None
-        ids = alone.channels.argmax(dim=2) + 1
-        lit = alone.color.norm(dim=2) > MIN_BRIGHTNESS
-        rendering = rasterize(gaussians, camera, channels=None if unobserved is None else unobserved[:, None])
-        return rendering, torch.where(lit, ids, 0).to(torch.uint8), alone.alpha
+        instruments = rasterize(gaussians.select(moved), camera, channels=shares)
+        assert instruments.channels is not None
+        ids = instruments.channels.argmax(dim=2) + 1
+        lit = instruments.color.norm(dim=2) > MIN_BRIGHTNESS
+        channels = None if unobserved is None else unobserved[:, None]
+        rendering = rasterize(gaussians, camera, channels=channels, alone=alone)
+        return rendering, torch.where(lit, ids, 0).to(torch.uint8), instruments.alpha
 
 
 Labeller = CompositedLabels | ThresholdLabels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,11 +12,15 @@ from torch.autograd.function import once_differentiable
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.raster.native import native
-from neeco.raster.types import Gaussians, Rendering, differentiable
+from neeco.raster.types import Gaussians, Layer, Rendering, differentiable
 
 
 def rasterize_cpu(
-    gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
+    gaussians: Gaussians,
+    camera: Camera,
+    channels: Tensor | None,
+    background: Tensor | None,
+    alone: Sequence[Tensor] = (),
 ) -> Rendering:
     """`rasterize` with neeco's own C++ kernels. Inputs are taken as float32 on the CPU."""
     given = differentiable(gaussians, camera, channels, background)
@@ -23,8 +28,9 @@ def rasterize_cpu(
     frames = None if gaussians.sh_frames is None else _prepared(gaussians.sh_frames.detach())
     wanted = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     offsets = torch.zeros(len(gaussians), 2, requires_grad=wanted)
-    color, alpha, depth, composited, radii = _Rasterize.apply(offsets, frames, camera, wanted, *tensors)
-    return Rendering(color, alpha, depth, composited, radii, offsets)
+    color, alpha, depth, composited, radii, *layers = _Rasterize.apply(offsets, frames, camera, wanted, alone, *tensors)
+    pairs = zip(layers[::2], layers[1::2], strict=True)
+    return Rendering(color, alpha, depth, composited, radii, offsets, tuple(Layer(*pair) for pair in pairs))
 
 
 def last_statistics() -> dict[str, float]:
@@ -42,7 +48,13 @@ def _prepared(tensor: Tensor) -> Tensor:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, offsets: Tensor, frames: Tensor | None, camera: Camera, keep: bool, *tensors: Tensor | None
+        ctx: Any,
+        offsets: Tensor,
+        frames: Tensor | None,
+        camera: Camera,
+        keep: bool,
+        alone: Sequence[Tensor],
+        *tensors: Tensor | None,
     ) -> Any:
         plain = [None if t is None else t.detach() for t in tensors]
         means, quats, scales, opacities, sh, falloff, channels, left, vignette, world_from_camera, background = plain
@@ -60,15 +72,18 @@ class _Rasterize(torch.autograd.Function):
             radii = torch.empty(means.shape[0])
             composited = None if channels is None else torch.empty(height, width, channels.shape[1])
             drawing.forward(color, alpha, depth, composited, radii, keep)
+            layers = [torch.empty(height, width) for _ in range(2 * len(alone))]
+            for k, chosen in enumerate(alone):
+                drawing.alone(chosen.contiguous(), alpha, depth, *layers[2 * k : 2 * k + 2])
         except (ValueError, RuntimeError) as error:
             raise NeecoError(f"rasterize: {error}") from error
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(radii)
+        ctx.mark_non_differentiable(radii, *layers)
         if keep:
             # saved so that autograd detects a modified input before the backward pass
             ctx.save_for_backward(alpha, depth, *tensors)
             ctx.drawing = drawing
-        return color, alpha, depth, composited, radii
+        return color, alpha, depth, composited, radii, *layers
 
     @staticmethod
     @once_differentiable
@@ -76,7 +91,7 @@ class _Rasterize(torch.autograd.Function):
         alpha, depth, *tensors = ctx.saved_tensors
         images = [None if g is None else g.to(torch.float32).contiguous() for g in gradients[:4]]
         *gaussians, vignette, pose, background = tensors
-        wanted = ctx.needs_input_grad[4:]
+        wanted = ctx.needs_input_grad[5:]
         grads = [
             torch.empty_like(t) if need and t is not None else None
             for t, need in zip([*gaussians, vignette, pose], wanted[:10], strict=True)
@@ -86,4 +101,4 @@ class _Rasterize(torch.autograd.Function):
         to_background = None
         if wanted[10] and images[0] is not None and background is not None:
             to_background = ((1 - alpha.detach())[..., None] * images[0]).sum(dim=(0, 1))
-        return to_offsets, None, None, None, *grads, to_background
+        return to_offsets, None, None, None, None, *grads, to_background

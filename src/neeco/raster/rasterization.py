@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -16,7 +17,7 @@ from neeco.raster.native import runs_native
 from neeco.raster.resampling import draw_through, of_learned_size, widened
 from neeco.raster.shadow import shadowed
 from neeco.raster.triton.ready import require_triton
-from neeco.raster.types import Gaussians, Rendering
+from neeco.raster.types import Gaussians, Layer, Rendering
 
 BACKENDS = ("auto", "reference", "cpu", "cuda", "triton")
 SH_COUNTS = (1, 4, 9, 16)
@@ -28,12 +29,14 @@ def rasterize(
     *,
     channels: Tensor | None = None,
     background: Tensor | None = None,
+    alone: Sequence[Tensor] = (),
     backend: str = "auto",
 ) -> Rendering:
     """Render Gaussians (3D Gaussian splatting, Kerbl et al. 2023, with gsplat's conventions).
 
     channels [N, C], C <= 32: composited like colour over background 0. background [3]: colour behind all, by
-    default the Gaussians' background, or black.
+    default the Gaussians' background, or black. alone: sets of Gaussians, [N] bool each, that are also rendered without
+    the others, alpha and depth only and without gradient (`Rendering.alone`).
     backend: "cpu" (native, float32), "reference" (plain torch, any float type and device, slow), "cuda" (gsplat),
     "triton" (neeco's own, float32, on a CUDA device), or "auto": for tensors on a CUDA device cuda where gsplat is
     installed, else triton; cpu for those on the CPU, reference on other devices and within
@@ -58,22 +61,30 @@ def rasterize(
         background = gaussians.background
     _check(gaussians, camera, channels, background)
     if channels is not None and channels.shape[1] == 0:  # kernels take no empty channels
-        rendering = rasterize(gaussians, camera, background=background, backend=backend)
+        rendering = rasterize(gaussians, camera, background=background, alone=alone, backend=backend)
         return replace(rendering, channels=rendering.color.new_zeros((camera.height, camera.width, 0)))
     if camera.is_resampled:
-        return draw_through(camera, partial(_rasterize_resized, gaussians, channels, background, backend))
+        return draw_through(camera, partial(_rasterize_resized, gaussians, channels, background, alone, backend))
     gaussians = shadowed(gaussians, camera, partial(rasterize, backend=backend))
     if backend == "auto":
         on_cpu = "cpu" if runs_native(gaussians.means) else "reference"
         backend = cuda_backend() if gaussians.means.is_cuda else on_cpu
+    if backend == "cpu":
+        from neeco.raster.cpu_backend import rasterize_cpu
+
+        return rasterize_cpu(gaussians, camera, channels, background, alone)
+    rendering = _rasterize_by(backend, gaussians, camera, channels, background)
+    return replace(rendering, alone=tuple(_alone(gaussians.select(chosen), camera, backend) for chosen in alone))
+
+
+def _rasterize_by(
+    backend: str, gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
+) -> Rendering:
+    """`rasterize` by one of the backends that share no work between a rendering and its layers."""
     if backend == "reference":
         from neeco.raster.reference import rasterize_reference
 
         return rasterize_reference(gaussians, camera, channels, background)
-    if backend == "cpu":
-        from neeco.raster.cpu_backend import rasterize_cpu
-
-        return rasterize_cpu(gaussians, camera, channels, background)
     if backend == "cuda":
         if not torch.cuda.is_available() or importlib.util.find_spec("gsplat") is None:
             raise NeecoError("backend: cuda: needs a CUDA device and gsplat; install neeco[cuda] or use backend='cpu'")
@@ -88,14 +99,26 @@ def rasterize(
     raise NeecoError(f"backend: {backend!r}: unknown; use one of {', '.join(BACKENDS)}")
 
 
+@torch.no_grad()
+def _alone(chosen: Gaussians, camera: Camera, backend: str) -> Layer:
+    """The chosen Gaussians without the others; colours, which take time, are left out."""
+    rendering = rasterize(replace(chosen, sh=chosen.sh[:, :1], headlight=None), camera, backend=backend)
+    return Layer(rendering.alpha, rendering.depth)
+
+
 def _rasterize_resized(
-    gaussians: Gaussians, channels: Tensor | None, background: Tensor | None, backend: str, camera: Camera
+    gaussians: Gaussians,
+    channels: Tensor | None,
+    background: Tensor | None,
+    alone: Sequence[Tensor],
+    backend: str,
+    camera: Camera,
 ) -> Rendering:
     """`rasterize` for a pinhole of the learned size or a larger one; shadows are as soft as they were learned."""
     draw = partial(rasterize, backend=backend)
     pinhole = replace(camera, learned_fx=None)
     gaussians = shadowed(gaussians, replace(of_learned_size(camera), learned_fx=None), draw)
-    return draw(widened(gaussians, camera), pinhole, channels=channels, background=background)
+    return draw(widened(gaussians, camera), pinhole, channels=channels, background=background, alone=alone)
 
 
 def _check(gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None) -> None:

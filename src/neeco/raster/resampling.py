@@ -19,7 +19,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import field_pinhole, lens_field
 from neeco.raster.reference import LOW_PASS
-from neeco.raster.types import Gaussians, Rendering
+from neeco.raster.types import Gaussians, Layer, Rendering
 
 # Scale from which the backends' own low-pass replaces supersampling. Measured at 0.9: 0.1 dB less than averaged.
 MIN_DIRECT_SCALE = 0.9
@@ -45,14 +45,23 @@ def draw_through(camera: Camera, draw: Draw) -> Rendering:
     planes = [rendering.color, alpha, rendering.depth[..., None] * alpha]
     planes += [] if rendering.channels is None else [rendering.channels]
     found = resampled(torch.cat(planes, -1), source, fine, camera)
-    alpha = found[..., 3]
+    layers = [
+        resampled(torch.stack([layer.alpha, layer.depth * layer.alpha], -1), source, fine, camera)
+        for layer in rendering.alone
+    ]
     return replace(
         rendering,
         color=found[..., :3],
-        alpha=alpha,
-        depth=torch.where(alpha > 0, found[..., 4] / alpha.clamp_min(torch.finfo(alpha.dtype).tiny), 0.0),
+        alpha=found[..., 3],
+        depth=_divided(found[..., 4], found[..., 3]),
         channels=None if rendering.channels is None else found[..., 5:],
+        alone=tuple(Layer(layer[..., 0], _divided(layer[..., 1], layer[..., 0])) for layer in layers),
     )
+
+
+def _divided(weighted: Tensor, alpha: Tensor) -> Tensor:
+    """Return depths [H, W] from their sums weighted by alpha [H, W]; 0 where that is 0."""
+    return torch.where(alpha > 0, weighted / alpha.clamp_min(torch.finfo(alpha.dtype).tiny), 0.0)
 
 
 def learned_scale(camera: Camera) -> float:

@@ -117,6 +117,14 @@ def differentiable(
 
 
 @dataclass(frozen=True)
+class Layer:
+    """Some of the Gaussians of a rendering, rendered without the others; no gradient."""
+
+    alpha: Tensor  # [H, W]
+    depth: Tensor  # [H, W] mm, as that of a rendering
+
+
+@dataclass(frozen=True)
 class Rendering:
     """A rendered image, and statistics for density control."""
 
@@ -126,6 +134,7 @@ class Rendering:
     channels: Tensor | None  # [H, W, C] composited like colour, background 0
     radii: Tensor  # [N] px, 3-sigma-like extent of the ellipse, 0 where not rendered; no gradient
     center_offsets: Tensor  # [N, 2] px, zeros added to the projected centres; `.grad` after backward: d loss / d centre
+    alone: tuple[Layer, ...] = ()  # of the Gaussians that were asked for alone
 
     @property
     def visible(self) -> Tensor:

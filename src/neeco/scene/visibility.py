@@ -23,6 +23,7 @@ from neeco.geometry.projection import in_image, pixel_centers, project_world, un
 from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import rasterize
 from neeco.raster.devices import constant
+from neeco.raster.native import all_run_native, native
 from neeco.raster.types import Gaussians
 from neeco.scene.canonical import TISSUE, CanonicalGaussians, seed_gaussians
 from neeco.scene.drawable import Recorded
@@ -76,7 +77,17 @@ def measure_visibility(canonical: CanonicalGaussians, recorded: Recorded, at: Ca
 
 def unobserved_share(visibility: Tensor, posed: Gaussians, camera: Camera) -> Tensor:
     """Return the share [N] in [0, 1] by which each posed Gaussian, viewed by `camera`, is unobserved: 1 where no frame
-    observed it from a similar direction. `visibility`: by `measure_visibility`."""
+    observed it from a similar direction. `visibility`: by `measure_visibility`. float32 on the CPU takes the native
+    kernel."""
+    if all_run_native(visibility, posed.means) and not torch.is_grad_enabled():
+        frames = None if posed.sh_frames is None else posed.sh_frames.contiguous()
+        centre = camera.world_from_camera[:3, 3].cpu().float()
+        numbers = torch.cat([centre, torch.tensor([HALF_VISIBILITY])])
+        share = torch.empty(len(visibility))
+        native().unobserved(
+            posed.means.contiguous(), frames, visibility.contiguous(), _directions("cpu"), numbers, share
+        )
+        return share
     toward = _toward(posed, camera)
     share = (visibility * toward).sum(1) / toward.sum(1)
     return HALF_VISIBILITY / (share + HALF_VISIBILITY)
@@ -89,8 +100,12 @@ def _toward(posed: Gaussians, camera: Camera) -> Tensor:
     outward = normalize(camera.world_from_camera[:3, 3].to(means) - means, dim=1)  # [N, 3]
     if posed.sh_frames is not None:
         outward = torch.einsum("nji,nj->ni", quat_to_matrix(posed.sh_frames), outward)
-    directions = constant(tuple(value for corner in DIRECTIONS for value in corner), outward.device).view(-1, 3)
-    return (outward @ directions.T).clamp_min(0) ** SHARPNESS
+    return (outward @ _directions(outward.device).T).clamp_min(0) ** SHARPNESS
+
+
+def _directions(device: torch.device | str) -> Tensor:
+    """Return `DIRECTIONS` [12, 3] on a device."""
+    return constant(tuple(value for corner in DIRECTIONS for value in corner), torch.device(device)).view(-1, 3)
 
 
 def visible_pixels(posed: Gaussians, camera: Camera, weight: Tensor | None = None) -> Tensor:
