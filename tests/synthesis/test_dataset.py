@@ -312,7 +312,7 @@ def test_a_data_set_is_not_continued_with_other_settings(made, run, tmp_path, ot
 
 def test_states_that_are_refused_are_drawn_anew_and_counted(run, tmp_path, monkeypatch):
     refusals = iter(["leaves the image", "enters the tissue", None, None])
-    monkeypatch.setattr(Acceptance, "refusal", lambda self, scene, drawing: next(refusals))
+    monkeypatch.setattr(Acceptance, "refusal", lambda self, drawing: next(refusals))
     summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=2))
     assert summary.refused == {"leaves the image": 1, "enters the tissue": 1}
     assert json.loads((tmp_path / "dataset/dataset.json").read_text())["refused"] == summary.refused
