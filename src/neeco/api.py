@@ -209,7 +209,7 @@ def train(
 ) -> Run:
     """Learn a scene from the training frames of the capture in folder `capture`; writes the run folder `output`.
 
-    method: kinematic (None), neeco (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta. iterations: frames
+    method: kinematic (None), nps (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta. iterations: frames
     that are learned from (None: 6,000, with fewer than 60 training frames kinematic takes less); minutes: stop in time
     with a finished run. The same seed (None: 0) gives the same scene on the same machine, unless `minutes` is given.
     resume: continue an interrupted run in `output`, under its own
