@@ -17,7 +17,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, nearest
 
 Device = Annotated[str, tyro.conf.arg(help="cpu, cuda, cuda:N, or auto: a CUDA device where there is one.")]
 T = TypeVar("T")
@@ -137,9 +137,11 @@ def _problems(error: BaseException, where: str, owner: str) -> Iterator[str]:
             notes = [note for note in getattr(inner, "__notes__", []) if isinstance(note, AttributeValidationNote)]
             yield from _problems(inner, _dotted(where, *(note.name for note in notes)), owner)
     elif isinstance(error, ForbiddenExtraKeysError):
-        known = ", ".join(field.name for field in dataclasses.fields(error.cl)) or "none"
+        known = [field.name for field in dataclasses.fields(error.cl)]
         for name in sorted(error.extra_fields):
-            yield f"{_dotted(where, name)}: {owner} has no such field; it has {known}"
+            meant = nearest(name, known)
+            hint = "" if meant is None else f"; did you mean {meant}?"
+            yield f"{_dotted(where, name)}: {owner} has no such field; it has {', '.join(known) or 'none'}{hint}"
     elif isinstance(error, NeecoError):
         yield str(error)
     elif isinstance(error, ValueError):
