@@ -25,8 +25,8 @@ class Downstream:
     `paste` (the labelled instruments over other backgrounds), `match` (labelled frames in another recording's colours),
     `strong` (augmentation of everything), `permuted` (sets with labels of other images, a control), and when what is
     learned: `finetune`, `balanced`, `pool` or `blend`; for the edges of synthetic labels `hard`, `soft` or `ignore`.
-    The same command continues interrupted work; with more models, sets, conditions or folds it adds them. Needs
-    neeco[downstream].
+    The same command continues interrupted work; with more models, sets, conditions or folds it adds them. Needs the
+    extra `downstream`.
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
@@ -66,7 +66,7 @@ class Downstream:
     weights: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """MODEL=FILE.safetensors to begin from instead of from scratch; repeatable."""
     workers: int = 1
-    """Trainings at once, which share the GPUs; RAY_ADDRESS names a Ray cluster (install neeco[cluster])."""
+    """Trainings at once, which share the GPUs; RAY_ADDRESS names a Ray cluster (needs the extra `cluster`)."""
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     device: Device = "auto"
