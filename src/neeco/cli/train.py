@@ -20,7 +20,7 @@ class Arguments:
     output: Path
     """Run folder to write."""
     method: str | None = None
-    """kinematic (the default), neeco (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's
+    """kinematic (the default), nps (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's
     training adjustment."""
     iterations: int | None = None
     """Frames rendered and learned from; by default 6,000, of fewer than 60 training frames fewer (kinematic)."""
