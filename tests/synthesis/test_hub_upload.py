@@ -126,11 +126,11 @@ def test_whoever_is_not_logged_in_learns_it_before_anything_is_rendered(
 
 def test_a_refused_upload_is_one_line(hub: Hub, dataset: Path) -> None:
     hub.refuses = "/api/repos/create"
-    with pytest.raises(NeecoError, match="^--push-to-hub lab/rods: .*403") as caught:
+    with pytest.raises(NeecoError, match=r"^--push-to-hub lab/rods: .*403") as caught:
         push_to_hub(dataset, "lab/rods")
     assert "\n" not in str(caught.value)
     hub.shutdown()
     hub.server_close()
-    with pytest.raises(NeecoError, match="^--push-to-hub lab/rods: ") as caught:
+    with pytest.raises(NeecoError, match=r"^--push-to-hub lab/rods: ") as caught:
         check_hub("lab/rods")
     assert "\n" not in str(caught.value)
