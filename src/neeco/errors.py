@@ -31,6 +31,11 @@ class NeecoError(Exception):
     command_line: str | None = None  # the message as the command line words it, where that differs
 
 
+def install_hint(extra: str) -> str:
+    """Return the command that installs an extra of neeco ("view"). No package index has neeco yet."""
+    return f"pip install '.[{extra}]' in neeco's checkout"
+
+
 @contextmanager
 def naming_arguments() -> Iterator[None]:
     """Name arguments of Python in the messages of errors raised in the block, or in the function so decorated:

@@ -43,7 +43,7 @@ class Compare:
     masks: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """NAME=FOLDER: masks of the same frames from another program, scored in the same table; repeatable."""
     workers: int = 1
-    """Runs at once; each gets its share of the cores. RAY_ADDRESS names a Ray cluster (install neeco[cluster])."""
+    """Runs at once; each gets its share of the cores. RAY_ADDRESS names a Ray cluster (needs the extra `cluster`)."""
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()

@@ -109,14 +109,13 @@ def _refuse_others(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
 
 
 def _list_formats() -> int:
-    from rich.markup import escape
     from rich.table import Table
 
     from neeco.ingest.readers import recording_formats
 
-    table = Table("format", "read of it", "needs")
+    table = Table("format", "read of it", "extra")
     for known in recording_formats():
-        table.add_row(known.format, known.holds, escape(f"neeco[{known.extra}]") if known.extra else "")
+        table.add_row(known.format, known.holds, known.extra or "")
     whole_lines().print(table)
     return 0
 

@@ -22,7 +22,7 @@ class Arguments:
     output: Path
     """Run folder to write."""
     method: str | None = None
-    """kinematic, neeco (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's training
+    """kinematic, nps (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's training
     adjustment. Default: kinematic."""
     iterations: int | None = None
     """Frames rendered and learned from. Default: 6,000, with fewer than 60 training frames less (kinematic)."""

@@ -1,4 +1,4 @@
-"""The paper's network (NeeCo, "neural pose-state" field F), method `neeco`.
+"""The paper's network (NeeCo, "neural pose-state" field F), method `nps`.
 
 G' = C + F(gamma(mu), gamma(p)): an MLP of depth 12 and width 256 maps each canonical mean and the instrument state to
 changes of mean, rotation and scale. Where the paper is silent: an input skip at the middle layer, a zero-initialised
@@ -89,7 +89,8 @@ class NPSSettings:
 class NPS(LabelledByMotion):
     """The network F; `gate`, where there is one, is the volume within which it is evaluated."""
 
-    method = "neeco"
+    method = "nps"
+    former_names = ("neeco",)
     Settings = NPSSettings
     training_defaults: ClassVar[Mapping[str, Any]] = HALF_BY_DEFAULT  # the rest is the paper's
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {

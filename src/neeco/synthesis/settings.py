@@ -24,7 +24,6 @@ SAMPLERS = ("interpolate", "extrapolate", "grid")  # values of `states` other th
 MAX_PIXELS = 2**26  # of an image
 JPEG_QUALITY = 95  # of 100, by default
 
-RELIGHT_SHARE = 0.5  # of the images over backgrounds, by default
 MIN_TRUST = 0.8  # of a recorded frame's label, below which `annotate` does not write it
 
 
@@ -155,9 +154,6 @@ class Settings(ImageSettings):
     backgrounds: str | None = None
     """Folder of images without an instrument (of the next operation, or others): half of the set shows them instead of
     the tissue (docs/synthesis.md)."""
-    relight: float | None = None
-    """Share of the images whose instruments have another exposure, colour, saturation and contrast. Default: 0.5
-    with --backgrounds, else 0."""
     match_colors: str | None = None
     """Folder of frames of the next operation, with instruments or without: half of the set takes on their colours."""
     max_attempts: int = 50
@@ -194,17 +190,10 @@ class Settings(ImageSettings):
             raise NeecoError(f"--label-threshold: {self.label_threshold} is not between 0 and 1")
         if self.tissue_tolerance_mm is not None and not self.tissue_tolerance_mm >= 0:
             raise NeecoError(f"--tissue-tolerance-mm: {self.tissue_tolerance_mm} is negative; give 0 or more")
-        if self.relight is not None and not 0 <= self.relight <= 1:
-            raise NeecoError(f"--relight: {self.relight} is not a share of the images; give 0 to 1")
         if not 0 <= self.max_unobserved <= 1:
             raise NeecoError(f"--max-unobserved: {self.max_unobserved} is not a share; give 0 to 1")
         if not 0 <= self.min_component < 1:
             raise NeecoError(f"--min-component: {self.min_component} is not a share; give 0 or more and less than 1")
-
-    @property
-    def relight_share(self) -> float:
-        """`relight`, or its default."""
-        return self.relight if self.relight is not None else RELIGHT_SHARE if self.backgrounds else 0.0
 
     def image_folders(self) -> dict[str, str | None]:
         """Return the folders of images of another operation, by setting."""
