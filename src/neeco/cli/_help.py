@@ -1,4 +1,4 @@
-"""What `--help` says beyond tyro's: how optional values are written and what holds without them; tables of settings."""
+"""Parts of `--help` besides tyro's: how optional values are written, what holds without them, tables of settings."""
 
 from __future__ import annotations
 

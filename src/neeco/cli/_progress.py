@@ -126,7 +126,7 @@ class Bars:
 
 
 def _line(task: Task) -> str:
-    """What is done, how far it is, and how long it still takes at the speed so far."""
+    """State what is done, how far it is, and how long it still takes at the speed so far."""
     passed = task.elapsed or 0.0
     words = [f"{task.percentage:.0f} %"] if task.total else []
     words += [task.fields["text"]] if task.fields["text"] else []
