@@ -22,10 +22,10 @@ class Arguments:
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote."""
     format: Format | None = None
-    """ply: as 3D Gaussian splatting's own code writes it. spz: a tenth of the size, coarser. usdc: OpenUSD,
-    needs the extra usd. By default as --output ends, else ply."""
+    """ply: as 3D Gaussian splatting's own code writes it. spz: a tenth of the size, coarser. usdc: OpenUSD (needs the
+    extra usd). Default: as --output ends, else ply."""
     output: Path | None = None
-    """File to write, .ply, .spz or .usdc; scene.ply (.spz, .usdc) in the run folder when not given."""
+    """File to write, .ply, .spz or .usdc. Default: scene.ply (.spz, .usdc) in the run folder."""
     frame: int = 0
     """Number of the frame, of those trained on, whose state and light are taken."""
     states: Path | None = None
