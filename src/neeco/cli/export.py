@@ -22,10 +22,10 @@ class Arguments:
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote."""
     format: Format | None = None
-    """ply: as 3D Gaussian splatting's own code writes it. spz: a tenth of the size, coarser. By default as --output
+    """ply: as 3D Gaussian splatting's own code writes it. spz: a tenth of the size, coarser. Default: as --output
     ends, else ply."""
     output: Path | None = None
-    """File to write, .ply or .spz; scene.ply or scene.spz in the run folder when not given."""
+    """File to write, .ply or .spz. Default: scene.ply or scene.spz in the run folder."""
     frame: int = 0
     """Number of the frame, of those trained on, whose state and light are taken."""
     states: Path | None = None
