@@ -21,7 +21,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 SIZES = PAGE.parents[1] / "notes" / "2026-11-26-results-methods-and-speed.md"  # has the table of sizes
 GREY = "#808080"  # readable on light and on dark pages
 METHOD_COLORS = {  # of a method in every plot
-    "neeco": "#0f9488",
+    "nps": "#0f9488",
     "deformable-3dgs": "#d97706",
     "4dgs": "#8b5cf6",
     "3dgs": "#808b99",

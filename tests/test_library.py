@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -17,6 +19,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import neeco
 from neeco.capture import write_capture
@@ -191,6 +194,43 @@ def test_errors_name_arguments_in_python_and_options_on_the_command_line(
         assert message in str(caught.value)
     assert main(["track", str(run), str(folder / "footage"), "--output", str(output), "--min-trust", "2"]) == 1
     assert "neeco: error: --min-trust: 2.0 is not a share" in capsys.readouterr().err
+
+
+def test_the_recipe_for_the_next_operation_runs_as_the_page_says(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commands and the Python of docs/does-it-help.md, tiny: 14 frames of liver-mini are both recordings."""
+    pytest.importorskip("transformers")
+    page = (ROOT / "docs" / "does-it-help.md").read_text(encoding="utf-8").partition("## What to do")[2]
+    train, synthesize_set, downstream = (
+        line.split() for line in re.findall(r"^    (neeco .*)$", page, re.MULTILINE)[:3]
+    )
+    monkeypatch.chdir(tmp_path)
+    capture = neeco.read_capture(SAMPLE)
+    frames = [*capture.split("train")[::6], *capture.split("test")[:2]]
+    write_capture(replace(capture, frames=frames), Path("FIRST"))
+    shutil.copytree(SAMPLE / "truth", "FIRST/truth", dirs_exist_ok=True)
+    Path("SECOND").symlink_to("FIRST")
+    Path("RUN").symlink_to(folder / "runs" / "sample")
+    Path("PLATES").mkdir()
+    for k in range(2):
+        Image.fromarray(np.random.default_rng(k).integers(60, 180, (64, 80, 3), np.uint8)).save(f"PLATES/{k}.png")
+    assert train == ["neeco", "train", "FIRST", "--output", "RUN"]  # which the first program did
+    synthesize_set[synthesize_set.index("--count") + 1] = "4"
+    assert main([*synthesize_set[1:], "--min-share", "0"]) == 0
+    assert (
+        main([*downstream[1:], *["--folds", "1", "--steps", "1", "--size", "48", "--batch", "2", "--device", "cpu"]])
+        == 0
+    )
+    study = json.loads(Path("HELPS/downstream.json").read_text(encoding="utf-8"))
+    assert {job["condition"] for job in study["jobs"]} == {"real", "real+strong", "next+strong"}
+    assert study["sets"][0]["made_by"]["settings"]["match_colors"]
+    code = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0]
+    code = code.replace('"RUN", 8000', '"RUN", 4, min_share=0.0').replace("num_workers=2", "num_workers=0")
+    code = code.replace("batch_size=8", "batch_size=2")
+    found: dict = {}
+    exec(compile(code, "<does-it-help.md>", "exec"), found)
+    assert torch.isfinite(found["loss"])
 
 
 def test_python_blocks_of_the_pages_pass_a_type_checker(tmp_path: Path) -> None:

@@ -178,6 +178,23 @@ def test_yolo_labels_lie_where_tools_look_and_stay_in_range(made, variant, numbe
         assert (coordinates <= 1).all()
 
 
+def test_yolo_has_the_parts_as_classes(made):
+    data = yaml.safe_load((made / "yolo/parts/data.yaml").read_text())
+    assert data["names"] == {0: "rod/shaft", 1: "rod/jaw"}
+    drawn = 0
+    for split in ("train", "val"):
+        for label in sorted((made / "yolo/parts/labels" / split).glob("*.txt")):
+            ids = pixels(made / "parts" / f"{label.stem}.png")
+            rows = {int(row.split()[0]): np.array(row.split()[1:], float) for row in label.read_text().splitlines()}
+            assert {category + 1 for category in rows} == set(np.unique(ids)) - {0}
+            for category, points in rows.items():
+                x, y = (points.reshape(-1, 2) * (64, 48)).T
+                area = abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2
+                assert area == pytest.approx((ids == category + 1).sum(), rel=0.15)
+                drawn += 1
+    assert drawn > COUNT
+
+
 def test_a_yolo_box_is_the_extreme_pixels(made):
     values = np.array((made / "yolo/labels/train/000000.txt").read_text().split()[1:], dtype=float)
     mask = pixels(made / "masks" / "000000.png") > 0

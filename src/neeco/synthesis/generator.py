@@ -231,10 +231,10 @@ class SampleGenerator:
     @torch.no_grad()
     def _image(self, state: State, camera: Camera, image: Tensor, share: Tensor, appearance: Appearance) -> Tensor:
         """The rendered `image` of a state, with its share of instruments, in an appearance."""
-        if appearance.of_layers:
+        if appearance.background is not None:
             gaussians = self.scene.at(state)
             owners = self.labeller.owners(state, gaussians)
-            image = appearance.of(split(gaussians, owners, camera, image, share))
+            image = appearance.over_background(split(gaussians, owners, camera, image, share))
         return appearance.matched(image)
 
     def _through_camera(
