@@ -38,7 +38,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
-from torch.utils.data import Dataset, IterableDataset, get_worker_info
+from torch.utils.data import Dataset, IterableDataset, default_collate, get_worker_info
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from neeco.capture.documents import Node, RaisingReport
@@ -110,10 +110,9 @@ default_collate_fn_map[State] = _refuse_default_collate  # as PyTorch documents 
 def collate(samples: Sequence[Sample]) -> dict[str, Any]:
     """A batch of B samples, for `DataLoader(collate_fn=...)`: image [B, 3, H, W], parts, depth and ignore [B, H, W] are
     stacked; everything else, which differs in size from image to image, is a list of B. Images must be of one size."""
-    return {
-        key: torch.stack([sample[key] for sample in samples]) if key in STACKED else [sample[key] for sample in samples]
-        for key in samples[0]
-    }
+    batch = {key: [sample[key] for sample in samples] for key in samples[0]}
+    # which in a worker stacks in shared memory
+    return {key: default_collate(values) if key in STACKED else values for key, values in batch.items()}
 
 
 @naming_arguments()
