@@ -235,6 +235,14 @@ def test_charts_tell_methods_apart_without_colour():
     assert line_chart("t", "x", []) == line_chart("t", "x", [Series("one", 0, ((1.0, 1.0),))]) == ""
 
 
+@pytest.mark.parametrize(("values", "cut"), [((20.0, 31.0), True), ((8.0, 23.0), False), ((-1.0, 2.0), False)])
+def test_a_vertical_axis_begins_at_zero_or_says_that_it_is_cut(values, cut):
+    chart = line_chart("PSNR", "steps", [Series("", 0, tuple(enumerate(values)))])
+    assert ("axis cut" in chart) == cut
+    assert ("vertical axis cut" in chart.partition(">")[0]) == cut
+    assert (">0<" in chart.replace(" ", "").partition("steps")[2]) or cut
+
+
 def test_names_at_the_ends_of_lines_do_not_cover_one_another():
     series = [Series(f"m{k}", k, ((0.0, 1.0), (1.0, 2.0 + k * 1e-3))) for k in range(6)] + [
         Series("low", 6, ((0.0, 0.0), (1.0, 0.0)))
