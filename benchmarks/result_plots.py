@@ -35,7 +35,7 @@ TRAINED_ON = {  # heading of the table: colour, as in does_it_help.py
     "synthetic images alone": "#56b4e9",
 }
 SPLITS = ("seen", "unseen")  # filled and hollow bars
-WIDTH, BAR = 4.6, 0.125  # inches: of a figure that a phone shows whole, of a bar
+WIDTH, BAR = 4.1, 0.125  # inches: of a figure that a phone shows whole, of a bar
 FONT = 8.5
 
 
