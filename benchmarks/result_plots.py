@@ -146,7 +146,7 @@ def main() -> None:
 
     rows = table("U-Net on", headings=True)
     columns = [rows[0].index(heading) for heading in TRAINED_ON]
-    figure, panels = new_figure(3 * len(rows[1:]), 2, key=False)
+    figure, panels = new_figure(4 * len(rows[1:]), 2, key=False)
     groups, colors = [row[0] for row in rows[1:]], list(TRAINED_ON.values())
     for k, (axes, split) in enumerate(zip(panels, SPLITS, strict=True)):
         values = [[pair(row[column])[k] for column in columns] for row in rows[1:]]

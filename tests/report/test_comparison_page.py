@@ -209,7 +209,7 @@ def test_sentences_go_split_by_split(comparison):
     assert [split for split, _ in reported] == ["test", "unseen", "", ""]
     assert reported[0][1].startswith("kinematic first in PSNR, 24.20 dB, 4.15 dB before 3dgs")
     assert reported[1][1].startswith("kinematic first")
-    assert "level in drawing speed" in reported[2][1]
+    assert "level in rendering speed" in reported[2][1]
 
 
 def test_one_seed_is_said_once(comparison):

@@ -62,7 +62,7 @@ PUBLISHED: Mapping[str, int | float] = {
 
 @dataclass(frozen=True, kw_only=True)
 class NerfiesSettings:
-    """`rays` per step; `coarse_samples` and `fine_samples` along each (0 fine: one network draws); template `depth` x
+    """`rays` per step; `coarse_samples` and `fine_samples` along each (0 fine: one network renders); template `depth` x
     `width`, with `frequencies` of points and `view_frequencies` of directions; warp `warp_depth` x `warp_width`, with
     `warp_frequencies`; numbers per warp `code` and `appearance` code (0: none); `window`: share of the run over which
     the warp's frequencies open; `elastic_weight` of the Jacobians at `elastic_rays` rays, `background_weight` of
@@ -374,7 +374,7 @@ class NerfScene(nn.Module):
         """A field has no Gaussians that could move."""
 
     def torch_threads(self) -> AbstractContextManager[None]:
-        """All of torch's threads: a drawing is a few large products."""
+        """All of torch's threads: an image is a few large products."""
         return nullcontext()
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
