@@ -167,7 +167,7 @@ def interval(differences: np.ndarray) -> tuple[float, float]:
 
 
 def differences(entries: Sequence[Entry]) -> list[dict[str, Any]]:
-    """What SUBJECT has more than each other method trained on as many frames, on the frames that both drew."""
+    """What SUBJECT has more than each other method trained on as many frames, on the frames that both rendered."""
     rows = []
     for frames, other in dict.fromkeys((entry.frames, entry.name) for entry in entries if entry.name != SUBJECT):
         both = [[e for e in entries if (e.frames, e.name) == (frames, name)] for name in (SUBJECT, other)]

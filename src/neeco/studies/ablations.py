@@ -38,7 +38,7 @@ class AblationPlan:
     iterations: int = 1_000
     """Steps of every run of nps; the paper's schedule, stated for 20,000, is scaled to them."""
     kinematic_iterations: int | None = None
-    """Steps of every kinematic run, which cost less; by default as many, but at least 1,000."""
+    """Steps of every kinematic run, which cost less. Default: as many, but at least 1,000."""
     seed: int = 0
     """Of every run, and of the noise put on tracker poses."""
     workers: int = 1
