@@ -123,7 +123,7 @@ class DrawnBatches(BatchSampler):
 
 
 def train_on_the_fly(args: OnTheFly, capture_folder: Path, folder: Path) -> dict[str, Any]:
-    """Train the U-Net for `args.steps` on images rendered meanwhile; its scores on each held-out split with true masks."""
+    """Train the U-Net for `args.steps` on images rendered meanwhile; its scores on each held-out split with masks."""
     capture = read_capture(capture_folder)
     frame = capture.frames[0].camera
     workers = max(args.workers)

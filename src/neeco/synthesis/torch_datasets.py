@@ -257,9 +257,8 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
         shard: (rank, world size) of this process, where several share the samples
 
     The workers of a DataLoader share the indices: of W workers the k-th renders start + k, start + k + W, ...;
-    processes share them in the same way first. So no sample is rendered twice, and each is the same in any worker. Prescribed
-    states that are refused are left out; path:FILE.jsonl, which has an end, is not
-    for a stream.
+    processes share them in the same way first. So no sample is rendered twice, and each is the same in any worker.
+    Prescribed states that are refused are left out; path:FILE.jsonl, which has an end, is not for a stream.
 
         stream = neeco.LabelledStream("runs/sample", seed=1)
         for batch in torch.utils.data.DataLoader(stream, batch_size=2, num_workers=2, collate_fn=stream.collate):

@@ -37,8 +37,8 @@ def missing(device: torch.device) -> str | None:
     if capability < OLDEST:
         has, needs = (".".join(map(str, version)) for version in (capability, OLDEST))
         return (
-            f"{device} has compute capability {has}, Triton needs {needs}; {install_hint('cuda')} to render with gsplat, or "
-            "use --device cpu"
+            f"{device} has compute capability {has}, Triton needs {needs}; {install_hint('cuda')} to render with "
+            "gsplat, or use --device cpu"
         )
     return None
 
