@@ -1,8 +1,8 @@
 """What several comparisons on more and more training frames of one capture say of the paper's claims.
 
-    neeco compare CAPTURE --transforms transforms-225.json --methods neeco 4dgs+dta … --output c225     # and so on
+    neeco compare CAPTURE --transforms transforms-225.json --methods nps 4dgs+dta … --output c225     # and so on
     python benchmarks/paper_frames.py labels c75 c225 c675 c2025            # or run folders
-    python benchmarks/paper_frames.py tables c75 c225 c675 c2025 [--run 'neeco practical=RUN' ...] [--output DIR]
+    python benchmarks/paper_frames.py tables c75 c225 c675 c2025 [--run 'nps practical=RUN' ...] [--output DIR]
     python benchmarks/paper_frames.py figure docs/reproducing-the-paper.md --output docs/images/paper-frames.svg
 
 `labels`: for every finished run of a network whose deltas tell what moves, the mask IoU (mean over a split's frames)
@@ -10,7 +10,7 @@ of its own labels, of the paper's thresholds by Otsu's method, and of the best t
 masks of `test` (`label_scan.py`): on deltas from canonical, and from their mean. Written into each run as
 `label_scan.json`, and read there again unless the scene is newer.
 
-`tables`: means over frames and seeds by number of training frames, and what `neeco` has more than each other method on
+`tables`: means over frames and seeds by number of training frames, and what `nps` has more than each other method on
 the same frames, with a 95% bootstrap interval over frames (seeds averaged first; frames count as independent). Markdown
 to standard output, everything to DIR/paper_frames.json. Runs of a comparison that have not finished are left out.
 
@@ -51,14 +51,14 @@ LINES: dict[str, dict[str, Any]] = {
     SEEN: {"linestyle": "-", "marker": "o", "markersize": 4},
     "unseen": {"linestyle": "--", "marker": "o", "markersize": 4, "markerfacecolor": "none"},
 }
-SUBJECT = "neeco"  # whom the paper has before all others
+SUBJECT = "nps"  # whom the paper has before all others
 COMPARED = {"psnr": "PSNR", "psnr_instrument": "PSNR instrument"}
 RESAMPLES = 10_000
 SCANNED = Column("scanned_iou", "IoU, best thresholds", 3, "high")
 COLUMNS = (*SPLIT_COLUMNS, SCANNED)
 KEYS = ("frames", "states", "method")
 COLOURS = {  # further runs take those that are left
-    "neeco": "#0f9488",
+    "nps": "#0f9488",
     "deformable-3dgs+dta": "#d97706",
     "4dgs+dta": "#8b5cf6",
     "3dgs": "#808b99",
@@ -123,7 +123,7 @@ def read_entries(folders: Sequence[Path], further: Sequence[str]) -> list[Entry]
     for word in further:
         name, equals, path = word.partition("=")
         if not (name and equals and path):
-            raise NeecoError(f"--run: {word!r}: expected NAME=FOLDER, such as 'neeco practical=RUN'")
+            raise NeecoError(f"--run: {word!r}: expected NAME=FOLDER, such as 'nps practical=RUN'")
         named.append((name, Path(path)))
     known: dict[tuple[str, int, int], Entry] = {}
     for name, folder in named:

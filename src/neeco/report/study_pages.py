@@ -385,7 +385,7 @@ def write_ablation_report(output: Path, ablation: AblationResult) -> Path:
     intro = [
         "What becomes of the result when one part is taken away or turned round. Runs have "
         f"{steps}, seed {ablation.seed}{settings}, on {hardware_words(ablation.machine)}. "
-        f"{scaled if 'neeco' in ablation.iterations else ''}"
+        f"{scaled if 'nps' in ablation.iterations else ''}"
         "In brackets: the difference to the line in bold.",
         f"One seed: a difference below {EVEN_DB} dB is called even, and one little above it may still be chance. The "
         "paper's numbers come from other recordings and longer runs; only directions are compared.",
@@ -426,7 +426,7 @@ def _learning_curves(table: AblationTable, ablation: AblationResult) -> list[Fig
         rows = [row for row in table.curves if row["comparison"] == comparison]
         labels = list(dict.fromkeys(row["label"] for row in rows))
         series = _series(labels, [(row["label"], row["iteration"], row["psnr"]) for row in rows])
-        phase_2 = (PHASE_1_SHARE * ablation.iterations["neeco"], "phase 2")
+        phase_2 = (PHASE_1_SHARE * ablation.iterations["nps"], "phase 2")
         chart = line_chart(f"{comparison}: PSNR on {split}, dB", "steps", series, starts=[phase_2])
         data = [{"setting": r["label"], "iteration": r["iteration"], f"psnr_{split}": r["psnr"]} for r in rows]
         words = "".join(letter if letter.isalnum() else "-" for letter in comparison)

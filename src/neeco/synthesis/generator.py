@@ -21,7 +21,7 @@ from torch import Tensor
 from neeco.capture.model import State, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
-from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends
+from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends_of
 from neeco.labels.drawing import MAX_UNOBSERVED, LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.raster.native import keep_freed_memory, set_threads
@@ -97,11 +97,11 @@ class Acceptance:
     max_unobserved: float = 1.0
     recorded_together: tuple[frozenset[str], ...] = ()
 
-    def refusal(self, scene: GaussianScene, drawing: LayeredDrawing) -> str | None:
+    def refusal(self, drawing: LayeredDrawing) -> str | None:
         """The reason to refuse the drawing, or None."""
-        keypoints = working_ends(scene, drawing.state)
+        keypoints = working_ends_of(drawing.keypoints)
         # first: an instrument wholly behind the tissue shows no pixels either
-        if self.tolerance_mm is not None and buried_depth(scene, drawing) > self.tolerance_mm:
+        if self.tolerance_mm is not None and buried_depth(drawing) > self.tolerance_mm:
             return ENTERS_TISSUE
         if int(drawing.parts.count_nonzero()) < self.min_share * drawing.parts.numel():
             return LEAVES_IMAGE
@@ -203,7 +203,7 @@ class SampleGenerator:
             drawing = draw_layers(self.scene, self.labeller, state, camera, settings.min_component)
             if "field_of_view" in effects:
                 drawing = _within_circle(drawing, effects["field_of_view"])
-            reason = self.acceptance.refusal(self.scene, drawing)
+            reason = self.acceptance.refusal(drawing)
             if reason is None:
                 return drawing, refused
             refused[reason] += 1
@@ -231,10 +231,10 @@ class SampleGenerator:
     @torch.no_grad()
     def _image(self, state: State, camera: Camera, image: Tensor, share: Tensor, appearance: Appearance) -> Tensor:
         """The rendered `image` of a state, with its share of instruments, in an appearance."""
-        if appearance.of_layers:
+        if appearance.background is not None:
             gaussians = self.scene.at(state)
             owners = self.labeller.owners(state, gaussians)
-            image = appearance.of(split(gaussians, owners, camera, image, share))
+            image = appearance.over_background(split(gaussians, owners, camera, image, share))
         return appearance.matched(image)
 
     def _through_camera(
@@ -320,23 +320,25 @@ def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
     """
     recorded = scene.recorded
     depths = [
-        buried_depth(scene, draw_layers(scene, labeller, recorded.states[k], recorded.cameras[k], min_component=0.0))
+        buried_depth(draw_layers(scene, labeller, recorded.states[k], recorded.cameras[k], min_component=0.0))
         for k in evenly_spaced(len(recorded.states), N_TOLERANCE_STATES, floor=True)
     ]
     return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *TOLERANCE_RANGE_MM)) / 100)
 
 
-def buried_depth(scene: GaussianScene, drawing: LayeredDrawing) -> float:
+def buried_depth(drawing: LayeredDrawing) -> float:
     """Return the depth, in mm, of the deepest instrument behind the tissue surface in this camera; 0 for none.
 
     All but the deepest BURIED_SHARE of an instrument's pixels are above this depth, and all keypoints of its working
     end.
     """
     deepest = 0.0
-    keypoints = working_ends(scene, drawing.state)
+    keypoints = working_ends_of(drawing.keypoints)
     surface = drawing.tissue_depth
     for name, layer in drawing.layers.items():
-        below = np.where(surface > 0, layer.depth - surface, 0.0)[layer.mask & (layer.depth > 0)]
+        shown = layer.mask & (layer.depth > 0)
+        behind = surface[shown]
+        below = np.where(behind > 0, layer.depth[shown] - behind, 0.0)
         if len(below):
             deepest = max(deepest, float(np.quantile(below, 1 - BURIED_SHARE)))
         for point in keypoints.get(name, []):
