@@ -28,7 +28,7 @@ from neeco.raster.resampling import resampled, supersampled
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings
-from neeco.synthesis.writers.folder import Record, write_sample, write_skipped
+from neeco.synthesis.writers.folder import Record, encoded_sample, skipped_sample
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
@@ -156,12 +156,13 @@ class _Annotator:
         if trust.value < self.min_trust:
             labels = annotate(self.scene, drawing, self.labeller.names)
             facts["labels"] = [label.to_json() for label in labels]
-            return write_skipped(self.output, index, {NOT_TRUSTED: 1}, facts)
+            return skipped_sample(index, {NOT_TRUSTED: 1}, facts).write(self.output)
         drawing, missing = self._as_written(drawing, image)
         labels = annotate(self.scene, drawing, self.labeller.names)
         if missing is not None:
             labels = [_without_keypoints_in(missing, label) for label in labels]
-        return write_sample(self.output, index, drawing, labels, facts=facts, quality=self.images.jpeg_quality)
+        encoded = encoded_sample(index, drawing, labels, facts=facts, quality=self.images.jpeg_quality)
+        return encoded.write(self.output)
 
     def _as_written(self, drawing: LayeredDrawing, image: Tensor) -> tuple[LayeredDrawing, Tensor | None]:
         """The recorded `image` with the labels of `drawing`, at the requested size and lens, and where it shows nothing
