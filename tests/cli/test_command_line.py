@@ -52,6 +52,16 @@ def test_help_names_every_verb_with_a_line() -> None:
         assert line.split()[0] in shown.stdout
 
 
+def test_help_waits_for_no_numerical_library() -> None:
+    program = (
+        "import sys; from neeco.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: print('imported:', *sorted({'cv2', 'numpy', 'scipy', 'torch'} & set(sys.modules)))"
+    )
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert shown.stdout.splitlines()[-1].strip() == "imported:"
+
+
 @pytest.mark.parametrize("verb", cli.VERBS)
 def test_every_verb_has_help_with_hyphenated_options(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
