@@ -66,7 +66,7 @@ def annotate_capture(
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Annotated:
     """Label every frame of `capture`, a recording of the run's instruments over its tissue (None: the run's own), and
-    write those that can be trusted as a data set: the recorded images with the labels that the scene draws at poses
+    write those that can be trusted as a data set: the recorded images with the labels that the scene renders at poses
     fitted to them. Both are resized and distorted by the recording's lens as `images` request; what the recorded image
     does not show of the lens's field, since undistorting left it out, is black and ignored.
 
@@ -129,7 +129,7 @@ def annotate_capture(
 
 @dataclass(frozen=True, kw_only=True)
 class _Annotator:
-    """Fits, draws, judges and writes frames."""
+    """Fits, renders, judges and writes frames."""
 
     scene: GaussianScene
     labeller: CompositedLabels
@@ -208,7 +208,7 @@ def _without_keypoints_in(missing: Tensor, label: InstrumentLabel) -> Instrument
 def fitted(
     scene: GaussianScene, labeller: CompositedLabels, frame: Frame, image: Tensor, start: Tensor | None
 ) -> tuple[AlignedFrame, LayeredDrawing]:
-    """The poses of `frame` fitted to its image [H, W, 3], and what the scene draws there; `start`: a neighbour's
+    """The poses of `frame` fitted to its image [H, W, 3], and what the scene renders there; `start`: a neighbour's
     increments, without which the search starts coarse."""
     near = start is not None and STATE_ERRORS not in scene.diagnostics  # errors as large differ between neighbours
     fit = align_frame(scene, frame, image, start, FROM_NEIGHBOUR if near else None)

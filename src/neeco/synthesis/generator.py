@@ -221,7 +221,7 @@ class SampleGenerator:
         return self.appearances.draw(rng, width, height)
 
     def _with(self, drawing: LayeredDrawing, appearance: Appearance) -> LayeredDrawing:
-        """Return the drawing in another appearance; the depth of a background is unknown."""
+        """Return the rendering in another appearance; the depth of a background is unknown."""
         image = self._image(drawing.state, drawing.camera, drawing.image, drawing.share, appearance)
         if appearance.background is None:
             return replace(drawing, image=image)
