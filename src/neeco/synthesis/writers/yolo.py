@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from neeco.files import write_text
+from neeco.files import write_text, write_unsynced
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import Record, link, stem
 
@@ -121,7 +121,7 @@ def _write_variant(
             " ".join([str(category), *(f"{value:.6g}" for value in row(shape, size))])
             for category, shape in shapes(images, record)
         ]
-        write_text(folder / "labels" / split / f"{name}.txt", "".join(f"{line}\n" for line in lines))
+        write_unsynced(folder / "labels" / split / f"{name}.txt", "".join(f"{line}\n" for line in lines).encode())
         link(images.root / record["image"], folder / "images" / split / Path(record["image"]).name)
     has_validation = any(record["split"] == "val" for record in records)
     # without "path", tools take the folder of data.yaml itself, wherever the data set is moved
