@@ -1,13 +1,14 @@
 """The table and the figure of docs/does-it-help.md, from studies of pairs of captures.
 
-python benchmarks/does_it_help.py scissors=OUT/scissors grasper=OUT/grasper driver=OUT/driver    # table and figure
-python benchmarks/does_it_help.py                                                                # figure of the table
+python benchmarks/does_it_help.py scissors=OUT/scissors grasper=OUT/grasper    # these pairs' rows anew, and the figure
+python benchmarks/does_it_help.py                                              # figure of the table
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +26,26 @@ TABLE = PAGE.parent / "images" / "does-it-help.csv"
 ARM = ("pair", "test", "trained on", "labelled", "seeds", "iou", "low", "high")
 COMPARISON = ("against", "against labelled", "difference", "difference low", "difference high")
 TESTS = {"across": ("across",), "within": ("test", "unseen")}  # of the page: of the study
-BEST = "better of real and real+strong"
 PASTED = "real+paste+strong"
+FEW, ALL = 10, 86  # labelled frames in the upper panels
+RECIPE = ("target+strong", "recipe+strong")  # the second in colours that match, without relit instruments
+FINE_TUNED = ("target+real+strong", "recipe+real+strong")
 CUT = 0.75  # the axis of IoU begins here
+CURVES = (  # by labelled frames, of the pair that has most numbers of them: conditions, colour, marker
+    (BASELINES, "#999999", "o"),
+    (("recipe+strong",), "#009E73", "*"),
+    (("recipe+real+strong",), "#0072B2", "v"),
+    (("recipe+real+strong+permuted",), "#D55E00", "X"),
+)
 TITLES = {"across": "The next operation: another recording", "within": "The same recording"}
 # what the figure shows of the table: colour (Okabe and Ito, "Color universal design", 2008), marker, name
 SHOWN = {
-    (BEST, "few"): ("#999999", "o", "10 labelled frames"),
-    (BEST, "all"): ("#E69F00", "s", "all 86 labelled frames"),
-    (PASTED, "few"): ("#CC79A7", "D", "10 labelled, pasted over the next operation's tissue"),
-    ("plain+strong", "none"): ("#56B4E9", "^", "synthetic alone, over its own tissue"),
-    ("target+strong", "none"): ("#009E73", "*", "synthetic alone, half over the next operation's tissue"),
-    ("target+real+strong", "all"): ("#0072B2", "v", "the same, then fine-tuned on all 86"),
+    (BASELINES, FEW): ("#999999", "o", "10 labelled frames"),
+    (BASELINES, ALL): ("#E69F00", "s", "all 86 labelled frames"),
+    ((PASTED,), FEW): ("#CC79A7", "D", "10 labelled, pasted over the next operation's tissue"),
+    (("plain+strong",), 0): ("#56B4E9", "^", "synthetic alone, over its own tissue"),
+    (RECIPE, 0): ("#009E73", "*", "synthetic alone, half over the next operation's tissue"),
+    (FINE_TUNED, ALL): ("#0072B2", "v", "the same, then fine-tuned on all 86"),
 }
 
 
@@ -76,11 +85,11 @@ def rows_of(pair: str, study: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def points(rows: list[dict[str, str]], pair: str, test: str, condition: str, amount: str) -> tuple[float, ...] | None:
-    """IoU, the ends of its interval and the number of seeds of what SHOWN names; None where the table lacks it."""
-    counts = sorted({int(row["labelled"]) for row in rows})
-    labelled = {"none": 0, "few": counts[1], "all": counts[-1]}[amount]
-    names = BASELINES if condition == BEST else (condition,)
+def points(
+    rows: list[dict[str, str]], pair: str, test: str, names: Sequence[str], labelled: int
+) -> tuple[float, ...] | None:
+    """IoU, the ends of its interval and the number of seeds of the better of some conditions; None where the table has
+    none of them."""
     found = [
         tuple(float(row[key]) for key in ("iou", "low", "high", "seeds"))
         for row in rows
@@ -115,6 +124,23 @@ def panel(axes: Axes, rows: list[dict[str, str]], test: str) -> None:
         axes.plot([-0.02, 0.02], [height - 0.012, height + 0.012], color=GREY, transform=axes.transAxes, clip_on=False)
 
 
+def curves(axes: Axes, rows: list[dict[str, str]], pair: str) -> None:
+    """IoU in the next operation against the number of labelled frames; of synthetic images alone a level line."""
+    counts = sorted({int(row["labelled"]) for row in rows if row["pair"] == pair} - {0})
+    for names, colour, marker in CURVES:
+        found = [(n, point) for n in counts if (point := points(rows, pair, "across", names, n)) is not None]
+        if (alone := points(rows, pair, "across", names, 0)) is not None:
+            axes.axhspan(*alone[1:3], color=colour, alpha=0.2, linewidth=0)
+            axes.axhline(alone[0], color=colour, linewidth=1.6)
+        places, ious = [place for place, _ in found], [point[0] for _, point in found]
+        axes.fill_between(places, *(([p[k] for _, p in found]) for k in (1, 2)), color=colour, alpha=0.2, linewidth=0)
+        axes.plot(places, ious, f"{marker}-", color=colour, linewidth=1.6, markersize=6, markerfacecolor="white")
+    axes.set_xscale("log")
+    axes.set_xticks(counts, [str(count) for count in counts])
+    axes.set_xticks([], minor=True)
+    axes.set_xlabel(f"labelled frames of pair {pair}", fontsize=8, color=GREY)
+
+
 def draw(rows: list[dict[str, str]]) -> None:
     """Write the figure: narrow, so that it is read on a phone without shrinking."""
     figure = Figure(figsize=(4.1, 6.3), layout="constrained")
@@ -133,7 +159,9 @@ def main() -> None:
     parser.add_argument("studies", nargs="*", metavar="PAIR=FOLDER", help="what `neeco downstream` wrote")
     studies = [word.partition("=") for word in parser.parse_args().studies]
     if studies:
-        rows = [row for pair, _, folder in studies for row in rows_of(pair, read_json(Path(folder) / FILE))]
+        with TABLE.open(encoding="utf-8", newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["pair"] not in {pair for pair, _, _ in studies}]
+        rows += [row for pair, _, folder in studies for row in rows_of(pair, read_json(Path(folder) / FILE))]
         with TABLE.open("w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, (*ARM, *COMPARISON), lineterminator="\n")
             writer.writeheader()
