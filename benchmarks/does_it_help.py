@@ -28,14 +28,14 @@ COMPARISON = ("against", "against labelled", "difference", "difference low", "di
 TESTS = {"across": ("across",), "within": ("test", "unseen")}  # of the page: of the study
 PASTED = "real+paste+strong"
 FEW, ALL = 10, 86  # labelled frames in the upper panels
-RECIPE = ("target+strong", "recipe+strong")  # the second in colours that match, without relit instruments
-FINE_TUNED = ("target+real+strong", "recipe+real+strong")
 CUT = 0.75  # the axis of IoU begins here
-CURVES = (  # by labelled frames, of the pair that has most numbers of them: conditions, colour, marker
-    (BASELINES, "#999999", "o"),
-    (("recipe+strong",), "#009E73", "*"),
-    (("recipe+real+strong",), "#0072B2", "v"),
-    (("recipe+real+strong+permuted",), "#D55E00", "X"),
+APART = "back"  # the pair that no choice was made by; the last panel
+CURVES = (  # of it, by labelled frames: conditions, colour, marker, name
+    ("recipe+strong", "#009E73", "*", "synthetic alone: no labelled frame"),
+    ("real+strong", "#999999", "o", "labelled frames, strong augmentation"),
+    ("real+match+strong", "#7F3C8D", "D", "the same in the next colours"),
+    ("recipe+real+strong", "#0072B2", "v", "synthetic, then labelled frames"),
+    ("recipe+real+strong+permuted", "#D55E00", "X", "labels of other images"),
 )
 TITLES = {"across": "The next operation: another recording", "within": "The same recording"}
 # what the figure shows of the table: colour (Okabe and Ito, "Color universal design", 2008), marker, name
@@ -44,8 +44,8 @@ SHOWN = {
     (BASELINES, ALL): ("#E69F00", "s", "all 86 labelled frames"),
     ((PASTED,), FEW): ("#CC79A7", "D", "10 labelled, pasted over the next operation's tissue"),
     (("plain+strong",), 0): ("#56B4E9", "^", "synthetic alone, over its own tissue"),
-    (RECIPE, 0): ("#009E73", "*", "synthetic alone, half over the next operation's tissue"),
-    (FINE_TUNED, ALL): ("#0072B2", "v", "the same, then fine-tuned on all 86"),
+    (("target+strong",), 0): ("#009E73", "*", "synthetic alone, half over the next operation's tissue"),
+    (("target+real+strong",), ALL): ("#0072B2", "v", "the same, then fine-tuned on all 86"),
 }
 
 
@@ -124,28 +124,41 @@ def panel(axes: Axes, rows: list[dict[str, str]], test: str) -> None:
         axes.plot([-0.02, 0.02], [height - 0.012, height + 0.012], color=GREY, transform=axes.transAxes, clip_on=False)
 
 
-def curves(axes: Axes, rows: list[dict[str, str]], pair: str) -> None:
-    """IoU in the next operation against the number of labelled frames; of synthetic images alone a level line."""
-    counts = sorted({int(row["labelled"]) for row in rows if row["pair"] == pair} - {0})
-    for names, colour, marker in CURVES:
-        found = [(n, point) for n in counts if (point := points(rows, pair, "across", names, n)) is not None]
-        if (alone := points(rows, pair, "across", names, 0)) is not None:
-            axes.axhspan(*alone[1:3], color=colour, alpha=0.2, linewidth=0)
-            axes.axhline(alone[0], color=colour, linewidth=1.6)
-        places, ious = [place for place, _ in found], [point[0] for _, point in found]
-        axes.fill_between(places, *(([p[k] for _, p in found]) for k in (1, 2)), color=colour, alpha=0.2, linewidth=0)
-        axes.plot(places, ious, f"{marker}-", color=colour, linewidth=1.6, markersize=6, markerfacecolor="white")
+def curves(axes: Axes, rows: list[dict[str, str]]) -> None:
+    """IoU in the next operation of the pair APART against the number of labelled frames; a level line without any."""
+    counts = sorted({int(row["labelled"]) for row in rows if row["pair"] == APART} - {0})
+    for k, (condition, colour, marker, name) in enumerate(CURVES):
+        of = {n: points(rows, APART, "across", [condition], n) for n in (0, *counts)}
+        found = [(n, point) for n, point in of.items() if point is not None]
+        if [n for n, _ in found] == [0]:
+            found = [(n, found[0][1]) for n in (counts[0], counts[-1])]
+        found = [(n * 1.08 ** (k - 1), point) for n, point in found]  # beside each other
+        for n, (_, low, high, _) in found:
+            axes.plot([n, n], [low, high], color=colour, linewidth=1.6, alpha=0.5)
+        line = [n for n, _ in found], [point[0] for _, point in found]
+        axes.plot(*line, f"{marker}-", color=colour, linewidth=1.6, markersize=6, markerfacecolor="white", label=name)
+    axes.legend(fontsize=7, frameon=False, loc="lower right")
+    axes.set_xlim(counts[0] / 1.3, ALL * 1.3)
+    axes.set_ylim(0, 1)
     axes.set_xscale("log")
     axes.set_xticks(counts, [str(count) for count in counts])
     axes.set_xticks([], minor=True)
-    axes.set_xlabel(f"labelled frames of pair {pair}", fontsize=8, color=GREY)
+    axes.set_xlabel("labelled frames", fontsize=8, color=GREY)
+    axes.set_title("The next operation, pair kept apart", fontsize=10, color=GREY, loc="left", fontweight="bold")
+    axes.set_ylabel("IoU", fontsize=8, color=GREY)
+    axes.tick_params(colors=GREY, labelsize=9)
+    axes.grid(axis="y", color=GREY, alpha=0.25, linewidth=0.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(GREY)
 
 
 def draw(rows: list[dict[str, str]]) -> None:
     """Write the figure: narrow, so that it is read on a phone without shrinking."""
-    figure = Figure(figsize=(4.1, 6.3), layout="constrained")
-    for axes, test in zip(figure.subplots(2, 1), TESTS, strict=True):
-        panel(axes, rows, test)
+    figure = Figure(figsize=(4.1, 8.4), layout="constrained")
+    *panels, last = figure.subplots(3, 1)
+    for axes, test in zip(panels, TESTS, strict=True):
+        panel(axes, [row for row in rows if row["pair"] != APART], test)
+    curves(last, rows)
     handles = [
         Line2D([], [], color=colour, marker=marker, linewidth=1.6, markersize=9 if marker == "*" else 6, label=name)
         for colour, marker, name in SHOWN.values()
