@@ -226,7 +226,7 @@ def train(
     Args:
         capture: the capture's folder
         output: run folder to write
-        method: kinematic (None), neeco (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta
+        method: kinematic (None), nps (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta
         iterations: frames that are learned from; None: 6,000, with fewer than 60 training frames kinematic takes less
         minutes: stop in time with a finished run; None: no limit
         seed: the same one gives the same scene on the same machine, unless `minutes` is given; None: 0

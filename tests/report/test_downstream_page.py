@@ -183,8 +183,8 @@ def test_one_fold_is_no_answer(capture, output):
 
 
 def test_without_labelled_frames_sets_stand_alone(capture, output):
-    jobs = jobs_of(capture, output, conditions=("kinematic", "neeco"))
-    text, page = page_of(output, experiment_of(capture, jobs, sets=("kinematic", "neeco"), labelled=0), capture)
+    jobs = jobs_of(capture, output, conditions=("kinematic", "nps"))
+    text, page = page_of(output, experiment_of(capture, jobs, sets=("kinematic", "nps"), labelled=0), capture)
     assert "No condition has synthetic images with labelled frames" in text
     assert "one set against another" in text
     assert "best and worst; fold 0" in text

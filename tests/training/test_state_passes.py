@@ -12,32 +12,57 @@ from neeco.methods.kinematic.state_registration import LARGE_ERRORS
 from neeco.training.silhouettes import Silhouettes
 
 
-def session_of(silhouettes: Silhouettes | None, *, expected: bool) -> Any:
+def session_of(silhouettes: Silhouettes | None, *, linked: bool, expected: bool) -> Any:
     refinement = SimpleNamespace(frames_of_instant=[(0,)], set_deviations=lambda index, deviations: None)
-    scene = SimpleNamespace(instruments=("tool",), diagnostics={LARGE_ERRORS: expected})
+    tool = SimpleNamespace(kinematics="links" if linked else None)
+    scene = SimpleNamespace(instruments=(tool,), diagnostics={LARGE_ERRORS: expected} if linked else {})
     config = SimpleNamespace(refine=SimpleNamespace(frame_poses=True))
     return SimpleNamespace(
         scene=scene, refinement=refinement, config=config, silhouettes=silhouettes, report=lambda text: None
     )
 
 
-@pytest.mark.parametrize(
-    ("observed", "expected", "size", "fitted"),
-    [
-        (False, False, 1.0, False),  # colours and tissue tell nothing: no fit is to be believed
-        (False, True, 0.15, False),
-        (False, True, 0.3, True),
-        (True, False, 0.06, False),
-        (True, False, 0.15, True),
-    ],
-)
-def test_errors_are_large_by_what_images_can_tell(
-    observed: bool, expected: bool, size: float, fitted: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    search = SimpleNamespace(deviations=lambda index, scale: None)
+def decided(
+    monkeypatch: pytest.MonkeyPatch, session: Any, mark: float, *, size: float = 0.0, stated: float = 0.0
+) -> bool:
+    """Whether states are fitted after a mark at which images show errors of a size, and the recording states others."""
+    search = SimpleNamespace(
+        session=session, deviations=lambda index, scale: None, stated_scale=lambda: stated, fitted=lambda *given: None
+    )
     monkeypatch.setattr(module.StateSearch, "of", lambda session, articulated: search)
     monkeypatch.setattr(module, "size_of_errors", lambda search: size)
     monkeypatch.setattr(module, "doubt_states", lambda search, scale: None)
-    session = session_of(Silhouettes((), 0.0) if observed else None, expected=expected)
-    module.fit_states(session, None, module.DECIDED_AT)  # type: ignore[arg-type]
-    assert (module.FOUND in session.scene.diagnostics) == fitted
+    monkeypatch.setattr(module, "CARVED_AT", ())
+    module.fit_states(session, None, mark)  # type: ignore[arg-type]
+    return module.STATE_ERRORS in session.scene.diagnostics
+
+
+@pytest.mark.parametrize(
+    ("linked", "observed", "expected", "size", "fitted"),
+    [
+        (True, False, False, 1.0, False),  # colours and tissue tell nothing: no fit is to be believed
+        (True, False, True, 0.15, False),
+        (True, False, True, 0.3, True),
+        (True, True, False, 0.06, False),
+        (True, True, False, 0.15, True),
+        (False, False, False, 0.15, False),
+        (False, False, False, 0.3, True),
+    ],
+)
+def test_errors_are_large_by_what_images_can_tell(
+    linked: bool, observed: bool, expected: bool, size: float, fitted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = session_of(Silhouettes((), 0.0) if observed else None, linked=linked, expected=expected)
+    assert decided(monkeypatch, session, module.DECIDED_AT[0], size=size) == fitted
+
+
+@pytest.mark.parametrize("stated", [0.1, 1.0])
+def test_stated_errors_are_believed_whatever_images_show(stated: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = session_of(None, linked=True, expected=False)
+    assert decided(monkeypatch, session, module.DECIDED_AT[0], stated=stated) == (stated == 1.0)
+
+
+def test_errors_that_images_show_only_later_are_found_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = session_of(Silhouettes((), 0.0), linked=True, expected=False)
+    assert not decided(monkeypatch, session, module.DECIDED_AT[0], size=0.05)
+    assert decided(monkeypatch, session, module.DECIDED_AT[1], size=0.15)

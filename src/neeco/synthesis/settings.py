@@ -35,9 +35,9 @@ class SizeSettings:
     """Size of the images."""
 
     size: str | None = None
-    """WIDTHxHEIGHT of the images, px, in the shape of the recorded ones; theirs when not given."""
+    """WIDTHxHEIGHT of the images, px, in the shape of the recorded ones. Default: theirs."""
     scale: float | None = None
-    """Instead of --size: times the recorded width and height."""
+    """Instead of --size: times the recorded width and height. Default: 1."""
 
     def check(self) -> None:
         """Raises NeecoError naming the option that makes no sense."""
@@ -136,15 +136,15 @@ class Settings(ImageSettings):
     labels: LabelWay = "composited"
     """composited: from compositing, occlusion-correct. threshold: the paper's, from Gaussians that move."""
     label_threshold: float | None = None
-    """Share of a pixel that must be instrument (composited); the project's measured best when not given."""
+    """Share of a pixel that must be instrument (composited). Default: the project's measured best."""
     delta_thresholds: tuple[float, float, float] | None = None
-    """Position (mm), rotation and scale (mm) above which a Gaussian has moved (threshold); found when not given."""
+    """Position (mm), rotation and scale (mm) above which a Gaussian has moved (threshold). Default: found."""
     min_component: float = 0.01
     """Drop components of an instrument's mask smaller than this share of its largest."""
     tissue_check: bool = True
     """States whose instrument enters the tissue, as far as the view shows it, are refused, unless --no-tissue-check."""
     tissue_tolerance_mm: float | None = None
-    """How far behind the tissue surface still counts as touching it; found from the recorded states when not given."""
+    """How far behind the tissue surface still counts as touching it. Default: found from the recorded states."""
     min_share: float = 0.005
     """Refuse images with less than this share of instrument pixels."""
     max_unobserved: float = 0.25

@@ -14,7 +14,7 @@ import yaml
 from neeco.errors import NeecoError, nearest
 from neeco.files import YamlLoader
 from neeco.fitting.refinement import RefineConfig
-from neeco.scene.method_registry import DEFAULT, method_class, method_settings
+from neeco.scene.method_registry import DEFAULT, current_name, method_class, method_settings
 from neeco.scene.training_session import RunLength
 from neeco.settings import name_and_value, plain, structure, with_fields
 from neeco.training.resolution import ResolutionConfig, size_factor
@@ -95,6 +95,7 @@ class TrainConfig:
     checkpoint_interval: int = 500  # iterations
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "method", current_name(self.method))
         if self.deformation is None:
             object.__setattr__(self, "deformation", method_class(self.method).Settings())
 
@@ -276,7 +277,7 @@ def check_ranges(config: TrainConfig) -> None:
         )
     if config.batch_size > 1 and not method_class(config.method).has_gaussians:
         raise NeecoError(
-            f"--batch-size: method {config.method} draws rays of all frames in every step; "
+            f"--batch-size: method {config.method} samples rays of all frames in every step; "
             "use --set deformation.rays=NUMBER"
         )
     options = {"seed": 0, "batch_size": 1, "max_tissue_gaussians": 1, "max_instrument_gaussians": 1}
