@@ -27,7 +27,7 @@ from rendered.base import SHARE, base_errors, wrong_base
 from rendered.errors import ErrorModel, disturb_poses
 from rendered.motion import FRAME_RATE
 from rendered.wristed import Encoders
-from result_plots import COLOURS, GREY, write
+from result_plots import GREY, METHOD_COLORS, write
 from scipy.interpolate import interp1d
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
@@ -135,10 +135,12 @@ def plot(values: np.ndarray, path: Path) -> None:
     """Write errors [N, Q] in standard deviations, and their root mean squares, as a plot."""
     figure = Figure(figsize=(8, 3), layout="constrained")
     axes = figure.subplots()
-    axes.axhspan(0.7, 1.5, color=COLOURS[0], alpha=0.15)
+    axes.axhspan(0.7, 1.5, color=GREY, alpha=0.15)
     for column in range(values.shape[1]):
-        axes.plot(np.full(len(values), column), values[:, column], ".", color=COLOURS[3])
-    axes.plot(np.sqrt(np.square(values).mean(0)), "_", color=COLOURS[1], markersize=18, markeredgewidth=3)
+        axes.plot(np.full(len(values), column), values[:, column], ".", color=GREY)
+    axes.plot(
+        np.sqrt(np.square(values).mean(0)), "_", color=METHOD_COLORS["kinematic"], markersize=18, markeredgewidth=3
+    )
     axes.set_xticks(range(len(QUANTITIES)), QUANTITIES, fontsize=7, rotation=30)
     axes.set_title("|error| / standard deviation; bar: root mean square", fontsize=9, color=GREY, loc="left")
     axes.tick_params(colors=GREY)

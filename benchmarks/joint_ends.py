@@ -1,4 +1,4 @@
-"""Draws a run's instruments with every joint at both ends of its recorded range, to be looked at.
+"""Renders a run's instruments with every joint at both ends of its recorded range, to be looked at.
 
     python benchmarks/joint_ends.py RUN OUT.png [--poses 3]
 
@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw
 import neeco
 from neeco.capture.model import Camera, State, evenly_spaced
 from neeco.errors import NeecoError
-from neeco.synthesis.preview import PALETTE
+from neeco.evaluation.image_metrics import PART_COLORS
 from neeco.synthesis.states import joint_ranges
 
 TINT = 0.35
@@ -40,7 +40,7 @@ def picture(scene: neeco.Scene, state: State, camera: Camera) -> np.ndarray:
     """[H, W, 3] uint8: parts tinted, keypoints joined."""
     drawn = scene.draw(state, camera)
     image, ids = drawn.image.numpy() * 255, drawn.parts.numpy()
-    colors = np.concatenate([np.zeros((1, 3)), PALETTE])[ids]
+    colors = np.concatenate([np.zeros((1, 3)), PART_COLORS])[ids]
     canvas = Image.fromarray(np.where(ids[..., None] > 0, (1 - TINT) * image + TINT * colors, image).astype(np.uint8))
     draw = ImageDraw.Draw(canvas)
     for instrument in drawn.keypoints:  # [K, 3]

@@ -1,4 +1,4 @@
-"""Times the networks of `neeco` and `deformable-3dgs`, forward and backward: float32 against bfloat16, in turns.
+"""Times the networks of `nps` and `deformable-3dgs`, forward and backward: float32 against bfloat16, in turns.
 
     python benchmarks/networks.py [--gaussians 2000 8000] [--threads 1 2] [--repeats 15]
 

@@ -1,4 +1,4 @@
-"""The plots of docs/results.md, drawn from its tables, so that a plot never says anything else than the table above it.
+"""The plots of docs/results.md, made from its tables, so that a plot never says anything else than the table above it.
 
 python benchmarks/result_plots.py            # writes docs/images/results-*.svg
 """
@@ -6,18 +6,37 @@ python benchmarks/result_plots.py            # writes docs/images/results-*.svg
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from neeco.errors import NeecoError
 
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"
-COLOURS = ("#0f766e", "#b45309", "#6d28d9", "#64748b")
+SIZES = PAGE.parents[1] / "notes" / "2026-11-26-results-methods-and-speed.md"  # has the table of sizes
 GREY = "#808080"  # readable on light and on dark pages
+METHOD_COLORS = {  # of a method in every plot
+    "nps": "#0f9488",
+    "deformable-3dgs": "#d97706",
+    "4dgs": "#8b5cf6",
+    "3dgs": "#808b99",
+    "kinematic": "#e0457b",
+    "nerfies": "#2f8fdd",
+}
+PART_COLORS = {"shaft": "#0072b2", "wrist": "#e69f00", "jaws": "#009e73"}  # as in neeco's images of parts
+TRAINED_ON = {  # heading of the table: colour, as in does_it_help.py
+    "5 labelled frames": "#999999",
+    "all labelled frames": "#e69f00",
+    "synthetic images alone": "#56b4e9",
+}
+SPLITS = ("seen", "unseen")  # filled and hollow bars
+WIDTH, BAR = 4.1, 0.125  # inches: of a figure that a phone shows whole, of a bar
+FONT = 8.5
 
 
 def table(first_heading: str, page: Path = PAGE, headings: bool = False) -> list[list[str]]:
@@ -40,19 +59,59 @@ def number(cell: str) -> float:
     return float("nan") if cell == "-" else float(cell)
 
 
-def grouped_bars(axes: Axes, groups: list[str], series: dict[str, list[float]], title: str, least: float) -> None:
-    """Bars of every series beside each other in each group, their values above them."""
-    width = 0.8 / len(series)
-    for k, (name, values) in enumerate(series.items()):
-        places = np.arange(len(groups)) + (k - (len(series) - 1) / 2) * width
-        bars = axes.bar(places, values, width * 0.92, label=name, color=COLOURS[k])
-        axes.bar_label(bars, [f"{v:.3g}" if v == v else "" for v in values], fontsize=7, color=GREY, padding=1)
-    axes.set_xticks(range(len(groups)), groups, fontsize=8)
-    axes.set_title(title, fontsize=9, color=GREY, loc="left")
-    axes.set_ylim(least)
-    axes.tick_params(colors=GREY, labelsize=8)
+def pair(cell: str) -> tuple[float, float]:
+    """The numbers of a cell "seen / unseen"; NaN where it has none."""
+    seen, _, unseen = cell.partition(" / ")
+    return number(seen), number(unseen) if unseen else float("nan")
+
+
+def bars(
+    axes: Axes,
+    groups: Sequence[str],
+    values: Sequence[Sequence[float]],
+    colors: Sequence[str],
+    title: str,
+    *,
+    end: float,
+    written: str = "{:.2f}",
+) -> None:
+    """Horizontal bars from zero: of every group its values [groups][bars] from above, each written at its end.
+
+    colors: one for each group, whose two bars are the seen value, filled, and the unseen one, hollow; or one for each
+    of three bars. end: of the axis.
+    """
+    count = len(values[0])
+    for k in range(count):
+        lengths = np.array([row[k] for row in values])
+        places = np.arange(len(groups)) + (k - (count - 1) / 2) * 0.84 / count
+        edges = colors if count < 3 else [colors[k]] * len(groups)
+        faces = ["none"] * len(groups) if k and count < 3 else edges
+        known = ~np.isnan(lengths)
+        patches = axes.barh(places, np.where(known, lengths, 0), 0.7 / count, color=faces, edgecolor=edges)
+        for patch in (patch for patch, shown in zip(patches, known, strict=True) if not shown):
+            patch.set_visible(False)
+        names = [written.format(length) if shown else "" for length, shown in zip(lengths, known, strict=True)]
+        axes.bar_label(patches, names, fontsize=FONT - 1.2, color=GREY, padding=2)
+    axes.set_yticks(range(len(groups)), groups, fontsize=FONT)
+    axes.set_ylim(len(groups) - 0.5, -0.5)
+    axes.set_xlim(0, end * 1.25)
+    axes.set_xticks([0, end / 2, end])
+    axes.set_title(title, fontsize=FONT, color=GREY, loc="left")
+    axes.tick_params(colors=GREY, labelsize=FONT, length=0)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(GREY)
+
+
+def new_figure(rows: int, columns: int = 1, key: bool = True) -> tuple[Figure, list[Axes]]:
+    """A figure of as many bars below each other, and its panels, which share the names of groups; with a key where
+    bars are filled and hollow."""
+    figure = Figure(figsize=(WIDTH, rows * BAR + 0.75), layout="constrained")
+    if key:
+        handles = [
+            Patch(facecolor=GREY if split == "seen" else "none", edgecolor=GREY, label=split) for split in SPLITS
+        ]
+        figure.legend(handles=handles, fontsize=FONT, frameon=False, ncols=2, loc="outside lower center")
+    return figure, list(figure.subplots(1, columns, sharey=True, squeeze=False)[0])
 
 
 def write(figure: Figure, path: Path) -> None:
@@ -71,50 +130,48 @@ def save(figure: Figure, name: str) -> None:
 
 
 def main() -> None:
-    rows, capture = [], ""
-    for row in table("capture"):
-        capture = row[0] or capture
-        rows.append([f"{capture.split(',')[0]}\n{row[1]}", capture.split(", ")[1], *row[2:]])
-    groups = list(dict.fromkeys(row[0] for row in rows))
-    figure = Figure(figsize=(8, 2.8), layout="constrained")
-    for axes, column, title, least in zip(
-        figure.subplots(1, 2), (5, 6), ("PSNR in the instrument, dB", "label IoU"), (15, 0.7), strict=True
-    ):
-        series = {kind: [number(row[column]) for row in rows if row[1] == kind] for kind in ("as given", "aligned")}
-        grouped_bars(axes, groups, series, title, least)
-    figure.axes[0].legend(fontsize=8, frameon=False, loc="upper right")
+    rows = table("scored")
+    captures, color = [row[0].split(",")[0] for row in rows], METHOD_COLORS["kinematic"]
+    figure, panels = new_figure(2 * len(rows), 2)
+    for axes, column, title in zip(panels, (2, 4), ("label IoU, as given", "label IoU, aligned"), strict=True):
+        bars(axes, captures, [pair(row[column]) for row in rows], [color] * len(rows), title, end=1)
     save(figure, "quality")
 
-    rows = table("U-Net on")
-    figure = Figure(figsize=(8, 2.8), layout="constrained")
-    headings = ("5 labelled frames", "all labelled frames", "drawn images alone")
-    for k, (axes, split) in enumerate(zip(figure.subplots(1, 2, sharey=True), ("seen", "unseen"), strict=True)):
-        series = {
-            name: [number(row[2 + c].split(" / ")[k]) if " / " in row[2 + c] else float("nan") for row in rows]
-            for c, name in enumerate(headings)
-        }
-        grouped_bars(axes, [row[0] for row in rows], series, f"IoU on {split} states", 0.75)
-    figure.legend(
-        *figure.axes[0].get_legend_handles_labels(), fontsize=8, frameon=False, ncols=3, loc="outside lower center"
-    )
+    rows = table("parts of")
+    captures = [row[0].split(",")[0] for row in rows]
+    figure, panels = new_figure(2 * len(rows), 3)
+    for column, (axes, (part, color)) in enumerate(zip(panels, PART_COLORS.items(), strict=True), start=1):
+        bars(axes, captures, [pair(row[column]) for row in rows], [color] * len(rows), f"{part}, IoU", end=1)
+    save(figure, "parts")
+
+    rows = table("U-Net on", headings=True)
+    columns = [rows[0].index(heading) for heading in TRAINED_ON]
+    figure, panels = new_figure(4 * len(rows[1:]), 2, key=False)
+    groups, colors = [row[0] for row in rows[1:]], list(TRAINED_ON.values())
+    for k, (axes, split) in enumerate(zip(panels, SPLITS, strict=True)):
+        values = [[pair(row[column])[k] for column in columns] for row in rows[1:]]
+        bars(axes, groups, values, colors, f"IoU, {split}", end=1)
+    handles = [Patch(color=color, label=heading) for heading, color in TRAINED_ON.items()]
+    figure.legend(handles=handles, fontsize=FONT, frameon=False, ncols=1, loc="outside lower center")
     save(figure, "teaching")
 
     rows = table("method")
-    figure = Figure(figsize=(8, 2.8), layout="constrained")
-    series = {"seen": [number(row[1]) for row in rows], "unseen": [number(row[2]) for row in rows]}
-    names = [re.split(r"[ ,]", row[0])[0].replace("deformable-3dgs", "deformable\n-3dgs") for row in rows]
-    grouped_bars(figure.subplots(), names, series, "PSNR, dB (liver, four CPU minutes)", 20)
-    figure.axes[0].legend(fontsize=8, frameon=False)
+    names = [re.split(r"[ ,]", row[0])[0] for row in rows]
+    colors = [METHOD_COLORS[name.removesuffix("+dta")] for name in names]
+    figure, panels = new_figure(2 * len(rows), 2)
+    for axes, column, title in zip(panels, (1, 3), ("PSNR, dB", "PSNR in instrument, dB"), strict=True):
+        values = [[number(row[column]), number(row[column + 1])] for row in rows]
+        bars(axes, names, values, colors, title, end=30, written="{:.1f}")
     save(figure, "methods")
 
-    rows = table("recorded at")
-    figure = Figure(figsize=(8, 2.8), layout="constrained")
-    cost, quality = figure.subplots(1, 2)
+    rows = table("recorded at", SIZES)
+    color = METHOD_COLORS["kinematic"]
     groups = [row[0] if row[0] == row[1] else f"{row[0]}\nfrom {row[1]}" for row in rows]
-    grouped_bars(cost, groups, {"CPU minutes": [number(row[2]) for row in rows]}, "CPU minutes of training", 0)
-    series = {split: [number(row[6 + k].split(" / ")[0]) for row in rows] for k, split in enumerate(("seen", "unseen"))}
-    grouped_bars(quality, groups, series, "PSNR as given, dB", 24)
-    quality.legend(fontsize=8, frameon=False, loc="upper right", ncols=2)
+    figure, panels = new_figure(3 * len(rows), 2)
+    minutes = [[number(row[2])] for row in rows]
+    bars(panels[0], groups, minutes, [color] * len(rows), "training, CPU minutes", end=50, written="{:g}")
+    quality = [[number(row[6 + k].split(" / ")[0]) for k in range(2)] for row in rows]
+    bars(panels[1], groups, quality, [color] * len(rows), "PSNR as given, dB", end=30, written="{:.1f}")
     save(figure, "sizes")
 
 

@@ -1,8 +1,10 @@
 """Train a U-Net on images that are rendered while it learns; nothing is written to disk.
 
     python examples/02_train_on_the_fly.py RUN        # RUN: of examples/01_train_and_draw.py, or any of your own
+    python examples/02_train_on_the_fly.py RUN --backgrounds PLATES --steps 1000    # for the next operation
 
-It is tested on recorded frames that neither the scene nor the U-Net was trained on.
+It is tested on recorded frames that neither the scene nor the U-Net was trained on. PLATES: frames of the next
+operation without an instrument (docs/does-it-help.md).
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 import neeco
+from neeco.synthesis.augmentation import augment_batch
 
 
 def block(inputs: int, outputs: int) -> nn.Sequential:
@@ -65,14 +68,18 @@ def iou_on_recorded_frames(network: UNet, run: neeco.api.Run, split: str) -> flo
     return float(np.mean(scores))
 
 
-def main(folder: Path, steps: int, workers: int) -> None:
+def main(folder: Path, steps: int, workers: int, backgrounds: Path | None = None) -> None:
     run = neeco.load(folder)
-    images = neeco.LabelledImages(run, count=8 * steps, states="extrapolate", transform=smaller)
+    images = neeco.LabelledImages(
+        run, count=8 * steps, states="extrapolate", backgrounds=backgrounds, match_colors=backgrounds, transform=smaller
+    )
     loader = DataLoader(images, batch_size=8, num_workers=workers, collate_fn=images.collate)
     torch.manual_seed(0)
+    random = torch.Generator().manual_seed(0)
     network = UNet()
     optimiser = torch.optim.Adam(network.parameters(), 2e-3)
     for step, batch in enumerate(loader):
+        batch = augment_batch(batch, random)
         target = (batch["parts"] > 0).float()
         weight = (~batch["ignore"]).float()
         loss = nn.functional.binary_cross_entropy_with_logits(network(batch["image"])[:, 0], target, weight)
@@ -87,7 +94,8 @@ def main(folder: Path, steps: int, workers: int) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
+    parser.add_argument("--backgrounds", type=Path)
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    main(arguments.run, arguments.steps, arguments.workers)
+    main(arguments.run, arguments.steps, arguments.workers, arguments.backgrounds)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -17,6 +19,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import neeco
 from neeco.capture import write_capture
@@ -78,13 +81,17 @@ def test_the_page_of_the_api_documents_every_name_and_no_other() -> None:
     assert set(re.findall(r"^::: neeco\.(?:api\.(?=ingest$))?(\w+)$", page, re.MULTILINE)) == set(neeco.__all__)
 
 
+SECTION = re.compile(r"^Args:\n(?:    .*\n)+", re.MULTILINE)
+
+
 def examples_of(name: str) -> str:
-    """The indented code of a name's docstrings: its own, and those of its public methods."""
+    """The indented code of a name's docstrings, but their tables of arguments: its own, and its public methods'."""
     value = getattr(neeco, name)
     texts = [inspect.getdoc(value) or ""]
     if inspect.isclass(value):
         texts += [inspect.getdoc(member) or "" for key, member in vars(value).items() if not key.startswith("_")]
-    blocks = [re.findall(r"(?:^    .*\n?|^\n(?=    ))+", text + "\n", re.MULTILINE) for text in texts]
+    texts = [SECTION.sub("", text + "\n") for text in texts]
+    blocks = [re.findall(r"(?:^    .*\n?|^\n(?=    ))+", text, re.MULTILINE) for text in texts]
     return "\n".join(textwrap.dedent(block) for found in blocks for block in found)
 
 
@@ -98,6 +105,45 @@ def test_the_example_of_every_name_runs(name: str, folder: Path, monkeypatch: py
     code = code.replace("num_workers=2", "num_workers=0").replace('"samples/liver-mini"', f'"{SAMPLE}"')
     code = code.replace('start="first"', 'start="first", min_trust=0.0').replace('"recording.yaml"', f'"{SAMPLE}"')
     exec(compile(code, f"<example of {name}>", "exec"), {"neeco": neeco, "np": np, "torch": torch})
+
+
+@pytest.mark.parametrize("name", [name for name in neeco.__all__ if name not in ("Run", "NeecoError")])
+def test_the_table_of_arguments_of_a_name_has_every_argument(name: str) -> None:
+    """`Run` is made by functions only."""
+    value = getattr(neeco, name)
+    arguments = [key for key in inspect.signature(value).parameters if key != "self"]
+    shared = [*inspect.signature(neeco.LabelledImages).parameters] if name == "LabelledStream" else []
+    section = SECTION.search(inspect.getdoc(value) or "")
+    assert section is not None, name
+    assert [key for key in re.findall(r"^    (\w+):", section[0], re.MULTILINE)] == [
+        key for key in arguments if key not in shared
+    ]
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/getting-started.md"])
+def test_python_of_the_first_pages_runs_as_written(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = "\n".join(re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.M | re.S))
+    smaller = {
+        "minutes=2": "iterations=5",
+        "runs/sample": f"runs/{Path(page).stem}",
+        "count=1000": "count=2, min_share=0.0",
+        "num_workers=2": "num_workers=0",
+    }
+    for written, run in smaller.items():
+        assert written in code or page == "README.md"
+        code = code.replace(written, run)
+    monkeypatch.chdir(folder)
+    names: dict[str, object] = {}
+    exec(compile(code, page, "exec"), names)
+    images = names["images"]
+    assert isinstance(images, neeco.LabelledImages)
+    assert images[1]["image"].shape[0] == 3
+
+
+def test_a_loader_without_our_collate_function_is_told_of_it(folder: Path) -> None:
+    images = neeco.StoredImages(folder / "dataset")
+    with pytest.raises(neeco.NeecoError, match=r"give collate_fn=neeco\.LabelledImages"):
+        next(iter(torch.utils.data.DataLoader(images, batch_size=2)))
 
 
 def test_what_a_notebook_shows_of_an_object_is_one_short_line(folder: Path) -> None:
@@ -127,6 +173,10 @@ def test_errors_name_arguments_in_python_and_options_on_the_command_line(
     run, output = folder / "runs" / "sample", folder / "refused"
     wrong: list[tuple[Callable[[], object], str]] = [
         (lambda: neeco.train(SAMPLE, output, iterations=0), "iterations: 0 is not a positive number"),
+        (lambda: neeco.train(SAMPLE, output, iteration=9), "iteration: unknown field; see config.yaml of any run for"),
+        (lambda: neeco.train(SAMPLE, output, iteration=9), "; did you mean iterations?"),
+        (lambda: neeco.train(SAMPLE, output, density__prune_stp=1), "; did you mean density__prune_stop?"),
+        (lambda: neeco.synthesize(run, output, 1, sed=1), "; did you mean seed?"),
         (
             lambda: neeco.train(SAMPLE, output, density__prune_interval="x"),
             "density__prune_interval: 'x' is not a",
@@ -144,6 +194,43 @@ def test_errors_name_arguments_in_python_and_options_on_the_command_line(
         assert message in str(caught.value)
     assert main(["track", str(run), str(folder / "footage"), "--output", str(output), "--min-trust", "2"]) == 1
     assert "neeco: error: --min-trust: 2.0 is not a share" in capsys.readouterr().err
+
+
+def test_the_recipe_for_the_next_operation_runs_as_the_page_says(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commands and the Python of docs/does-it-help.md, tiny: 14 frames of liver-mini are both recordings."""
+    pytest.importorskip("transformers")
+    page = (ROOT / "docs" / "does-it-help.md").read_text(encoding="utf-8").partition("## What to do")[2]
+    train, synthesize_set, downstream = (
+        line.split() for line in re.findall(r"^    (neeco .*)$", page, re.MULTILINE)[:3]
+    )
+    monkeypatch.chdir(tmp_path)
+    capture = neeco.read_capture(SAMPLE)
+    frames = [*capture.split("train")[::6], *capture.split("test")[:2]]
+    write_capture(replace(capture, frames=frames), Path("FIRST"))
+    shutil.copytree(SAMPLE / "truth", "FIRST/truth", dirs_exist_ok=True)
+    Path("SECOND").symlink_to("FIRST")
+    Path("RUN").symlink_to(folder / "runs" / "sample")
+    Path("PLATES").mkdir()
+    for k in range(2):
+        Image.fromarray(np.random.default_rng(k).integers(60, 180, (64, 80, 3), np.uint8)).save(f"PLATES/{k}.png")
+    assert train == ["neeco", "train", "FIRST", "--output", "RUN"]  # which the first program did
+    synthesize_set[synthesize_set.index("--count") + 1] = "4"
+    assert main([*synthesize_set[1:], "--min-share", "0"]) == 0
+    assert (
+        main([*downstream[1:], *["--folds", "1", "--steps", "1", "--size", "48", "--batch", "2", "--device", "cpu"]])
+        == 0
+    )
+    study = json.loads(Path("HELPS/downstream.json").read_text(encoding="utf-8"))
+    assert {job["condition"] for job in study["jobs"]} == {"real", "real+strong", "next+strong"}
+    assert study["sets"][0]["made_by"]["settings"]["match_colors"]
+    code = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0]
+    code = code.replace('"RUN", 8000', '"RUN", 4, min_share=0.0').replace("num_workers=2", "num_workers=0")
+    code = code.replace("batch_size=8", "batch_size=2")
+    found: dict = {}
+    exec(compile(code, "<does-it-help.md>", "exec"), found)
+    assert torch.isfinite(found["loss"])
 
 
 def test_python_blocks_of_the_pages_pass_a_type_checker(tmp_path: Path) -> None:

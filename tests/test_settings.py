@@ -15,7 +15,8 @@ from neeco.settings import described, plain, structure, with_fields
 
 @dataclass(frozen=True)
 class Inner:
-    count: int = 3
+    count: int = 3  # of things
+    # which
     word: Literal["on", "off"] = "on"
 
 
@@ -75,4 +76,7 @@ def test_dots_reach_into_groups() -> None:
 
 
 def test_fields_are_described_in_words() -> None:
-    assert list(described(Inner)) == [("count", "int", "3"), ("word", "on|off", "on")]
+    fields = {name: (default, text) for name, default, text in described(Outer)}
+    assert fields["share"] == ("None", " (FLOAT)")
+    assert fields["inner.count"] == ("3", "of things")
+    assert fields["inner.word"] == ("on", "which (on,off)")

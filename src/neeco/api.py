@@ -46,8 +46,11 @@ class Scene:
         state, camera = scene.recorded[0]
         image = scene.draw(state, camera).image                    # float32 [H, W, 3]
 
-    device: cpu, cuda, cuda:N, or auto, which is the first CUDA device where there is one. Raises NeecoError when the
-    file is no scene, or the device cannot be used.
+    Args:
+        file: scene.safetensors of a run's folder
+        device: cpu, cuda, cuda:N, or auto, which is the first CUDA device where there is one
+
+    Raises NeecoError when the file is no scene, or the device cannot be used.
     """
 
     learned: DrawableScene  # the scene as training makes it: a torch module
@@ -96,12 +99,15 @@ class Scene:
     def draw(self, state: State, camera: Camera, labels: bool = True) -> RGBDImage:
         """Render `state` from `camera`: image and depth; with `labels` also masks, parts, boxes and keypoints.
 
-        state: poses world_from_instrument [4, 4] in mm and joints in rad, of every instrument of the scene. camera:
-        intrinsics in px and world_from_camera [4, 4] in mm, OpenCV axes (x right, y down, z forward). Poses may be
-        numpy arrays or tensors. The result's tensors are on the CPU; no gradient reaches the scene (for that, use
-        `scene.learned.render`). Raises NeecoError where the state lacks an instrument or joint or has one that is not
-        in the scene, for poses that are not rigid, joints beyond their limits (without stated ones: far out of the
-        recorded range), focal lengths that fit no lens, and with `labels` where the method learns none.
+        Args:
+            state: poses world_from_instrument [4, 4] in mm and joints in rad, of every instrument of the scene
+            camera: intrinsics in px and world_from_camera [4, 4] in mm, OpenCV axes (x right, y down, z forward)
+            labels: whether masks, parts, boxes and keypoints are rendered, too
+
+        The result's tensors are on the CPU; no gradient reaches the scene (for that, use `scene.learned.render`).
+        Raises NeecoError where the state lacks an instrument or joint or has one that is not in the scene, for poses
+        that are not rigid, joints beyond their limits (without stated ones: far out of the recorded range), focal
+        lengths that fit no lens, and with `labels` where the method learns none.
 
             run = neeco.load("runs/sample")
             rendering = run.scene.draw(state, camera)
@@ -158,10 +164,14 @@ class Run:
     ) -> dict[str, Any]:
         """Score the run on recorded frames, as `neeco evaluate` does; writes evaluation.json into the run's folder.
 
-        splits: by default all but train. align: also score with poses fitted to each image, the scene frozen.
-        lpips_weights: folder of LPIPS weights (or the environment variable NEECO_LPIPS_WEIGHTS). progress(what, done,
-        total). Returns {"given": {split: numbers}, "aligned": ..., "notes": [...]}; docs/evaluation.md has every
-        number. Raises NeecoError for a split that is not there.
+        Args:
+            splits: which to score; None: all but train
+            align: also score with poses fitted to each image, the scene frozen
+            lpips_weights: folder of LPIPS weights; None: that of the environment variable NEECO_LPIPS_WEIGHTS, if set
+            progress: is called with what is being done, how much of it is done, and of how much
+
+        Returns {"given": {split: numbers}, "aligned": ..., "notes": [...]}; docs/evaluation.md has every number. Raises
+        NeecoError for a split that is not there.
 
             neeco.load("runs/sample").evaluate(["test"])["given"]["test"]["psnr"]
         """
@@ -182,7 +192,11 @@ def _view_fault(camera: Camera) -> Fault | None:
 
 @naming_arguments()
 def load(path: PathLike, device: str = "auto") -> Run:
-    """Open the run folder `path` that `train` or `neeco train` wrote; its scene goes to `device` (see `Scene`).
+    """Open a run.
+
+    Args:
+        path: folder that `train` or `neeco train` wrote
+        device: where its scene goes: cpu, cuda, cuda:N, or auto (see `Scene`)
 
     Raises NeecoError when it is no run folder, or its training has not finished.
 
@@ -207,15 +221,21 @@ def train(
     progress: Callable[[ProgressRow], None] | None = None,
     **settings: Any,
 ) -> Run:
-    """Learn a scene from the training frames of the capture in folder `capture`; writes the run folder `output`.
+    """Learn a scene from a capture's training frames.
 
-    method: kinematic (None), neeco (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta. iterations: frames
-    that are learned from (None: 6,000, with fewer than 60 training frames kinematic takes less); minutes: stop in time
-    with a finished run. The same seed (None: 0) gives the same scene on the same machine, unless `minutes` is given.
-    resume: continue an interrupted run in `output`, under its own
-    settings, which what is given here must not contradict. progress: is called with every row of metrics (iteration,
-    loss, psnr, num_gaussians, progress in [0, 1], note). settings: any field of the training config, with two
-    underscores for a dot (`deformation__shadow=False`); `neeco train --help` lists them.
+    Args:
+        capture: the capture's folder
+        output: run folder to write
+        method: kinematic (None), nps (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta
+        iterations: frames that are learned from; None: 6,000, with fewer than 60 training frames kinematic takes less
+        minutes: stop in time with a finished run; None: no limit
+        seed: the same one gives the same scene on the same machine, unless `minutes` is given; None: 0
+        device: cpu, cuda, cuda:N, or auto (see `Scene`)
+        resume: continue an interrupted run in `output`, under its own settings, which what is given here must not
+            contradict
+        progress: is called with every row of metrics: iteration, loss, psnr, num_gaussians, progress in [0, 1], note
+        settings: any field of the training config, with two underscores for a dot (`deformation__shadow=False`);
+            `neeco train --help` lists those of a method
 
     Raises NeecoError for a capture that `check` finds errors in, for settings that do not fit, and for an `output` that
     is not empty.
@@ -231,7 +251,11 @@ def train(
 
 @naming_arguments()
 def check(capture: PathLike, transforms: str = "transforms.json") -> list[Problem]:
-    """Everything that is wrong with the capture in folder `capture`, at once; an empty list when nothing is.
+    """Everything that is wrong with a capture, at once; an empty list when nothing is.
+
+    Args:
+        capture: the capture's folder
+        transforms: which file of the folder to read
 
     Each problem has `severity` (error or warning), the file and field, what is wrong and what to do; errors keep it
     from being trained on. Bad data never raises.
@@ -256,15 +280,23 @@ def synthesize(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Synthesized:
-    """Write a labelled data set of `count` images of states that nobody recorded into the folder `output`.
+    """Write a labelled data set of images of states that nobody recorded.
 
-    run: a run or its folder, opened on `device`. instruments: runs whose instruments are rendered over the run's
-    tissue, instead of its own. formats: index files to write besides plain images, masks, parts and depth. resume:
-    continue a data set begun with the same settings, or enlarge it. workers: processes that share the work; more than
-    one need `if __name__ == "__main__"` around the program's start. settings: any option of `neeco synthesize`, such as
-    states="extrapolate", views="orbit", seed=1, size="640x512" or camera_effects="effects.yaml". The result has
-    `output` (the folder), `images` (how many), `refused` (states refused, by reason) and `skipped`.
+    Args:
+        run: a run or its folder
+        output: folder to write
+        count: how many images
+        instruments: runs whose instruments are rendered over the run's tissue, instead of its own
+        formats: index files to write besides plain images, masks, parts and depth
+        resume: continue a data set begun with the same settings, or enlarge it
+        workers: processes that share the work; more than one need `if __name__ == "__main__"` around the program's
+            start
+        device: where runs given as folders are opened (see `Scene`)
+        progress: is called with what is being done, how much of it is done, and of how much
+        settings: any option of `neeco synthesize`, such as states="extrapolate", views="orbit", seed=1, size="640x512"
+            or camera_effects="effects.yaml"
 
+    The result has `output` (the folder), `images` (how many), `refused` (states refused, by reason) and `skipped`.
     Raises NeecoError for settings that do not fit, an `output` that is not empty or was begun otherwise, and where
     every state is refused.
 
@@ -300,15 +332,22 @@ def track(
     device: str = "auto",
     progress: Progress | None = None,
 ) -> Tracked:
-    """Find the states of the run's instruments in `footage`, from its images alone; writes the frames that can be
-    trusted as a capture into the folder `output`, and track.html, the page about all of them.
+    """Find the states of a run's instruments in footage, from its images alone; writes the frames that can be trusted
+    as a capture, and track.html, the page about all of them.
 
-    run: a run of method kinematic, or its folder, opened on `device`. footage: a capture with cameras, whose states are
-    not read, or a video file, whose cameras are found first. start: "first" where the first frame's state is roughly
-    known. tissue: "run" where the footage shows the run's tissue with cameras in its world, "footage" for any other
-    (None: as a capture or a video mostly is). min_trust: the least confidence in [0, 1] of a frame that is written.
+    Args:
+        run: a run of method kinematic, or its folder
+        footage: a capture with cameras, whose states are not read, or a video file, whose cameras are found first
+        output: capture folder to write
+        start: "first" where the first frame's state is roughly known
+        tissue: "run" where the footage shows the run's tissue with cameras in its world, "footage" for any other;
+            None: as a capture or a video mostly is
+        min_trust: the least confidence in [0, 1] of a frame that is written
+        resume: continue interrupted work in `output`
+        device: where a run given as a folder is opened (see `Scene`)
+        progress: is called with what is being done, how much of it is done, and of how much
+
     The result has `output`, `records` (one for each frame), `written` (how many are in the capture) and `verdict`.
-
     Raises NeecoError for a run or footage that cannot be used, an `output` that is not empty (without `resume`), and
     where no frame reaches `min_trust`.
 
@@ -357,13 +396,23 @@ def ingest(
     fps: float | None = None,
     progress: Progress | None = None,
 ) -> Ingested:
-    """Make the capture folder `output` from a recording, as `neeco ingest` does.
+    """Make a capture from a recording, as `neeco ingest` does.
 
-    recordings: recording.yaml, or several of one instrument; or one folder in another format (nerfstudio, Blender,
-    COLMAP, EndoNeRF), which is converted. Without any: `video` (a file, or a folder of images) with the CSV logs of the
-    trackers of `instrument` and `laparoscope`, or with `shaft_diameter` in mm of an instrument that nothing tracked;
-    `joints`: name -> (log, calibration or None); `intrinsics` (fx, fy, cx, cy in px) or a file `calibration`; `sync`: a
-    JSON file of clock offsets; `frames`: how many to keep; `fps`, where the video does not state it.
+    Args:
+        recordings: recording.yaml, or several of one instrument; or one folder in another format (nerfstudio, Blender,
+            COLMAP, EndoNeRF), which is converted; none: `video` and what follows
+        output: capture folder to write
+        video: a file, or a folder of images
+        instrument: CSV log of the instrument's tracker
+        laparoscope: CSV log of the laparoscope's tracker
+        joints: name -> (CSV log, calibration or None)
+        shaft_diameter: mm, of an instrument that nothing tracked
+        intrinsics: fx, fy, cx, cy in px
+        calibration: file of the camera's calibration, in place of `intrinsics`
+        sync: JSON file of clock offsets
+        frames: how many to keep
+        fps: frames per second, where the video does not state it
+        progress: is called with what is being done, how much of it is done, and of how much
 
     Raises NeecoError for unusable input: file, row or key, and what to do.
 

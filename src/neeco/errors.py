@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 # what libraries without a MemoryError of their own say: PyTorch, safetensors, OpenCV, the dynamic linker, threads
@@ -31,6 +31,11 @@ class NeecoError(Exception):
     command_line: str | None = None  # the message as the command line words it, where that differs
 
 
+def install_hint(extra: str) -> str:
+    """Return the command that installs an extra of neeco ("view"). No package index has neeco yet."""
+    return f"pip install '.[{extra}]' in neeco's checkout"
+
+
 @contextmanager
 def naming_arguments() -> Iterator[None]:
     """Name arguments of Python in the messages of errors raised in the block, or in the function so decorated:
@@ -44,6 +49,13 @@ def naming_arguments() -> Iterator[None]:
         error.command_line = error.command_line or str(error)
         error.args = ("`".join(words),)
         raise
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Return the name in `known` that is most similar to `name`; None where none is similar."""
+    from difflib import get_close_matches  # slow to import
+
+    return next(iter(get_close_matches(name, list(known), n=1)), None)
 
 
 def _argument(option: re.Match[str]) -> str:

@@ -7,8 +7,10 @@ as a number and any text as true.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 import re
+import textwrap
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,11 +19,15 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, nearest
 
 Device = Annotated[str, tyro.conf.arg(help="cpu, cuda, cuda:N, or auto: a CUDA device where there is one.")]
 T = TypeVar("T")
 MAX_INTEGER = 2**63  # torch accepts no larger one
+VALUES = {str: "STR", int: "INT", float: "FLOAT", bool: "true|false"}
+FIELD = re.compile(  # of a dataclass: the comments above, the name, the comment behind, the text below
+    r'((?:^ {4}# [^\n]*\n)*)^ {4}(\w+): [^\n]*?(?: {2}# ([^\n]*))?\n(?: {4}"""(.*?)""")?', re.MULTILINE | re.DOTALL
+)
 WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
 
@@ -64,13 +70,48 @@ def with_fields(settings: Any, values: Mapping[str, Any]) -> Any:
 
 
 def described(kind: type[Any]) -> Iterator[tuple[str, str, str]]:
-    """Yield every field of the dataclass `kind` as (name, type, default), in words."""
+    """Yield every field of the dataclass `kind`, those of nested ones by dotted names, as (name, default, what it is);
+    what a name or nothing can be replaced by stands in brackets."""
+    texts, hints = field_texts(kind), typing.get_type_hints(kind)
     for field in dataclasses.fields(kind):
-        hint = field.type if isinstance(field.type, str) else getattr(field.type, "__name__", str(field.type))
         default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+        if dataclasses.is_dataclass(default):
+            yield from ((f"{field.name}.{name}", value, text) for name, value, text in described(type(default)))
+            continue
+        hint = hints[field.name]
+        shown = default is None or typing.get_origin(hint) is typing.Literal
+        choices = f" ({value_words(hint).strip('{}')})" if shown else ""
         text = f"{default:.4g}" if isinstance(default, float) else str(default)
-        words = re.sub(r"Literal\[(.*?)\]", lambda match: match[1].replace(", ", "|").replace("'", ""), hint)
-        yield field.name, words, text
+        yield field.name, text, texts.get(field.name, "") + choices
+
+
+def field_texts(kind: type[Any]) -> dict[str, str]:
+    """Return what the fields of the dataclass `kind` are, by name: from the text below each, else from the comments
+    above and behind it."""
+    texts = {}
+    for owner in (owner for owner in reversed(kind.__mro__) if dataclasses.is_dataclass(owner)):
+        try:
+            source = textwrap.dedent(inspect.getsource(owner))
+        except (OSError, TypeError):  # made by a program
+            continue
+        for above, name, behind, below in FIELD.findall(source):
+            comments = " ".join(line.strip().removeprefix("# ") for line in [*above.splitlines(), behind])
+            if words := " ".join((below or comments).split()):
+                texts[name] = words
+    return texts
+
+
+def value_words(hint: Any) -> str:
+    """Return what a value of a type looks like on the command line, such as INT or {on,off}; None does not count."""
+    if typing.get_origin(hint) is Annotated:
+        return value_words(typing.get_args(hint)[0])
+    arms = [arm for arm in typing.get_args(hint) if arm not in (type(None), ...)]
+    if typing.get_origin(hint) is typing.Literal:
+        return f"{{{','.join(map(str, arms))}}}"
+    if typing.get_origin(hint) is tuple:
+        repeated = f"[{value_words(arms[0])} ...]"
+        return repeated if ... in typing.get_args(hint) else " ".join(map(value_words, arms))
+    return "|".join(map(value_words, arms)) if arms else VALUES.get(hint, hint.__name__.upper())
 
 
 def _plain(value: Any) -> Any:
@@ -137,9 +178,11 @@ def _problems(error: BaseException, where: str, owner: str) -> Iterator[str]:
             notes = [note for note in getattr(inner, "__notes__", []) if isinstance(note, AttributeValidationNote)]
             yield from _problems(inner, _dotted(where, *(note.name for note in notes)), owner)
     elif isinstance(error, ForbiddenExtraKeysError):
-        known = ", ".join(field.name for field in dataclasses.fields(error.cl)) or "none"
+        known = [field.name for field in dataclasses.fields(error.cl)]
         for name in sorted(error.extra_fields):
-            yield f"{_dotted(where, name)}: {owner} has no such field; it has {known}"
+            meant = nearest(name, known)
+            hint = "" if meant is None else f"; did you mean {meant}?"
+            yield f"{_dotted(where, name)}: {owner} has no such field; it has {', '.join(known) or 'none'}{hint}"
     elif isinstance(error, NeecoError):
         yield str(error)
     elif isinstance(error, ValueError):

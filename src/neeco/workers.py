@@ -25,7 +25,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Literal
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
 
 MAX_RETRIES = 3  # of a task whose worker died
 CONNECT_S = 5.0  # that a cluster's head gets to answer
@@ -85,7 +85,7 @@ def check_workers(count: int) -> None:
     if not (given := address()):
         return
     if importlib.util.find_spec("ray") is None:
-        raise NeecoError("RAY_ADDRESS: a cluster needs Ray; install neeco[cluster], or unset RAY_ADDRESS")
+        raise NeecoError(f"RAY_ADDRESS: a cluster needs Ray; {install_hint('cluster')}, or unset RAY_ADDRESS")
     host, _, port = given.rpartition(":")
     if "/" in given or not (host and port.isdecimal()):  # ray://..., auto, local: for Ray to understand
         return

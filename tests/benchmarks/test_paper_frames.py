@@ -41,7 +41,7 @@ def compared(benchmarks: ModuleType, world: ModuleType, tmp_path_factory: pytest
     folder = tmp_path_factory.mktemp("paper")
     splits = ("train",) * 4 + ("test", "unseen", "train", "test")
     write_capture(world.make_capture(folder / "capture", world.TinyScene(), splits), folder / "capture")
-    methods = ("3dgs", "neeco")
+    methods = ("3dgs", "nps")
     spec = ComparisonSpec(
         capture=folder / "capture",
         output=folder / "c5",
@@ -110,8 +110,8 @@ def entry(paper: ModuleType, name: str, frames: int, seed: int, psnr: list[float
 
 def test_differences_are_paired_by_frame_and_average_the_seeds(paper: ModuleType) -> None:
     entries = [
-        entry(paper, "neeco", 75, 0, [20.0, 30.0, 25.0]),
-        entry(paper, "neeco", 75, 1, [22.0, 32.0, 27.0]),
+        entry(paper, "nps", 75, 0, [20.0, 30.0, 25.0]),
+        entry(paper, "nps", 75, 1, [22.0, 32.0, 27.0]),
         entry(paper, "4dgs+dta", 75, 0, [20.5, 30.5, None]),  # the last frame cannot be paired
         entry(paper, "3dgs", 75, 0, [22.0, 30.0, 26.0]),
         entry(paper, "3dgs", 225, 0, [1.0, 2.0, 3.0]),  # nothing to compare with
@@ -134,7 +134,7 @@ def test_the_figure_has_a_line_per_method_and_split(paper: ModuleType, tmp_path:
     entries = [
         entry(paper, name, frames, 0, [20.0, 21.0, 22.0], 0.5)
         for frames in (75, 225, 2025)
-        for name in ("neeco", "3dgs", "another")
+        for name in ("nps", "3dgs", "another")
     ]
     page = tmp_path / "page.md"
     page.write_text("# A page\n\n| other | table |\n|---|---|\n\n" + paper.markdown(paper.summarise(entries), []))
@@ -154,7 +154,7 @@ def test_runs_are_scanned_once_and_told_in_tables(
     assert paper.main(["labels", str(compared)]) == 0
     printed = capsys.readouterr().out
     assert "3dgs-seed0: its labels are not by motion" in printed
-    file = compared / "runs" / "neeco-seed0" / "label_scan.json"
+    file = compared / "runs" / "nps-seed0" / "label_scan.json"
     found = json.loads(file.read_text())
     assert list(found["splits"]) == ["test", "unseen"]
     for of_split in found["splits"].values():
@@ -164,15 +164,15 @@ def test_runs_are_scanned_once_and_told_in_tables(
     assert found["splits"]["test"]["mean"] == pytest.approx(found["scans"]["mean"]["iou"])
     found["splits"]["test"][found["best"]] = 0.125
     file.write_text(json.dumps(found))
-    further = f"again={compared / 'runs' / 'neeco-seed0'}"
+    further = f"again={compared / 'runs' / 'nps-seed0'}"
     assert paper.main(["tables", str(compared), "--run", further, "--output", str(tmp_path / "out")]) == 0
     assert "0.125" in capsys.readouterr().out
     stored = json.loads((tmp_path / "out" / "paper_frames.json").read_text())
-    assert [(run["name"], run["frames"]) for run in stored["runs"]] == [("neeco", 5), ("3dgs", 5), ("again", 5)]
+    assert [(run["name"], run["frames"]) for run in stored["runs"]] == [("nps", 5), ("3dgs", 5), ("again", 5)]
     same = [row for row in stored["differences"] if row["other"] == "again"]
     assert [(row["low"], row["high"], row["word"]) for row in same] == [(0, 0, "even")] * 4
     os.utime(file, (1, 1))  # older than the scene
-    assert paper.main(["labels", str(compared / "runs" / "neeco-seed0")]) == 0
+    assert paper.main(["labels", str(compared / "runs" / "nps-seed0")]) == 0
     assert json.loads(file.read_text())["splits"]["test"][found["best"]] != 0.125
 
 
@@ -192,9 +192,9 @@ def test_what_is_missing_or_unfinished_ends_in_one_line(
         (["tables", str(tmp_path / "nowhere")], "comparison.json"),
         (["tables", str(unfinished)], "none of its 2 runs has finished"),
         (["labels", str(unfinished)], "none of its 2 runs has finished"),
-        (["labels", str(unfinished / "runs" / "neeco-seed0")], "has no evaluation.json"),
+        (["labels", str(unfinished / "runs" / "nps-seed0")], "has no evaluation.json"),
         (["labels", str(tmp_path / "nowhere")], "no such run folder"),
-        (["tables", str(compared), "--run", "neeco"], "expected NAME=FOLDER"),
+        (["tables", str(compared), "--run", "nps"], "expected NAME=FOLDER"),
         (["tables", str(compared), "--run", f"3dgs={run}"], "is there already"),
         (["figure", str(no_table), "--output", str(tmp_path / "x.svg")], "no table whose first heading is frames"),
         (["figure", str(other_table), "--output", str(tmp_path / "x.svg")], "is not one that `tables` printed"),
@@ -204,6 +204,6 @@ def test_what_is_missing_or_unfinished_ends_in_one_line(
         assert printed.out == ""
         assert printed.err.count("\n") == 1
         assert said in printed.err
-    (unfinished / "runs" / "neeco-seed0" / "evaluation.json").write_text("{}")
+    (unfinished / "runs" / "nps-seed0" / "evaluation.json").write_text("{}")
     assert paper.main(["tables", str(unfinished)]) == 1
     assert capsys.readouterr().err.count("\n") == 1

@@ -19,6 +19,7 @@ from neeco.capture.checks import read_checked
 from neeco.capture.points import read_ply, write_ply
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.cli import check as check_verb
+from neeco.cli import main
 from neeco.errors import NeecoError
 
 LENS = {"w": 32, "h": 24, "fl_x": 30, "fl_y": 30, "cx": 16, "cy": 12}
@@ -360,8 +361,11 @@ def test_the_verb_prints_and_returns_a_status(folder, capsys):
     assert check_verb.run(check_verb.Arguments(SAMPLE)) == 0
     assert "no problems found" in capsys.readouterr().out
     folder.edit(_joint(5, 2.0))
-    assert check_verb.run(check_verb.Arguments(folder.root, json=True)) == 1
+    assert main(["check", "--json", str(folder.root)]) == 1
     report = json.loads(capsys.readouterr().out)
+    assert main(["check", str(folder.root), "--json", str(folder.root / "problems.json")]) == 1
+    assert json.loads((folder.root / "problems.json").read_text()) == report
+    assert "1 error" in capsys.readouterr().out
     assert report["errors"] == 1
     errors = [problem for problem in report["problems"] if problem["severity"] == "error"]
     assert errors[0]["field"] == "frames[5].instruments[0].joints.jaw_angle"

@@ -111,7 +111,7 @@ def test_names_that_are_none_of_its_are_told(file: Path) -> None:
 
 def test_without_the_package_the_extra_is_named(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "urdf_parser_py", None)
-    with pytest.raises(NeecoError, match=r"needs urdfdom-py to be read; pip install 'neeco\[urdf\]'"):
+    with pytest.raises(NeecoError, match=r"needs urdfdom-py to be read; pip install '\.\[urdf\]'"):
         read_urdf(file)
 
 

@@ -1,9 +1,13 @@
 """What is told of work that goes on."""
 
+import time
+
 import pytest
 
-from neeco.cli._progress import counting
+from neeco.cli import _progress
+from neeco.cli._progress import Bars, counting
 from neeco.errors import NeecoError
+from neeco.training.train import ProgressRow
 
 
 def test_a_progress_bar_says_nothing_before_there_is_news(capsys):
@@ -13,3 +17,32 @@ def test_a_progress_bar_says_nothing_before_there_is_news(capsys):
     with counting("synthesize", 3) as advance:
         advance(3)
     assert "3/3" in capsys.readouterr().err
+
+
+def test_a_file_gets_a_line_at_intervals_with_what_how_far_and_how_long_still(capsys, monkeypatch):
+    monkeypatch.setattr("neeco.cli._progress.LINE_INTERVAL_S", 0.02)
+    monkeypatch.delenv("COLUMNS", raising=False)
+    row = ProgressRow(iteration=1234, loss=0.1, psnr=30.04, num_gaussians=23456, phase=1, progress=0.25)
+    with Bars() as bars:
+        bars.training(row)
+        time.sleep(0.1)
+    first, *_, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("training: 25 %, iteration 1234  PSNR 30.0 dB  23456 Gaussians  phase 1, 0:00:00 passed")
+    assert first.endswith("left")
+    assert last.startswith("training: 25 %")
+    assert len(first) > 80
+
+
+def test_a_stage_that_reports_nothing_is_told_too_and_an_error_alone_ends_it(capsys, monkeypatch):
+    monkeypatch.setattr(_progress, "LINE_INTERVAL_S", 0.02)
+
+    def work() -> None:
+        with Bars() as bars:
+            bars.stage("reading", 0, 0)
+            bars.stage("matching", 0, 0)
+            time.sleep(0.1)
+            raise NeecoError("bad input")
+
+    with pytest.raises(NeecoError):
+        work()
+    assert set(capsys.readouterr().err.splitlines()) == {"matching: 0:00:00 passed"}

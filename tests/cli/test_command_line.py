@@ -45,6 +45,8 @@ def neeco(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[s
 def test_help_names_every_verb_with_a_line() -> None:
     shown = neeco("--help")
     assert shown.returncode == 0
+    assert "--version" in shown.stdout
+    assert "--tyro-print-completion" in shown.stdout
     for verb, line in cli.VERBS.items():
         assert verb in shown.stdout
         assert line.split()[0] in shown.stdout
@@ -59,6 +61,45 @@ def test_every_verb_has_help_with_hyphenated_options(verb: str, capsys: pytest.C
     assert f"neeco {verb}" in shown
     options = [word for word in shown.split() if word.startswith("--")]
     assert not [word for word in options if "_" in word]
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_help_states_what_holds_where_an_option_is_left_out(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main([verb, "--help"])
+    options = capsys.readouterr().out.partition("settings of method")[0]
+    assert "None" not in options
+    assert "(default: )" not in options
+
+
+def test_help_of_train_ends_with_a_table_of_the_chosen_method(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, setting, default in (([], "shaft_roll_start", "600"), (["--method", "nerfies"], "rays", "128")):
+        with pytest.raises(SystemExit) as left:
+            cli.main(["train", *words, "--help"])
+        options, _, table = capsys.readouterr().out.partition("settings of method ")
+        assert left.value.code == 0
+        assert "--output" in options
+        assert [setting, default] in [line.replace("│", " ").split()[:2] for line in table.splitlines()]
+        assert len(table) < 7000
+
+
+@pytest.mark.parametrize(("wrong", "right"), [("trian", "train"), ("synthesise", "synthesize"), ("veiw", "view")])
+def test_a_verb_that_is_nearly_one_is_answered_with_that_one(
+    wrong: str, right: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main([wrong, "somewhere"])
+    assert left.value.code == 2
+    assert f"{wrong}: no such verb; did you mean {right}?" in capsys.readouterr().err
+
+
+def test_completion_knows_the_options_of_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(["--tyro-print-completion", "bash"])
+    assert not left.value.code
+    script = capsys.readouterr().out
+    for option in ("--max-tissue-gaussians", "--shaft-diameter", "--min-trust", "--export"):
+        assert option in script
 
 
 def test_overview_loads_nothing_large() -> None:

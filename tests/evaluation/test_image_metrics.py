@@ -1,13 +1,24 @@
 """PSNR and SSIM against arithmetic and against an independent convolution; pictures of errors."""
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import correlate
 
-from neeco.evaluation.image_metrics import difference_map, outline, overlay_outline, overlay_parts, psnr, ssim
+from neeco.evaluation.image_metrics import (
+    PART_COLORS,
+    difference_map,
+    outline,
+    overlay_outline,
+    overlay_parts,
+    part_color,
+    psnr,
+    ssim,
+)
 
 
 def pair(seed=0, height=30, width=26):
@@ -102,3 +113,14 @@ def test_overlays_leave_tissue_alone_and_tint_each_part_differently():
     truth = overlay_outline(drawn, parts == 1)
     assert (truth[1, 1] == (255, 255, 0)).all()
     assert (drawn[1, 1] == 255).all()  # the input stays as it was
+
+
+def test_parts_have_the_same_colours_in_python_in_the_exported_page_and_in_its_rasteriser():
+    root = Path(__file__).parents[2]
+    page = (root / "src/neeco/viewer/page/panel.js").read_text()
+    native = (root / "native/web/viewer.cpp").read_text()
+    colors = [part_color(part) for part in range(1, 9)]
+    assert len(set(colors)) == 8
+    assert re.search(r"const TINTS = (\[.*?\])", page)[1] == str(colors).replace("'", '"')
+    tints = re.search(r"tints\[8\]\[3\] = \{(.*)\};", native)[1]
+    assert [int(value) for value in re.findall(r"\d+", tints)] == PART_COLORS.astype(int).ravel().tolist()

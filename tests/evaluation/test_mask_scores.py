@@ -353,4 +353,7 @@ def test_the_verb_prints_a_table_and_writes_json(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "jaw_left" in shown
     assert "Challenge IoU of the instrument 1.000, of its parts 1.000" in shown
-    assert json.loads((tmp_path / "out/scores.json").read_text())["classes"]["challenge_iou"] == 1.0
+    scores = json.loads((tmp_path / "out/scores.json").read_text())
+    assert scores["classes"]["challenge_iou"] == 1.0
+    assert cli.main(["score-masks", str(truth), str(truth), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == scores

@@ -30,7 +30,7 @@ from neeco.training.train import ProgressRow, train
 OF_GAUSSIANS = [name for name, kind in methods().items() if kind.has_gaussians]
 STEPS = 40
 SMALL = {
-    "neeco": ["deformation.width=16"],
+    "nps": ["deformation.width=16"],
     "deformable-3dgs": ["deformation.width=16"],
     "4dgs": ["deformation.resolution=8", "deformation.width=8", "deformation.time_resolution=5"],
     "nerfies": [

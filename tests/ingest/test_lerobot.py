@@ -446,7 +446,7 @@ def test_without_the_package(tmp_path, monkeypatch):
         importlib.util, "find_spec", lambda name, *rest: None if name == "pyarrow" else found(name, *rest)
     )
     monkeypatch.setattr(builtins, "__import__", _without(builtins.__import__, "pyarrow"))
-    assert "LeRobot data set: needs pyarrow; pip install 'neeco[lerobot]'" in refusal(path)
+    assert "LeRobot data set: needs pyarrow; pip install '.[lerobot]'" in refusal(path)
 
 
 def _without(own: Any, name: str) -> Any:

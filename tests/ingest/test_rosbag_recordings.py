@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture import read_capture
 from neeco.cli import main
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
 from neeco.ingest.cameras.still_scene import read_right_camera
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers import format_of, read_table
@@ -300,7 +300,7 @@ def test_without_rosbags_what_to_install_is_said(bags: dict[str, Path], monkeypa
     for path in bags.values():
         for action in (read_arm, write_template):
             said = refusal(lambda action=action, path=path: action(path))
-            assert said == f"{path}: ROS bag: needs rosbags; pip install 'neeco[ros]'"
+            assert said == f"{path}: ROS bag: needs rosbags; {install_hint('ros')}"
 
 
 def test_files_packed_as_a_whole_are_refused(tmp_path: Path, bags: dict[str, Path]) -> None:

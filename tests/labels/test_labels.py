@@ -78,8 +78,8 @@ def test_the_unobserved_share_of_pixels_is_known(scene, state, camera):
     right = torch.arange(camera.width) > camera.width / 2 + 3
     assert bool(halved.ignored[~shown & right].all())
     assert torch.equal(halved.ignored[:, : camera.width // 2 - 3], drawing.ignored[:, : camera.width // 2 - 3])
-    assert Acceptance(0.0, None).refusal(scene, drawing) is None
-    assert Acceptance(0.0, None).refusal(scene, halved) == UNOBSERVED_TISSUE
+    assert Acceptance(0.0, None).refusal(drawing) is None
+    assert Acceptance(0.0, None).refusal(halved) == UNOBSERVED_TISSUE
 
 
 def test_an_instrument_that_shows_sides_no_frame_saw_is_refused_when_too_much_of_it_does(scene, camera):
@@ -94,8 +94,8 @@ def test_an_instrument_that_shows_sides_no_frame_saw_is_refused_when_too_much_of
             share = float((drawing.unobserved > 0.5)[instrument].float().mean())
             assert 0.5 < share < 1.0
             assert not (drawing.unobserved > 0.5)[~instrument].float().mean() > 0.02
-            assert Acceptance(0.0, None, share).refusal(scene, drawing) is None
-            assert Acceptance(0.0, None, 0.99 * share).refusal(scene, drawing) == UNOBSERVED_SIDE
+            assert Acceptance(0.0, None, share).refusal(drawing) is None
+            assert Acceptance(0.0, None, 0.99 * share).refusal(drawing) == UNOBSERVED_SIDE
     finally:
         scene.canonical = plain
 

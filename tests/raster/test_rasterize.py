@@ -328,7 +328,7 @@ def test_the_reference_draws_the_same_on_cuda() -> None:
 @pytest.mark.parametrize(
     ("backend", "package"),
     [
-        ("cpu", "neeco"),
+        ("cpu", "nps"),
         pytest.param("triton", "triton", marks=ON_A_GPU),
         pytest.param("cuda", "gsplat", marks=ON_A_GPU),
     ],

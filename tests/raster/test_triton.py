@@ -203,7 +203,7 @@ def test_tensors_on_the_cpu_are_refused() -> None:
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ready, "installed", lambda: False)
     _, gaussians, camera = leaves(make_scene(3), torch.float32)
-    with pytest.raises(NeecoError, match=r"triton is missing; on Linux pip install 'neeco\[triton\]'"):
+    with pytest.raises(NeecoError, match=r"triton is missing; on Linux pip install '\.\[triton\]'"):
         rasterize(gaussians, camera, backend="triton")
 
 

@@ -49,13 +49,13 @@ def ablation() -> AblationResult:
         version="0.1.0",
         capture="/data/a<b>&c",
         seed=3,
-        iterations={"neeco": 100},
+        iterations={"nps": 100},
         machine={"cpu": "a <processor>", "cores": 2, "gpu": "A GPU"},
         settings=[],
         splits=list(SPLITS),
         tables=[replace(motion, rows=[off, on], curves=curves), noise],
-        runs=[{"name": "neeco", "iterations": 100, "seconds": 9.0, "processor_seconds": 8.0, "num_gaussians": 4000}],
-        failures=[{"run": "neeco-no-sh", "error": "it <failed>"}],
+        runs=[{"name": "nps", "iterations": 100, "seconds": 9.0, "processor_seconds": 8.0, "num_gaussians": 4000}],
+        failures=[{"run": "nps-no-sh", "error": "it <failed>"}],
         notes=["too short"],
     )
 

@@ -183,8 +183,8 @@ def test_one_fold_is_no_answer(capture, output):
 
 
 def test_without_labelled_frames_sets_stand_alone(capture, output):
-    jobs = jobs_of(capture, output, conditions=("kinematic", "neeco"))
-    text, page = page_of(output, experiment_of(capture, jobs, sets=("kinematic", "neeco"), labelled=0), capture)
+    jobs = jobs_of(capture, output, conditions=("kinematic", "nps"))
+    text, page = page_of(output, experiment_of(capture, jobs, sets=("kinematic", "nps"), labelled=0), capture)
     assert "No condition has synthetic images with labelled frames" in text
     assert "one set against another" in text
     assert "best and worst; fold 0" in text
@@ -298,6 +298,7 @@ def test_differences_go_by_what_they_answer(experiment):
     assert question({"condition": "a+real", "against": "b+real"}, sets) == "sets"
     assert question({"condition": "a+real+permuted", "against": "a+real"}, sets) == "control"
     assert question({"condition": "real+paste", "against": "real+strong"}, sets) == "paste"
+    assert question({"condition": "real+match+strong", "against": "real+strong"}, sets) == "match"
     assert verdict({"low": 0.1, "high": 0.2, "folds": 1}) == ""
     assert question({"condition": "a+soft+real", "against": "a+real"}, sets) == "use"
     assert verdict({"low": 0.0, "high": 0.1, "folds": 2}) == "no difference shown"

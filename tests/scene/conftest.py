@@ -19,9 +19,9 @@ def kinematic() -> GaussianScene:
 
 @pytest.fixture
 def neeco() -> GaussianScene:
-    return make_scene("neeco")
+    return make_scene("nps")
 
 
-@pytest.fixture(params=["kinematic", "neeco", "3dgs", "deformable-3dgs", "4dgs"])
+@pytest.fixture(params=["kinematic", "nps", "3dgs", "deformable-3dgs", "4dgs"])
 def any_scene(request: pytest.FixtureRequest) -> GaussianScene:
     return make_scene(request.param)

@@ -32,13 +32,13 @@ def gated(scene: GaussianScene) -> GaussianScene:
     network = NPS(scene.instruments, NPSSettings(gate_mm=MARGIN_MM))
     network.load_state_dict(scene.deformation.state_dict(), strict=False)
     network.gate.cover(path_points())
-    return GaussianScene("neeco", scene.canonical, network, scene.instruments, scene.recorded, scene.center)
+    return GaussianScene("nps", scene.canonical, network, scene.instruments, scene.recorded, scene.center)
 
 
 @pytest.fixture
 def neeco() -> GaussianScene:
     """A scene whose network moves every Gaussian."""
-    scene = make_scene("neeco")
+    scene = make_scene("nps")
     torch.manual_seed(1)
     torch.nn.init.normal_(scene.deformation.head.weight)
     return scene

@@ -12,6 +12,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
+from scene_worlds import make_scene
 from torch import Tensor
 
 from neeco.errors import NeecoError
@@ -205,6 +206,14 @@ def test_recorded_poses_that_are_none_are_refused(
     save_tensors(tensors, {"neeco": json.dumps(header)}, tmp_path / "scene.safetensors")
     with pytest.raises(NeecoError, match=rf"scene.safetensors: damaged scene \({told}\)"):
         load_scene(tmp_path / "scene.safetensors")
+
+
+def test_a_scene_stored_under_a_methods_former_name_is_read(tmp_path: Path) -> None:
+    tensors, header = pack_scene(make_scene("nps"))
+    path = tmp_path / "scene.safetensors"
+    save_tensors(tensors, {"neeco": json.dumps(header | {"method": "neeco"})}, path)
+    with pytest.warns(FutureWarning, match="method neeco is now called nps"):
+        assert load_scene(path).method == "nps"
 
 
 @pytest.mark.parametrize("change", [{"recorded": 3}, {"instruments": [{"name": 1}]}, {"deformation": []}])

@@ -47,7 +47,7 @@ def test_a_network_is_not_evaluated_in_its_warm_up(neeco: GaussianScene, monkeyp
 @pytest.mark.parametrize("share", [-0.1, 1.0])
 def test_a_warm_up_is_a_share_of_the_training(share: float) -> None:
     with pytest.raises(NeecoError, match=r"deformation\.warm_up: .* is not a share"):
-        method_settings("neeco", {"warm_up": share})
+        method_settings("nps", {"warm_up": share})
 
 
 def test_encoding_by_hand() -> None:
@@ -240,7 +240,7 @@ def test_bfloat16_is_fast_with_tiles_and_on_amd(
         processor_has.cache_clear()
 
 
-@pytest.mark.parametrize("method", ["neeco", "deformable-3dgs"])
+@pytest.mark.parametrize("method", ["nps", "deformable-3dgs"])
 def test_networks_start_in_bfloat16_where_that_is_fast(method: str) -> None:
     config = method_defaults(method)
     assert config.deformation.half is None  # until training starts

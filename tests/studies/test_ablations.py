@@ -57,7 +57,7 @@ def plan(capture: Path, tmp_path: Path) -> AblationPlan:
 def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_says(plan: AblationPlan) -> None:
     reported: set[str] = set()
     ablation = run_ablations(plan, progress=lambda event: reported.add(event.job.name))
-    names = ["neeco-no-uniform-motion", "neeco", "neeco-no-density"]
+    names = ["nps-no-uniform-motion", "nps", "nps-no-density"]
     assert [run["name"] for run in ablation.runs] == names
     assert reported == set(names)
     configs = {name: read_config(plan.output / "runs" / name) for name in names}
@@ -65,10 +65,10 @@ def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_sa
         assert (config["schedule"]["published_steps"], config["schedule"]["earliest"]) == (20_000, 8_000)
         assert config["deformation"]["warm_up"] == 0.25
         assert (config["iterations"], config["initial_points"], config["max_tissue_gaussians"]) == (12, 30, 120)
-    changed = {key for key, value in configs["neeco-no-uniform-motion"].items() if value != configs["neeco"][key]}
+    changed = {key for key, value in configs["nps-no-uniform-motion"].items() if value != configs["nps"][key]}
     assert changed == {"schedule"}
-    schedule = configs["neeco-no-uniform-motion"]["schedule"]
-    assert {key for key in schedule if schedule[key] != configs["neeco"]["schedule"][key]} == {"frame_order"}
+    schedule = configs["nps-no-uniform-motion"]["schedule"]
+    assert {key for key in schedule if schedule[key] != configs["nps"]["schedule"][key]} == {"frame_order"}
     assert json.loads((plan.output / "ablation.json").read_text()) == plain(ablation)
     uniform = ablation.tables[0]
     off, on = uniform.rows
@@ -89,13 +89,13 @@ def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch
     real = training_job.train
 
     def fails(path, folder, *rest, **more):
-        if folder.name == "neeco-no-density":
+        if folder.name == "nps-no-density":
             raise NeecoError("the loss became nan")
         return real(path, folder, *rest, **more)
 
     monkeypatch.setattr(training_job, "train", fails)
     ablation = run_ablations(plan)
-    assert ablation.failures == [{"run": "neeco-no-density", "error": "the loss became nan"}]
+    assert ablation.failures == [{"run": "nps-no-density", "error": "the loss became nan"}]
     off, on = ablation.tables[1].rows
     assert (off.values, off.agrees) == ({}, {"psnr.test": None})
     assert on.values["psnr.test"] > 5
@@ -117,7 +117,7 @@ def test_runs_too_short_for_a_row_of_metrics_leave_the_first_phase_unknown(
     plan: AblationPlan,
 ) -> None:
     ablation = run_ablations(replace(plan, tables=("uniform-motion",), settings=SMALL))
-    assert not (plan.output / "runs" / "neeco" / "metrics.jsonl").exists()
+    assert not (plan.output / "runs" / "nps" / "metrics.jsonl").exists()
     assert ablation.failures == []
     assert any(note.startswith("phase-1 PSNR: not known, phase 1 of 12 steps") for note in ablation.notes)
     for row in ablation.tables[0].rows:
@@ -143,18 +143,18 @@ def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch
         device="cpu",
     )
     monkeypatch.setattr(ablation_study, "run_jobs", lambda made, *_: [job.run() for job in made if _neeco(job)])
-    monkeypatch.setattr(ablation_study, "distinct_variants", lambda chosen: [Variant("neeco")])
+    monkeypatch.setattr(ablation_study, "distinct_variants", lambda chosen: [Variant("nps")])
     monkeypatch.setattr(ablation_study, "score_label_ways", score)
     for _ in range(2):
         table = run_ablations(labels).tables[0]
-    assert asked == ["neeco"]
+    assert asked == ["nps"]
     assert table.rows[0].values == {"mask_iou.test": 0.6, "mask_iou.unseen": 0.6}
     assert table.rows[0].difference["mask_iou.test"] == pytest.approx(-0.3)
     assert table.rows[2].values == {}  # the run that is not there
 
 
 def _neeco(job) -> bool:
-    return job.config.method == "neeco"
+    return job.config.method == "nps"
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ def test_every_table_compares_with_one_of_its_own_entries_and_no_run_has_two_mea
     variants = distinct_variants(chosen_ablations(("paper", "ours")))
     assert len({variant.name for variant in variants}) == len(variants) == 26
     network = distinct_variants(chosen_ablations(["network"]))
-    assert {variant.method for variant in network} == {"neeco"}
+    assert {variant.method for variant in network} == {"nps"}
     assert all(other == variant for variant in network for other in variants if other.name == variant.name)
     published = [entry.paper for table in chosen_ablations(["paper"]) for entry in table.entries]
     assert sum(map(len, published)) == 9 + 4 * len(CHECKPOINTS) + 2
@@ -244,7 +244,7 @@ def test_tables_are_written_for_programs_pages_and_papers(tmp_path: Path) -> Non
         "table": "sh-compensation",
         "comparison": "SH order x compensation",
         "setting": "none",
-        "run": "neeco-no-sh-no-compensation",
+        "run": "nps-no-sh-no-compensation",
         "measure": "psnr_at_20.test",
         "paper": "15.21",
         "ours": "20.0",

@@ -264,19 +264,19 @@ def test_a_method_that_needs_states_is_refused_on_a_capture_without(spec: Compar
     for frame in document["frames"]:
         frame.pop("instruments")
     path.write_text(json.dumps(document))
-    with pytest.raises(NeecoError, match="--methods: neeco needs instrument states"):
-        compared(replace(spec, methods=("3dgs", "neeco")))
+    with pytest.raises(NeecoError, match="--methods: nps needs instrument states"):
+        compared(replace(spec, methods=("3dgs", "nps")))
 
 
 def test_settings_reach_the_methods_that_have_them(spec: ComparisonSpec) -> None:
     given = ("max_tissue_gaussians=70", "deformation.width=16")
-    result = compared(replace(spec, methods=("3dgs", "neeco"), seeds=1, assignments=given))
+    result = compared(replace(spec, methods=("3dgs", "nps"), seeds=1, assignments=given))
     configs = {
         name: yaml.safe_load((spec.output / "runs" / f"{name}-seed0" / "config.yaml").read_text())
-        for name in ("3dgs", "neeco")
+        for name in ("3dgs", "nps")
     }
     assert [configs[name]["max_tissue_gaussians"] for name in configs] == [70, 70]
-    assert configs["neeco"]["deformation"] == plain(method_settings("neeco", {"width": 16, "half": fast_bfloat16()}))
+    assert configs["nps"]["deformation"] == plain(method_settings("nps", {"width": 16, "half": fast_bfloat16()}))
     assert configs["3dgs"]["deformation"] == {}
     assert result["settings"] == list(given)
 
@@ -291,6 +291,6 @@ def test_a_setting_that_cannot_be_shared_is_refused(spec: ComparisonSpec, given:
 def test_a_cluster_without_ray_is_refused_before_anything_is_written(spec: ComparisonSpec, monkeypatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")
     monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(NeecoError, match=r"neeco\[cluster\]"):
+    with pytest.raises(NeecoError, match=r"\[cluster\]"):
         compared(replace(spec, workers=2))
     assert not spec.output.exists()

@@ -81,12 +81,12 @@ def test_a_finished_job_is_not_done_again(make_job, monkeypatch: pytest.MonkeyPa
 
 
 def test_a_begun_run_keeps_what_its_processor_decided(make_job) -> None:
-    job = make_job(config=training_config("neeco", {}))
+    job = make_job(config=training_config("nps", {}))
     for half in (True, False):  # one of them is not what this processor would decide
         write_config(job.folder, job.capture, with_fields(job.train_config, {"deformation.half": half}), "")
         job.check()
     with pytest.raises(NeecoError, match="deformation: begun with"):
-        make_job(config=training_config("neeco", {}, ["deformation.half=true"])).check()
+        make_job(config=training_config("nps", {}, ["deformation.half=true"])).check()
 
 
 def test_the_numbers_of_a_capture_that_changed_are_not_given_again(make_job) -> None:

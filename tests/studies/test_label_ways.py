@@ -13,7 +13,7 @@ from neeco.training.run import load_run
 from neeco.training.train import train
 
 
-@pytest.mark.parametrize(("method", "known"), [("neeco", True), ("3dgs", False)])
+@pytest.mark.parametrize(("method", "known"), [("nps", True), ("3dgs", False)])
 def test_each_way_has_an_overlap_for_each_split_or_none(method: str, known: bool, world, tmp_path: Path) -> None:
     root = tmp_path / "capture"
     write_capture(world.make_capture(root, world.TinyScene(), ("train",) * 4 + ("test", "unseen")), root)

@@ -17,7 +17,7 @@ def drawn(scene, state, camera):
 def test_recorded_states_are_acceptable(scene, camera):
     for recorded in scene.recorded.states[:4]:
         drawing = drawn(scene, recorded, camera)
-        assert ACCEPTANCE.refusal(scene, drawing) is None
+        assert ACCEPTANCE.refusal(drawing) is None
 
 
 @pytest.mark.parametrize(
@@ -31,22 +31,22 @@ def test_recorded_states_are_acceptable(scene, camera):
 )
 def test_states_out_of_the_image_or_behind_the_tissue_are_refused(scene, state, camera, placed, reason):
     drawing = drawn(scene, state(**placed, jaw=0.0), camera)
-    assert ACCEPTANCE.refusal(scene, drawing) == reason
+    assert ACCEPTANCE.refusal(drawing) == reason
 
 
 def test_a_tip_in_the_tissue_is_refused_unless_the_check_is_off(scene, state, camera):
     dipping = state(z=97.0, jaw=0.8)  # the jaw turns its tips away from the camera, 7 mm deeper than the hinge
     drawing = drawn(scene, dipping, camera)
-    assert ACCEPTANCE.refusal(scene, drawing) == ENTERS_TISSUE
-    assert Acceptance(0.005, None).refusal(scene, drawing) is None
-    assert Acceptance(0.005, 20.0).refusal(scene, drawing) is None
+    assert ACCEPTANCE.refusal(drawing) == ENTERS_TISSUE
+    assert Acceptance(0.005, None).refusal(drawing) is None
+    assert Acceptance(0.005, 20.0).refusal(drawing) is None
 
 
 def test_buried_depth_is_how_far_the_tip_lies_behind_the_surface(scene, state, camera):
     drawing = drawn(scene, state(z=97.0, jaw=0.8), camera)
-    assert buried_depth(scene, drawing) == pytest.approx(97 + 10 * np.sin(0.8) - 100, abs=0.5)
+    assert buried_depth(drawing) == pytest.approx(97 + 10 * np.sin(0.8) - 100, abs=0.5)
     drawing = drawn(scene, state(z=70.0), camera)
-    assert buried_depth(scene, drawing) == 0
+    assert buried_depth(drawing) == 0
 
 
 def test_the_tolerance_is_found_so_that_recorded_states_pass(scene, state, camera, monkeypatch):
@@ -59,4 +59,4 @@ def test_the_tolerance_is_found_so_that_recorded_states_pass(scene, state, camer
     tolerance = find_tolerance(scene, labeller)
     assert 2.5 < tolerance < 4.5
     drawing = drawn(scene, dipping[0], camera)
-    assert Acceptance(0.005, tolerance).refusal(scene, drawing) is None
+    assert Acceptance(0.005, tolerance).refusal(drawing) is None

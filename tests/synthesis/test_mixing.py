@@ -109,8 +109,8 @@ def test_instruments_in_each_other_are_refused_but_not_those_recorded_so(
     for depth, refused in ((75.0, False), (58.0, True)):
         state = State({"near": InstrumentState(at(-2, 0, 55), {}), "far": InstrumentState(at(2, 0, depth), {})}, 0.0)
         drawing = draw_layers(mixed, labeller, state, CAMERA, 0.01)
-        assert (Acceptance(0.0, None, recorded_together=groups).refusal(mixed, drawing) == ENTERS_ANOTHER) is refused
-        assert Acceptance(0.0, None, recorded_together=(groups[0] | groups[1],)).refusal(mixed, drawing) is None
+        assert (Acceptance(0.0, None, recorded_together=groups).refusal(drawing) == ENTERS_ANOTHER) is refused
+        assert Acceptance(0.0, None, recorded_together=(groups[0] | groups[1],)).refusal(drawing) is None
 
 
 def test_a_mixed_data_set_is_made_by_any_number_of_workers_with_the_same_bytes(

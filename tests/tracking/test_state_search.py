@@ -74,6 +74,19 @@ def test_errors_of_a_robot_are_told_from_those_of_a_tracker(tmp_path: Path) -> N
     assert scales[0] < LARGE < scales[1] < 1.5
 
 
+def test_without_stated_links_only_tilt_tells_how_large_errors_are(tmp_path: Path) -> None:
+    search = search_of(session_of(tmp_path, TRUE))
+    assert search.session.scene.instruments[0].kinematics is None
+    fits = measured(search, 0.1)
+    rough = []
+    for sign, fit in zip((1.0, -1.0) * 6, fits, strict=True):
+        view = search.session.recorded.cameras[fit.index].world_from_camera[:3, 2].double()
+        away = TRUE[fit.index].instruments["grasper"].pose[:3, :3].double().T @ view
+        wrong = torch.cat([math.radians(12) * search.shafts[0], 3.0 * away, torch.tensor([0.2])])  # roll, depth, jaw
+        rough.append(replace(fit, correction=fit.correction + sign * wrong))
+    assert search.scale_of(rough) == pytest.approx(search.scale_of(fits), abs=0.02)
+
+
 def test_a_joint_is_fitted_to_its_image(tmp_path: Path) -> None:
     states = list(TRUE)
     given = TRUE[6].instruments["grasper"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from neeco.capture import read_capture
 from neeco.capture.model import Frame, InstrumentState, State
 from neeco.geometry.rotations import rigid_from_vector
 from neeco.methods.kinematic import discovery
-from neeco.methods.kinematic.hinge_search import search_hinge, unbend_seeds
+from neeco.methods.kinematic.hinge_search import find_hinges, search_hinge, unbend_seeds
 from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve, shape_around_frame
 from neeco.methods.tissue_fit import tissue_evidence
@@ -151,6 +152,24 @@ def test_seeds_stand_at_the_middle_reading_where_offsets_are_nothing() -> None:
     assert torch.allclose(hinges.bend(moved, torch.softmax(logits, -1), {"jaw_angle": 0.9})[0], before, atol=rounding)
     assert torch.allclose(moved[:20], seeds[:20], atol=rounding)
     assert (moved[20:] - seeds[20:]).norm(dim=1).max() > 0.1
+
+
+def test_a_hinge_as_learned_stays_where_another_shaft_is_carved() -> None:
+    evidence, shape, _ = found("straight")
+    hinges = Hinges(("jaw",))
+    with torch.no_grad():
+        hinges.hinge_depth.fill_(3.0)
+        hinges.hinge_angle.fill_(2.0)
+        hinges.share.fill_(0.62)
+        learned = hinges.axes()
+        turned = torch.tensor([0.0, 0.0, 1.2, 0.0, 0.0, -4.0], dtype=torch.float64)
+        hinges.base.copy_(rigid_from_vector(turned))
+    session = SimpleNamespace(report=pytest.fail)
+    find_hinges(session, hinges, evidence, "tool", shape, learned)  # type: ignore[arg-type]
+    pivots, axes = hinges.axes()
+    assert torch.allclose(pivots, learned[0], atol=1e-5)
+    assert torch.allclose(axes, learned[1], atol=1e-5)
+    assert float(hinges.share.detach()) == pytest.approx(0.62)
 
 
 def test_the_search_makes_every_tensor_where_the_evidence_is() -> None:

@@ -20,7 +20,7 @@ from neeco.training.initial import begin_session
 
 STEPS = 100
 SMALL = {
-    "neeco": ["deformation.depth=3", "deformation.width=16"],
+    "nps": ["deformation.depth=3", "deformation.width=16"],
     "deformable-3dgs": ["deformation.width=16"],
     "kinematic": ["deformation.carving.seeds=300"],
     "4dgs": [

@@ -87,7 +87,7 @@ def drift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def test_methods_are_found_in_their_files_the_default_one_first() -> None:
-    assert list(methods()) == ["kinematic", "3dgs", "4dgs", "deformable-3dgs", "drift", "neeco", "nerfies"]
+    assert list(methods()) == ["kinematic", "3dgs", "4dgs", "deformable-3dgs", "drift", "nerfies", "nps"]
 
 
 def test_two_files_of_one_method_are_refused(tmp_path: Path) -> None:

@@ -43,19 +43,19 @@ def test_few_frames_are_repeated_less_unless_iterations_are_set() -> None:
 
 
 def test_a_preset_comes_before_whatever_else_is_set() -> None:
-    published = training_config("neeco", {}, ["deformation.preset=published"])
-    assert published == training_config("neeco", {})
-    practical = training_config("neeco", {}, ["deformation.preset=practical"])
+    published = training_config("nps", {}, ["deformation.preset=published"])
+    assert published == training_config("nps", {})
+    practical = training_config("nps", {}, ["deformation.preset=practical"])
     assert practical.deformation.preset == "practical"
     assert practical.deformation.membership
-    changed = training_config("neeco", {"iterations": 10}, ["deformation.width=64", "deformation.preset=practical"])
+    changed = training_config("nps", {"iterations": 10}, ["deformation.width=64", "deformation.preset=practical"])
     assert changed == replace(practical, iterations=10, deformation=replace(practical.deformation, width=64))
-    assert method_class("neeco").presets.keys() == set(get_args(get_type_hints(type(practical.deformation))["preset"]))
+    assert method_class("nps").presets.keys() == set(get_args(get_type_hints(type(practical.deformation))["preset"]))
 
 
-@pytest.mark.parametrize("method", ["neeco", "kinematic"])
+@pytest.mark.parametrize("method", ["nps", "kinematic"])
 def test_an_unknown_preset_is_refused(method: str) -> None:
-    said = "'fast' is none of published, practical" if method == "neeco" else "method kinematic has no such field"
+    said = "'fast' is none of published, practical" if method == "nps" else "method kinematic has no such field"
     with pytest.raises(NeecoError, match=f"deformation.preset: {said}"):
         training_config(method, {}, ["deformation.preset=fast"])
 
@@ -99,12 +99,12 @@ def test_a_field_of_a_deformation_is_refused_by_name_when_it_does_not_fit(
     field: str, value: object, named: str
 ) -> None:
     with pytest.raises(NeecoError, match=f"deformation.{field}: .*{named}"):
-        method_settings("neeco", {field: value})
+        method_settings("nps", {field: value})
 
 
 def test_numbers_of_a_deformation_may_be_whole_and_absent_ones_none() -> None:
-    assert method_settings("neeco", {"gate_mm": 20, "depth": 2}).gate_mm == 20
-    drafts = method_settings("neeco", {"gate_mm": None, "state": "rotation_jaw"})
+    assert method_settings("nps", {"gate_mm": 20, "depth": 2}).gate_mm == 20
+    drafts = method_settings("nps", {"gate_mm": None, "state": "rotation_jaw"})
     assert drafts.state == "rotation_jaw"
 
 
@@ -116,16 +116,16 @@ def test_a_number_may_be_written_with_an_exponent(text: str) -> None:
 @pytest.mark.parametrize("steps", ["0", "many", "2.5", "true"])
 def test_a_schedule_is_stated_for_a_whole_number_of_steps(steps: str) -> None:
     with pytest.raises(NeecoError, match=r"published_steps: .* is not a (positive )?whole number"):
-        training_config("neeco", {}, [f"schedule.published_steps={steps}"])
+        training_config("nps", {}, [f"schedule.published_steps={steps}"])
 
 
 def test_a_schedule_cannot_scale_to_a_run_of_unknown_length() -> None:
     with pytest.raises(NeecoError, match=r"published_steps: .*give --iterations alone"):
-        training_config("neeco", {"minutes": 1.0}, ["schedule.published_steps=20000"])
+        training_config("nps", {"minutes": 1.0}, ["schedule.published_steps=20000"])
 
 
 @pytest.mark.parametrize("value", ["on", "off", "inverse"])
-@pytest.mark.parametrize("method", ["neeco", "kinematic"])
+@pytest.mark.parametrize("method", ["nps", "kinematic"])
 def test_every_part_of_the_schedule_takes_the_words_the_manual_names(method: str, value: str) -> None:
     assert training_config(method, {}, [f"schedule.opacity_reset={value}"]).schedule.opacity_reset == value
 
@@ -172,7 +172,7 @@ def test_a_variant_turns_every_part_of_the_adjustment_on_and_nothing_else(method
 
 
 def test_parts_of_the_adjustment_are_those_that_take_on_off_and_inverse() -> None:
-    plain = config_to_dict(method_defaults("neeco"))["schedule"]
+    plain = config_to_dict(method_defaults("nps"))["schedule"]
     assert schedule_parts() == tuple(name for name, value in plain.items() if value == "on")
 
 
@@ -184,7 +184,7 @@ def test_a_part_of_a_variant_can_be_turned_off_again() -> None:
 @pytest.mark.parametrize(
     ("name", "named"),
     [
-        ("neeco+dta", "neeco trains with the dynamic adjustment by itself; leave out"),
+        ("nps+dta", "nps trains with the dynamic adjustment by itself; leave out"),
         ("4dgs+dat", r"'4dgs\+dat' is unknown; the one variant of a method is METHOD\+dta"),
         ("4dgs+dta+dta", "is unknown"),
         ("4dgs+", "is unknown"),
@@ -200,7 +200,7 @@ def test_a_batch_is_of_gaussians_and_at_least_one_frame() -> None:
     assert training_config("3dgs", {"batch_size": 4}).batch_size == 4
     with pytest.raises(NeecoError, match="--batch-size: 0 is too small; give at least 1"):
         training_config("3dgs", {}, ["batch_size=0"])
-    with pytest.raises(NeecoError, match=r"--batch-size: method nerfies draws rays .* deformation\.rays=NUMBER"):
+    with pytest.raises(NeecoError, match=r"--batch-size: method nerfies samples rays .* deformation\.rays=NUMBER"):
         training_config("nerfies", {"batch_size": 2})
 
 

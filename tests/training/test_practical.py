@@ -17,7 +17,7 @@ from neeco.training.train import ProgressRow, train
 
 SHORT = ["density_start=10", "log_interval=1", "checkpoint_interval=20", "deformation.carving.tissue_steps=100"]
 SMALL = ["deformation.preset=practical", "deformation.width=16", "deformation.depth=2", *SHORT]
-CONFIG = training_config("neeco", {"iterations": 60}, SMALL)
+CONFIG = training_config("nps", {"iterations": 60}, SMALL)
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,7 @@ def run(capture: Path, tmp_path: Path) -> Path:
         (["--iterations", "200"], "--iterations 200: the run was begun with 20"),
         (["--minutes", "5"], "--minutes 5.0: the run was begun with 3.0"),
         (["--seed", "5"], "--seed 5: the run was begun with 0"),
-        (["--method", "neeco"], "--method neeco: the run was begun with 3dgs"),
+        (["--method", "nps"], "--method nps: the run was begun with 3dgs"),
         (["--transforms", "other.json"], "--transforms other.json: the run was begun with transforms.json"),
         (["--batch-size", "2"], "--batch-size 2: the run was begun with 1"),
         (["--scale", "0.5"], "--scale 0.5: the run was begun with 1.0"),
@@ -71,7 +71,7 @@ def test_a_run_is_continued_without_flags_or_with_its_own(flags: list[str], capt
 
 def test_an_adjusted_run_is_continued_by_its_own_name_alone() -> None:
     sets = ["schedule.compensation=inverse"]
-    for name in ("3dgs+dta", "neeco"):
+    for name in ("3dgs+dta", "nps"):
         for words in ([], sets):
             begun = training_config(name, {}, words)
             assert training_config(name, {}, words, begun) == begun
@@ -91,7 +91,7 @@ def test_a_finished_run_of_another_capture_is_not_called_finished(
 def test_python_is_refused_as_the_command_line_is_without_dashes(capture: Path, run: Path) -> None:
     for given, said in (
         ({"seed": 5}, "^seed 5"),
-        ({"method": "neeco"}, "^method neeco"),
+        ({"method": "nps"}, "^method nps"),
         ({"density_start": 3}, "3"),
     ):
         with pytest.raises(NeecoError, match=f"{said}: the run was begun with"):

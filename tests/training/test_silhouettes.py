@@ -136,7 +136,7 @@ def test_a_checkpoint_brings_them_back(capture: Path) -> None:
     views = TrainingViews.read(read_capture(capture).split("train"))
     first, second = (
         begin_session(
-            read_capture(capture), views, training_config("neeco", {"iterations": 20}, ["deformation.width=16"]), print
+            read_capture(capture), views, training_config("nps", {"iterations": 20}, ["deformation.width=16"]), print
         )
         for _ in range(2)
     )

@@ -123,8 +123,8 @@ def test_a_state_must_name_one_of_the_tissues(run: Path) -> None:
 
 
 def test_a_method_that_takes_one_tissue_says_so(capture: Path, tmp_path: Path) -> None:
-    with pytest.raises(NeecoError, match=r"tissues: there are several \(red, green\); method neeco learns one"):
-        train(capture, tmp_path / "run", training_config("neeco", {"iterations": 5}))
+    with pytest.raises(NeecoError, match=r"tissues: there are several \(red, green\); method nps learns one"):
+        train(capture, tmp_path / "run", training_config("nps", {"iterations": 5}))
 
 
 def test_a_constant_error_of_one_world_is_corrected(capture: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from neeco.training.train import ProgressRow, train
 
 SHORT = ["density_start=10", "density_stop=0.9", "log_interval=5", "checkpoint_interval=20"]
 SMALL = {
-    "neeco": ["deformation.width=16", "deformation.depth=2"],
+    "nps": ["deformation.width=16", "deformation.depth=2"],
     "deformable-3dgs+dta": ["deformation.width=16"],
     "4dgs": ["deformation.resolution=8", "deformation.width=8"],
     "4dgs+dta": ["deformation.resolution=8", "deformation.width=8"],
@@ -27,7 +27,7 @@ def config_of(method: str):
     return training_config(method, {"iterations": 60}, [*SMALL.get(method, []), *SHORT])
 
 
-@pytest.mark.parametrize("method", ["3dgs", "neeco", "deformable-3dgs+dta", "4dgs"])
+@pytest.mark.parametrize("method", ["3dgs", "nps", "deformable-3dgs+dta", "4dgs"])
 def test_two_runs_give_the_same_bytes(method: str, capture: Path, tmp_path: Path) -> None:
     scenes = [train(capture, tmp_path / name, config_of(method)) / "scene.safetensors" for name in ("a", "b")]
     assert scenes[0].read_bytes() == scenes[1].read_bytes()
@@ -38,7 +38,7 @@ def test_two_runs_give_the_same_bytes(method: str, capture: Path, tmp_path: Path
 
 @pytest.mark.parametrize(
     ("method", "stop"),
-    [(method, stop) for method in ("3dgs", "neeco") for stop in (10, 35, 55)]
+    [(method, stop) for method in ("3dgs", "nps") for stop in (10, 35, 55)]
     + [("deformable-3dgs+dta", 35), ("4dgs+dta", 35)],
 )
 def test_an_interrupted_run_ends_in_the_same_bytes(method: str, stop: int, capture: Path, tmp_path: Path) -> None:
@@ -66,8 +66,8 @@ def test_watching_a_run_neither_changes_it_nor_costs_it_time(capture: Path, tmp_
         for _ in range(1000):
             next(times)
 
-    plain = train(capture, tmp_path / "plain", config_of("neeco"))
-    watched = train(capture, tmp_path / "watched", config_of("neeco"), watch=watch, clock=lambda: float(next(times)))
+    plain = train(capture, tmp_path / "plain", config_of("nps"))
+    watched = train(capture, tmp_path / "watched", config_of("nps"), watch=watch, clock=lambda: float(next(times)))
     assert seen == list(range(1, 61))
     assert (watched / "scene.safetensors").read_bytes() == (plain / "scene.safetensors").read_bytes()
     rows = [json.loads(line) for line in (watched / "metrics.jsonl").read_text().splitlines()]
@@ -84,7 +84,7 @@ def test_a_network_rests_while_the_scene_takes_shape(share: float, capture: Path
         moved[session.iteration] = float(deltas.means.detach().abs().max())
 
     small = ["deformation.width=16", "deformation.depth=2", f"deformation.warm_up={share}"]
-    run = train(capture, tmp_path / "run", training_config("neeco", {"iterations": 20}, small), watch=watch)
+    run = train(capture, tmp_path / "run", training_config("nps", {"iterations": 20}, small), watch=watch)
     awake = [iteration for iteration in moved if iteration / 20 >= share]
     assert all(moved[iteration] > 0 for iteration in awake)
     assert all(moved[iteration] == 0 for iteration in moved if iteration not in awake)

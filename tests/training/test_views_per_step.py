@@ -21,9 +21,9 @@ from neeco.training.train import ProgressRow, train
 NEECO = ["deformation.width=16", "deformation.depth=2", "deformation.warm_up=0", "refine.start=0"]
 
 
-def config_of(views: int, method: str = "neeco", assignments: tuple[str, ...] = ()) -> TrainConfig:
+def config_of(views: int, method: str = "nps", assignments: tuple[str, ...] = ()) -> TrainConfig:
     small = [
-        *(NEECO if method == "neeco" else []),
+        *(NEECO if method == "nps" else []),
         "density_start=10",
         "density_stop=0.9",
         "log_interval=5",
@@ -80,7 +80,7 @@ def test_gradients_are_the_mean_of_single_ones_and_density_counts_every_frame(
     assert torch.allclose(*histories, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("method", "views"), [("3dgs", 2), ("neeco", 3)])
+@pytest.mark.parametrize(("method", "views"), [("3dgs", 2), ("nps", 3)])
 def test_an_interrupted_run_ends_in_the_same_bytes(method: str, views: int, capture: Path, tmp_path: Path) -> None:
     def interrupt(row: ProgressRow) -> None:
         if row.iteration == 36 and not row.note:

@@ -322,7 +322,7 @@ def test_a_run_that_changes_is_shown_anew(serve: Serve, context: Any, made_run: 
     assert alike(after, lighter, 2.0, seen_by=2) > ALIKE_DB
 
 
-@pytest.mark.parametrize("method", ["neeco", "3dgs", "deformable-3dgs", "4dgs", "nerfies"])
+@pytest.mark.parametrize("method", ["nps", "3dgs", "deformable-3dgs", "4dgs", "nerfies"])
 def test_every_method_is_shown_in_all_its_views(method: str, serve: Serve, context: Any, tmp_path: Path) -> None:
     scene = make_nerf(chunk=4096) if method == "nerfies" else make_scene(method)  # 7 rays at a time take half a minute
     with torch.no_grad():

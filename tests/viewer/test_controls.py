@@ -128,7 +128,7 @@ def test_only_an_unsteered_frame_is_recorded(controls: Controls, frame: int | No
     assert controls.recorded_frame == frame
 
 
-@pytest.mark.parametrize("method", ["kinematic", "neeco", "3dgs", "deformable-3dgs", "4dgs"])
+@pytest.mark.parametrize("method", ["kinematic", "nps", "3dgs", "deformable-3dgs", "4dgs"])
 def test_every_method_is_steered_to_a_state_it_can_draw(method: str) -> None:
     scene = make_scene(method)
     shafts = shafts_of(scene)

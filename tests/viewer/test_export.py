@@ -113,7 +113,7 @@ def test_lamps_that_were_found_are_packed_and_no_others() -> None:
     assert pack(scene, 0)[0]["light"]["lamps"] == [[7.0, -5.0, 1.0, 0.25]]
 
 
-@pytest.mark.parametrize("method", ["neeco", "deformable-3dgs", "4dgs"])
+@pytest.mark.parametrize("method", ["nps", "deformable-3dgs", "4dgs"])
 def test_a_network_for_every_state_is_refused_in_one_line(method: str) -> None:
     with pytest.raises(NeecoError, match=rf"--export: method {method} .*neeco view RUN") as refusal:
         pack(make_scene(method), 3)

@@ -136,7 +136,7 @@ def test_a_damaged_checkpoint_is_refused_in_one_line(run: Path) -> None:
         WatchedRun(run)
 
 
-@pytest.mark.parametrize("method", ["neeco", "3dgs", "deformable-3dgs", "4dgs", "nerfies"])
+@pytest.mark.parametrize("method", ["nps", "3dgs", "deformable-3dgs", "4dgs", "nerfies"])
 def test_every_method_can_be_looked_at(method: str, tmp_path: Path) -> None:
     scene = make_nerf() if method == "nerfies" else make_scene(method)
     with torch.no_grad():

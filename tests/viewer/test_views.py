@@ -31,7 +31,7 @@ from neeco.viewer.views import (
     views_of,
 )
 
-METHODS = ("kinematic", "neeco", "3dgs", "deformable-3dgs", "4dgs")
+METHODS = ("kinematic", "nps", "3dgs", "deformable-3dgs", "4dgs")
 
 
 @pytest.fixture(scope="module")

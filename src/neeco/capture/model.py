@@ -89,7 +89,11 @@ class InstrumentState:
 class State:
     """Everything that moves, at one moment: each instrument's state by its name, and the time.
 
-    An instrument's state may be given as (pose, joints), too: world_from_instrument [4, 4] in mm, and name -> rad.
+    Args:
+        instruments: name -> InstrumentState, or (pose, joints): world_from_instrument [4, 4] in mm, and name -> rad
+            (mm for sliding joints)
+        time: s
+        tissue: name of the tissue whose world the poses are in, where a scene has several
 
         neeco.State({"maryland": (np.eye(4), {"jaw_angle": 0.4})}, time=1.2)
     """

@@ -20,7 +20,7 @@ from dataclasses import make_dataclass
 from typing import Any, get_type_hints
 
 from neeco import __version__
-from neeco.errors import NeecoError, memory_failure
+from neeco.errors import NeecoError, memory_failure, nearest
 from neeco.files import require_utf8
 
 VERBS = {
@@ -33,7 +33,7 @@ VERBS = {
     "compare": "Train and score several methods under the same budget; tables and a report.",
     "score-masks": "Score a folder of masks from any source against the truth.",
     "view": "Show a run interactively, in a browser or as one file.",
-    "export": "Write a scene in one state for other viewers of Gaussians (PLY, SPZ).",
+    "export": "Write a scene in one state for other viewers of Gaussians (PLY, SPZ, OpenUSD).",
     "synthesize": "Render a labelled data set of states that nobody recorded.",
     "annotate": "Label the recorded frames by the scene, each with its confidence.",
     "track": "Find instruments in footage that has no states, by their learned scene.",
@@ -42,8 +42,15 @@ VERBS = {
     "ablate": "Remove parts of the methods one by one; the paper's tables and ours.",
 }
 
-DESCRIPTION = "Labelled images of surgical instruments in states nobody recorded."
+DESCRIPTION = """Labelled images of surgical instruments in states nobody recorded.
 
+neeco VERB --help: the options of a verb.
+neeco --version: the version.
+neeco --tyro-print-completion bash|zsh|tcsh: completion for a shell, to be sourced (bash, tcsh) or saved as _neeco in a
+folder of fpath (zsh)."""
+COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
+
+USAGE = 2
 INTERRUPTED = 130  # 128 + SIGINT, what a shell reports
 PIPE_CLOSED = 141  # 128 + SIGPIPE
 
@@ -55,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     output went away. Usage errors (2) and `--help` (0) leave through SystemExit. Standard streams may be closed, and
     may be in any encoding.
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    words = _with_target(list(sys.argv[1:] if arguments is None else arguments))
     _prepare_streams()
     terminate = None
     if threading.current_thread() is threading.main_thread():
@@ -106,6 +113,18 @@ def _status(words: list[str]) -> int:
         return 1
 
 
+def _with_target(words: list[str]) -> list[str]:
+    """Words in which every `--json` that no file follows is followed by `-`, standard output. Before version 0.3, no
+    file followed that of `check` and `ingest`, but captures and recordings might."""
+    bare = words[:1] in (["check"], ["ingest"])
+    for at in reversed([at for at, word in enumerate(words) if word == "--json"]):
+        following = words[at + 1] if at + 1 < len(words) else "--"
+        read = not following.endswith(".json") or os.path.basename(following).startswith("transforms")
+        if following.startswith("--") or (bare and following != "-" and read):
+            words.insert(at + 1, "-")
+    return words
+
+
 def _prepare_streams() -> None:
     """Replace standard streams that are closed, as under cron, by the null device, so that no file gets their numbers,
     and escape what their encoding cannot write."""
@@ -143,14 +162,27 @@ def _dispatch(words: list[str]) -> int:
         return 0
     import tyro
 
+    if words and words[0] not in VERBS and not words[0].startswith("-"):
+        meant = nearest(words[0], VERBS)
+        hint = "" if meant is None else f"did you mean {meant}? "
+        _print_error(f"{words[0]}: no such verb; {hint}`neeco --help` lists all")
+        raise SystemExit(USAGE)
     run, arguments = _verb(words) if words and words[0] in VERBS else (None, None)
+    complete = bool(words) and words[0] in COMPLETION
     choices: dict[str, Callable[..., Any]] = {
-        name: arguments if arguments is not None and name == words[0] else _named_only(name, line)
+        name: arguments
+        if arguments is not None and name == words[0]
+        else (_verb([name])[1] if complete else _named_only(name, line))
         for name, line in VERBS.items()
     }
-    parsed = tyro.extras.subcommand_cli_from_dict(
-        choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
-    )
+    try:
+        parsed = tyro.extras.subcommand_cli_from_dict(
+            choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
+        )
+    except SystemExit as end:
+        if not end.code and words[:1] == ["train"]:
+            importlib.import_module(f"{__name__}.train").explain(words)
+        raise
     assert run is not None, "tyro leaves through SystemExit when no verb was given"
     with contextlib.suppress(FileNotFoundError):  # the current folder was removed: absolute paths may do
         for word in (os.getcwd(), *words):
@@ -169,13 +201,13 @@ def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -
 
 
 def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any]]:
-    """The first word's `run` and the dataclass of its arguments, which is what `run` takes. Where the verb's help takes
-    longer to find out (`explain`), it is only when help is asked for."""
+    """The first word's `run` and the dataclass of its arguments, which is what `run` takes."""
     module = importlib.import_module(f"{__name__}.{words[0].replace('-', '_')}")
     arguments = next(iter(get_type_hints(module.run).values()))
-    if hasattr(module, "explain") and not {"-h", "--help"}.isdisjoint(words):
-        explained = f"{arguments.__doc__.strip()}\n\n{module.explain()}"
-        arguments = type(arguments.__name__, (arguments,), {"__doc__": explained})
+    if not {"-h", "--help"}.isdisjoint(words):
+        from neeco.cli._help import state_defaults
+
+        state_defaults(arguments)
     return module.run, arguments
 
 

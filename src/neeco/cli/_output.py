@@ -2,22 +2,45 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
+import tyro
 from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
 from neeco.errors import NeecoError
-from neeco.files import new_folder
+from neeco.files import finite, new_folder, write_json
 
 if TYPE_CHECKING:
     from neeco.studies.tables import ResultTable
 
+STANDARD_OUTPUT = Path("-")  # as the value of --json
+FILE_WIDTH = 1000  # characters of a line in files and pipes, at most
 BORDER = 3  # characters of a column in addition to its text
+
+
+JsonTarget = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        metavar="[FILE]",
+        help="Write the numbers as one JSON object into FILE; without FILE to standard output, and nothing else there.",
+        help_behavior_hint="(optional)",
+    ),
+]
+
+
+def whole_lines(*, stderr: bool = False) -> Console:
+    """Return a console that cuts and wraps nothing where no terminal's width asks for it: in files and pipes."""
+    console = Console(stderr=stderr)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = FILE_WIDTH
+    return console
 
 
 def fitted(table: ResultTable, width: int) -> list[Table]:
@@ -84,7 +107,7 @@ def print_outcome(
 ) -> int:
     """Print tables, sentences, notes, the files named by `stem` and the report; returns 1 when any of `runs` (`3 runs`)
     failed, and prints the first failure."""
-    console = Console()
+    console = whole_lines()
     for table in tables:
         for piece in fitted(table, console.width):
             console.print(piece)
@@ -110,15 +133,25 @@ def require_ending(option: str, path: Path, *endings: str) -> None:
         raise NeecoError(f"{option}: {path}: another format's name; what is written ends in {' or '.join(endings)}")
 
 
+def write_numbers(path: Path | None, numbers: Any) -> bool:
+    """Write what `--json` asks for; True where that is all that standard output is to have."""
+    if path == STANDARD_OUTPUT:
+        print(json.dumps(finite(numbers), indent=2, allow_nan=False))
+    elif path is not None:
+        write_json(path, numbers)
+    return path == STANDARD_OUTPUT
+
+
 @contextmanager
 def ready_for_json(path: Path | None) -> Iterator[None]:
     """Check before the work whose numbers go to `--json` that the file can be written.
 
     Raises NeecoError for a folder, a name of another format, or a file whose folder cannot be written to.
     """
-    if path is not None and path.is_dir():
-        raise NeecoError(f"--json: {path} is a folder; name a file")
-    if path is not None:
-        require_ending("--json", path, ".json")
-    with nullcontext() if path is None else new_folder(path.parent):
+    file = None if path == STANDARD_OUTPUT else path
+    if file is not None and file.is_dir():
+        raise NeecoError(f"--json: {file} is a folder; name a file")
+    if file is not None:
+        require_ending("--json", file, ".json")
+    with nullcontext() if file is None else new_folder(file.parent):
         yield

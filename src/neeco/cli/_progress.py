@@ -1,16 +1,18 @@
-"""Progress bars on the error stream, and messages for interrupted work."""
+"""Progress on the error stream, as bars or lines, and messages for interrupted work."""
 
 from __future__ import annotations
 
 import shlex
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from neeco.cli._output import whole_lines
 from neeco.errors import NeecoError
 from neeco.raster.devices import device_failure
 
@@ -21,12 +23,14 @@ if TYPE_CHECKING:
     from neeco.training.config import TrainConfig
     from neeco.training.train import ProgressRow
 
+LINE_INTERVAL_S = 30.0  # between two lines about the same work, where no terminal shows bars
+MIN_SHOWN_S = 1.0  # what took less has no last line
 EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
 
 
 class Bars:
-    """A bar for each count and each running job; none before there is progress, so that bad input prints
-    its one line alone."""
+    """A bar for each count and each running job on a terminal; elsewhere a line for each every LINE_INTERVAL_S. None
+    before there is progress, so that bad input prints its one line alone."""
 
     def __init__(self) -> None:
         columns = (
@@ -36,26 +40,42 @@ class Bars:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        self.bar = Progress(*columns, console=Console(stderr=True))
+        self.bar = Progress(*columns, console=whole_lines(stderr=True))
         self.tasks: dict[str, TaskID] = {}
+        self.stages: list[TaskID] = []
         self.ended: set[int] = set()
+        self.left = threading.Event()
+        self.lines = threading.Thread(target=self._print_lines, daemon=True)
 
     def __enter__(self) -> Bars:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self.bar.live.is_started:
             self.bar.stop()
+        elif self.lines.is_alive():
+            self.left.set()
+            self.lines.join()
+            if kind is None:
+                *before, last = [task for task in self.bar.tasks if task.visible]
+                for task in [task for task in before if (task.elapsed or 0) >= MIN_SHOWN_S] + [last]:
+                    self._print(_line(task))
 
     def stage(self, what: str, done: int, total: int | None) -> None:
-        """Show that `done` of `total` are done."""
-        self.bar.update(self._task(what), completed=done, total=total, text=f"{done}/{total}")
+        """Show that `done` of `total` are done; those of the stages before are, then."""
+        begins = what not in self.tasks
+        task = self._task(what, total or None)
+        if begins:
+            for before in self.stages:
+                self._complete(before)
+            self.stages.append(task)
+        self.bar.update(task, completed=done, total=total or None, text=f"{done}/{total}" if total else "")
 
     def training(self, row: ProgressRow) -> None:
         """Progress of `train`."""
         task = self._task("training")
         if row.note:
-            self.bar.console.print(row.note, style="dim", highlight=False)
+            self._print(row.note, style="dim")
             return
         size = f"  {row.num_gaussians} Gaussians  phase {row.phase}" if row.num_gaussians else ""
         text = f"iteration {row.iteration}  PSNR {row.psnr:.1f} dB{size}"
@@ -64,7 +84,7 @@ class Bars:
     def end(self, title: str) -> None:
         """Complete the bar of `title`, if there is one."""
         if title in self.tasks:
-            self.bar.update(self.tasks[title], completed=1.0)
+            self._complete(self.tasks[title])
 
     def job(self, news: JobEvent) -> None:
         """Progress of `run_jobs`."""
@@ -75,18 +95,49 @@ class Bars:
             self.bar.update(task, visible=False)
             words = news.text if news.stage == "failed" else f"{news.result['iterations']} iterations"
             line = f"{title}: {news.stage}: {words} ({len(self.ended)} of {news.total} ended)"
-            self.bar.console.print(line, markup=False, highlight=False, style="red" if news.stage == "failed" else "")
+            self._print(line, style="red" if news.stage == "failed" else "")
             return
         share = news.share * (1 - EVALUATION_SHARE)
         if news.stage == "evaluating":
             share = 1 - EVALUATION_SHARE * (1 - news.share)
         self.bar.update(task, completed=share, text=f"{news.stage} {news.text}".rstrip())
 
-    def _task(self, title: str) -> TaskID:
-        self.bar.start()
+    def _task(self, title: str, total: float | None = 1.0) -> TaskID:
+        if self.bar.console.is_terminal:
+            self.bar.start()
+        elif not self.tasks:
+            self.lines.start()
         if title not in self.tasks:
-            self.tasks[title] = self.bar.add_task(title, total=1.0, text="")
+            self.tasks[title] = self.bar.add_task(title, total=total, text="")
         return self.tasks[title]
+
+    def _complete(self, task: TaskID) -> None:
+        found = next(one for one in self.bar.tasks if one.id == task)
+        total = found.total or 1.0
+        self.bar.update(task, completed=total, total=total)
+
+    def _print_lines(self) -> None:
+        while not self.left.wait(LINE_INTERVAL_S):
+            for task in [task for task in self.bar.tasks if task.visible and not task.finished]:
+                self._print(_line(task))
+
+    def _print(self, line: str, style: str = "") -> None:
+        self.bar.console.print(line, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def _line(task: Task) -> str:
+    """State what is done, how far it is, and how long it still takes at the speed so far."""
+    passed = task.elapsed or 0.0
+    words = [f"{task.percentage:.0f} %"] if task.total else []
+    words += [task.fields["text"]] if task.fields["text"] else []
+    words += [f"{_duration(passed)} passed"]
+    if task.total and 0 < task.completed < task.total:
+        words += [f"about {_duration(passed * (task.total / task.completed - 1))} left"]
+    return f"{task.description}: {', '.join(words)}"
+
+
+def _duration(seconds: float) -> str:
+    return str(timedelta(seconds=round(seconds)))
 
 
 @contextmanager

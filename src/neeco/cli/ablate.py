@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from neeco.cli._output import fitted
+from neeco.cli._output import fitted, whole_lines
 from neeco.studies.ablations import AblationPlan
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ def run(plan: AblationPlan) -> int:
     with Bars() as bars:
         ablation = run_ablations(plan, bars.job)
     page = write_ablation_report(plan.output, ablation)
-    print_tables(Console(), ablation)
+    print_tables(whole_lines(), ablation)
     for line in (f"tables: {plan.output}/tables/: NAME.csv, .md, .tex", f"report: {page}"):
         print(line)
     return 1 if ablation.failures else 0

@@ -22,7 +22,7 @@ class Arguments:
     output: Path
     """Data set folder to write; must be empty or absent unless --resume."""
     capture: Path | None = None
-    """Another recording of the same instruments over the same tissue; the run's own when not given."""
+    """Another recording of the same instruments over the same tissue. Default: the run's own."""
     min_trust: float = MIN_TRUST
     """Frames trusted less are listed, not written: 0 to 1, about the overlap (IoU) that the image speaks for."""
     formats: Annotated[tuple[str, ...], tyro.conf.arg(help=formats_help())] = DEFAULT_FORMATS

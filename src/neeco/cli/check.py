@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
-from neeco.files import finite
+from neeco.cli._output import JsonTarget, ready_for_json, write_numbers
 
 if TYPE_CHECKING:
     from neeco.capture.checks import CaptureSummary
@@ -26,8 +25,7 @@ class Arguments:
     """The capture's folder, or a transforms file in it."""
     transforms: str = "transforms.json"
     """Which transforms file of the folder to check."""
-    json: bool = False
-    """Print one JSON object on stdout and nothing else."""
+    json: JsonTarget = None
 
 
 def run(arguments: Arguments) -> int:
@@ -35,15 +33,14 @@ def run(arguments: Arguments) -> int:
     from neeco.capture.checks import inspect_capture
     from neeco.capture.documents import errors_only
 
-    checked = inspect_capture(arguments.capture, arguments.transforms)
-    problems, summary = checked.problems, checked.summary
-    errors = len(errors_only(problems))
-    if arguments.json:
+    with ready_for_json(arguments.json):
+        checked = inspect_capture(arguments.capture, arguments.transforms)
+        problems, summary = checked.problems, checked.summary
+        errors = len(errors_only(problems))
         report = {"capture": str(arguments.capture), "errors": errors, "warnings": len(problems) - errors}
-        report["problems"] = [asdict(problem) for problem in problems]
-        print(json.dumps(finite({**report, "summary": summary.as_json()}), indent=1, allow_nan=False))
-    else:
-        _print(problems, errors, summary)
+        report |= {"problems": [asdict(problem) for problem in problems], "summary": summary.as_json()}
+        if not write_numbers(arguments.json, report):
+            _print(problems, errors, summary)
     return 1 if errors else 0
 
 

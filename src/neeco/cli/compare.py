@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.console import Console
 
 from neeco.cli._output import print_outcome
 from neeco.settings import Device, name_and_value
@@ -40,17 +39,17 @@ class Compare:
     iterations: int | None = None
     """Each run trains so many steps."""
     splits: tuple[str, ...] | None = None
-    """Splits to score; default: all but train."""
+    """Splits to score. Default: all but train."""
     masks: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """NAME=FOLDER: masks of the same frames from another program, scored in the same table; repeatable."""
     workers: int = 1
-    """Runs at once; each gets its share of the cores. RAY_ADDRESS names a Ray cluster (install neeco[cluster])."""
+    """Runs at once; each gets its share of the cores. RAY_ADDRESS names a Ray cluster (needs the extra `cluster`)."""
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """A field of every method's training config, as NAME=VALUE (e.g. max_tissue_gaussians=5000); repeatable."""
     lpips_weights: Path | None = None
-    """Folder with alexnet.safetensors and/or vgg16.safetensors (or set NEECO_LPIPS_WEIGHTS)."""
+    """Folder with alexnet.safetensors and/or vgg16.safetensors. Default: that of NEECO_LPIPS_WEIGHTS."""
     device: Device = "auto"
 
 
@@ -66,7 +65,7 @@ def run(args: Compare) -> int:
         bars.stage("report", 0, 1)
         page = write_comparison_report(args.output, comparison, plan.capture)
         bars.stage("report", 1, 1)
-    Console().print(f"{args.capture}: {budget_words(comparison)}", markup=False, highlight=False)
+    print(f"{args.capture}: {budget_words(comparison)}")
     return print_outcome(
         args.output,
         "comparison",

@@ -22,10 +22,11 @@ class Downstream:
 
     Each model is trained from scratch in every condition, with as many steps, on the same labelled frames of a fold;
     tests are frames of the other splits, and of other captures. Conditions are sums of words: `real`, names of sets,
-    `paste` (the labelled instruments over other backgrounds), `strong` (augmentation of everything), `permuted` (sets
-    with labels of other images, a control), and when what is learned: `finetune`, `balanced`, `pool` or `blend`; for
-    the edges of synthetic labels `hard`, `soft` or `ignore`. The same command continues interrupted work; with more
-    models, sets, conditions or folds it adds them. Needs neeco[downstream].
+    `paste` (the labelled instruments over other backgrounds), `match` (labelled frames in another recording's colours),
+    `strong` (augmentation of everything), `permuted` (sets with labels of other images, a control), and when what is
+    learned: `finetune`, `balanced`, `pool` or `blend`; for the edges of synthetic labels `hard`, `soft` or `ignore`.
+    The same command continues interrupted work; with more models, sets, conditions or folds it adds them. Needs the
+    extra `downstream`.
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
@@ -43,27 +44,29 @@ class Downstream:
     folds: int = 5
     """Each takes other labelled frames and another seed; intervals are over folds and frames."""
     conditions: tuple[str, ...] = ()
-    """Training data; default: real, real+strong, real+paste, SET, SET+real, SET+real+strong, SET+real+permuted."""
+    """Training data. Default: real, real+strong, real+paste, SET, SET+strong, SET+real, SET+real+permuted."""
     backgrounds: Path | None = None
-    """Folder of images without an instrument to paste over; default: the labelled frames, instruments filled in."""
+    """Folder of images without an instrument to paste over. Default: the labelled frames, instruments filled in."""
+    match_colors: Path | None = None
+    """Folder of unlabelled frames of the other recording, with instruments or without, for the word match."""
     labels: Path | None = None
-    """Folder of masks named as the frames, for the recorded training frames; default: the capture's truth."""
+    """Folder of masks named as the frames, for the recorded training frames. Default: the capture's truth."""
     classes: Literal["instrument", "parts"] = "instrument"
     """One class, or shaft, wrist and jaws."""
     frame_selection: Literal["spread", "first"] = "spread"
     """Which frames are labelled: spread over the recording, or its first."""
     splits: tuple[str, ...] = ()
-    """Splits to test on; default: all but train that have true masks."""
+    """Splits to test on. Default: all but train that have true masks."""
     steps: int | None = None
-    """Optimisation steps of every training; default: the model's own."""
+    """Optimisation steps of every training. Default: the model's own."""
     size: int | None = None
-    """Longer side in pixels of a model's input images; default: the model's own. Scores are at full size."""
+    """Longer side in pixels of a model's input images; scores are at full size. Default: the model's own."""
     batch: int | None = None
-    """Images in a step; default: the model's own."""
+    """Images in a step. Default: the model's own."""
     weights: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """MODEL=FILE.safetensors to begin from instead of from scratch; repeatable."""
     workers: int = 1
-    """Trainings at once, which share the GPUs; RAY_ADDRESS names a Ray cluster (install neeco[cluster])."""
+    """Trainings at once, which share the GPUs; RAY_ADDRESS names a Ray cluster (needs the extra `cluster`)."""
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     device: Device = "auto"

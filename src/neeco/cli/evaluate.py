@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from rich.table import Column, Table
 
+from neeco.cli._output import JsonTarget, ready_for_json, whole_lines, write_numbers
 from neeco.settings import Device
 
 COLUMNS = (
@@ -37,29 +37,27 @@ class Evaluate:
     run: Annotated[Path, tyro.conf.Positional]
     """Folder that `neeco train` wrote."""
     splits: tuple[str, ...] | None = None
-    """Splits to score; default: all but train."""
+    """Splits to score. Default: all but train."""
     align: bool = False
     """Also score with instrument and camera pose of each frame fitted to its image, the scene frozen."""
     lpips_weights: Path | None = None
-    """Folder with alexnet.safetensors and/or vgg16.safetensors (or set NEECO_LPIPS_WEIGHTS)."""
-    json: Path | None = None
-    """Also write the numbers to this file."""
+    """Folder with alexnet.safetensors and/or vgg16.safetensors. Default: that of NEECO_LPIPS_WEIGHTS."""
+    json: JsonTarget = None
     device: Device = "auto"
 
 
 def run(args: Evaluate) -> int:
     """Evaluate, write the report, print a table."""
-    from neeco.cli._output import ready_for_json
     from neeco.cli._progress import Bars
     from neeco.evaluation.evaluate import evaluate_run
     from neeco.evaluation.image_metrics import find_lpips
-    from neeco.files import new_folder, write_json
+    from neeco.files import new_folder
     from neeco.raster.devices import device_of
     from neeco.report import write_report
     from neeco.training.run import open_run
     from neeco.viewer.export import embedded_page
 
-    console = Console()
+    console = whole_lines()
     networks = find_lpips(args.lpips_weights)
     with ready_for_json(args.json), open_run(args.run, device_of(args.device)) as trained:
         capture = trained.capture()
@@ -68,8 +66,8 @@ def run(args: Evaluate) -> int:
                 trained, capture, args.splits, align=args.align, networks=networks, progress=bars.stage
             )
         page = write_report(args.run, evaluation, capture, trained.scene, playable=embedded_page(trained))
-        if args.json is not None:
-            write_json(args.json, evaluation)
+        if write_numbers(args.json, evaluation):
+            return 0
     console.print(evaluation_table(evaluation))
     for note in evaluation["notes"]:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)

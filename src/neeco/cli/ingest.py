@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from neeco.cli._output import JsonTarget, whole_lines
 
 if TYPE_CHECKING:
     from neeco.ingest.recording.model import Recording
@@ -26,11 +23,11 @@ class Ingest:
     """recording.yaml, or several of one instrument for one capture; or a folder in another format to convert
     (nerfstudio, Blender, COLMAP, EndoNeRF); with --init, a recording's folder or file."""
     output: Path | None = None
-    """Folder of the capture to write; must not exist."""
+    """Folder of the capture to write; must not exist. Default: none; needed, but with --init and --formats."""
     video: Path | None = None
     """Video file, or a folder of images."""
     fps: float | None = None
-    """Frames per second, where the video does not say or is wrong."""
+    """Frames per second, where the video does not say or is wrong. Default: the video's."""
     instrument: Path | None = None
     """CSV log of the instrument's tracker."""
     laparoscope: Path | None = None
@@ -41,13 +38,13 @@ class Ingest:
     joint: Annotated[tuple[tuple[str, Path, Path], ...], tyro.conf.UseAppendAction] = ()
     """Joint sensor: NAME LOG.csv CALIBRATION.csv (counts and angles). May be given several times."""
     intrinsics: tuple[float, float, float, float] | None = None
-    """FX FY CX CY in pixels; estimated with distortion when left out."""
+    """FX FY CX CY in pixels. Default: estimated, with distortion."""
     calibration: Path | None = None
     """Intrinsics from a file instead: OpenCV/ROS YAML or nerfstudio JSON."""
     sync: Path | None = None
-    """JSON with clock offsets (t_log = t_video + offset); found from the images when left out."""
+    """JSON with clock offsets (t_log = t_video + offset). Default: found from the images."""
     frames: int | None = None
-    """How many frames to keep, spread over states and views."""
+    """How many frames to keep, spread over states and views. Default: at most 400."""
     init: bool = False
     """Look at the files in SOURCE (a folder; default: here), or into a file of several streams, and write a commented
     recording.yaml into it, or next to it."""
@@ -55,15 +52,15 @@ class Ingest:
     """List the formats that recordings are read from."""
     rrd: Path | None = None
     """Write images, poses, joints, what moves and clocks into this file, too, for the rerun viewer."""
-    json: bool = False
-    """Print the numbers as JSON."""
+    json: JsonTarget = None
     strict: bool = False
     """End with exit status 1 where the verdict is DOUBTFUL."""
 
 
 def run(args: Ingest) -> int:
     """Ingest, convert, or write a template."""
-    from neeco.cli._output import require_ending
+    from neeco.cli._output import ready_for_json, require_ending, write_numbers
+    from neeco.cli._progress import Bars
     from neeco.errors import NeecoError
     from neeco.ingest.convert import convert_folder
     from neeco.ingest.sources import folder_to_convert
@@ -91,12 +88,14 @@ def run(args: Ingest) -> int:
     recordings = recordings_of(args)
     if args.rrd is not None:
         require_ending("--rrd", args.rrd, ".rrd")
-    with _progress_bars() as progress:
-        try:
-            done = ingest_and_report(recordings, output, progress, args.rrd)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt("nothing was written") from None
-    print(json.dumps(done.as_json(), indent=2, allow_nan=False) if args.json else "\n".join(done.lines()))
+    with ready_for_json(args.json):
+        with Bars() as bars:
+            try:
+                done = ingest_and_report(recordings, output, bars.stage, args.rrd)
+            except KeyboardInterrupt:
+                raise KeyboardInterrupt("nothing was written") from None
+        if not write_numbers(args.json, done.as_json()):
+            print("\n".join(done.lines()))
     return 1 if args.strict and done.verdict == "doubtful" else 0
 
 
@@ -110,15 +109,14 @@ def _refuse_others(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
 
 
 def _list_formats() -> int:
-    from rich.markup import escape
     from rich.table import Table
 
     from neeco.ingest.readers import recording_formats
 
-    table = Table("format", "read of it", "needs")
+    table = Table("format", "read of it", "extra")
     for known in recording_formats():
-        table.add_row(known.format, known.holds, escape(f"neeco[{known.extra}]") if known.extra else "")
-    Console().print(table)
+        table.add_row(known.format, known.holds, known.extra or "")
+    whole_lines().print(table)
     return 0
 
 
@@ -140,21 +138,3 @@ def recordings_of(args: Ingest) -> list[Recording]:
         sync=args.sync, frames=args.frames, fps=args.fps, shaft_diameter=args.shaft_diameter,
     )  # fmt: skip
     return [recording]
-
-
-@contextmanager
-def _progress_bars() -> Iterator[Callable[[str, int, int], None]]:
-    """Yield a function that shows the progress of one stage after another, on a terminal."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        tasks: dict[str, TaskID] = {}
-
-        def report(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                for task in tasks.values():
-                    bar.update(task, total=1, completed=1)
-                tasks[what] = bar.add_task(what, total=total or None)
-            bar.update(tasks[what], completed=done, total=total or None)
-
-        yield report

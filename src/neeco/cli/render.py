@@ -20,7 +20,7 @@ class Arguments:
     output: Path
     """Folder to write to; pictures go into OUTPUT/SPLIT or OUTPUT/states."""
     capture: Path | None = None
-    """Capture whose frames are rendered; the run's own when not given."""
+    """Capture whose frames are rendered. Default: the run's own."""
     split: str = "test"
     """Which frames."""
     states: Path | None = None

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from rich.table import Column, Table
+
+from neeco.cli._output import JsonTarget, ready_for_json, whole_lines, write_numbers
 
 COLUMNS = (
     ("IoU", "iou"),
@@ -28,24 +29,21 @@ class Arguments:
     truth: Annotated[Path, tyro.conf.Positional]
     """A capture (its truth/masks or reference_masks), or a folder of masks. Files are matched by name."""
     splits: tuple[str, ...] | None = None
-    """Splits of the capture; default: those of which PREDICTED has an image."""
+    """Splits of the capture. Default: those of which PREDICTED has an image."""
     classes: tuple[str, ...] = ()
-    """What PREDICTED's ids mean, such as shaft=10 wrist=20; default: 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right."""
+    """What PREDICTED's ids mean, such as shaft=10 wrist=20. Default: 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right."""
     truth_classes: tuple[str, ...] = ()
-    """The same for TRUTH."""
+    """What TRUTH's ids mean. Default: as above."""
     components: bool = False
     """Boxes about each connected group of pixels, not one per part."""
-    json: Path | None = None
-    """Also write the numbers to this file."""
+    json: JsonTarget = None
 
 
 def run(arguments: Arguments) -> int:
     """Score, print a table."""
-    from neeco.cli._output import ready_for_json
     from neeco.cli._progress import counting
     from neeco.evaluation.mask_folders import parse_classes
     from neeco.evaluation.mask_scores import score_masks
-    from neeco.files import write_json
 
     with ready_for_json(arguments.json), counting("score masks") as advance:
         scores = score_masks(
@@ -57,9 +55,9 @@ def run(arguments: Arguments) -> int:
             components=arguments.components,
             progress=advance,
         )
-        if arguments.json is not None:
-            write_json(arguments.json, scores)
-    console = Console()
+        if write_numbers(arguments.json, scores):
+            return 0
+    console = whole_lines()
     console.print(_table(scores))
     for line in _lines(scores):
         console.print(line, markup=False, highlight=False)

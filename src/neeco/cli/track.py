@@ -26,9 +26,9 @@ class Arguments:
     start: Literal["first", "none"] = "none"
     """first: the footage states the first frame's states roughly. none: nothing is known."""
     tissue: Literal["run", "footage"] | None = None
-    """run: the footage shows the run's tissue, its cameras in the run's world (default for a capture). footage: any
-    tissue, cameras in any world; it is learned from the footage first, and OUTPUT/run becomes a run of the instruments
-    over it (default for a video)."""
+    """run: the footage shows the run's tissue, its cameras in the run's world. footage: any tissue, cameras in any
+    world; it is learned from the footage first, and OUTPUT/run becomes a run of the instruments over it. Default: run
+    for a capture, footage for a video."""
     min_trust: float = 0.5
     """Frames trusted less are left out of the capture: 0 to 1."""
     resume: bool = False

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -20,29 +22,29 @@ class Arguments:
     output: Path
     """Run folder to write."""
     method: str | None = None
-    """kinematic (the default), neeco (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's
-    training adjustment."""
+    """kinematic, nps (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's training
+    adjustment. Default: kinematic."""
     iterations: int | None = None
-    """Frames rendered and learned from; by default 6,000, of fewer than 60 training frames fewer (kinematic)."""
+    """Frames rendered and learned from. Default: 6,000, with fewer than 60 training frames less (kinematic)."""
     batch_size: int | None = None
-    """Frames between two optimisation steps, whose mean loss is minimised; by default 1. More are for a GPU."""
+    """Frames between two optimisation steps, whose mean loss is minimised; more than 1 are for a GPU. Default: 1."""
     minutes: float | None = None
-    """Stop in time with a finished run."""
+    """Stop in time with a finished run. Default: no limit."""
     device: Device = "auto"
     seed: int | None = None
-    """The same seed gives the same scene on the same machine (without --minutes); by default 0."""
+    """The same seed gives the same scene on the same machine (without --minutes). Default: 0."""
     resume: bool = False
     """Continue an interrupted run in --output, under the settings it was started with; others are refused."""
     transforms: str | None = None
-    """Which transforms file of the capture to read; by default transforms.json."""
+    """Which transforms file of the capture to read. Default: transforms.json."""
     scale: float | None = None
-    """Share of the recorded images' size to learn at: less for a quick run or little memory; by default 1."""
+    """Share of the recorded images' size to learn at: less for a quick run or little memory. Default: 1."""
     joints: tuple[str, ...] | None = None
-    """Joints that move parts; by default those that the pose does not already explain."""
+    """Joints that move parts. Default: those that the pose does not already explain."""
     max_tissue_gaussians: int | None = None
-    """Most Gaussians of the tissue."""
+    """Most Gaussians of the tissue. Default: 20,000 for images of 320x256, more for larger ones."""
     max_instrument_gaussians: int | None = None
-    """Most Gaussians of each instrument."""
+    """Most Gaussians of each instrument. Default: 4,000 for images of 320x256, more for larger ones."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Any other field of the training config, as NAME=VALUE (e.g. schedule.opacity_reset=inverse); repeatable."""
 
@@ -75,15 +77,20 @@ def run(args: Arguments) -> int:
     return 0
 
 
-def explain() -> str:
-    """Return the paragraphs that `--help` adds: each method's own settings."""
-    from neeco.scene.method_registry import methods
-    from neeco.settings import described
+def explain(words: Sequence[str]) -> None:
+    """Print the settings of the method that `words` name, a table behind `--help`."""
+    from neeco.cli._help import print_settings
+    from neeco.scene.method_registry import DEFAULT, method_class, methods
 
-    paragraphs = ["Settings of each method, as --set deformation.NAME=VALUE:"]
-    for name, method in methods().items():
-        fields = [f"{field}: {kind} = {default}" for field, kind, default in described(method.Settings)]
-        if fields:
-            words = " ".join((method.Settings.__doc__ or "").split())
-            paragraphs.append(f"{name}: {', '.join(fields)}. {words}")
-    return "\n\n".join(paragraphs)
+    named = [word.removeprefix("--method=") for before, word in pairwise(["", *words]) if _names_method(before, word)]
+    method = method_class((named or [DEFAULT])[-1].partition("+")[0])
+    others = ", ".join(name for name in methods() if name != method.method)
+    print_settings(
+        f"settings of method {method.method}: --set deformation.NAME=VALUE",
+        method.Settings,
+        f"of other methods: neeco train --method NAME --help ({others})",
+    )
+
+
+def _names_method(before: str, word: str) -> bool:
+    return before == "--method" or word.startswith("--method=")

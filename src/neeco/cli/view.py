@@ -39,7 +39,7 @@ class Arguments:
     sh: int = 3
     """Degree of the spherical harmonics that an exported file keeps, 0 to 3; lower is smaller."""
     tissue: str | None = None
-    """Which tissue to show of a run that has several; the first when not given."""
+    """Which tissue to show of a run that has several. Default: the first."""
     device: Device = "auto"
 
 

@@ -35,10 +35,15 @@ FULL_SCALE = 0.25  # mean absolute difference shown in the brightest colour; fix
 _COLORS = np.array(
     [[0, 0, 4], [60, 15, 110], [150, 38, 103], [221, 81, 58], [251, 165, 10], [252, 255, 200]], np.float64
 )
+# of part ids 1, 2, ..., on every page and picture (Okabe and Ito, "Color universal design", 2008: colour-blind readers
+# can distinguish them; the last is grey); `native/web/viewer.cpp` and `viewer/page/panel.js` have the same
 PART_COLORS = np.array(
-    [[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [213, 94, 0], [240, 228, 66]],
+    [
+        *([0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167]),
+        *([86, 180, 233], [213, 94, 0], [240, 228, 66], [180, 180, 180]),
+    ],
     np.float64,
-)  # Okabe and Ito: colour-blind readers can distinguish them
+)
 LEGEND_HEIGHT, LEGEND_FONT = 14, 10  # px
 
 

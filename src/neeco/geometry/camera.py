@@ -23,9 +23,24 @@ class Camera:
 
     It is a pinhole unless it has OpenCV's distortion or an endoscope's round border, black outside. With `learned_fx`
     an image of another size than the learned one shows the same picture, larger or smaller (`draw_through` in
-    neeco.raster.resampling; `Scene.draw` sets it). The pose may be an array or nested lists, which become float32
-    (`as_pose`). Raises NeecoError for a pose that is not rigid, a size that is not whole and positive, and other
-    numbers that are not finite.
+    neeco.raster.resampling; `Scene.draw` sets it).
+
+    Args:
+        world_from_camera: rigid pose [4, 4] in mm; an array or nested lists become float32
+        fx: focal length in px
+        fy: focal length in px
+        cx: principal point in px from the image's left edge
+        cy: principal point in px from the image's upper edge
+        width: of the image in px
+        height: of the image in px
+        near: mm; Gaussians whose mean is nearer render nothing
+        distortion: OpenCV's k1, k2, p1, p2[, k3, ...]
+        border: centre x, centre y and radius in px of what the lens shows; None: everything
+        learned_fx: focal length in px of the images that Gaussians were learned from; None: of images like this one
+        world_from_lamps: rigid pose [4, 4] in mm of the camera next to the lamps, where it is another one
+
+    Raises NeecoError for a pose that is not rigid, a size that is not whole and positive, and other numbers that are
+    not finite.
 
         neeco.Camera(np.eye(4), fx=290, fy=290, cx=160, cy=128, width=320, height=256)
     """
@@ -37,7 +52,7 @@ class Camera:
     cy: float  # px from its upper edge
     width: int  # px
     height: int
-    near: float = 0.01  # mm; Gaussians whose mean is nearer draw nothing
+    near: float = 0.01  # mm; Gaussians whose mean is nearer render nothing
     distortion: tuple[float, ...] = ()  # k1, k2, p1, p2[, k3, ...]
     border: tuple[float, float, float] | None = None  # px: centre x, y and radius of what the lens shows
     learned_fx: float | None = None  # px, of the images that Gaussians were learned from; None: of ones like this

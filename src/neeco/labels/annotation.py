@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
 
 import cv2
@@ -17,7 +18,7 @@ from torch import Tensor
 from neeco.capture.model import State
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_local
-from neeco.labels.drawing import LayeredDrawing, draw_layers, surface_depth, to_numpy
+from neeco.labels.drawing import LayeredDrawing, draw_layers, keypoint_arrays, shows_any, surface_depth, to_numpy
 from neeco.labels.labellers import CompositedLabels, instruments_of
 from neeco.scene.gaussian_scene import require_gaussians
 
@@ -54,14 +55,29 @@ class Keypoint(NamedTuple):
 
 @dataclass(frozen=True)
 class InstrumentLabel:
-    """The labels of one instrument in one image."""
+    """The labels of one instrument in one image. Contours are found when they are asked for: a network needs none."""
 
     name: str
-    shape: Shape | None  # None: no pixel of it is visible
+    image: np.ndarray  # uint8 [H, W]: part ids
+    ids: Mapping[str, int]  # of the instrument's parts
     visibility: float  # visible pixels / pixels if nothing else were there
-    parts: dict[str, Shape]  # visible parts
     keypoints: dict[str, Keypoint]
     camera_from_instrument: list[list[float]]  # 4x4 rigid, mm, OpenCV camera axes
+
+    @cached_property
+    def mask(self) -> np.ndarray:
+        """[H, W] bool: its visible pixels."""
+        return shows_any(self.image, tuple(self.ids.values()))
+
+    @cached_property
+    def shape(self) -> Shape | None:
+        """Its visible pixels in numbers; None: there are none."""
+        return shape_of(self.mask)
+
+    @cached_property
+    def parts(self) -> dict[str, Shape]:
+        """Its visible parts."""
+        return {part: shape for part, index in self.ids.items() if (shape := shape_of(self.image == index))}
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for files."""
@@ -79,8 +95,7 @@ class InstrumentLabel:
 def annotate(
     scene: GaussianScene, drawing: LayeredDrawing, names: tuple[tuple[str, str], ...]
 ) -> list[InstrumentLabel]:
-    """Return the labels of every instrument of a drawing; names: (instrument, part) of its part ids."""
-    keypoints = scene.keypoints(drawing.state)
+    """Return the labels of every instrument of a rendering; names: (instrument, part) of its part ids."""
     drawn_at = scene.registered(drawing.state)  # the pose that agrees with the pixels
     parts = drawing.parts.numpy()
     camera_from_world = np.linalg.inv(to_numpy(drawing.camera.world_from_camera))
@@ -88,16 +103,16 @@ def annotate(
     for instrument in instruments_of(names):
         if instrument not in drawing.state.instruments:
             continue
-        masks = {part: parts == k + 1 for k, (owner, part) in enumerate(names) if owner == instrument}
-        whole = np.any(list(masks.values()), axis=0)
+        ids = {part: k for k, (owner, part) in enumerate(names, 1) if owner == instrument}
+        visible = shows_any(parts, tuple(ids.values()))
         pose = camera_from_world @ to_numpy(drawn_at.instruments[instrument].pose)
         labels.append(
             InstrumentLabel(
                 name=instrument,
-                shape=shape_of(whole),
-                visibility=visibility(whole, drawing.layers[instrument].mask),
-                parts={part: shape for part, mask in masks.items() if (shape := shape_of(mask))},
-                keypoints=project_keypoints(keypoints.get(instrument, {}), drawing, instrument),
+                image=parts,
+                ids=ids,
+                visibility=visibility(visible, drawing.layers[instrument].mask),
+                keypoints=project_keypoints(drawing, instrument),
                 camera_from_instrument=_rounded(pose, 6),
             )
         )
@@ -127,7 +142,7 @@ def place_in_image(point: np.ndarray, camera: Camera) -> tuple[float, float, flo
     return (float(x), float(y), float(local[2])) if inside else None
 
 
-def project_keypoints(points: dict[str, Tensor], drawing: LayeredDrawing, instrument: str) -> dict[str, Keypoint]:
+def project_keypoints(drawing: LayeredDrawing, instrument: str) -> dict[str, Keypoint]:
     """Return an instrument's keypoints (world mm) in the image, and whether anything hides them.
 
     Keypoints of an instrument that has no pixel even alone are OUTSIDE.
@@ -136,8 +151,8 @@ def project_keypoints(points: dict[str, Tensor], drawing: LayeredDrawing, instru
     others = [drawing.tissue_depth] + [layer.depth for name, layer in drawing.layers.items() if name != instrument]
     absent = not drawing.layers[instrument].mask.any()
     projected = {}
-    for name, point in points.items():
-        place = place_in_image(to_numpy(point), camera)
+    for name, point in drawing.keypoints.get(instrument, {}).items():
+        place = place_in_image(point, camera)
         projected[name] = Keypoint(0.0, 0.0, OUTSIDE)
         if not absent and place is not None:
             x, y, z = place
@@ -160,9 +175,14 @@ def keypoint_names(scene: GaussianScene) -> tuple[str, ...]:
 @torch.no_grad()
 def working_ends(scene: GaussianScene, state: State) -> dict[str, list[np.ndarray]]:
     """Return pivots and tips [3] mm of every instrument for which the scene has any."""
+    return working_ends_of(keypoint_arrays(scene, state))
+
+
+def working_ends_of(keypoints: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, list[np.ndarray]]:
+    """Return the pivots and tips [3] mm among keypoints, of every instrument that has any."""
     ends = {
-        instrument: [to_numpy(point) for name, point in points.items() if name not in SHAFT_ENDS]
-        for instrument, points in scene.keypoints(state).items()
+        instrument: [point for name, point in points.items() if name not in SHAFT_ENDS]
+        for instrument, points in keypoints.items()
     }
     return {instrument: points for instrument, points in ends.items() if points}
 
@@ -313,7 +333,7 @@ class LabelledImage(RGBDImage):
         """Make one from pixels and the `labels` of a data set's record (`InstrumentLabel.to_json`)."""
         visible = [label for label in labels if label["area"] > 0]
         ids = {name: [k + 1 for k, (owner, _) in enumerate(part_names) if owner == name] for name, _ in part_names}
-        masks = [torch.isin(parts, torch.tensor(ids[label["name"]], dtype=parts.dtype)) for label in visible]
+        masks = [torch.from_numpy(shows_any(parts.numpy(), ids[label["name"]])) for label in visible]
         boxes = [(x, y, x + width, y + height) for x, y, width, height in (label["box"] for label in visible)]
         keypoints = [[label["keypoints"].get(name, (0, 0, 0)) for name in keypoint_names] for label in visible]
         count = len(visible)
@@ -339,13 +359,22 @@ class LabelledImage(RGBDImage):
         part_names: tuple[tuple[str, str], ...],
         keypoint_names: tuple[str, ...],
     ) -> LabelledImage:
-        """Make one from a drawing and the `labels` that `annotate` finds in it."""
+        """Make one from a rendering and the `labels` that `annotate` finds in it."""
         return cls.of(
             image=drawing.image,
             depth=torch.from_numpy(drawing.depth),
             parts=drawing.parts,
             ignore=drawing.ignored,
-            labels=[label.to_json() for label in labels],
+            labels=[
+                {
+                    "name": label.name,
+                    "area": int(label.mask.sum()),
+                    "box": bounding_box(label.mask),
+                    "keypoints": label.keypoints,
+                    "camera_from_instrument": label.camera_from_instrument,
+                }
+                for label in labels
+            ],
             part_names=part_names,
             keypoint_names=keypoint_names,
         )
@@ -391,7 +420,7 @@ def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bo
         rendering = scene.render(state, scene.recorded.as_learned(camera))
         depth = torch.from_numpy(surface_depth(rendering)).float()
         return RGBDImage(rendering.color.clamp(0, 1).cpu(), depth)
-    known = require_gaussians(scene, "draw labels")
+    known = require_gaussians(scene, "render labels")
     labeller = CompositedLabels(known)
     drawing = draw_layers(known, labeller, state, camera, MIN_COMPONENT)
     found = annotate(known, drawing, labeller.names)

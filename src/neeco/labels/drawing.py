@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from neeco.capture.model import State
@@ -62,6 +61,7 @@ class LayeredDrawing(Drawing):
     tissue_image: Tensor | None  # [H, W, 3] in [0, 1] of the tissue alone, where it was asked for
     layers: dict[str, InstrumentLayer]  # by instrument
     unobserved: Tensor  # [H, W] in [0, 1]: share of a pixel that no training frame observed from a similar direction
+    keypoints: dict[str, dict[str, np.ndarray]]  # by instrument and name, [3] mm, world
 
     @property
     def ignored(self) -> Tensor:
@@ -117,6 +117,7 @@ def draw_layers(
         tissue_image=tissue.color.clamp(0, 1).cpu() if tissue_image else None,
         layers=layers,
         unobserved=rendering.channels[..., -1].cpu(),
+        keypoints=keypoint_arrays(scene, state),
     )
 
 
@@ -142,6 +143,14 @@ def extended_silhouettes(
 def surface_depth(rendering: Rendering) -> np.ndarray:
     """Return the expected depth [H, W] mm where the rendering is opaque, 0 elsewhere."""
     return to_numpy(rendering.depth * (rendering.alpha > SURFACE_ALPHA))
+
+
+def keypoint_arrays(scene: GaussianScene, state: State) -> dict[str, dict[str, np.ndarray]]:
+    """Return the keypoints [3] mm, world frame, by instrument and name."""
+    return {
+        instrument: {name: to_numpy(point) for name, point in points.items()}
+        for instrument, points in scene.keypoints(state).items()
+    }
 
 
 def to_numpy(tensor: Tensor) -> np.ndarray:
@@ -172,11 +181,12 @@ def uncertain_edge(share: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 def without_small_components(mask: np.ndarray, share: float) -> np.ndarray:
     """Return the mask without the (edge-connected) components smaller than `share` of its largest."""
-    components, count = ndimage.label(mask)
-    if count < 2:
+    count, components, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    if count < 3:  # the background is the first
         return mask
-    areas = np.bincount(components.ravel())[1:]
-    keep = np.concatenate([[False], areas >= share * areas.max()])
+    areas = statistics[:, cv2.CC_STAT_AREA]
+    keep = areas >= share * areas[1:].max()
+    keep[0] = False
     return keep[components]
 
 
@@ -186,7 +196,7 @@ def without_part_islands(parts: np.ndarray, ids: Sequence[int], share: float) ->
     An island is an edge-connected component of a part smaller than `share` of the instrument's pixels that is not the
     part's largest. It takes the part that most pixels touching it have; one that touches no other part stays.
     """
-    smallest = share * np.isin(parts, ids).sum()
+    smallest = share * shows_any(parts, ids).sum()
     cleaned = parts.copy()
     for part in ids:
         mask = (parts == part).astype(np.uint8)
@@ -200,7 +210,7 @@ def without_part_islands(parts: np.ndarray, ids: Sequence[int], share: float) ->
             around = slice(max(0, y - 1), y + height + 1), slice(max(0, x - 1), x + width + 1)
             island = components[around] == k
             nearby = cleaned[around][cv2.dilate(island.astype(np.uint8), NEIGHBOURS).astype(bool) & ~island]
-            nearby = nearby[np.isin(nearby, ids)]
+            nearby = nearby[shows_any(nearby, ids)]
             if len(nearby):
                 cleaned[around][island] = np.bincount(nearby).argmax()
     return cleaned
@@ -221,15 +231,25 @@ def without_components(share: np.ndarray, remaining: np.ndarray, dropped: np.nda
 def _drop_small_components(
     parts: Tensor, share: Tensor, names: tuple[tuple[str, str], ...], min_component: float
 ) -> tuple[Tensor, Tensor]:
-    cleaned = torch.zeros_like(parts)
+    found, cleaned = parts.numpy(), np.zeros_like(parts.numpy())
     for instrument in instruments_of(names):
         ids = [k + 1 for k, (owner, _) in enumerate(names) if owner == instrument]
-        keep = torch.from_numpy(without_small_components(np.isin(parts.numpy(), ids), min_component))
-        cleaned[keep] = parts[keep]
-        cleaned.numpy()[:] = without_part_islands(cleaned.numpy(), ids, min_component)
-    remaining = (cleaned > 0).numpy()
-    dropped = (parts > 0).numpy() & ~remaining
-    return cleaned, torch.from_numpy(without_components(share.numpy(), remaining, dropped))
+        mask = shows_any(found, ids)
+        x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+        box = slice(y, y + height), slice(x, x + width)
+        own = np.where(without_small_components(mask[box], min_component), found[box], 0)
+        own = without_part_islands(own, ids, min_component)
+        np.copyto(cleaned[box], own, where=own > 0)
+    remaining = cleaned > 0
+    dropped = (found > 0) & ~remaining
+    return torch.from_numpy(cleaned), torch.from_numpy(without_components(share.numpy(), remaining, dropped))
+
+
+def shows_any(parts: np.ndarray, ids: Sequence[int]) -> np.ndarray:
+    """Return bool [H, W]: the pixels of a part image (uint8 [H, W]) that have one of these ids."""
+    chosen = np.zeros(256, dtype=bool)
+    chosen[list(ids)] = True
+    return chosen[parts]
 
 
 def _distance_to(pixels: np.ndarray) -> np.ndarray:

@@ -42,20 +42,18 @@ MARGIN = 1.2  # the cube's side, in those of the points' longest
 
 @dataclass(frozen=True, kw_only=True)
 class HexPlaneSettings:
-    """`channels` per plane and resolution; `resolution` of space, doubled `levels` - 1 times; `time_resolution`;
-    `width` of the network; `warm_up`: share of the training over which all of it is off; `rate_scale` multiplies the
-    learning rates; `space_smoothness`, `time_smoothness`, `time_l1`: weights of the regularisation."""
+    """Settings of the method."""
 
-    channels: int = 16
-    resolution: int = 64
-    levels: int = 2
-    time_resolution: int = 25
-    width: int = 64
-    warm_up: float = 3 / 17
-    rate_scale: float = 5.0
-    space_smoothness: float = 1e-4
-    time_smoothness: float = 1e-2
-    time_l1: float = 1e-4
+    channels: int = 16  # of a plane, per resolution
+    resolution: int = 64  # of space, the lowest
+    levels: int = 2  # resolutions of space, each twice the one before
+    time_resolution: int = 25  # of time
+    width: int = 64  # of the network
+    warm_up: float = 3 / 17  # share of the training over which all of it is off
+    rate_scale: float = 5.0  # times the learning rates
+    space_smoothness: float = 1e-4  # weight in the loss
+    time_smoothness: float = 1e-2  # weight in the loss
+    time_l1: float = 1e-4  # weight in the loss
 
     def __post_init__(self) -> None:
         for name, least in (("resolution", 3), ("time_resolution", 3), ("levels", 1)):

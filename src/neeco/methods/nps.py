@@ -1,4 +1,4 @@
-"""The paper's network (NeeCo, "neural pose-state" field F), method `neeco`.
+"""The paper's network (NeeCo, "neural pose-state" field F), method `nps`.
 
 G' = C + F(gamma(mu), gamma(p)): an MLP of depth 12 and width 256 maps each canonical mean and the instrument state to
 changes of mean, rotation and scale. Where the paper is silent: an input skip at the middle layer, a zero-initialised
@@ -39,41 +39,37 @@ INITIAL_LOGIT = 6.0  # its magnitude at the start: 0.2 % of a motion affects Gau
 
 @dataclass(frozen=True, kw_only=True)
 class NPSSettings:
-    """depth, width, L_mean, L_state as published; `identity` keeps the raw inputs in addition to their encodings.
+    """Settings of the method."""
 
-    `preset`: what the fields below were set to before each was set for itself; "practical" departs from the paper.
-    `state`: "full" (position, quaternion, joints), "rotation_jaw" (the 2024 drafts: quaternion and joints) or, with
-    `membership`, which carries what poses move, "joints".
-    `half`: hidden layers multiply in bfloat16 on a CPU that has it; None: decided when training starts,
-    by whether this processor is fast at it.
-    `chunk`: Gaussians per evaluation without gradients. `warm_up`: share of the training over which the network is off;
-    without it the first steps, whose gradients all ask to fill a half-empty image, may move the Gaussians out of sight
-    for good. `rate`: learning rate at the start.
-    `gate_mm` (None: off, as published): Gaussians farther than this from all that the instruments were recorded to
-    sweep stay canonical without being evaluated.
-    Not in the paper: `anneal`: share of the training over which the octaves open, coarse to fine; `carried_places`: the
-    network is also given how far each Gaussian would be carried with each instrument; `seeds`: Gaussians begin on the
-    carved instruments, too; `membership`: each Gaussian learns its share of each instrument's recorded motion, by which
-    what the network deformed is carried, and which is its label. `carving`: of the search for instruments, for
-    `gate_mm` and `seeds`.
-    """
-
+    # what the fields below were set to before each was set for itself; "practical" departs from the paper
     preset: Literal["published", "practical"] = "published"
-    depth: int = 12
-    width: int = 256
-    L_mean: int = 10
-    L_state: int = 10
-    identity: bool = False
+    depth: int = 12  # layers of the network, as published
+    width: int = 256  # of the network, as published
+    L_mean: int = 10  # octaves of the place's encoding, as published
+    L_state: int = 10  # octaves of the state's encoding, as published
+    identity: bool = False  # keep the raw inputs in addition to their encodings
+    # "full": position, quaternion, joints; "rotation_jaw": quaternion and joints (the 2024 drafts); "joints": with
+    # `membership`, which carries what poses move
     state: Literal["full", "rotation_jaw", "joints"] = "full"
+    # hidden layers multiply in bfloat16 on a CPU that has it; None: decided when training starts, by whether it is fast
+    # at it
     half: bool | None = False
-    chunk: int = 65536
+    chunk: int = 65536  # Gaussians per evaluation without gradients
+    # share of the training over which the network is off; without it the first steps, whose gradients all ask to fill a
+    # half-empty image, may move the Gaussians out of sight for good
     warm_up: float = 0.075
+    # Gaussians farther than this from all that the instruments were recorded to sweep stay canonical without being
+    # evaluated; None: off, as published
     gate_mm: float | None = None
-    rate: float = 8e-4
-    anneal: float = 0.0
+    rate: float = 8e-4  # learning rate at the start
+    anneal: float = 0.0  # not in the paper: share of the training over which the octaves open, coarse to fine
+    # not in the paper: the network is also given how far each Gaussian would be carried with each instrument
     carried_places: bool = False
-    seeds: bool = False
+    seeds: bool = False  # not in the paper: Gaussians begin on the carved instruments, too
+    # not in the paper: each Gaussian learns its share of each instrument's recorded motion, by which what the network
+    # deformed is carried, and which is its label
     membership: bool = False
+    # of the search for instruments, for `gate_mm` and `seeds`
     carving: CarvingSettings = field(default_factory=CarvingSettings)
 
     def __post_init__(self) -> None:
@@ -93,7 +89,8 @@ class NPSSettings:
 class NPS(LabelledByMotion):
     """The network F; `gate`, where there is one, is the volume within which it is evaluated."""
 
-    method = "neeco"
+    method = "nps"
+    former_names = ("neeco",)
     Settings = NPSSettings
     training_defaults: ClassVar[Mapping[str, Any]] = HALF_BY_DEFAULT  # the rest is the paper's
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {

@@ -37,24 +37,19 @@ MIN_LEVEL = 0.6  # mean evidence of a point that may be inside, or on a moving j
 
 @dataclass(frozen=True, kw_only=True)
 class CarvingSettings:
-    """`tissue_steps`: of the tissue-only fit whose residual is the evidence; `long_tissue_steps`: of the one with
-    density control, where the first leaves more than `max_evidence` on average; `evidence_frames`: the most training
-    frames used; `evidence_floor`, `evidence_range`: residual at which evidence begins and, above that, saturates
-    (images in [0, 1]); `grid`, `fine_grid`: voxels per side, the second where the first finds too few of a thin
-    instrument; `pose_shifts`: exchanges of poses among frames that evidence is compared with; `motion_ratio`: evidence
-    under an instrument's own poses to that under exchanged ones, at least; `seeds`: points per instrument."""
+    """Settings of the search for instruments."""
 
-    tissue_steps: int = 500
-    long_tissue_steps: int = 1500
-    max_evidence: float = 0.25
-    evidence_frames: int = 120
-    evidence_floor: float = 0.04
-    evidence_range: float = 0.06
-    grid: int = 48
-    fine_grid: int = 72
-    pose_shifts: int = 4
-    motion_ratio: float = 1.5
-    seeds: int = 3000
+    tissue_steps: int = 500  # of the tissue-only fit whose residual is the evidence
+    long_tissue_steps: int = 1500  # of the one with density control, where the first leaves more than `max_evidence`
+    max_evidence: float = 0.25  # on average
+    evidence_frames: int = 120  # the most training frames used
+    evidence_floor: float = 0.04  # residual at which evidence begins (images in [0, 1])
+    evidence_range: float = 0.06  # residual above that at which it saturates
+    grid: int = 48  # voxels per side
+    fine_grid: int = 72  # voxels per side where `grid` finds too few of a thin instrument
+    pose_shifts: int = 4  # exchanges of poses among frames that evidence is compared with
+    motion_ratio: float = 1.5  # evidence under an instrument's own poses to that under exchanged ones, at least
+    seeds: int = 3000  # points per instrument
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -42,21 +42,18 @@ def octaves(values: Tensor, count: int) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class TimeMLPSettings:
-    """`width` of the network and the octaves `L_mean`, `L_time` as published (None: 10, or 6 where synthetic);
-    `synthetic`: the variant for D-NeRF's data; `warm_up`: share of the training over which the network is off;
-    `time_noise` at the start, in frame intervals, falling to none at the share `time_noise_stop` of the training;
-    `rate` and `final_rate`: learning rates at its ends; `half`: layers multiply in bfloat16 on a CPU that has it;
-    None: decided when training starts, by whether this processor is fast at it."""
+    """Settings of the method, as published."""
 
-    width: int = 256
-    L_mean: int = 10
-    L_time: int | None = None
-    synthetic: bool = False
-    warm_up: float = 0.075
-    time_noise: float = 0.1
-    time_noise_stop: float = 0.5
-    rate: float = 8e-4
-    final_rate: float = 1.6e-6
+    width: int = 256  # of the network
+    L_mean: int = 10  # octaves of the place's encoding
+    L_time: int | None = None  # octaves of the time's encoding; None: 10, or 6 where synthetic
+    synthetic: bool = False  # the variant for D-NeRF's data
+    warm_up: float = 0.075  # share of the training over which the network is off
+    time_noise: float = 0.1  # at the start, in frame intervals
+    time_noise_stop: float = 0.5  # share of the training at which that noise has fallen to none
+    rate: float = 8e-4  # learning rate at the start
+    final_rate: float = 1.6e-6  # learning rate at the end
+    # layers multiply in bfloat16 on a CPU that has it; None: decided when training starts, by whether it is fast at it
     half: bool | None = False
 
     def __post_init__(self) -> None:

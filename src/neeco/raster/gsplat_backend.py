@@ -1,4 +1,4 @@
-"""The cuda backend: gsplat (an extra, `pip install neeco[cuda]`) renders, plain torch evaluates the colours."""
+"""The cuda backend: gsplat (the extra `cuda`) renders, plain torch evaluates the colours."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
 from neeco.geometry.camera import Camera
 from neeco.raster.devices import cuda_backend
 from neeco.raster.native import runs_native
@@ -76,7 +76,9 @@ def rasterize(
         return rasterize_cpu(gaussians, camera, channels, background)
     if backend == "cuda":
         if not torch.cuda.is_available() or importlib.util.find_spec("gsplat") is None:
-            raise NeecoError("backend: cuda: needs a CUDA device and gsplat; install neeco[cuda] or use backend='cpu'")
+            raise NeecoError(
+                f"backend: cuda: needs a CUDA device and gsplat; {install_hint('cuda')}, or use backend='cpu'"
+            )
         from neeco.raster.gsplat_backend import rasterize_cuda
 
         return rasterize_cuda(gaussians, camera, channels, background)

@@ -10,12 +10,12 @@ import numpy as np
 from PIL import Image
 
 from neeco.capture.model import Capture, Frame
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
 from neeco.files import write_atomically
 from neeco.ingest.result import IngestResult
 from neeco.report.ingest_figures import AXIS_COLORS, axis_length
 
-MISSING = "--rrd: needs the package rerun-sdk; install neeco[rerun]"
+MISSING = f"--rrd: needs the package rerun-sdk; {install_hint('rerun')}"
 VIDEO_CLOCK = "video"  # the timeline of the video's seconds; others are the logs' clocks
 WORLD, CAMERA, RIGHT_CAMERA = "world", "world/camera", "world/right_camera"
 

@@ -25,7 +25,7 @@ from neeco.scene.deformation import Deformation
 from neeco.scene.drawable import DrawableScene, Recorded
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.method import Stored
-from neeco.scene.method_registry import method_class, method_settings
+from neeco.scene.method_registry import current_name, method_class, method_settings
 from neeco.settings import plain
 
 SCHEMA = "neeco-scene/2"
@@ -150,7 +150,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Drawable
     if HALVES.search(json.dumps(header, ensure_ascii=False)):
         raise ValueError("its header holds an unpaired surrogate character")
     instruments, recorded = _recording(tensors, header)
-    method = header["method"]
+    method = header["method"] = current_name(header["method"])
     settings = method_settings(method, header["deformation"])
     kind = method_class(method)
     stored = Stored(settings, instruments, recorded, tensors, header)

@@ -53,6 +53,7 @@ class Method:
     """
 
     method: ClassVar[str]
+    former_names: ClassVar[tuple[str, ...]] = ()  # of the method in older versions, which are still accepted
     Settings: ClassVar[type[Any]] = NoSettings
     training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}

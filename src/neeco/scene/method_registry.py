@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -37,8 +38,19 @@ def add_method(kind: type[Method]) -> type[Method]:
     return kind
 
 
+def current_name(method: str) -> str:
+    """Return today's name of a method; of a former one, with a warning. An unknown name is returned as it is."""
+    if method not in methods():
+        for name, kind in methods().items():
+            if method in kind.former_names:
+                warnings.warn(f"method {method} is now called {name}", FutureWarning, stacklevel=1)  # once: one place
+                return name
+    return method
+
+
 def method_class(method: str) -> type[Method]:
-    """Return the class of the method. Raises NeecoError for an unknown name."""
+    """Return the class of the method, by today's name or a former one. Raises NeecoError for an unknown name."""
+    method = current_name(method)
     if method not in methods():
         raise NeecoError(
             f"method: {method!r} is unknown; choose one of {', '.join(methods())}, or install the package that has it"

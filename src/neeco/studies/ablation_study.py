@@ -100,7 +100,7 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | Non
     finished = {job.name: result for job, result in zip(jobs, results, strict=True) if "error" not in result}
     failures = [{"run": result["name"], "error": result["error"]} for result in results if "error" in result]
     folders = {job.name: job.folder for job in jobs if job.name in finished}
-    methods = [method for method in ("neeco", "kinematic") if any(v.method == method for v in variants)]
+    methods = [method for method in ("nps", "kinematic") if any(v.method == method for v in variants)]
     log_intervals = {job.config.method: job.config.log_interval for job in jobs}
     labels, unscored = _label_scores(chosen, folders, capture, splits, device)
     result = AblationResult(
@@ -157,7 +157,7 @@ def _open_capture(plan: AblationPlan, variants: Sequence[Variant]) -> Capture:
 
 def _steps(plan: AblationPlan, method: str) -> int:
     """Iterations of a run of `method`."""
-    if method == "neeco":
+    if method == "nps":
         return plan.iterations
     return plan.kinematic_iterations or max(MIN_KINEMATIC_STEPS, plan.iterations)
 
@@ -167,9 +167,9 @@ def _job(plan: AblationPlan, variant: Variant) -> TrainingJob:
     steps, capture = _steps(plan, variant.method), plan.capture
     values = {"iterations": steps, "seed": plan.seed, "transforms": plan.transforms}
     given = settings_for(variant.method, plan.settings)
-    common = _paper_settings(steps) if variant.method == "neeco" else ()
+    common = _paper_settings(steps) if variant.method == "nps" else ()
     config = training_config(variant.method, values, [*common, *given, *variant.settings])
-    if variant.method == "neeco":
+    if variant.method == "nps":
         config = _with_room_to_grow(config)
     if variant.derived is not None:
         capture = plan.output / "captures" / variant.derived.name
@@ -189,7 +189,7 @@ def _job(plan: AblationPlan, variant: Variant) -> TrainingJob:
 def _paper_settings(iterations: int) -> tuple[str, ...]:
     """The paper's schedule is stated for its own 20,000 steps and scaled to the run. The network is off for its
     usual share of the run or MIN_WARM_UP_STEPS, whichever is longer."""
-    warm_up = max(method_settings("neeco", {}).warm_up, min(MAX_WARM_UP, MIN_WARM_UP_STEPS / iterations))
+    warm_up = max(method_settings("nps", {}).warm_up, min(MAX_WARM_UP, MIN_WARM_UP_STEPS / iterations))
     return (
         f"schedule.published_steps={PUBLISHED_STEPS}",
         f"schedule.earliest={PHASE_1_STEPS}",
@@ -209,12 +209,12 @@ def _with_room_to_grow(config: TrainConfig) -> TrainConfig:
 def _shortcomings(method: str, steps: int, log_interval: int) -> list[str]:
     """Return notes on what runs of so many steps are too short to show."""
     notes = []
-    if method == "neeco" and PHASE_1_SHARE * steps < log_interval:
+    if method == "nps" and PHASE_1_SHARE * steps < log_interval:
         notes.append(
             f"phase-1 PSNR: not known, phase 1 of {steps} steps ends before the first row of metrics.jsonl "
             f"({log_interval} steps); give --iterations {math.ceil(log_interval / PHASE_1_SHARE)} or more"
         )
-    if method == "neeco" and TrainConfig().growth_stop * steps <= MIN_RESET_INTERVAL:
+    if method == "nps" and TrainConfig().growth_stop * steps <= MIN_RESET_INTERVAL:
         notes.append(
             f"opacity reset: none comes in {steps} steps (intervals do not scale below {MIN_RESET_INTERVAL}, and "
             "density control ends half-way), so P_oi changes nothing here"
@@ -349,7 +349,7 @@ def _values(
         return {}
     folder, result = folders[name], results[name]
     values: Values = {}
-    if entry.variant.method == "neeco":  # trained in phases: how good it was in the first and on the way
+    if entry.variant.method == "nps":  # trained in phases: how good it was in the first and on the way
         values["phase_1_psnr"] = phase_1_psnr(folder, int(result["iterations"]))
         curve, split = read_rows(folder / CURVE_FILE), primary_split(splits)
         for percent in CHECKPOINTS:

@@ -36,9 +36,9 @@ class AblationPlan:
     shadow, extrapolation, labels, frames, tracker-noise), or tables by name. By name only: kinematics, of captures that
     state the links of an instrument; network, what the published network lacks, over many frames."""
     iterations: int = 1_000
-    """Steps of every neeco run; the paper's schedule, stated for 20,000, is scaled to them."""
+    """Steps of every run of nps; the paper's schedule, stated for 20,000, is scaled to them."""
     kinematic_iterations: int | None = None
-    """Steps of every kinematic run, which cost less; by default as many, but at least 1,000."""
+    """Steps of every kinematic run, which cost less. Default: as many, but at least 1,000."""
     seed: int = 0
     """Of every run, and of the noise put on tracker poses."""
     workers: int = 1
@@ -77,7 +77,7 @@ class Variant:
 
     @property
     def method(self) -> str:
-        """neeco or kinematic."""
+        """nps or kinematic."""
         return self.name.partition("-")[0]
 
 

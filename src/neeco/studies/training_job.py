@@ -25,7 +25,7 @@ from neeco.evaluation.image_metrics import find_lpips, psnr
 from neeco.files import finite, read_json, read_json_lines, require_like, require_same, write_json, write_text
 from neeco.labels.drawing import draw
 from neeco.raster.devices import device_of
-from neeco.scene.method_registry import method_class
+from neeco.scene.method_registry import current_name, method_class
 from neeco.studies.machine import peak_memory_mb, reset_peak_memory
 from neeco.studies.study import REMEDY, JobProgress, Result
 from neeco.training.config import TrainConfig
@@ -64,7 +64,7 @@ class Budget:
     """The training budget of every job: minutes on `clock`, or iterations; the other is None.
 
     "wall" is the time that passes; "processor" is CPU time of all threads of the process, which others' work on the
-    same machine does not change. Drawing the curve is counted by neither.
+    same machine does not change. Rendering the curve is counted by neither.
     """
 
     minutes: float | None
@@ -140,6 +140,7 @@ class TrainingJob:
         identity = self.identity()
         for file in (folder / name for name in (JOB_FILE, BEGUN_FILE) if (folder / name).exists()):
             values = require_like(read_json(file), IDENTITY, str(file), ANEW)
+            values = values | {"method": current_name(values["method"])}
             if values["budget"] != identity["budget"]:
                 before = Budget(*(values["budget"][key] for key in BUDGET))
                 try:

@@ -1,7 +1,7 @@
-"""Appearances of another operation: instruments over images of its tissue, in other light, in its frames' colours.
+"""Appearances of another operation: instruments over images of its tissue, in its light, in its frames' colours.
 
-Half of the images of a data set keep the scene's tissue, half its colours, and some its instruments' light: what is
-rendered is learned as well as what replaces it.
+Half of the images of a data set keep the scene's tissue, and half its colours: what is rendered is learned as well as
+what replaces it.
 """
 
 from __future__ import annotations
@@ -34,10 +34,6 @@ SHADOW_BLUR_PX = 1.5  # standard deviation, of the shadow that is found at the i
 CLEAR_TISSUE = 0.5  # share of tissue in a pixel from which the shadow on it is measured
 REPLACED = 0.5  # share of the images that show a background, and of those with the colours of other frames
 BORDER = 12 / 255  # brightest channel of an endoscope's black border
-MAX_STOPS = 1.0  # of the instruments' exposure, either way
-MAX_TINT = 0.2  # natural logarithm of a colour gain, either way
-MAX_SATURATION = 0.3  # change of the saturation, either way
-MAX_CONTRAST = 0.3  # natural logarithm of the exponent on the stored image, either way
 DARK = 1e-3  # of white: no mean light is taken to be less
 ADAPTATION_RANGE = (0.25, 4.0)  # of gains that follow from other images
 SHADOW_RANGE = (0.2, 1.1)  # of the light that a shadow leaves; above 1: errors of the renderings
@@ -120,28 +116,6 @@ def _colors_of_file(file: Path) -> Colors:
 
 
 @dataclass(frozen=True)
-class Tone:
-    """Other light and camera: gains [3] of linear light, saturation, and exponent on the stored image."""
-
-    gains: np.ndarray
-    saturation: float
-    exponent: float
-
-    @classmethod
-    def draw(cls, rng: Generator) -> Tone:
-        """Sample one."""
-        gains = 2 ** rng.uniform(-MAX_STOPS, MAX_STOPS) * np.exp(rng.uniform(-MAX_TINT, MAX_TINT, 3))
-        saturation = 1 + rng.uniform(-MAX_SATURATION, MAX_SATURATION)
-        return cls(gains, saturation, float(np.exp(rng.uniform(-MAX_CONTRAST, MAX_CONTRAST))))
-
-    def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Stored image [H, W, 3] as this camera stores it."""
-        stored = linear_to_srgb(srgb_to_linear(image) * self.gains)
-        grey = stored.mean(2, keepdims=True)
-        return np.clip(grey + self.saturation * (stored - grey), 0, 1) ** np.float32(self.exponent)
-
-
-@dataclass(frozen=True)
 class Appearance:
     """A background, the name of its file, the light on the instruments over it, and colours; None: as recorded.
 
@@ -152,28 +126,20 @@ class Appearance:
     source: str | None = None
     background: Tensor | None = None  # [H, W, 3] in [0, 1]
     adaptation: float = 0.0  # in [0, 1]
-    tone: Tone | None = None
     colors: Colors | None = None
-
-    @property
-    def of_layers(self) -> bool:
-        """Whether tissue or instruments change apart from each other."""
-        return self.background is not None or self.tone is not None
 
     def matched(self, image: Tensor) -> Tensor:
         """The image [H, W, 3] in the colours."""
         return image if self.colors is None else torch.from_numpy(self.colors.given_to(image.numpy()))
 
-    def of(self, layers: Layers) -> Tensor:
-        """The image [H, W, 3] of these layers in this appearance."""
+    def over_background(self, layers: Layers) -> Tensor:
+        """The image [H, W, 3] of these layers over the background."""
+        assert self.background is not None
         share = layers.share.clamp(min=MIN_SHARE)[..., None].numpy()
         alone = np.clip(layers.instruments.numpy() / share, 0, 1)
-        if self.tone is not None:
-            alone = self.tone(alone)
-        if self.background is not None:
-            here, own = (srgb_to_linear(x.numpy()).mean((0, 1)) + DARK for x in (self.background, layers.tissue))
-            gains = np.clip((here / own) ** self.adaptation, *ADAPTATION_RANGE)
-            alone = linear_to_srgb(srgb_to_linear(alone) * gains)
+        here, own = (srgb_to_linear(x.numpy()).mean((0, 1)) + DARK for x in (self.background, layers.tissue))
+        gains = np.clip((here / own) ** self.adaptation, *ADAPTATION_RANGE)
+        alone = linear_to_srgb(srgb_to_linear(alone) * gains)
         return replace(layers, instruments=torch.from_numpy((alone * share).astype(np.float32))).over(self.background)
 
 
@@ -182,10 +148,9 @@ AS_RECORDED = Appearance()
 
 @dataclass(frozen=True)
 class Appearances:
-    """The appearances of a data set. relit: share of its images whose instruments have another tone."""
+    """The appearances of a data set."""
 
     backgrounds: ImageFolder | None = None
-    relit: float = 0.0
     frames: ImageFolder | None = None  # whose colours half of the images take on
 
     @classmethod
@@ -195,12 +160,12 @@ class Appearances:
             name: None if folder is None else ImageFolder.of(folder, name)
             for name, folder in settings.image_folders().items()
         }
-        return cls(folders["backgrounds"], settings.relight_share, folders["match_colors"])
+        return cls(folders["backgrounds"], folders["match_colors"])
 
     def draw(self, rng: Generator, width: int, height: int) -> Appearance:
         """Sample the appearance of an image. Raises NeecoError where a background cannot be read."""
-        replaced, lit, adaptation, place, matched, frame = rng.random(6)
-        found = Appearance(tone=Tone.draw(rng) if lit < self.relit else None)
+        replaced, adaptation, place, matched, frame = rng.random(5)
+        found = Appearance()
         if self.frames is not None and matched < REPLACED:
             found = replace(found, colors=self.frames.colors(int(frame * len(self.frames.files))))
         if self.backgrounds is None or replaced >= REPLACED:
@@ -216,18 +181,15 @@ ALL_AS_RECORDED = Appearances()
 
 @dataclass(frozen=True)
 class Layers:
-    """A rendering taken apart: image = instruments + behind; behind is about (1 - share) * shadow * tissue."""
+    """A rendering taken apart: image is about instruments + (1 - share) * shadow * tissue."""
 
     instruments: Tensor  # [H, W, 3] in [0, 1], times their share of the pixel
     share: Tensor  # [H, W] in [0, 1], of instruments in a pixel
     shadow: Tensor  # [H, W] share of the light that the instruments' shadow leaves on the tissue
-    behind: Tensor  # [H, W, 3] in [0, 1], what the pixels show beside instruments
     tissue: Tensor  # [H, W, 3] in [0, 1], without instruments and shadow
 
-    def over(self, background: Tensor | None) -> Tensor:
-        """The image [H, W, 3] over a `background` [H, W, 3]; None: over the tissue, as rendered."""
-        if background is None:
-            return (self.instruments + self.behind).clamp(0, 1)
+    def over(self, background: Tensor) -> Tensor:
+        """The image [H, W, 3] over a `background` [H, W, 3]."""
         return (self.instruments + ((1 - self.share) * self.shadow)[..., None] * background).clamp(0, 1)
 
 
@@ -250,7 +212,7 @@ def split(gaussians: Gaussians, owners: Tensor, camera: Camera, image: Tensor, s
     lit = tissue.mean(2).numpy() * clear
     ratio = (_smoothed(behind.mean(2).numpy() * (clear > 0)) + DARK) / (_smoothed(lit) + DARK)
     shadow = torch.from_numpy(np.clip(ratio, *SHADOW_RANGE).astype(np.float32))
-    return Layers(instruments, share, shadow, behind, tissue)
+    return Layers(instruments, share, shadow, tissue)
 
 
 def _smoothed(plane: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from torch import Tensor
 from neeco.capture.model import State, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
-from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends
+from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends_of
 from neeco.labels.drawing import MAX_UNOBSERVED, LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.raster.native import keep_freed_memory, set_threads
@@ -41,7 +41,7 @@ from neeco.synthesis.cameras import RECORDED_CAMERAS, DrawnCameras
 from neeco.synthesis.mixing import MixedSampler, Mixture
 from neeco.synthesis.samplers import Sampler, TissueSampler, make_sampler
 from neeco.synthesis.settings import Settings
-from neeco.synthesis.writers.folder import Record, write_sample, write_skipped
+from neeco.synthesis.writers.folder import Encoded, Record, encoded_sample, skipped_sample
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
@@ -97,11 +97,11 @@ class Acceptance:
     max_unobserved: float = 1.0
     recorded_together: tuple[frozenset[str], ...] = ()
 
-    def refusal(self, scene: GaussianScene, drawing: LayeredDrawing) -> str | None:
+    def refusal(self, drawing: LayeredDrawing) -> str | None:
         """The reason to refuse the drawing, or None."""
-        keypoints = working_ends(scene, drawing.state)
+        keypoints = working_ends_of(drawing.keypoints)
         # first: an instrument wholly behind the tissue shows no pixels either
-        if self.tolerance_mm is not None and buried_depth(scene, drawing) > self.tolerance_mm:
+        if self.tolerance_mm is not None and buried_depth(drawing) > self.tolerance_mm:
             return ENTERS_TISSUE
         if int(drawing.parts.count_nonzero()) < self.min_share * drawing.parts.numel():
             return LEAVES_IMAGE
@@ -203,7 +203,7 @@ class SampleGenerator:
             drawing = draw_layers(self.scene, self.labeller, state, camera, settings.min_component)
             if "field_of_view" in effects:
                 drawing = _within_circle(drawing, effects["field_of_view"])
-            reason = self.acceptance.refusal(self.scene, drawing)
+            reason = self.acceptance.refusal(drawing)
             if reason is None:
                 return drawing, refused
             refused[reason] += 1
@@ -221,7 +221,7 @@ class SampleGenerator:
         return self.appearances.draw(rng, width, height)
 
     def _with(self, drawing: LayeredDrawing, appearance: Appearance) -> LayeredDrawing:
-        """Return the drawing in another appearance; the depth of a background is unknown."""
+        """Return the rendering in another appearance; the depth of a background is unknown."""
         image = self._image(drawing.state, drawing.camera, drawing.image, drawing.share, appearance)
         if appearance.background is None:
             return replace(drawing, image=image)
@@ -231,10 +231,10 @@ class SampleGenerator:
     @torch.no_grad()
     def _image(self, state: State, camera: Camera, image: Tensor, share: Tensor, appearance: Appearance) -> Tensor:
         """The rendered `image` of a state, with its share of instruments, in an appearance."""
-        if appearance.of_layers:
+        if appearance.background is not None:
             gaussians = self.scene.at(state)
             owners = self.labeller.owners(state, gaussians)
-            image = appearance.of(split(gaussians, owners, camera, image, share))
+            image = appearance.over_background(split(gaussians, owners, camera, image, share))
         return appearance.matched(image)
 
     def _through_camera(
@@ -297,19 +297,29 @@ def limit_threads(threads: int) -> None:
     keep_freed_memory()
 
 
-def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:
-    """Render sample `index` and write it to `output`; returns its record, which for a prescribed state that was refused
-    says so. Raises NeecoError where no random state was acceptable, or the files cannot be written."""
+def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
+    """Render sample `index` as it is written, or, for a prescribed state that was refused, that it was. Raises
+    StatesRefused where no random state was acceptable."""
     try:
         sample = generator.draw(index)
     except StatesRefused as error:
         if generator.sampler.prescribed:
-            return write_skipped(output, index, error.refused)
-        raise NeecoError(f"{output}: {error}") from None
+            return skipped_sample(index, error.refused)
+        raise
     quality = generator.settings.jpeg_quality
-    return write_sample(
-        output, index, sample.drawing, sample.labels, refused=sample.refused, facts=sample.facts, quality=quality
+    return encoded_sample(
+        index, sample.drawing, sample.labels, refused=sample.refused, facts=sample.facts, quality=quality
     )
+
+
+def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:
+    """Render sample `index` and write it to `output`; returns its record. Raises NeecoError where no random state was
+    acceptable, or the files cannot be written."""
+    try:
+        encoded = draw_encoded(generator, index)
+    except StatesRefused as error:
+        raise NeecoError(f"{output}: {error}") from None
+    return encoded.write(output)
 
 
 def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
@@ -320,23 +330,25 @@ def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
     """
     recorded = scene.recorded
     depths = [
-        buried_depth(scene, draw_layers(scene, labeller, recorded.states[k], recorded.cameras[k], min_component=0.0))
+        buried_depth(draw_layers(scene, labeller, recorded.states[k], recorded.cameras[k], min_component=0.0))
         for k in evenly_spaced(len(recorded.states), N_TOLERANCE_STATES, floor=True)
     ]
     return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *TOLERANCE_RANGE_MM)) / 100)
 
 
-def buried_depth(scene: GaussianScene, drawing: LayeredDrawing) -> float:
+def buried_depth(drawing: LayeredDrawing) -> float:
     """Return the depth, in mm, of the deepest instrument behind the tissue surface in this camera; 0 for none.
 
     All but the deepest BURIED_SHARE of an instrument's pixels are above this depth, and all keypoints of its working
     end.
     """
     deepest = 0.0
-    keypoints = working_ends(scene, drawing.state)
+    keypoints = working_ends_of(drawing.keypoints)
     surface = drawing.tissue_depth
     for name, layer in drawing.layers.items():
-        below = np.where(surface > 0, layer.depth - surface, 0.0)[layer.mask & (layer.depth > 0)]
+        shown = layer.mask & (layer.depth > 0)
+        behind = surface[shown]
+        below = np.where(behind > 0, layer.depth[shown] - behind, 0.0)
         if len(below):
             deepest = max(deepest, float(np.quantile(below, 1 - BURIED_SHARE)))
         for point in keypoints.get(name, []):

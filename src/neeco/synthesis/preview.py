@@ -7,19 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageColor, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont
 
 from neeco.capture.model import evenly_spaced
-from neeco.evaluation.image_metrics import outline
+from neeco.evaluation.image_metrics import PART_COLORS, outline, part_color
 from neeco.files import write_atomically
 from neeco.labels.annotation import OCCLUDED
 from neeco.synthesis.writers.folder import Record, stem
 
 TILES, COLUMNS, TILE_WIDTH, GAP, CAPTION_LINE = 12, 4, 360, 14, 17
-PART_COLORS = ("#4287f5", "#1cc8a0", "#ff7a45", "#d650c8", "#a0c83c", "#fac83c", "#786ef0", "#eb5569")
 PAPER, INK, FAINT = (250, 250, 248), (30, 32, 36), (120, 124, 130)
 BOX, RECTANGLE, BONE, HIDDEN = (255, 255, 255), (255, 209, 70), (20, 22, 26), (150, 150, 150)
-PALETTE = np.array([ImageColor.getrgb(color) for color in PART_COLORS])
+Color = str | tuple[int, int, int]
 TINT = 0.42  # opacity of a part's colour over the image
 CAPTION_FONTS = 13, 12  # px
 LABEL_COLUMN = 210
@@ -81,7 +80,7 @@ def wrap(items: Sequence[str], width: float, font: int) -> list[str]:
 
 
 def _tinted(image: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    colors = np.concatenate([np.zeros((1, 3)), PALETTE[np.arange(max(int(ids.max()), 1)) % len(PALETTE)]])[ids]
+    colors = np.concatenate([np.zeros((1, 3)), PART_COLORS[np.arange(max(int(ids.max()), 1)) % len(PART_COLORS)]])[ids]
     inside = ids > 0
     tinted = np.where(inside[..., None], (1 - TINT) * image + TINT * colors, image)
     edge = outline(inside)
@@ -126,7 +125,9 @@ def _caption(record: Record) -> tuple[list[str], list[str]]:
 
 
 def _legend(canvas: ImageDraw.ImageDraw, names: Sequence[tuple[str, str]], width: int) -> None:
-    entries = [(f"{name} {part}", tuple(PALETTE[k % len(PALETTE)].tolist())) for k, (name, part) in enumerate(names)]
+    entries: list[tuple[str, Color]] = [
+        (f"{name} {part}", part_color(part_id)) for part_id, (name, part) in enumerate(names, 1)
+    ]
     entries += [("minimum-area box", RECTANGLE), ("keypoint seen", BOX), ("keypoint occluded", HIDDEN)]
     columns = max((width - GAP) // LABEL_COLUMN, 1)
     for k, (text, color) in enumerate(entries):

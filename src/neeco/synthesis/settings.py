@@ -24,7 +24,6 @@ SAMPLERS = ("interpolate", "extrapolate", "grid")  # values of `states` other th
 MAX_PIXELS = 2**26  # of an image
 JPEG_QUALITY = 95  # of 100, by default
 
-RELIGHT_SHARE = 0.5  # of the images over backgrounds, by default
 MIN_TRUST = 0.8  # of a recorded frame's label, below which `annotate` does not write it
 
 
@@ -36,9 +35,9 @@ class SizeSettings:
     """Size of the images."""
 
     size: str | None = None
-    """WIDTHxHEIGHT of the images, px, in the shape of the recorded ones; theirs when not given."""
+    """WIDTHxHEIGHT of the images, px, in the shape of the recorded ones. Default: theirs."""
     scale: float | None = None
-    """Instead of --size: times the recorded width and height."""
+    """Instead of --size: times the recorded width and height. Default: 1."""
 
     def check(self) -> None:
         """Raises NeecoError naming the option that makes no sense."""
@@ -137,15 +136,15 @@ class Settings(ImageSettings):
     labels: LabelWay = "composited"
     """composited: from compositing, occlusion-correct. threshold: the paper's, from Gaussians that move."""
     label_threshold: float | None = None
-    """Share of a pixel that must be instrument (composited); the project's measured best when not given."""
+    """Share of a pixel that must be instrument (composited). Default: the project's measured best."""
     delta_thresholds: tuple[float, float, float] | None = None
-    """Position (mm), rotation and scale (mm) above which a Gaussian has moved (threshold); found when not given."""
+    """Position (mm), rotation and scale (mm) above which a Gaussian has moved (threshold). Default: found."""
     min_component: float = 0.01
     """Drop components of an instrument's mask smaller than this share of its largest."""
     tissue_check: bool = True
     """States whose instrument enters the tissue, as far as the view shows it, are refused, unless --no-tissue-check."""
     tissue_tolerance_mm: float | None = None
-    """How far behind the tissue surface still counts as touching it; found from the recorded states when not given."""
+    """How far behind the tissue surface still counts as touching it. Default: found from the recorded states."""
     min_share: float = 0.005
     """Refuse images with less than this share of instrument pixels."""
     max_unobserved: float = 0.25
@@ -155,9 +154,6 @@ class Settings(ImageSettings):
     backgrounds: str | None = None
     """Folder of images without an instrument (of the next operation, or others): half of the set shows them instead of
     the tissue (docs/synthesis.md)."""
-    relight: float | None = None
-    """Share of the images whose instruments have another exposure, colour, saturation and contrast; 0.5 with
-    --backgrounds, else 0, when not given."""
     match_colors: str | None = None
     """Folder of frames of the next operation, with instruments or without: half of the set takes on their colours."""
     max_attempts: int = 50
@@ -194,17 +190,10 @@ class Settings(ImageSettings):
             raise NeecoError(f"--label-threshold: {self.label_threshold} is not between 0 and 1")
         if self.tissue_tolerance_mm is not None and not self.tissue_tolerance_mm >= 0:
             raise NeecoError(f"--tissue-tolerance-mm: {self.tissue_tolerance_mm} is negative; give 0 or more")
-        if self.relight is not None and not 0 <= self.relight <= 1:
-            raise NeecoError(f"--relight: {self.relight} is not a share of the images; give 0 to 1")
         if not 0 <= self.max_unobserved <= 1:
             raise NeecoError(f"--max-unobserved: {self.max_unobserved} is not a share; give 0 to 1")
         if not 0 <= self.min_component < 1:
             raise NeecoError(f"--min-component: {self.min_component} is not a share; give 0 or more and less than 1")
-
-    @property
-    def relight_share(self) -> float:
-        """`relight`, or its default."""
-        return self.relight if self.relight is not None else RELIGHT_SHARE if self.backgrounds else 0.0
 
     def image_folders(self) -> dict[str, str | None]:
         """Return the folders of images of another operation, by setting."""

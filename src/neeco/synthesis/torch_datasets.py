@@ -39,6 +39,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import torch
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
+from torch.utils.data._utils.collate import default_collate_fn_map
 
 from neeco.capture.documents import Node, RaisingReport
 from neeco.capture.images import open_image, read_image, read_labels
@@ -97,6 +98,15 @@ INFO_LIKE = {
 }
 
 
+def _refuse_default_collate(_: Sequence[State], **__: Any) -> None:
+    raise NeecoError(
+        "DataLoader: numbers of instruments differ from image to image; give collate_fn=neeco.LabelledImages.collate"
+    )
+
+
+default_collate_fn_map[State] = _refuse_default_collate  # as PyTorch documents for types of one's own
+
+
 def collate(samples: Sequence[Sample]) -> dict[str, Any]:
     """A batch of B samples, for `DataLoader(collate_fn=...)`: image [B, 3, H, W], parts, depth and ignore [B, H, W] are
     stacked; everything else, which differs in size from image to image, is a list of B. Images must be of one size."""
@@ -116,11 +126,18 @@ def sample_states(
     views: Views = Settings.views,
     margin: float = Settings.margin,
 ) -> list[tuple[State, Camera]]:
-    """`count` instrument states, each with a camera to see it from, as `neeco synthesize` draws them at first.
+    """Instrument states, each with a camera to see it from, as `neeco synthesize` samples them at first.
 
-    scene: a run, its folder, a scene, or its file. states: interpolate, extrapolate, grid, path:FILE.jsonl or
-    FILE.jsonl; views: recorded, perturbed or orbit (see `Settings`). Nothing is rendered, so none is refused for what
-    the image shows. The same seed gives the same states. Raises NeecoError for settings or a scene that do not fit.
+    Args:
+        scene: a run, its folder, a scene, or its file
+        count: how many
+        seed: the same one gives the same states
+        states: interpolate, extrapolate, grid, path:FILE.jsonl or FILE.jsonl
+        views: recorded, perturbed or orbit
+        margin: how far extrapolate goes, as a share of the recorded range at either end
+
+    Nothing is rendered, so none is refused for what the image shows. Raises NeecoError for settings or a scene that do
+    not fit.
 
         for state, camera in neeco.sample_states("runs/sample", 3, states="extrapolate"):
             print(state.instruments["maryland"].joints, camera.width, camera.height)
@@ -168,23 +185,29 @@ class _Generated:
             sample = self._generator.draw(index)
             drawing = sample.drawing
             labelled = LabelledImage.from_drawing(drawing, sample.labels, self.part_names, self.keypoint_names)
-            found = labelled.targets() | {"state": drawing.state, "camera": drawing.camera, "index": index}
+            found = {"state": drawing.state, "camera": drawing.camera, "index": index} | labelled.targets()
         return found if self.transform is None else self.transform(found)
 
 
 class LabelledImages(_Generated, Dataset[Sample]):
     """A map-style data set of `count` labelled images, rendered on access: nothing is written.
 
-    scene: a run (`neeco.load`), its folder, a scene, or its file. instruments: runs or scenes whose instruments are
-    rendered over the scene's tissue, instead of its own. states: interpolate, extrapolate, grid, path:FILE.jsonl or
-    FILE.jsonl; views: recorded, perturbed or orbit; labels: composited or threshold; camera_effects: a YAML file;
-    `settings`: any other field of `neeco.synthesis.settings.Settings`, such as size="1280x1024", scale=2.0 or
-    lens=True. transform: sample -> sample, such as an augmentation. Samples are described in this module's docstring.
+    Args:
+        scene: a run (`neeco.load`), its folder, a scene, or its file
+        count: how many images
+        seed: the same one gives the same images
+        states: interpolate, extrapolate, grid, path:FILE.jsonl or FILE.jsonl
+        views: recorded, perturbed or orbit
+        labels: composited or threshold
+        camera_effects: YAML file of blur, noise, smoke and the like
+        instruments: runs or scenes whose instruments are rendered over the scene's tissue, instead of its own
+        transform: sample -> sample, such as an augmentation
+        settings: any other option of `neeco synthesize`, such as size="1280x1024", scale=2.0 or lens=True
 
-    Sample `index` is what `neeco synthesize` draws as image `index` for the same settings and seed, before its pixels
+    Sample `index` is what `neeco synthesize` renders as image `index` for the same settings and seed, before its pixels
     are rounded to 8 bits (depth: to 0.05 mm); it is the same in any worker of any DataLoader, forked or spawned. A
-    worker uses one thread; it opens the scene's file when it draws its first sample (a scene without a file is sent to
-    it). Drawing on a GPU needs spawned workers, or none.
+    worker uses one thread; it opens the scene's file when it renders its first sample (a scene without a file is sent
+    to it). Rendering on a GPU needs spawned workers, or none.
 
     Raises NeecoError for a scene or settings that do not fit, and, when a sample is rendered, StatesRefused (a
     NeecoError) where no state is acceptable.
@@ -227,12 +250,15 @@ class LabelledImages(_Generated, Dataset[Sample]):
 
 
 class LabelledStream(_Generated, IterableDataset[Sample]):
-    """An endless stream of the samples `start`, `start` + 1, ... of `LabelledImages`, which see for the arguments.
+    """An endless stream of the samples of `LabelledImages`, which see for the other arguments.
 
-    The workers of a DataLoader share the indices: of W workers the k-th draws start + k, start + k + W, ...; `shard` =
-    (rank, world size) shares them among processes in the same way first. So no sample is rendered twice, and each is
-    the same in any worker. Prescribed states that are refused are left out; path:FILE.jsonl, which has an end, is not
-    for a stream.
+    Args:
+        start: index of the first sample
+        shard: (rank, world size) of this process, where several share the samples
+
+    The workers of a DataLoader share the indices: of W workers the k-th renders start + k, start + k + W, ...;
+    processes share them in the same way first. So no sample is rendered twice, and each is the same in any worker.
+    Prescribed states that are refused are left out; path:FILE.jsonl, which has an end, is not for a stream.
 
         stream = neeco.LabelledStream("runs/sample", seed=1)
         for batch in torch.utils.data.DataLoader(stream, batch_size=2, num_workers=2, collate_fn=stream.collate):
@@ -289,8 +315,14 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
 class StoredImages(Dataset[Sample]):
     """A map-style data set of the images in a folder that `neeco synthesize` or `neeco annotate` wrote.
 
-    Samples have the same keys as those of `LabelledImages`, and the pixels and numbers of the files. split: train, val,
-    or None for both. Raises NeecoError for a folder that is no such data set, a split without images, and a damaged
+    Samples have the same keys as those of `LabelledImages`, and the pixels and numbers of the files.
+
+    Args:
+        folder: the data set's folder
+        split: train, val, or None for both
+        transform: sample -> sample, such as an augmentation
+
+    Raises NeecoError for a folder that is no such data set, a split without images, and a damaged
     file.
 
         images = neeco.StoredImages("dataset", split="train")
@@ -348,7 +380,7 @@ class StoredImages(Dataset[Sample]):
         lens = parse_lens(place)
         assert lens is not None
         camera = lens.distorted_camera(Camera(world_from_camera, *lens.intrinsics, *size))
-        found = labelled.targets() | {"state": state, "camera": camera, "index": record["index"]}
+        found = {"state": state, "camera": camera, "index": record["index"]} | labelled.targets()
         return found if self.transform is None else self.transform(found)
 
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import yaml
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, nearest
 from neeco.files import YamlLoader
 from neeco.fitting.refinement import RefineConfig
-from neeco.scene.method_registry import DEFAULT, method_class, method_settings
+from neeco.scene.method_registry import DEFAULT, current_name, method_class, method_settings
 from neeco.scene.training_session import RunLength
 from neeco.settings import name_and_value, plain, structure, with_fields
 from neeco.training.resolution import ResolutionConfig, size_factor
@@ -95,6 +95,7 @@ class TrainConfig:
     checkpoint_interval: int = 500  # iterations
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "method", current_name(self.method))
         if self.deformation is None:
             object.__setattr__(self, "deformation", method_class(self.method).Settings())
 
@@ -231,12 +232,17 @@ def require_begun_with(begun: TrainConfig, now: TrainConfig, output: Path) -> No
     names = [*FLAGS, *(name for name in after if name not in FLAGS and begun.method == now.method)]
     differing = []
     for name in (name for name in names if after[name] is not None and after[name] != before.get(name)):
-        flag = f"--{name.replace('_', '-')} {after[name]}" if name in FLAGS else f"--set {name}={after[name]}"
+        flag = f"{_option(name)}{' ' if name in FLAGS else '='}{after[name]}"
         old = "without" if before.get(name) is None else f"with {before[name]}"
         differing.append(f"{flag}: the run was begun {old}")
     if differing:
         them = "it" if len(differing) == 1 else "them"
         raise NeecoError(f"{'; '.join(differing)}; leave {them} out to continue {output}, or give another --output")
+
+
+def _option(name: str) -> str:
+    """Return how the command line sets the field `name`."""
+    return f"--{name.replace('_', '-')}" if name in FLAGS else f"--set {name}"
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -271,7 +277,7 @@ def check_ranges(config: TrainConfig) -> None:
         )
     if config.batch_size > 1 and not method_class(config.method).has_gaussians:
         raise NeecoError(
-            f"--batch-size: method {config.method} draws rays of all frames in every step; "
+            f"--batch-size: method {config.method} samples rays of all frames in every step; "
             "use --set deformation.rays=NUMBER"
         )
     options = {"seed": 0, "batch_size": 1, "max_tissue_gaussians": 1, "max_instrument_gaussians": 1}
@@ -309,7 +315,9 @@ def _assign(values: dict[str, Any], name: str, value: Any, *, parse: bool) -> No
         target = target.get(part) if isinstance(target, dict) else None
     open_ended = path == ["deformation"]
     if not isinstance(target, dict) or (last not in target and not open_ended):
-        raise NeecoError(f"--set {name}: unknown field; see config.yaml of any run for the names")
+        meant = nearest(name, _flat(values))
+        hint = "" if meant is None else f"; did you mean {_option(meant)}?"
+        raise NeecoError(f"--set {name}: unknown field; see config.yaml of any run for the names{hint}")
     if path == [] and last == "method":
         raise NeecoError("--set method: would keep the other method's settings; use --method")
     old = target.get(last)

@@ -34,6 +34,7 @@ from neeco.files import (
 from neeco.scene.drawable import DrawableScene
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import DAMAGED, load_scene, pack_scene, save_tensors, unpack_scene
+from neeco.scene.method_registry import current_name
 from neeco.scene.training_session import Session, StepResult, members
 from neeco.training.config import TrainConfig, check_ranges, config_from_dict, config_to_dict
 
@@ -94,7 +95,7 @@ def load_run(path: Path, device: torch.device | None = None) -> TrainedRun:
 
 @contextmanager
 def open_run(path: Path, device: torch.device | None = None) -> Iterator[TrainedRun]:
-    """`load_run` for a block that draws: until its end torch uses as many threads as pay for the run's method."""
+    """`load_run` for a block that renders: until its end torch uses as many threads as pay for the run's method."""
     run = load_run(path, device)
     with run.scene.torch_threads():
         yield run
@@ -125,7 +126,7 @@ def read_config(path: Path) -> dict[str, Any]:
         found = config.get("schema") if isinstance(config, dict) else None
         raise NeecoError(f"{file}: schema is {found!r}, this version reads {SCHEMA!r}; train again")
     require_like(config, {"capture": str, "transforms": str, "method": str, "seed": int}, str(file), "train again")
-    return config
+    return config | {"method": current_name(config["method"])}
 
 
 def write_config(path: Path, capture: Path, config: TrainConfig, fingerprint: str) -> None:

@@ -208,7 +208,8 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
             session.seconds, last = session.seconds + now - last, now
             if session.phase != phase:
                 phase = session.phase
-                log.note(f"phase {phase} begins" + (" (forced)" if session.forced else ""))
+                why = "enough of the run is over" if session.forced else "PSNR is high enough and the loss falls"
+                log.note(f"phase {phase} of the schedule begins at iteration {session.iteration}: {why}")
             session.between_steps(before)
             if due(config.log_interval, iteration, session.iteration):
                 log.row(session)

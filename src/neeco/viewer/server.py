@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
 from neeco.labels.drawing import to_numpy
 from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 from neeco.viewer.access import AccessControl, free_port, is_loopback, url_of
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 HOST, PORT = "127.0.0.1", 8080
 MAX_RUNS = 2
 TOKEN_BYTES = 24
-MISSING = "view: needs viser; install neeco[view]"
+MISSING = f"view: needs viser; {install_hint('view')}"
 MAX_BROWSERS = 32  # at once
 MAX_MESSAGE = 2**20  # bytes; a browser's messages have some hundred
 
@@ -113,7 +113,9 @@ def require_viser() -> None:
     except ImportError:
         raise NeecoError(MISSING) from None
     if tuple(int(part) for part in viser.__version__.split(".")[:2]) < (1, 1):
-        raise NeecoError(f"view: viser {viser.__version__} is too old; install neeco[view], or viser>=1.1,<2")
+        raise NeecoError(
+            f"view: viser {viser.__version__} is too old; {install_hint('view')}, or install viser>=1.1,<2"
+        )
 
 
 def _start_server(access: AccessControl, host: str, port: int) -> viser.ViserServer:

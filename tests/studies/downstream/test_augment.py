@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from neeco.studies.downstream.augmentation import augment, moved
 from neeco.studies.downstream.batches import collate, shrink
 from neeco.studies.downstream.samples import Example
+from neeco.synthesis.augmentation import augment, augment_batch, moved
 
 SIZE = (60, 80)
 COUNT = 24
@@ -95,3 +95,20 @@ def test_brightness_differs_between_images_of_a_batch() -> None:
     inside = [(image[:3].mean(0)[image[4] > 0.99]).mean().item() for image in images if (image[4] > 0.99).any()]
     assert max(inside) > 1.4 * min(inside)
     assert pytest.approx(np.mean(inside), rel=0.5) == 250 / 3 / 255
+
+
+def test_parts_of_a_batch_stay_under_what_they_label_and_what_is_lost_is_ignored() -> None:
+    example = coloured(half_valid=True)
+    image = torch.from_numpy(example.image).permute(2, 0, 1).float() / 255
+    batch = {"image": image, "parts": torch.from_numpy(example.classes), "ignore": ~torch.from_numpy(example.valid)}
+    batch = {key: torch.stack([value] * COUNT) for key, value in batch.items()} | {"boxes": []}
+    found, again = (augment_batch(batch, torch.Generator().manual_seed(0)) for _ in range(2))
+    assert set(found) == {"image", "parts", "ignore"}
+    assert all(torch.equal(value, again[key]) for key, value in found.items())
+    image, parts, kept = found["image"], found["parts"], ~found["ignore"]
+    bright = kept & (image.max(1).values > 0.25)
+    for part, colour in ((1, 0), (2, 1), (0, 2)):
+        there = bright & (parts == part)
+        assert there.sum() > 1000
+        assert (image.argmax(1)[there] == colour).float().mean() > 0.9  # edges are blurred
+    assert 0.3 < kept.float().mean() < 0.75  # three quarters of the image are right of column 20

@@ -41,6 +41,7 @@ SETTINGS = DownstreamSettings(capture=Path("capture"), output=Path("out"))
         ("other+strong", {"sets": ("other",), "strong": True}),
         ("kin+real+permuted", {"sets": ("kin",), "real": True, "permuted": True}),
         ("kin+real+pool", {"sets": ("kin",), "real": True, "schedule": "pool"}),
+        ("real+match+strong", {"real": True, "match": True, "strong": True}),
         ("real+paste+balanced", {"real": True, "paste": True, "schedule": "balanced"}),
     ],
 )
@@ -62,6 +63,7 @@ def test_a_condition_is_a_sum_of_words(name: str, expected: dict) -> None:
         ("strong", "nothing to learn from; add real or a set"),
         ("real+permuted", "permuted only together with a set"),
         ("kin+paste", "paste only together with real"),
+        ("kin+match", "match only together with real; synthesize the set with --match-colors"),
         ("kin+pool", "only together with real and a set or paste"),
         ("real+finetune", "only together with real and a set or paste"),
         ("kin+real+pool+balanced", "one of balanced, pool, finetune, blend at most"),
@@ -77,7 +79,7 @@ def test_usual_conditions_are_baselines_and_each_set_alone_beside_labelled_frame
     baselines = ["real", "real+strong", "real+paste"]
     assert default_conditions(()) == baselines
     assert default_conditions(SETS[:1]) == [
-        *baselines, "kin", "kin+real", "kin+real+strong", "kin+real+permuted"
+        *baselines, "kin", "kin+strong", "kin+real", "kin+real+permuted"
     ]  # fmt: skip
     assert [parse_condition(name, SETS).name for name in default_conditions(SETS)] == default_conditions(SETS)
 
@@ -140,6 +142,7 @@ def test_the_command_makes_the_same_study() -> None:
         labels=Path("/labels"),
         tests=(OtherCapture("far", Path("/captures/far")), OtherCapture("near", Path("/captures/near"))),
         backgrounds=Path("/plates"),
+        match_colors=Path("/frames"),
         pasted=10,
     )
     words = shlex.split(changed.command())[5:]
@@ -148,6 +151,8 @@ def test_the_command_makes_the_same_study() -> None:
     rest = [
         "--backgrounds",
         "/plates",
+        "--match-colors",
+        "/frames",
         "--labels",
         "/labels",
         "--frame-selection",

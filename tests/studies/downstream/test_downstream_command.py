@@ -61,8 +61,8 @@ def test_it_prints_tables_answers_and_where_all_of_it_lies(words, tmp_path: Path
         "real+strong",
         "real+paste",
         "kin",
+        "kin+strong",
         "kin+real",
-        "kin+real+strong",
         "kin+real+permuted",
     ]
     assert {"downstream.csv", "downstream.md", "downstream.tex", "data", "jobs"} <= {p.name for p in output.iterdir()}

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from downstream_world import Held, square, squares, task_of
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
 from neeco.studies.downstream.batches import BatchSampler
 from neeco.studies.downstream.models.yolo import NO_AUGMENTATION, Yolo
 from neeco.studies.downstream.scores import Detections
@@ -154,7 +154,7 @@ def test_with_the_program_what_scores_its_boxes_must_be_there(install, monkeypat
     install()
     assert Yolo.missing_requirement() is None
     monkeypatch.setattr(model.importlib.util, "find_spec", lambda name: None)
-    assert Yolo.missing_requirement() == "needs pycocotools; pip install 'neeco[downstream]'"
+    assert Yolo.missing_requirement() == f"needs pycocotools; {install_hint('downstream')}"
 
 
 def test_a_failing_program_is_told_in_one_line_with_its_last_words(install, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # Training frames -> label IoU on seen and on unseen states, of the capture that looks most like a real recording; the
-# commands are in docs/results.md, "Few frames".
+# commands are in notes/2026-11-26-results-quality.md, "Few frames".
 LABEL_IOU = {10: (0.91, 0.82), 15: (0.94, 0.88), 60: (0.97, 0.93)}
 
 

@@ -24,9 +24,12 @@ from neeco.files import require_utf8
 def read_capture(path: Path | str, transforms: str = "transforms.json", *, background: float = 1.0) -> Capture:
     """Read a capture: neeco-capture/1, nerfstudio, Blender / D-NeRF transforms, a COLMAP model or an EndoNeRF folder.
 
-    path: the capture's folder, or a transforms file in it. transforms: which file of the folder to read.
-    background: what shows through transparent pixels (0 black, 1 white). Image pixels are not read here.
-    Raises NeecoError with the first problem found; `check_capture` finds all of them.
+    Args:
+        path: the capture's folder, or a transforms file in it
+        transforms: which file of the folder to read
+        background: what shows through transparent pixels: 0 black, 1 white
+
+    Image pixels are not read here. Raises NeecoError with the first problem found; `check_capture` finds all of them.
 
         capture = neeco.read_capture("samples/liver-mini")
         frame = capture.split("test")[0]

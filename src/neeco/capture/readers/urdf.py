@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.kinematics import FIXED, PRISMATIC, REVOLUTE, KinematicTree, Link
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
 from neeco.files import read_text
 from neeco.geometry.rotations import rigid
 
@@ -82,7 +82,7 @@ def _parse(path: Path) -> Any:
         from urdf_parser_py import urdf
         from urdf_parser_py.xml_reflection import core
     except ImportError:
-        raise NeecoError(f"{path}: needs urdfdom-py to be read; pip install 'neeco[urdf]'") from None
+        raise NeecoError(f"{path}: needs urdfdom-py to be read; {install_hint('urdf')}") from None
     text = read_text(path, WHAT)
     _refuse_xacro(path, text)
     core.on_error = lambda message: None  # of tags that it does not know, which it would print

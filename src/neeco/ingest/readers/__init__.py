@@ -19,7 +19,7 @@ from typing import ClassVar
 import numpy as np
 
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
 from neeco.geometry.lens import Lens
 from neeco.ingest.readers.frame_names import NamedFrame
 from neeco.registry import plugins
@@ -159,7 +159,7 @@ class RecordingFormat(ABC):
     def require_package(self, path: Path) -> None:
         """Raise NeecoError stating what to install when the module it needs is absent; imports nothing."""
         if self.package is not None and importlib.util.find_spec(self.package) is None:
-            raise NeecoError(f"{path}: {self.format}: needs {self.package}; pip install 'neeco[{self.extra}]'")
+            raise NeecoError(f"{path}: {self.format}: needs {self.package}; {install_hint(self.extra or '')}")
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         """Return what the file holds; () where it is one table."""

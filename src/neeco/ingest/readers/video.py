@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from neeco.capture.images import open_image
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
 from neeco.files import require_content, visible_entries
 from neeco.ingest.readers import VideoSource, numbers, read_table
 from neeco.ingest.readers.columns import recognise_time, scale_of
@@ -33,7 +33,7 @@ MAX_KEPT_BYTES = (
 def require_installed(name: str) -> None:
     """Raise NeecoError saying what to install when `name` ("av", "pycolmap") is absent; imports nothing."""
     if importlib.util.find_spec(name) is None:
-        raise NeecoError("ingest: needs PyAV and pycolmap; pip install 'neeco[ingest]'")
+        raise NeecoError(f"ingest: needs PyAV and pycolmap; {install_hint('ingest')}")
 
 
 def open_video(path: Path, fps: float | None = None, part: tuple[float, float] | None = None) -> VideoSource:

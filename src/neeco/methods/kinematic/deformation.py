@@ -65,39 +65,33 @@ PRIOR_WEIGHT = 1e-5  # on what is learned of stated kinematics, in squared stand
 
 @dataclass(frozen=True, kw_only=True)
 class KinematicSettings:
-    """`shaft_roll`: probability of spinning the shaft (a surface of revolution) by a random angle, from iteration
-    `shaft_roll_start` on; `opacity_penalty`: on the instruments' mean opacity, a tenth of it from iteration
-    `opacity_penalty_stop` on; `label_sharpness`: weight of l (1 - l) on the rendered instrument label, after iteration
-    `label_sharpness_start`; `part_sharpness`: weight of how mixed Gaussians are of parts, after iteration
-    `hinge_start`, from which on hinges are learned, by rates that `rate_scale` multiplies; `refine_wrists`: whether
-    wrists are looked for again at 60 and 80 % of the run; `shadow`: whether the instruments' shadow on the tissue is
-    looked for and rendered (see `neeco.raster.shadow`), first at the iterations `shadow_at`; `extrapolate_tissue`:
-    whether tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`); `label_shares`:
-    whether Gaussians that model shadow or blur next to an instrument count less in its labels, by the images' colours;
-    `breathing`: whether a period is looked for with which the tissue moves, and its motion learned (see
-    `neeco.methods.breathing`); `kinematics`: whether joints move as the capture's kinematics state, where they do (else
-    as found from the images); `stated_axes`, `stated_readings`: whether the axes stated there, and offsets and gains of
-    the readings, are corrected; `carving`: of the search for instruments (see `CarvingSettings`)."""
+    """Settings of the method."""
 
-    shaft_roll: float = 0.5
-    shaft_roll_start: int = 600
-    opacity_penalty: float = 0.002
-    opacity_penalty_stop: int = 1500
-    label_sharpness: float = 0.02
-    label_sharpness_start: int = 1000
-    part_sharpness: float = 0.003
-    hinge_start: int = 600  # before, unformed Gaussians would drag the hinges off
-    rate_scale: float = 1.0
-    refine_wrists: bool = True
+    shaft_roll: float = 0.5  # probability of spinning the shaft (a surface of revolution) by a random angle
+    shaft_roll_start: int = 600  # iteration from which it is spun
+    opacity_penalty: float = 0.002  # weight of the instruments' mean opacity
+    opacity_penalty_stop: int = 1500  # iteration from which that weight is a tenth
+    label_sharpness: float = 0.02  # weight of l (1 - l) on the rendered instrument label
+    label_sharpness_start: int = 1000  # iteration from which it is weighed
+    part_sharpness: float = 0.003  # weight of how mixed Gaussians are of parts, while hinges are learned
+    hinge_start: int = 600  # iteration from which hinges are learned: before, unformed Gaussians would drag them off
+    rate_scale: float = 1.0  # times the learning rates of hinges
+    refine_wrists: bool = True  # whether wrists are looked for again at 60 and 80 % of the run
+    # whether the instruments' shadow on the tissue is looked for and rendered (see `neeco.raster.shadow`)
     shadow: bool = True
-    shadow_at: tuple[int, ...] = (1000, 1500)  # instruments have shape, and no shadow is learned yet as a part of them
+    # iterations at which it is looked for first: instruments have shape, and no shadow is learned yet as a part of them
+    shadow_at: tuple[int, ...] = (1000, 1500)
+    # whether tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`)
     extrapolate_tissue: bool = True
+    # whether Gaussians that model shadow or blur next to an instrument count less in its labels, by the images' colours
     label_shares: bool = True
+    # whether a period is looked for with which the tissue moves, and its motion learned (see `neeco.methods.breathing`)
     breathing: bool = True
+    # whether joints move as the capture's kinematics state, where they do; else as found from the images
     kinematics: bool = True
-    stated_axes: bool = True
-    stated_readings: bool = True
-    carving: CarvingSettings = field(default_factory=CarvingSettings)
+    stated_axes: bool = True  # whether the axes stated there are corrected
+    stated_readings: bool = True  # whether offsets and gains of the readings of joints stated there are corrected
+    carving: CarvingSettings = field(default_factory=CarvingSettings)  # of the search for instruments
 
 
 @dataclass(frozen=True)

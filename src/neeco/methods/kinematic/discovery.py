@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
@@ -40,7 +42,7 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
     evidence = tissue_evidence(scene, session.views, session.config, tissue)
     if register_states(session, articulated.articulations) is not None:
         evidence = corrected_evidence(session, evidence)
-    scene.canonical = _with_instruments(session, articulated, evidence, register=True)
+    scene.canonical = _with_instruments(session, articulated, evidence)
 
 
 def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
@@ -61,10 +63,11 @@ def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -
     evidence = corrected_evidence(session, evidence)
     with torch.no_grad():
         scene.canonical = tissue
+        learned = [articulation.axes(articulation.shaft()) for articulation in articulated.articulations]
         for articulation in articulated.articulations:
             articulation.shaft_tilt.zero_()
             articulation.shaft_shift.zero_()
-        scene.canonical = _with_instruments(session, articulated, evidence, register=False)
+        scene.canonical = _with_instruments(session, articulated, evidence, learned)
     rows = torch.arange(len(scene.canonical), device=scene.center.device)
     fresh = rows >= len(tissue)
     session.adam.select_rows(list(scene.canonical.tensors()), torch.where(fresh, 0, rows), fresh)
@@ -72,10 +75,14 @@ def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -
 
 
 def _with_instruments(
-    session: GaussianSession, articulated: ArticulatedInstruments, recorded: Evidence, *, register: bool
+    session: GaussianSession,
+    articulated: ArticulatedInstruments,
+    recorded: Evidence,
+    learned: Sequence[tuple[Tensor, Tensor]] | None = None,
 ) -> CanonicalGaussians:
     """Return the Gaussians of the session's tissue and of every instrument on its carved shape, and start the joints.
-    register: whether the poses of stated links are corrected first."""
+    learned: the axes of joints so far (see `Articulation.axes`); None: they are searched for, poses of stated links
+    corrected."""
     scene, evidence = session.scene, recorded
     generator = torch.Generator().manual_seed(session.config.seed)
     bodies = [scene.canonical]
@@ -86,7 +93,7 @@ def _with_instruments(
             shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
             articulation.radius.fill_(shape.radius)
             readings = readings_of(session, evidence, instrument.name)
-            if register and correct_poses(session, articulation, evidence, instrument, shape, readings):
+            if learned is None and correct_poses(session, articulation, evidence, instrument, shape, readings):
                 corrected = (replace(frame, state=scene.registered(frame.state)) for frame in recorded.frames)
                 evidence = replace(recorded, frames=tuple(corrected))
                 shape = carved_shape(session, evidence, instrument.name, generator)
@@ -101,8 +108,13 @@ def _with_instruments(
             )
         else:
             assert isinstance(articulation, Hinges)
+            axes = (
+                learned[index]
+                if learned is not None and session.iteration > scene.deformation.start_iteration
+                else None
+            )
             seeds, logits = start_hinges(
-                session, articulation, evidence, instrument.name, shape, columns=columns, generator=generator
+                session, articulation, evidence, instrument.name, shape, axes, columns=columns, generator=generator
             )
         bodies.append(seed_instrument(seeds, shape.radius).with_extras(**{LINK_LOGITS: logits}))
     return join_bodies(bodies)

@@ -53,29 +53,43 @@ def start_hinges(
     evidence: Evidence,
     name: str,
     shape: CarvedShape,
+    learned: tuple[Tensor, Tensor] | None = None,
     *,
     columns: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Set each joint to the best hypothesis of the search; return seeds [M, 3] mm and their link logits [M,
-    columns]."""
-    find_hinges(session, hinges, evidence, name, shape)
+    """Set each joint to the best hypothesis of the search, or to its axis as `learned` (see `Articulation.axes`).
+
+    Returns seeds [M, 3] mm and their link logits [M, columns]."""
+    find_hinges(session, hinges, evidence, name, shape, learned)
     seeds = shape.seeds.to(hinges.base.device)
     logits = seed_logits(hinges, seeds, columns, generator)
     return unbend_seeds(hinges, seeds, logits), logits
 
 
-def find_hinges(session: GaussianSession, hinges: Hinges, evidence: Evidence, name: str, shape: CarvedShape) -> None:
-    """Set each joint of `hinges`, whose shaft is in place, to the best hypothesis of the search."""
+def find_hinges(
+    session: GaussianSession,
+    hinges: Hinges,
+    evidence: Evidence,
+    name: str,
+    shape: CarvedShape,
+    learned: tuple[Tensor, Tensor] | None = None,
+) -> None:
+    """Set each joint of `hinges`, whose shaft is in place, to the best hypothesis of the search, or to its axis as
+    `learned`."""
     for index, joint in enumerate(hinges.reading_names):
-        found = search_hinge(evidence, name, joint, shape, session.config.deformation.carving)
-        if found is None:
-            session.report(f"{name}: joint {joint} hardly moves in the training frames; its hinge cannot be found")
-            continue
         with torch.no_grad():
-            hinges.hinge_angle[index] = found.angle
-            hinges.hinge_depth[index] = found.depth
-            hinges.share[index] = 1.0 if found.gains[1] == 0 else 0.5
+            if learned is not None:
+                across = learned[1][index] @ hinges.base[:3, :2]
+                hinges.hinge_angle[index] = torch.atan2(across[1], across[0])
+                hinges.hinge_depth[index] = hinges.along_shaft(learned[0])[index]
+            elif found := search_hinge(evidence, name, joint, shape, session.config.deformation.carving):
+                hinges.hinge_angle[index] = found.angle
+                hinges.hinge_depth[index] = found.depth
+                hinges.share[index] = 1.0 if found.gains[1] == 0 else 0.5
+            else:
+                session.report(f"{name}: joint {joint} hardly moves in the training frames; its hinge cannot be found")
+                continue
             readings = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
             hinges.middle[index] = sum(readings) / len(readings)
             hinges.closed[index] = min(readings)

@@ -116,12 +116,13 @@ class Hinges(Articulation):
     def tips_at(self, joint: int, reading: float) -> Tensor:
         """Return the tips [2, 3] mm of a joint's left and right jaw, instrument frame. A tip that was not measured lies
         at the shaft's end when the joint is closed."""
-        pivot, axis = self.hinge(joint)
-        origin, direction = self.shaft()
+        origin, direction = shaft = self.shaft()
+        pivots, axes = self.axes(shaft)
         known = self.tips[joint].isfinite().all(1)  # [2]
         points = torch.where(known[:, None], self.tips[joint], origin + self.extent[1] * direction)  # [2, 3]
         angles = torch.where(known, self.turns(joint, reading), self.opening(joint, reading))
-        return rotate_about(points, axis, pivot, angles).index_select(0, self.left_right_order(joint))
+        order = self.left_right_order(joint, axes)
+        return rotate_about(points, axes[joint], pivots[joint], angles).index_select(0, order)
 
     def joint_points(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
         """Return the first joint's hinge and tips."""
@@ -175,13 +176,13 @@ class Hinges(Articulation):
         gains = self.gains[joint].detach().abs()
         return (gains < MAX_FIXED_JAW_GAIN) & (gains == gains.min())
 
-    def left_right_order(self, joint: int) -> Tensor:
-        """Return a joint's two jaws (0 and 1) as indices [2], the left one first.
+    def left_right_order(self, joint: int, axes: Tensor | None = None) -> Tensor:
+        """Return a joint's two jaws (0 and 1) as indices [2], the left one first; `axes`: those of `axes()`, if known.
 
         The hinge axis is given the sign that makes its largest component in the instrument frame positive; the left
         jaw opens towards (shaft direction x axis).
         """
-        _, axis = self.hinge(joint)
+        axis = (self.axes()[1] if axes is None else axes)[joint]
         sign = torch.sign(axis.gather(0, axis.abs().argmax()[None]))
         left = (sign * self.gains[joint]).argmin()
         return torch.stack([left, 1 - left])

@@ -42,7 +42,8 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
         return  # gradients of several cameras' images determine an instant's state better than each image does
     if mark == DECIDED_AT:
         search, scale = StateSearch.of(session, articulated), 0.0
-        expected = scene.diagnostics.get(LARGE_ERRORS, False)
+        linked = any(instrument.kinematics is not None for instrument in scene.instruments)
+        expected = scene.diagnostics.get(LARGE_ERRORS, not linked)
         if expected or session.silhouettes is not None:
             scale = size_of_errors(search)
         large = scale > (LARGE if expected else LARGE_OVER_KNOWN)

@@ -160,8 +160,11 @@ class StateSearch:
                 if len(each):
                     variances[number] = each[: math.ceil(KEPT_SHARE * len(each))].mean()
         object.__setattr__(self, "classes", variances.sqrt().tolist())
-        # a tracker's errors across the view are as large as a robot's
-        return float(variances[[number for number in (0, 1, 3, 4) if number in kinds]].sqrt().median())
+        # a tracker's errors across the view are as large as a robot's; without stated links, roll, depth and joints
+        # follow the errors of a hinge that is still rough
+        linked = all(item.kinematics is not None for item in self.session.scene.instruments)
+        counted = (0, 1, 3, 4) if linked else (0,)
+        return float(variances[[number for number in counted if number in kinds]].sqrt().median())
 
     def _usual(self) -> Tensor:
         """Return usual errors [P] of a robot's states (rad, mm)."""

@@ -62,36 +62,30 @@ PUBLISHED: Mapping[str, int | float] = {
 
 @dataclass(frozen=True, kw_only=True)
 class NerfiesSettings:
-    """`rays` per step; `coarse_samples` and `fine_samples` along each (0 fine: one network draws); template `depth` x
-    `width`, with `frequencies` of points and `view_frequencies` of directions; warp `warp_depth` x `warp_width`, with
-    `warp_frequencies`; numbers per warp `code` and `appearance` code (0: none); `window`: share of the run over which
-    the warp's frequencies open; `elastic_weight` of the Jacobians at `elastic_rays` rays, `background_weight` of
-    `background_points` sparse points, `robust_scale` c of both losses (log singular values, template units),
-    `point_noise` added to the points (template units); learning `rate` at the start, of which `rate_decay` is left at
-    the end; `chunk`: rays rendered at once."""
+    """Settings of the method."""
 
-    rays: int = 128
-    coarse_samples: int = 32
-    fine_samples: int = 0
-    depth: int = 4
-    width: int = 64
-    frequencies: int = 10
-    view_frequencies: int = 4
-    warp_depth: int = 4
-    warp_width: int = 64
-    warp_frequencies: int = 8
-    code: int = 8
-    appearance: int = 0
-    window: float = 0.32
-    elastic_weight: float = 1e-3
-    elastic_rays: int = 32
-    background_weight: float = 1.0
-    background_points: int = 256
-    robust_scale: float = 0.03
-    point_noise: float = 1e-3
-    rate: float = 5e-3
-    rate_decay: float = 0.1
-    chunk: int = 512
+    rays: int = 128  # per step
+    coarse_samples: int = 32  # along a ray
+    fine_samples: int = 0  # along a ray; 0: one network renders
+    depth: int = 4  # layers of the template
+    width: int = 64  # of the template
+    frequencies: int = 10  # of the template's points
+    view_frequencies: int = 4  # of the template's directions
+    warp_depth: int = 4  # layers of the warp
+    warp_width: int = 64  # of the warp
+    warp_frequencies: int = 8  # of the warp's points
+    code: int = 8  # numbers of a moment's warp code
+    appearance: int = 0  # numbers of a moment's appearance code
+    window: float = 0.32  # share of the run over which the warp's frequencies open
+    elastic_weight: float = 1e-3  # of the Jacobians in the loss
+    elastic_rays: int = 32  # rays at which these are taken
+    background_weight: float = 1.0  # of sparse points that stay
+    background_points: int = 256  # how many of these per step
+    robust_scale: float = 0.03  # c of both losses (log singular values, template units)
+    point_noise: float = 1e-3  # added to the points (template units)
+    rate: float = 5e-3  # learning rate at the start
+    rate_decay: float = 0.1  # share of it that is left at the end
+    chunk: int = 512  # rays rendered at once
 
     def __post_init__(self) -> None:
         may_be_zero = {"fine_samples", "appearance", "elastic_rays", "background_points", "window", "point_noise"}
@@ -374,7 +368,7 @@ class NerfScene(nn.Module):
         """A field has no Gaussians that could move."""
 
     def torch_threads(self) -> AbstractContextManager[None]:
-        """All of torch's threads: a drawing is a few large products."""
+        """All of torch's threads: an image is a few large products."""
         return nullcontext()
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -10,7 +10,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
 
 OLDEST = (7, 0)  # compute capability that Triton compiles for
 
@@ -28,7 +28,7 @@ def interpreted() -> bool:
 def missing(device: torch.device) -> str | None:
     """Return what Triton lacks on `device`, as far as is known without trying, and the remedy; None: nothing."""
     if not installed():
-        return "package triton is missing; on Linux pip install 'neeco[triton]', or draw on the CPU"
+        return f"package triton is missing; on Linux {install_hint('triton')}, or render on the CPU"
     if interpreted():
         return None
     if device.type != "cuda":
@@ -37,7 +37,7 @@ def missing(device: torch.device) -> str | None:
     if capability < OLDEST:
         has, needs = (".".join(map(str, version)) for version in (capability, OLDEST))
         return (
-            f"{device} has compute capability {has}, Triton needs {needs}; pip install 'neeco[cuda]' to draw with "
+            f"{device} has compute capability {has}, Triton needs {needs}; {install_hint('cuda')} to render with "
             "gsplat, or use --device cpu"
         )
     return None

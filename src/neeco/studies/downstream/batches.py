@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.studies.downstream.augmentation import Outline, augment, moved
 from neeco.studies.downstream.samples import Example, LeastRecentlyUsed, Sample
+from neeco.synthesis.augmentation import Outline, augment, moved
 
 Schedule = Literal["balanced", "pool", "finetune", "blend"]
 SCHEDULES: tuple[Schedule, ...] = get_args(Schedule)

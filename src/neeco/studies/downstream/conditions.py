@@ -12,10 +12,10 @@ from neeco.errors import NeecoError
 from neeco.studies.downstream.batches import DEFAULT_SCHEDULE, SCHEDULES, Schedule
 from neeco.studies.downstream.samples import Edges
 
-REAL, STRONG, PASTE, PERMUTED = "real", "strong", "paste", "permuted"
+REAL, STRONG, PASTE, MATCH, PERMUTED = "real", "strong", "paste", "match", "permuted"
 EDGES: tuple[Edges, ...] = ("hard", "soft", "ignore")
 DEFAULT_EDGES: Edges = "hard"
-RESERVED = (REAL, STRONG, PASTE, PERMUTED, *SCHEDULES, *EDGES)
+RESERVED = (REAL, STRONG, PASTE, MATCH, PERMUTED, *SCHEDULES, *EDGES)
 BASELINES = (REAL, f"{REAL}+{STRONG}")  # without synthetic images: the better of them is the reference
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 
@@ -31,6 +31,7 @@ class Condition:
     real: bool = False  # with labelled recorded frames
     strong: bool = False  # with strong augmentation of every image
     paste: bool = False  # with the labelled instruments pasted over backgrounds
+    match: bool = False  # half of the labelled frames' images in the colours of another recording
     permuted: bool = False  # the sets' labels belong to other images
     edges: Edges = DEFAULT_EDGES  # how the edges of synthetic labels are learned
     schedule: Schedule = DEFAULT_SCHEDULE  # when recorded and when synthetic images are learned
@@ -57,6 +58,8 @@ def parse_condition(name: str, sets: Collection[str]) -> Condition:
         raise refuse(f"{PERMUTED} only together with a set, whose labels it permutes")
     if PASTE in words and REAL not in words:
         raise refuse(f"{PASTE} only together with {REAL}, whose instruments it pastes")
+    if MATCH in words and REAL not in words:
+        raise refuse(f"{MATCH} only together with {REAL}; synthesize the set with --match-colors")
     if len(schedules) > 1 or (schedules and not (REAL in words and (chosen or PASTE in words))):
         raise refuse(f"one of {', '.join(SCHEDULES)} at most, and only together with {REAL} and a set or {PASTE}")
     if not chosen and REAL not in words:
@@ -67,6 +70,7 @@ def parse_condition(name: str, sets: Collection[str]) -> Condition:
         real=REAL in words,
         strong=STRONG in words,
         paste=PASTE in words,
+        match=MATCH in words,
         permuted=PERMUTED in words,
         edges=edges[0] if edges else DEFAULT_EDGES,
         schedule=schedules[0] if schedules else DEFAULT_SCHEDULE,
@@ -74,9 +78,9 @@ def parse_condition(name: str, sets: Collection[str]) -> Condition:
 
 
 def default_conditions(sets: Sequence[str]) -> list[str]:
-    """The baselines and cut-and-paste; then each set alone, with labelled frames, and these strongly augmented or with
-    labels of other images."""
-    used = ("", f"+{REAL}", f"+{REAL}+{STRONG}", f"+{REAL}+{PERMUTED}")
+    """The baselines and cut-and-paste; then each set alone, alone and strongly augmented (the recipe for another
+    recording), with labelled frames (the one for the same), and with labels of other images."""
+    used = ("", f"+{STRONG}", f"+{REAL}", f"+{REAL}+{PERMUTED}")
     return [*BASELINES, f"{REAL}+{PASTE}", *(name + words for name in sets for words in used)]
 
 

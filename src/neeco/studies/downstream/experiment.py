@@ -36,6 +36,7 @@ from neeco.studies.downstream.samples import (
 )
 from neeco.studies.machine import machine, threads_per_worker
 from neeco.studies.study import JobEvent, check_output, check_workers, run_and_record
+from neeco.synthesis.backgrounds import ImageFolder
 
 SCHEMA = "neeco-downstream/2"
 FILE = "downstream.json"
@@ -70,6 +71,8 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
     _check_tests(settings, capture)
     if settings.backgrounds is not None:
         background_files(settings.backgrounds)
+    if settings.match_colors is not None:
+        ImageFolder.of(settings.match_colors, "match_colors")
     size = frame_size(recorded_samples(capture, settings.splits[0], settings.classes))
     images = {}
     for data in settings.sets:
@@ -127,6 +130,8 @@ def _conditions(settings: DownstreamSettings) -> list[Condition]:
     words = default_conditions(names) if settings.conditions is None else settings.conditions
     conditions = [parse_condition(word, names) for word in dict.fromkeys(words)]
     for condition in conditions:
+        if condition.match and settings.match_colors is None:
+            raise NeecoError(f"--conditions {condition.name}: in whose colours? give --match-colors FOLDER")
         if condition.edges == "soft" and settings.classes == "parts":
             raise NeecoError(
                 f"--conditions {condition.name}: soft/ says how much of a pixel is instrument, not of which part; "

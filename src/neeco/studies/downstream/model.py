@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
 from neeco.files import placeholder, write_atomically
 from neeco.registry import plugins
 from neeco.studies.downstream.batches import Batch, BatchSampler, collate, training_image
@@ -83,7 +83,7 @@ class Model(ABC):
 def missing_packages(*packages: str) -> str | None:
     """`missing_requirement` of a model that needs packages of the extra `downstream`."""
     absent = [name for name in packages if importlib.util.find_spec(name) is None]
-    return f"needs {' and '.join(absent)}; pip install 'neeco[downstream]'" if absent else None
+    return f"needs {' and '.join(absent)}; {install_hint('downstream')}" if absent else None
 
 
 @cache

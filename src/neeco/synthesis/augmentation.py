@@ -6,8 +6,9 @@ The usual recipe of segmentation (Isensee et al., "nnU-Net", 2021), with cut-out
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,6 +55,22 @@ def augment(planes: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
     colors = torch.where(cut, random.uniform(0, 1, 3)[..., None, None], colors)
     valid = labels[:, -1:] * ~cut
     return torch.cat([colors, labels[:, :-1], valid], 1), given_from_made
+
+
+def augment_batch(batch: Mapping[str, Any], rng: torch.Generator) -> dict[str, Tensor]:
+    """Augment every image of a batch that `LabelledImages.collate` made by itself.
+
+    Returns its image [B, 3, H, W], parts [B, H, W] and ignore [B, H, W]; ignored is also what comes from outside of an
+    image or is cut out. Boxes, depth and the rest, which would not fit any more, are left out. rng: on the images'
+    device; the same state gives the same batch.
+    """
+    parts = batch["parts"].long()
+    shares = functional.one_hot(parts, int(parts.max()) + 1).movedim(-1, 1)[:, 1:].float()
+    valid = (~batch["ignore"])[:, None].float()
+    planes, _ = augment(torch.cat([batch["image"], shares, valid], 1), rng)
+    shares = planes[:, 3:-1]
+    moved_parts = torch.cat([1 - shares.sum(1, keepdim=True), shares], 1).argmax(1).to(torch.uint8)
+    return {"image": planes[:, :3], "parts": moved_parts, "ignore": planes[:, -1] < 0.5}
 
 
 def moved(outlines: Sequence[Outline], given_from_made: np.ndarray) -> tuple[Outline, ...]:

@@ -1,0 +1,55 @@
+"""README's links are absolute on the page that an index shows of it, and relative in the repository."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def package_metadata(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    monkeypatch.chdir(ROOT)
+    import package_metadata
+
+    return package_metadata
+
+
+def test_links_of_the_page_on_an_index_lead_to_the_files_of_the_version(
+    package_metadata: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GITHUB_SERVER_URL", "https://forge.example")
+    monkeypatch.setenv("GITHUB_REPOSITORY", "surgery/neeco")
+    fields = package_metadata.dynamic_metadata({}, {"version": "9.1"})
+    links = re.findall(r"(!?)\[[^]]*\]\(([^)]+)\)", fields["readme"]["text"])
+    prefix = re.compile("https://forge.example/surgery/neeco/(blob|raw)/v9.1/([^#]+)")
+    leading = [(image, prefix.match(link)) for image, link in links if link.startswith("https://forge.example/")]
+    assert len(leading) > 10
+    for image, found in leading:
+        assert found
+        assert (ROOT / found[2]).exists()
+        assert (found[1] == "raw") == bool(image)
+    assert all("://" in link or link.startswith("#") for _, link in links)
+    assert fields["urls"]["Repository"] == "https://forge.example/surgery/neeco"
+
+
+def test_without_an_address_nothing_is_invented(package_metadata: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GITHUB_REPOSITORY", raising=False)
+    fields = package_metadata.dynamic_metadata({}, {"version": "9.1"})
+    assert fields["readme"]["text"] == (ROOT / "README.md").read_text()
+    assert fields["urls"] == {}
+
+
+def test_the_version_is_the_same_wherever_it_is_stated() -> None:
+    stated = {
+        "pyproject.toml": r'^version = "(.+)"$',
+        "CITATION.cff": "^version: (.+)$",
+        "src/neeco/__init__.py": r'^__version__ = "(.+)"$',
+    }
+    found = {re.findall(pattern, (ROOT / file).read_text(), re.MULTILINE)[0] for file, pattern in stated.items()}
+    assert len(found) == 1

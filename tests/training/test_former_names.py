@@ -1,0 +1,39 @@
+"""A method that was renamed is still trained, continued and loaded by its former name, with one line that says so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+import neeco
+from neeco.cli import main
+from neeco.scene.method_registry import current_name
+from neeco.training.config import training_config
+
+SAID = "method neeco is now called nps"
+SMALL = ["deformation.width=16", "deformation.depth=2"]
+
+
+def test_a_former_name_trains_the_method_of_today() -> None:
+    with pytest.warns(FutureWarning, match=f"^{SAID}$"):
+        assert training_config("neeco", {}, SMALL) == training_config("nps", {}, SMALL)
+    assert [current_name(name) for name in ("nps", "kinematic", "nothing")] == ["nps", "kinematic", "nothing"]
+
+
+def test_a_run_of_a_former_name_is_continued_under_either(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    flags = ["train", str(capture), "--output", str(run), "--iterations", "4", "--set", SMALL[0], "--set", SMALL[1]]
+    assert main([*flags, "--method", "neeco"]) == 0
+    assert capsys.readouterr().err.count(SAID) == 1
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert config["method"] == "nps"
+
+    (run / "config.yaml").write_text(yaml.safe_dump(config | {"method": "neeco"}, sort_keys=False))  # as 0.2 wrote it
+    with pytest.warns(FutureWarning, match=SAID):
+        assert neeco.load(run).config["method"] == "nps"
+    for name in ("neeco", "nps"):
+        assert main([*flags, "--resume", "--method", name]) == 0
