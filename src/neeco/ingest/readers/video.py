@@ -25,9 +25,7 @@ SQUARE = 0.005  # by which a square pixel's width and height may differ: 1 px of
 MAX_RATE = 1000.0  # frames a second, beyond which a file's own number is no rate
 MAX_LEFT_OUT = 0.1  # of a folder's images (or one): more that are missing or of another size are no slip
 SAME_RATE = 2e-4  # relative difference of frame rates that is none
-MAX_BUFFERED_BYTES = (
-    512 * 2**20
-)  # of a video's decoded frames, as stored; those of a larger one are decoded at every reading
+MAX_BUFFERED_BYTES = 512 * 2**20  # of a video's decoded frames; those of a larger one are decoded at every reading
 
 
 def require_installed(name: str) -> None:
@@ -38,8 +36,8 @@ def require_installed(name: str) -> None:
 
 def open_video(path: Path, fps: float | None = None, part: tuple[float, float] | None = None) -> VideoSource:
     """A video file, or the part of it from one time s to another, without it. Its frames are decoded once to find
-    those that can be, with their own times (`fps`: overrides them), and buffered for later readings (`MAX_BUFFERED_BYTES`).
-    What is damaged is left out and noted; raises NeecoError when nothing can be read."""
+    those that can be, with their own times (`fps`: overrides them), and buffered up to MAX_BUFFERED_BYTES. What is
+    damaged is left out and noted; raises NeecoError when nothing can be read."""
     path = Path(path)
     require_content(path)
     if not path.is_file():
