@@ -28,9 +28,23 @@ def rasterize_cpu(
     frames = None if gaussians.sh_frames is None else _prepared(gaussians.sh_frames.detach())
     wanted = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     offsets = torch.zeros(len(gaussians), 2, requires_grad=wanted)
-    color, alpha, depth, composited, radii, *layers = _Rasterize.apply(offsets, frames, camera, wanted, alone, *tensors)
-    pairs = zip(layers[::2], layers[1::2], strict=True)
-    return Rendering(color, alpha, depth, composited, radii, offsets, tuple(Layer(*pair) for pair in pairs))
+    if not wanted:  # autograd takes a tenth of a small rendering's time
+        drawing, images = _draw(frames, camera, tensors, keep=False)
+        return Rendering(*images, offsets, _alone(drawing, alone, images[1], images[2]))
+    layers: tuple[Layer, ...] = ()
+    if alone:  # drawn again: nobody asks for these with gradients where time matters
+        with torch.no_grad():
+            layers = rasterize_cpu(gaussians, camera, channels, background, alone).alone
+    color, alpha, depth, composited, radii = _Rasterize.apply(offsets, frames, camera, wanted, *tensors)
+    return Rendering(color, alpha, depth, composited, radii, offsets, layers)
+
+
+def _alone(drawing: Any, sets: Sequence[Tensor], alpha: Tensor, depth: Tensor) -> tuple[Layer, ...]:
+    """Some of the Gaussians of a drawing without the others, [N] bool each; alpha, depth [H, W]: of all."""
+    layers = tuple(Layer(torch.empty_like(alpha), torch.empty_like(depth)) for _ in sets)
+    for chosen, layer in zip(sets, layers, strict=True):
+        drawing.alone(chosen.contiguous(), alpha, depth, layer.alpha, layer.depth)
+    return layers
 
 
 def last_statistics() -> dict[str, float]:
@@ -45,45 +59,44 @@ def _prepared(tensor: Tensor) -> Tensor:
     return tensor.to(torch.float32).contiguous()
 
 
+def _draw(
+    frames: Tensor | None, camera: Camera, tensors: Sequence[Tensor | None], keep: bool
+) -> tuple[Any, tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor]]:
+    """Return the kernel's drawing, which its gradient needs (`keep`), and colour, alpha, depth, channels and radii."""
+    plain = [None if t is None else t.detach() for t in tensors]
+    means, quats, scales, opacities, sh, falloff, channels, left, vignette, world_from_camera, background = plain
+    assert means is not None
+    try:
+        drawing = native().Drawing(
+            means, quats, scales, opacities, sh, frames, falloff, vignette, left, channels, background,
+            world_from_camera,
+            camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
+        )  # fmt: skip
+        height, width = camera.height, camera.width
+        color = torch.empty(height, width, 3)
+        alpha = torch.empty(height, width)
+        depth = torch.empty(height, width)
+        radii = torch.empty(means.shape[0])
+        composited = None if channels is None else torch.empty(height, width, channels.shape[1])
+        drawing.forward(color, alpha, depth, composited, radii, keep)
+    except (ValueError, RuntimeError) as error:
+        raise NeecoError(f"rasterize: {error}") from error
+    return drawing, (color, alpha, depth, composited, radii)
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        offsets: Tensor,
-        frames: Tensor | None,
-        camera: Camera,
-        keep: bool,
-        alone: Sequence[Tensor],
-        *tensors: Tensor | None,
+        ctx: Any, offsets: Tensor, frames: Tensor | None, camera: Camera, keep: bool, *tensors: Tensor | None
     ) -> Any:
-        plain = [None if t is None else t.detach() for t in tensors]
-        means, quats, scales, opacities, sh, falloff, channels, left, vignette, world_from_camera, background = plain
-        assert means is not None
-        try:
-            drawing = native().Drawing(
-                means, quats, scales, opacities, sh, frames, falloff, vignette, left, channels, background,
-                world_from_camera,
-                camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
-            )  # fmt: skip
-            height, width = camera.height, camera.width
-            color = torch.empty(height, width, 3)
-            alpha = torch.empty(height, width)
-            depth = torch.empty(height, width)
-            radii = torch.empty(means.shape[0])
-            composited = None if channels is None else torch.empty(height, width, channels.shape[1])
-            drawing.forward(color, alpha, depth, composited, radii, keep)
-            layers = [torch.empty(height, width) for _ in range(2 * len(alone))]
-            for k, chosen in enumerate(alone):
-                drawing.alone(chosen.contiguous(), alpha, depth, *layers[2 * k : 2 * k + 2])
-        except (ValueError, RuntimeError) as error:
-            raise NeecoError(f"rasterize: {error}") from error
+        drawing, images = _draw(frames, camera, tensors, keep)
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(radii, *layers)
+        ctx.mark_non_differentiable(images[-1])
         if keep:
             # saved so that autograd detects a modified input before the backward pass
-            ctx.save_for_backward(alpha, depth, *tensors)
+            ctx.save_for_backward(images[1], images[2], *tensors)
             ctx.drawing = drawing
-        return color, alpha, depth, composited, radii, *layers
+        return images
 
     @staticmethod
     @once_differentiable
@@ -91,7 +104,7 @@ class _Rasterize(torch.autograd.Function):
         alpha, depth, *tensors = ctx.saved_tensors
         images = [None if g is None else g.to(torch.float32).contiguous() for g in gradients[:4]]
         *gaussians, vignette, pose, background = tensors
-        wanted = ctx.needs_input_grad[5:]
+        wanted = ctx.needs_input_grad[4:]
         grads = [
             torch.empty_like(t) if need and t is not None else None
             for t, need in zip([*gaussians, vignette, pose], wanted[:10], strict=True)
@@ -101,4 +114,4 @@ class _Rasterize(torch.autograd.Function):
         to_background = None
         if wanted[10] and images[0] is not None and background is not None:
             to_background = ((1 - alpha.detach())[..., None] * images[0]).sum(dim=(0, 1))
-        return to_offsets, None, None, None, None, *grads, to_background
+        return to_offsets, None, None, None, *grads, to_background
