@@ -19,7 +19,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import Trust, TypicalErrors, estimate_trust, typical_errors_of
-from neeco.fitting.alignment import AlignConfig, AlignedFrame, align_frame, pose_changes
+from neeco.fitting.alignment import STATE_ERRORS, AlignConfig, AlignedFrame, align_frame, pose_changes
 from neeco.geometry.distortion import field_pinhole
 from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
@@ -210,7 +210,8 @@ def fitted(
 ) -> tuple[AlignedFrame, LayeredDrawing]:
     """The poses of `frame` fitted to its image [H, W, 3], and what the scene renders there; `start`: a neighbour's
     increments, without which the search starts coarse."""
-    fit = align_frame(scene, frame, image, start, None if start is None else FROM_NEIGHBOUR)
+    near = start is not None and STATE_ERRORS not in scene.diagnostics  # errors as large differ between neighbours
+    fit = align_frame(scene, frame, image, start, FROM_NEIGHBOUR if near else None)
     return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.min_component, tissue_image=True)
 
 
