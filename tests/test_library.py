@@ -215,6 +215,7 @@ def test_the_recipe_for_the_next_operation_runs_as_the_page_says(
     Path("PLATES").mkdir()
     for k in range(2):
         Image.fromarray(np.random.default_rng(k).integers(60, 180, (64, 80, 3), np.uint8)).save(f"PLATES/{k}.png")
+    Path("FRAMES").symlink_to("PLATES")
     assert train == ["neeco", "train", "FIRST", "--output", "RUN"]  # which the first program did
     synthesize_set[synthesize_set.index("--count") + 1] = "4"
     assert main([*synthesize_set[1:], "--min-share", "0"]) == 0

@@ -201,8 +201,9 @@ class LabelledImages(_Generated, Dataset[Sample]):
         labels: composited or threshold
         camera_effects: YAML file of blur, noise, smoke and the like
         instruments: runs or scenes whose instruments are rendered over the scene's tissue, instead of its own
-        transform: sample -> sample, such as an augmentation
-        settings: any other option of `neeco synthesize`, such as size="1280x1024", scale=2.0 or lens=True
+        transform: sample -> sample; `neeco.synthesis.augmentation.augment_batch` augments whole batches strongly
+        settings: any other option of `neeco synthesize`, such as size="1280x1024" or scale=2.0; backgrounds and
+            match_colors are folders of frames of the next operation, for a network that is to work there
 
     Sample `index` is what `neeco synthesize` renders as image `index` for the same settings and seed, before its pixels
     are rounded to 8 bits (depth: to 0.05 mm); it is the same in any worker of any DataLoader, forked or spawned. A
