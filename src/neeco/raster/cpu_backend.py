@@ -30,13 +30,13 @@ def rasterize_cpu(
     offsets = torch.zeros(len(gaussians), 2, requires_grad=wanted)
     if not wanted:  # autograd takes a tenth of a small rendering's time
         drawing, images = _draw(frames, camera, tensors, keep=False)
-        return Rendering(*images, offsets, _alone(drawing, alone, images[1], images[2]))
+        return Rendering(*images, offsets, alone=_alone(drawing, alone, images[1], images[2]))
     layers: tuple[Layer, ...] = ()
     if alone:  # drawn again: nobody asks for these with gradients where time matters
         with torch.no_grad():
             layers = rasterize_cpu(gaussians, camera, channels, background, alone).alone
     color, alpha, depth, composited, radii = _Rasterize.apply(offsets, frames, camera, wanted, *tensors)
-    return Rendering(color, alpha, depth, composited, radii, offsets, layers)
+    return Rendering(color, alpha, depth, composited, radii, offsets, alone=layers)
 
 
 def _alone(drawing: Any, sets: Sequence[Tensor], alpha: Tensor, depth: Tensor) -> tuple[Layer, ...]:

@@ -134,6 +134,7 @@ class Rendering:
     channels: Tensor | None  # [H, W, C] composited like colour, background 0
     radii: Tensor  # [N] px, 3-sigma-like extent of the ellipse, 0 where not rendered; no gradient
     center_offsets: Tensor  # [N, 2] px, zeros added to the projected centres; `.grad` after backward: d loss / d centre
+    _: KW_ONLY
     alone: tuple[Layer, ...] = ()  # of the Gaussians that were asked for alone
 
     @property
