@@ -39,8 +39,23 @@ def test_errors_are_large_by_what_images_can_tell(
 ) -> None:
     search = SimpleNamespace(deviations=lambda index, scale: None)
     monkeypatch.setattr(module.StateSearch, "of", lambda session, articulated: search)
-    monkeypatch.setattr(module, "size_of_errors", lambda search: size)
-    monkeypatch.setattr(module, "doubt_states", lambda search, scale: None)
+    monkeypatch.setattr(module, "size_of_errors", lambda search, doubted: size)
+    monkeypatch.setattr(module, "doubt_states", lambda search, scale, misfits: None)
+    monkeypatch.setattr(module.Misfits, "of", lambda search: module.Misfits({}, 1.0, 1.0))
     session = session_of(Silhouettes((), 0.0) if observed else None, linked=linked, expected=expected)
     module.fit_states(session, None, module.DECIDED_AT)  # type: ignore[arg-type]
     assert (module.FOUND in session.scene.diagnostics) == fitted
+
+
+def test_states_that_are_doubted_do_not_count_for_the_size_of_all_errors() -> None:
+    tried: list[int] = []
+    session = SimpleNamespace(
+        full_views=SimpleNamespace(frames=[None] * 12), refinement=SimpleNamespace(fitted=[False] * 12)
+    )
+    search = SimpleNamespace(
+        session=session,
+        fitted=lambda index, scale, about: tried.append(index) or index,
+        scale_of=lambda fits: float(len(fits)),
+    )
+    assert module.size_of_errors(search, [3, 7]) == 10.0  # type: ignore[arg-type]
+    assert not {3, 7} & set(tried)

@@ -125,7 +125,9 @@ def _caption(record: Record) -> tuple[list[str], list[str]]:
 
 
 def _legend(canvas: ImageDraw.ImageDraw, names: Sequence[tuple[str, str]], width: int) -> None:
-    entries: list[tuple[str, Color]] = [(f"{name} {part}", part_color(part_id)) for part_id, (name, part) in enumerate(names, 1)]
+    entries: list[tuple[str, Color]] = [
+        (f"{name} {part}", part_color(part_id)) for part_id, (name, part) in enumerate(names, 1)
+    ]
     entries += [("minimum-area box", RECTANGLE), ("keypoint seen", BOX), ("keypoint occluded", HIDDEN)]
     columns = max((width - GAP) // LABEL_COLUMN, 1)
     for k, (text, color) in enumerate(entries):

@@ -16,11 +16,9 @@ from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.state_registration import corrected_evidence, register_states
 from neeco.methods.kinematic.stated_links import StatedLinks
-from neeco.methods.space_carving import Evidence, carved_shape, gather_evidence, pad_and_stack
-from neeco.methods.static import Static
+from neeco.methods.space_carving import Evidence, carved_shape, pad_and_stack
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
-from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.training.session import GaussianSession
 
@@ -48,21 +46,19 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
 def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Replace the instruments' Gaussians by seeds on shapes carved anew, at the states as corrected so far: what the
     former states taught is forgotten. The session's views are those of searches."""
-    scene = session.scene
-    tissue = scene.canonical.map(
+    scene, breathing = session.scene, articulated.breathing if isinstance(articulated, BreathingTissue) else None
+    scene.canonical = tissue = scene.canonical.map(
         lambda tensor: tensor[scene.canonical.body(0)].detach().clone(), scene.canonical.counts[:1]
     )
-    alone = GaussianScene(Static.method, tissue, Static(), (), Recorded(tissues=scene.recorded.tissues), scene.center)
-    alone.background, alone.sh_degree = scene.background, scene.sh_degree
-    linked = any(instrument.kinematics is not None for instrument in scene.instruments)
-    evidence = gather_evidence(alone, session.views, session.config.deformation.carving, unshaded=linked)
+    with torch.enable_grad():  # tissue learned together with an instrument leaves much more unexplained
+        fitted = fit_tissue(scene, session.views, session.config, breathing=breathing)
+        evidence = tissue_evidence(scene, session.views, session.config, fitted)
     if session.silhouettes is not None:
         numbers = {frame.name: number for number, frame in enumerate(session.views.frames)}
         hits = [session.silhouettes.instrument(numbers[frame.name]) for frame in evidence.frames]
         evidence = replace(evidence, hits=pad_and_stack(hits, 0.0).to(evidence.hits))
     evidence = corrected_evidence(session, evidence)
     with torch.no_grad():
-        scene.canonical = tissue
         learned = [articulation.axes(articulation.shaft()) for articulation in articulated.articulations]
         for articulation in articulated.articulations:
             articulation.shaft_tilt.zero_()

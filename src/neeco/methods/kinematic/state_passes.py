@@ -7,11 +7,13 @@ wrong states taught is forgotten.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from neeco.capture.model import evenly_spaced
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.methods.kinematic.contradictions import CONTRADICTING, doubt_states
+from neeco.methods.kinematic.contradictions import CONTRADICTING, Misfits, doubt_states
 from neeco.methods.kinematic.discovery import carve_again
 from neeco.methods.kinematic.state_registration import LARGE_ERRORS
 from neeco.methods.kinematic.state_search import LARGEST, StateSearch
@@ -42,17 +44,18 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
         return  # gradients of several cameras' images determine an instant's state better than each image does
     if mark == DECIDED_AT:
         search, scale = StateSearch.of(session, articulated), 0.0
+        misfits = Misfits.of(search)
         linked = any(instrument.kinematics is not None for instrument in scene.instruments)
         expected = scene.diagnostics.get(LARGE_ERRORS, not linked)
         if expected or session.silhouettes is not None:
-            scale = size_of_errors(search)
+            scale = size_of_errors(search, misfits.doubted)
         large = scale > (LARGE if expected else LARGE_OVER_KNOWN)
         if large:
             scene.diagnostics[FOUND] = round(scale, 3)
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
             for (index,) in refinement.frames_of_instant:
                 refinement.set_deviations(index, search.deviations(index, SCALE))
-        doubt_states(search, SCALE if large else LARGE)
+        doubt_states(search, SCALE if large else LARGE, misfits)
     if FOUND not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, doubted = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
@@ -69,11 +72,13 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
             carve_again(session, articulated)
 
 
-def size_of_errors(search: StateSearch) -> float:
-    """Return how large the errors of a sample of states are, times the usual ones of a robot."""
+def size_of_errors(search: StateSearch, doubted: Sequence[int]) -> float:
+    """Return how large the errors of a sample of states are, times the usual ones of a robot; without `doubted` ones,
+    which may be wrong altogether."""
     refinement = search.session.refinement
     fits = []
-    for index in evenly_spaced(len(search.session.full_views.frames), N_SAMPLED):
+    usual = [index for index in range(len(search.session.full_views.frames)) if index not in doubted]
+    for index in (usual[place] for place in evenly_spaced(len(usual), N_SAMPLED)):
         # states that were fitted before training are judged by what is left of their errors
         fit = search.fitted(index, LARGEST, search.state(index) if refinement.fitted[index] else None)
         fits += [] if fit is None else [fit]
