@@ -16,7 +16,7 @@ from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.state_registration import corrected_evidence, register_states
 from neeco.methods.kinematic.stated_links import StatedLinks
-from neeco.methods.space_carving import Evidence, carved_shape, pad_and_stack
+from neeco.methods.space_carving import Evidence, carve_along, carved_shape, frame_along, pad_and_stack
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
 from neeco.scene.gaussian_scene import GaussianScene
@@ -59,11 +59,12 @@ def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -
         evidence = replace(evidence, hits=pad_and_stack(hits, 0.0).to(evidence.hits))
     evidence = corrected_evidence(session, evidence)
     with torch.no_grad():
-        learned = [articulation.axes(articulation.shaft()) for articulation in articulated.articulations]
+        shafts = [articulation.shaft() for articulation in articulated.articulations]
+        axes = [articulation.axes(shaft) for articulation, shaft in zip(articulated.articulations, shafts, strict=True)]
         for articulation in articulated.articulations:
             articulation.shaft_tilt.zero_()
             articulation.shaft_shift.zero_()
-        scene.canonical = _with_instruments(session, articulated, evidence, learned)
+        scene.canonical = _with_instruments(session, articulated, evidence, list(zip(shafts, axes, strict=True)))
     rows = torch.arange(len(scene.canonical), device=scene.center.device)
     fresh = rows >= len(tissue)
     session.adam.select_rows(list(scene.canonical.tensors()), torch.where(fresh, 0, rows), fresh)
@@ -74,11 +75,11 @@ def _with_instruments(
     session: GaussianSession,
     articulated: ArticulatedInstruments,
     recorded: Evidence,
-    learned: Sequence[tuple[Tensor, Tensor]] | None = None,
+    learned: Sequence[tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]] | None = None,
 ) -> CanonicalGaussians:
     """Return the Gaussians of the session's tissue and of every instrument on its carved shape, and start the joints.
-    learned: the axes of joints so far (see `Articulation.axes`); None: they are searched for, poses of stated links
-    corrected."""
+    learned: shaft and axes of each so far (see `Articulation`), which hinges keep; None: hinges are searched for, and
+    poses of stated links corrected."""
     scene, evidence = session.scene, recorded
     generator = torch.Generator().manual_seed(session.config.seed)
     bodies = [scene.canonical]
@@ -94,6 +95,9 @@ def _with_instruments(
                 evidence = replace(recorded, frames=tuple(corrected))
                 shape = carved_shape(session, evidence, instrument.name, generator)
                 shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
+        elif learned is not None:  # carving few frames anew may take the rear end for the jaws
+            base, settings = frame_along(*learned[index][0]), session.config.deformation.carving
+            shape = carve_along(evidence, instrument.name, base, shape.level, generator, settings) or shape
         articulation.base.copy_(shape.instrument_from_shaft)
         articulation.extent.copy_(torch.tensor([shape.near, shape.tip]))
         articulation.radius.fill_(shape.radius)
@@ -104,11 +108,7 @@ def _with_instruments(
             )
         else:
             assert isinstance(articulation, Hinges)
-            axes = (
-                learned[index]
-                if learned is not None and session.iteration > scene.deformation.start_iteration
-                else None
-            )
+            axes = None if learned is None else learned[index][1]
             seeds, logits = start_hinges(
                 session, articulation, evidence, instrument.name, shape, axes, columns=columns, generator=generator
             )
