@@ -15,7 +15,7 @@ fitted with their joints; joints are read without errors. Then mm along the shaf
 printed with the errors in stated standard deviations (rms), and how many bases are within 1.5 mm and 0.8 degrees in
 every direction, or doubted.
 
-mm is the root mean square over the recording by which the instrument would be drawn beside its place once the best
+mm is the root mean square over the recording by which the instrument would be rendered beside its place once the best
 constant offset of its own frame is taken out: the shape that is learned makes up for that. `across` counts what of it
 lies across the view, `raw` is without that offset.
 

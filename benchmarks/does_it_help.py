@@ -1,13 +1,14 @@
 """The table and the figure of docs/does-it-help.md, from studies of pairs of captures.
 
-python benchmarks/does_it_help.py scissors=OUT/scissors grasper=OUT/grasper driver=OUT/driver    # table and figure
-python benchmarks/does_it_help.py                                                                # figure of the table
+python benchmarks/does_it_help.py scissors=OUT/scissors grasper=OUT/grasper    # these pairs' rows anew, and the figure
+python benchmarks/does_it_help.py                                              # figure of the table
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +26,26 @@ TABLE = PAGE.parent / "images" / "does-it-help.csv"
 ARM = ("pair", "test", "trained on", "labelled", "seeds", "iou", "low", "high")
 COMPARISON = ("against", "against labelled", "difference", "difference low", "difference high")
 TESTS = {"across": ("across",), "within": ("test", "unseen")}  # of the page: of the study
-BEST = "better of real and real+strong"
 PASTED = "real+paste+strong"
+FEW, ALL = 10, 86  # labelled frames in the upper panels
 CUT = 0.75  # the axis of IoU begins here
+APART = "back"  # the pair that no choice was made by; the last panel
+CURVES = (  # of it, by labelled frames: conditions, colour, marker, name
+    ("recipe+strong", "#009E73", "*", "synthetic alone: no labelled frame"),
+    ("real+strong", "#999999", "o", "labelled frames, strong augmentation"),
+    ("real+match+strong", "#7F3C8D", "D", "the same in the next colours"),
+    ("recipe+real+strong", "#0072B2", "v", "synthetic, then labelled frames"),
+    ("recipe+real+strong+permuted", "#D55E00", "X", "labels of other images"),
+)
 TITLES = {"across": "The next operation: another recording", "within": "The same recording"}
 # what the figure shows of the table: colour (Okabe and Ito, "Color universal design", 2008), marker, name
 SHOWN = {
-    (BEST, "few"): ("#999999", "o", "10 labelled frames"),
-    (BEST, "all"): ("#E69F00", "s", "all 86 labelled frames"),
-    (PASTED, "few"): ("#CC79A7", "D", "10 labelled, pasted over the next operation's tissue"),
-    ("plain+strong", "none"): ("#56B4E9", "^", "synthetic alone, over its own tissue"),
-    ("target+strong", "none"): ("#009E73", "*", "synthetic alone, half over the next operation's tissue"),
-    ("target+real+strong", "all"): ("#0072B2", "v", "the same, then fine-tuned on all 86"),
+    (BASELINES, FEW): ("#999999", "o", "10 labelled frames"),
+    (BASELINES, ALL): ("#E69F00", "s", "all 86 labelled frames"),
+    ((PASTED,), FEW): ("#CC79A7", "D", "10 labelled, pasted over the next operation's tissue"),
+    (("plain+strong",), 0): ("#56B4E9", "^", "synthetic alone, over its own tissue"),
+    (("target+strong",), 0): ("#009E73", "*", "synthetic alone, half over the next operation's tissue"),
+    (("target+real+strong",), ALL): ("#0072B2", "v", "the same, then fine-tuned on all 86"),
 }
 
 
@@ -76,11 +85,11 @@ def rows_of(pair: str, study: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def points(rows: list[dict[str, str]], pair: str, test: str, condition: str, amount: str) -> tuple[float, ...] | None:
-    """IoU, the ends of its interval and the number of seeds of what SHOWN names; None where the table lacks it."""
-    counts = sorted({int(row["labelled"]) for row in rows})
-    labelled = {"none": 0, "few": counts[1], "all": counts[-1]}[amount]
-    names = BASELINES if condition == BEST else (condition,)
+def points(
+    rows: list[dict[str, str]], pair: str, test: str, names: Sequence[str], labelled: int
+) -> tuple[float, ...] | None:
+    """IoU, the ends of its interval and the number of seeds of the better of some conditions; None where the table has
+    none of them."""
     found = [
         tuple(float(row[key]) for key in ("iou", "low", "high", "seeds"))
         for row in rows
@@ -115,11 +124,41 @@ def panel(axes: Axes, rows: list[dict[str, str]], test: str) -> None:
         axes.plot([-0.02, 0.02], [height - 0.012, height + 0.012], color=GREY, transform=axes.transAxes, clip_on=False)
 
 
+def curves(axes: Axes, rows: list[dict[str, str]]) -> None:
+    """IoU in the next operation of the pair APART against the number of labelled frames; a level line without any."""
+    counts = sorted({int(row["labelled"]) for row in rows if row["pair"] == APART} - {0})
+    for k, (condition, colour, marker, name) in enumerate(CURVES):
+        of = {n: points(rows, APART, "across", [condition], n) for n in (0, *counts)}
+        found = [(n, point) for n, point in of.items() if point is not None]
+        if [n for n, _ in found] == [0]:
+            found = [(n, found[0][1]) for n in (counts[0], counts[-1])]
+        found = [(n * 1.08 ** (k - 1), point) for n, point in found]  # beside each other
+        for n, (_, low, high, _) in found:
+            axes.plot([n, n], [low, high], color=colour, linewidth=1.6, alpha=0.5)
+        line = [n for n, _ in found], [point[0] for _, point in found]
+        axes.plot(*line, f"{marker}-", color=colour, linewidth=1.6, markersize=6, markerfacecolor="white", label=name)
+    axes.legend(fontsize=7, frameon=False, loc="lower right")
+    axes.set_xlim(counts[0] / 1.3, ALL * 1.3)
+    axes.set_ylim(0, 1)
+    axes.set_xscale("log")
+    axes.set_xticks(counts, [str(count) for count in counts])
+    axes.set_xticks([], minor=True)
+    axes.set_xlabel("labelled frames", fontsize=8, color=GREY)
+    axes.set_title("The next operation, pair kept apart", fontsize=10, color=GREY, loc="left", fontweight="bold")
+    axes.set_ylabel("IoU", fontsize=8, color=GREY)
+    axes.tick_params(colors=GREY, labelsize=9)
+    axes.grid(axis="y", color=GREY, alpha=0.25, linewidth=0.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(GREY)
+
+
 def draw(rows: list[dict[str, str]]) -> None:
     """Write the figure: narrow, so that it is read on a phone without shrinking."""
-    figure = Figure(figsize=(4.1, 6.3), layout="constrained")
-    for axes, test in zip(figure.subplots(2, 1), TESTS, strict=True):
-        panel(axes, rows, test)
+    figure = Figure(figsize=(4.1, 8.4), layout="constrained")
+    *panels, last = figure.subplots(3, 1)
+    for axes, test in zip(panels, TESTS, strict=True):
+        panel(axes, [row for row in rows if row["pair"] != APART], test)
+    curves(last, rows)
     handles = [
         Line2D([], [], color=colour, marker=marker, linewidth=1.6, markersize=9 if marker == "*" else 6, label=name)
         for colour, marker, name in SHOWN.values()
@@ -133,7 +172,9 @@ def main() -> None:
     parser.add_argument("studies", nargs="*", metavar="PAIR=FOLDER", help="what `neeco downstream` wrote")
     studies = [word.partition("=") for word in parser.parse_args().studies]
     if studies:
-        rows = [row for pair, _, folder in studies for row in rows_of(pair, read_json(Path(folder) / FILE))]
+        with TABLE.open(encoding="utf-8", newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["pair"] not in {pair for pair, _, _ in studies}]
+        rows += [row for pair, _, folder in studies for row in rows_of(pair, read_json(Path(folder) / FILE))]
         with TABLE.open("w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, (*ARM, *COMPARISON), lineterminator="\n")
             writer.writeheader()

@@ -12,7 +12,7 @@ instrument is, in a direction drawn with the seed (8x5). The jaws' opening is no
 All three trials follow each other; frames are `test` and `unseen` as in `dvrk`.
 
 `score` prints for each arm how far what `ingest` found is from the registration, as `benchmarks/base_registration.py`
-does, and how far the shaft is drawn beside itself. `references` puts that camera's hand-made masks into an ingested
+does, and how far the shaft is rendered beside itself. `references` puts that camera's hand-made masks into an ingested
 capture.
 """
 

@@ -3,8 +3,8 @@
     python benchmarks/gpu.py [--device cuda:0] [--workload 25000,320x256 ...] [--repeats 30] [--output FOLDER]
                              [--train CAPTURE [--iterations N] [--set NAME=VALUE]] [--synthesize RUN [--count N]]
 
-Method `kinematic`, random Gaussians on a closed surface, a fifth of them the instrument's: `frame` poses and draws
-them, `step` poses, draws, takes the photometric loss and its gradients and one step of Adam; `draw` and `draw+backward`
+Method `kinematic`, random Gaussians on a closed surface, a fifth of them the instrument's: `frame` poses and renders
+them, `step` does, takes the photometric loss and its gradients and one step of Adam; `draw` and `draw+backward`
 do the rasteriser's part alone, on the same posed tensors for all backends. Backends take turns, call by call; numbers
 are medians of the time from an idle device to an idle device, after three calls to warm up. Stages are timed by CUDA
 events in calls of their own, and held against peaks measured in the same run (`stages.MODEL`). FOLDER gets gpu.md and

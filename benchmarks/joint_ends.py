@@ -1,4 +1,4 @@
-"""Draws a run's instruments with every joint at both ends of its recorded range, to be looked at.
+"""Renders a run's instruments with every joint at both ends of its recorded range, to be looked at.
 
     python benchmarks/joint_ends.py RUN OUT.png [--poses 3]
 

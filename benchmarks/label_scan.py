@@ -68,7 +68,7 @@ class View:
     moved: dict[str, KnownDeltas]  # by origin
 
     def iou(self, origin: str, thresholds: DeltaThresholds) -> float:
-        """Overlap of what exceeds the thresholds, as the paper draws it, with the true mask."""
+        """Overlap of what exceeds the thresholds, as the paper renders it, with the true mask."""
         labeller = ThresholdLabels(cast("GaussianScene", self.moved[origin]), thresholds)
         owners = labeller.owners(self.state, self.gaussians)
         parts = labeller.draw(self.gaussians, self.camera, owners)[1]

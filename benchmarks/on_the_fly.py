@@ -1,4 +1,4 @@
-"""Images drawn while a network learns, against the same images read from disk: samples per second of a DataLoader.
+"""Images rendered while a network learns, against the same images read from disk: samples per second of a DataLoader.
 
     python benchmarks/on_the_fly.py runs/liver                                   # 200 images, 0, 1 and 2 workers
     python benchmarks/on_the_fly.py runs/liver --train --capture samples/liver   # and the U-Net of `neeco downstream`
@@ -39,7 +39,7 @@ class OnTheFly:
     """Measure how fast a DataLoader gets labelled images."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder that images are drawn from."""
+    """Run folder that images are rendered from."""
     count: int = 200
     """Images."""
     batch: int = 8
@@ -49,7 +49,7 @@ class OnTheFly:
     dataset: Path | None = None
     """A folder that `neeco synthesize` wrote; default: one is written to a temporary folder."""
     train: Annotated[bool, tyro.conf.arg(aliases=("--teach",))] = False
-    """Train the U-Net of `neeco downstream` straight on images drawn on the fly."""
+    """Train the U-Net of `neeco downstream` straight on images rendered on the fly."""
     capture: Path | None = None
     """Capture whose held-out frames it is tested on."""
     steps: int = UNet.steps
@@ -123,7 +123,7 @@ class DrawnBatches(BatchSampler):
 
 
 def train_on_the_fly(args: OnTheFly, capture_folder: Path, folder: Path) -> dict[str, Any]:
-    """Train the U-Net for `args.steps` on images drawn meanwhile; its scores on each held-out split with true masks."""
+    """Train the U-Net for `args.steps` on images rendered meanwhile; its scores on each held-out split with masks."""
     capture = read_capture(capture_folder)
     frame = capture.frames[0].camera
     workers = max(args.workers)

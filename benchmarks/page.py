@@ -1,4 +1,4 @@
-"""How close the exported page is to `rasterize`, how fast it draws, and how soon it shows something.
+"""How close the exported page is to `rasterize`, how fast it renders, and how soon it shows something.
 
     python benchmarks/page.py RUN [--frames 4] [--seconds 5]
 
@@ -98,7 +98,7 @@ def compare(page: Any, scene: GaussianScene, frame: int) -> None:
 
 @torch.no_grad()
 def native_rate(scene: GaussianScene, seconds: float) -> float:
-    """Posed drawings a second, by the native kernels."""
+    """Posed images a second, by the native kernels."""
     recorded, drawn, began = scene.recorded, 0, time.monotonic()
     while time.monotonic() - began < seconds:
         k = drawn % len(recorded.states)

@@ -33,7 +33,7 @@ from label_scan import SCAN_FILE, SEEN, label_scan, read_evaluation, read_scan
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
-from result_plots import GREY, number, table, write
+from result_plots import FONT, GREY, METHOD_COLORS, WIDTH, number, table, write
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
@@ -57,14 +57,11 @@ RESAMPLES = 10_000
 SCANNED = Column("scanned_iou", "IoU, best thresholds", 3, "high")
 COLUMNS = (*SPLIT_COLUMNS, SCANNED)
 KEYS = ("frames", "states", "method")
-COLOURS = {  # further runs take those that are left
-    "nps": "#0f9488",
-    "deformable-3dgs+dta": "#d97706",
-    "4dgs+dta": "#8b5cf6",
-    "3dgs": "#808b99",
-    "kinematic": "#e0457b",
+COLORS = {  # further runs take those that are left
+    name: METHOD_COLORS[name.removesuffix("+dta")]
+    for name in ("nps", "deformable-3dgs+dta", "4dgs+dta", "3dgs", "kinematic")
 }
-FURTHER = ("#2f8fdd", "#6a9a1f", "#b0703c")
+FURTHER = ("#56b4e9", "#6a9a1f", "#b0703c")
 PANELS = {
     "psnr": "PSNR, dB",
     "psnr_instrument": "PSNR in the instrument, dB",
@@ -134,7 +131,7 @@ def read_entries(folders: Sequence[Path], further: Sequence[str]) -> list[Entry]
                 f"{folder}: {name}, {entry.frames} frames, seed {entry.seed}: is there already from {first.folder}; "
                 "leave one out"
             )
-    order = {name: k for k, name in enumerate(COLOURS)}
+    order = {name: k for k, name in enumerate(COLORS)}
     return sorted(known.values(), key=lambda entry: (entry.frames, order.get(entry.name, len(order)), entry.seed))
 
 
@@ -170,7 +167,7 @@ def interval(differences: np.ndarray) -> tuple[float, float]:
 
 
 def differences(entries: Sequence[Entry]) -> list[dict[str, Any]]:
-    """What SUBJECT has more than each other method trained on as many frames, on the frames that both drew."""
+    """What SUBJECT has more than each other method trained on as many frames, on the frames that both rendered."""
     rows = []
     for frames, other in dict.fromkeys((entry.frames, entry.name) for entry in entries if entry.name != SUBJECT):
         both = [[e for e in entries if (e.frames, e.name) == (frames, name)] for name in (SUBJECT, other)]
@@ -230,34 +227,33 @@ def quoted(page: Path) -> list[dict[str, Any]]:
 def curves(summary: Sequence[dict[str, Any]]) -> Figure:
     """Means over the number of training frames: a colour per method, seen solid, unseen dashed with hollow points."""
     present = dict.fromkeys(row["name"] for row in summary)
-    further = [name for name in present if name not in COLOURS]
-    colours = COLOURS | {name: FURTHER[k % len(FURTHER)] for k, name in enumerate(further)}
-    names = [name for name in colours if name in present]
+    further = [name for name in present if name not in COLORS]
+    colors = COLORS | {name: FURTHER[k % len(FURTHER)] for k, name in enumerate(further)}
+    names = [name for name in colors if name in present]
     panels = [key for key in PANELS if any(row[key]["n"] for row in summary)]
     ticks = sorted({row["frames"] for row in summary})
-    figure = Figure(figsize=(8, 2.9 * ((len(panels) + 1) // 2)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 2.1 * len(panels) + 1), layout="constrained")
     for k, key in enumerate(panels):
-        axes = figure.add_subplot((len(panels) + 1) // 2, 2, k + 1)
+        axes = figure.add_subplot(len(panels), 1, k + 1)
         for name in names:
             for split in SPLITS:
                 line = [row for row in summary if (row["name"], row["split"]) == (name, split) and row[key]["n"]]
                 line.sort(key=lambda row: row["frames"])
                 places, means = [row["frames"] for row in line], [row[key]["mean"] for row in line]
-                axes.plot(places, means, color=colours[name], linewidth=1.6, **LINES[split])
+                axes.plot(places, means, color=colors[name], linewidth=1.6, **LINES[split])
         axes.set_xscale("log")
-        axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], fontsize=8)
+        axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], fontsize=FONT)
         axes.xaxis.set_minor_locator(NullLocator())
-        axes.set_title(PANELS[key], fontsize=9, color=GREY, loc="left")
-        axes.set_xlabel("training frames", fontsize=8, color=GREY)
-        axes.tick_params(colors=GREY, labelsize=8)
+        axes.set_title(PANELS[key], fontsize=FONT, color=GREY, loc="left")
+        axes.set_xlabel("training frames", fontsize=FONT, color=GREY)
+        axes.tick_params(colors=GREY, labelsize=FONT)
         axes.grid(axis="y", color=GREY, alpha=0.25, linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[["left", "bottom"]].set_color(GREY)
-        if key.endswith("iou"):
-            axes.set_ylim(0, 1)
-    handles = [Line2D([], [], color=colours[name], linewidth=2, label=name) for name in names]
+        axes.set_ylim(0, 1 if key.endswith("iou") else None)
+    handles = [Line2D([], [], color=colors[name], linewidth=2, label=name) for name in names]
     handles += [Line2D([], [], color=GREY, label=SPLITS[split], **style) for split, style in LINES.items()]
-    figure.legend(handles=handles, fontsize=8, frameon=False, ncols=4, loc="outside lower center")
+    figure.legend(handles=handles, fontsize=FONT, frameon=False, ncols=2, loc="outside lower center")
     return figure
 
 

@@ -1,4 +1,4 @@
-"""Times drawing: stages, forward, forward + backward, beside the arithmetic floor and a PyTorch tile loop.
+"""Times rendering: stages, forward, forward + backward, beside the arithmetic floor and a PyTorch tile loop.
 
     python benchmarks/raster.py [--threads N] [--repeats N] [--torch] [--compare LIB.so]
 

@@ -25,7 +25,7 @@ import yaml
 from PIL import Image
 
 LEAST_IOU = 0.9  # of all polygons filled with the mask: corners are simplified
-VARIANTS = ("", "segment", "pose", "obb")  # of yolo/
+VARIANTS = ("", "segment", "pose", "obb", "parts")  # of yolo/
 
 
 def pixels(path: Path | io.BytesIO) -> np.ndarray:
@@ -94,7 +94,7 @@ def read_datumaro(root: Path) -> str:
 
 
 def read_ultralytics(root: Path) -> str:
-    """Its own check of every image and label file, for all four tasks."""
+    """Its own check of every image and label file, for all tasks."""
     from ultralytics.data.utils import check_det_dataset, verify_image_label
 
     count = 0
@@ -123,7 +123,8 @@ def read_yolo_rules(root: Path) -> str:
                     keypoints, numbers = data["kpt_shape"]
                     require(size == 4 + keypoints * numbers, f"{label}: {size} columns")
                     points = np.delete(points, np.s_[4 + numbers - 1 :: numbers])
-                fits = {"": size == 4, "pose": True, "obb": size == 8, "segment": size >= 6 and size % 2 == 0}
+                polygon = size >= 6 and size % 2 == 0
+                fits = {"": size == 4, "pose": True, "obb": size == 8, "segment": polygon, "parts": polygon}
                 require(fits[variant], f"{label}: {size} columns")
                 require(values[0] in data["names"], f"{label}: class {values[0]}")
                 require(points.min() >= 0 and points.max() <= 1, f"{label}: beyond the image")

@@ -54,7 +54,7 @@ CPU seconds a frame, written, on one core of an EPYC: 0.6 at 320x256 (0.7 with d
 
 How it works (`benchmarks/rendered/`): the organ is a height field with procedural colour (`tissue.py`, `noise.py`),
 the instrument a distance function (`instrument.py`); rays meet both, 2 x 2 a pixel, lit by lamps beside the lens
-(`render.py`). With fine detail (`detail.py`, `textures.py`), `adaptive.py` draws from coarse to fine: one sample a
+(`render.py`). With fine detail (`detail.py`, `textures.py`), `adaptive.py` renders from coarse to fine: one sample a
 pixel, 3 x 3 at edges, where a pixel's part is what most samples see. `motion.py` plans camera and instrument,
 `breathing.py` moves the tissue, `exposure.py` and `optics.py` are the camera's, `errors.py` is what the sensors make of
 it, `scenes.py` holds the scenes; `frames.py`, `truth.py`, `points.py`, `recording.py` and `writing.py` write. A new
@@ -106,7 +106,7 @@ from rendered.writing import without_sign, write_recording
 
 from neeco.errors import NeecoError
 
-SMALLEST = 32  # px of either side that a scene is drawn at
+SMALLEST = 32  # px of either side that a scene is rendered at
 
 
 def main() -> int:

@@ -35,7 +35,7 @@ TRAINED_ON = {  # heading of the table: colour, as in does_it_help.py
     "synthetic images alone": "#56b4e9",
 }
 SPLITS = ("seen", "unseen")  # filled and hollow bars
-WIDTH, BAR = 4.6, 0.125  # inches: of a figure that a phone shows whole, of a bar
+WIDTH, BAR = 4.1, 0.125  # inches: of a figure that a phone shows whole, of a bar
 FONT = 8.5
 
 
@@ -146,7 +146,7 @@ def main() -> None:
 
     rows = table("U-Net on", headings=True)
     columns = [rows[0].index(heading) for heading in TRAINED_ON]
-    figure, panels = new_figure(3 * len(rows[1:]), 2, key=False)
+    figure, panels = new_figure(4 * len(rows[1:]), 2, key=False)
     groups, colors = [row[0] for row in rows[1:]], list(TRAINED_ON.values())
     for k, (axes, split) in enumerate(zip(panels, SPLITS, strict=True)):
         values = [[pair(row[column])[k] for column in columns] for row in rows[1:]]

@@ -1,11 +1,11 @@
-"""How well a run draws sizes that it did not learn: PSNR against recorded frames of those sizes, and how large its
+"""How well a run renders sizes that it did not learn: PSNR against recorded frames of those sizes, and how large its
 masks are, as a share of the true ones, where the capture has those.
 
     python benchmarks/sizes.py runs/liver                        # smaller: against its test frames, area-averaged
     python benchmarks/sizes.py runs/small --truth captures/large # larger: against a capture with larger images
 
 plain: by the rasteriser alone, whose low-pass is .3 px^2 of whatever is drawn. compensated: that, with the opacity that
-a Gaussian so widened has to lose (the 2D filter of Mip-Splatting, Yu et al. 2024). drawn: as every verb draws.
+a Gaussian so widened has to lose (the 2D filter of Mip-Splatting, Yu et al. 2024). drawn: as every verb renders.
 """
 
 from __future__ import annotations

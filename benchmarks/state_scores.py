@@ -80,6 +80,7 @@ def of_run(path: Path) -> States:
         refinement = Refinement(config.refine, frames, scene.instruments, torch.device("cpu"))
         parts = {name.removeprefix("refinement/"): t for name, t in tensors.items() if name.startswith("refinement/")}
         refinement.restore(refinement.tensors() | parts)  # older runs have fewer
+        refinement.scale_deviations(refinement.prior_shares())
         states = []
         for index, frame in enumerate(frames):
             state, _, _ = refinement.apply(index, frame.state, frame.camera, sys.maxsize)

@@ -16,7 +16,7 @@ readings of the jaw are compared as the openings they mean (truth/hinge.json).
 
 Errors are those of camera_from_instrument, so that the gauge of the cameras does not count. `px` is where a point near
 the tips falls in the image; `deg` the rotation; `joint` deg (mm where it slides), the largest of an instrument's;
-`IoU` that of the label that RUN draws at the tracked state. Every measure twice: as it is, and without the constant
+`IoU` that of the label that RUN renders at the tracked state. Every measure twice: as it is, and without the constant
 offset (one rigid transform and one number a joint, medians over all frames) by which the sensor's frame as learned
 differs from the true one, which no image shows. Lost: tip 10 px or rotation 15 degrees off. Trust: how many of the
 frames that are more than 10 degrees off have less than 0.5, and how many of the others. Frames whose tip is outside

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import stat
@@ -33,6 +34,7 @@ from neeco.files import (
     require_like,
     visible_entries,
     write_atomically,
+    write_unsynced,
 )
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers import read_table
@@ -299,3 +301,18 @@ def test_hidden_files_are_no_part_of_a_folder(tmp_path: Path) -> None:
     for name in ("b.png", "a.png", "._a.png", ".DS_Store"):
         (tmp_path / name).touch()
     assert [entry.name for entry in visible_entries(tmp_path)] == ["a.png", "b.png"]
+
+
+def test_unsynced_files_are_whole_and_so_is_what_they_replace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "made" / "file.bin"
+    write_unsynced(path, b"first")
+    assert path.read_bytes() == b"first"
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(NeecoError, match="cannot write: No space left"):
+        write_unsynced(path, b"second")
+    assert [entry.name for entry in path.parent.iterdir()] == ["file.bin"]
+    assert path.read_bytes() == b"first"

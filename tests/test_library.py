@@ -215,6 +215,7 @@ def test_the_recipe_for_the_next_operation_runs_as_the_page_says(
     Path("PLATES").mkdir()
     for k in range(2):
         Image.fromarray(np.random.default_rng(k).integers(60, 180, (64, 80, 3), np.uint8)).save(f"PLATES/{k}.png")
+    Path("FRAMES").symlink_to("PLATES")
     assert train == ["neeco", "train", "FIRST", "--output", "RUN"]  # which the first program did
     synthesize_set[synthesize_set.index("--count") + 1] = "4"
     assert main([*synthesize_set[1:], "--min-share", "0"]) == 0
@@ -298,6 +299,12 @@ def test_the_programs_in_examples_run(folder: Path, tmp_path: Path, capsys: pyte
     example("04_own_method").main(tmp_path / "sway", iterations=5)
     example("05_own_capture").main(tmp_path / "capture", iterations=5, method="3dgs")
     example("06_other_formats").main(run, tmp_path / "dataset", count=2)
+    logged: dict[int, dict[str, float]] = {}
+    example("07_log_training").main(
+        tmp_path / "watched", log=logged.__setitem__, iterations=50, method="3dgs", scale=0.5
+    )
+    assert logged[50]["loss"] > 0
+    assert logged[50]["num_gaussians"] > 0
     printed = capsys.readouterr().out
     assert "0 problems" in printed
     assert "COCO: 2 images" in printed

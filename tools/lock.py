@@ -50,7 +50,7 @@ def groups() -> dict[str, Group]:
         "dev": Group(
             "the extra dev",
             ("dev",),
-            includes=("neeco", "build", "docs", "downstream", "ingest", "lerobot", "ros", "urdf", "view"),
+            includes=("neeco", "build", "docs", "downstream", "hub", "ingest", "lerobot", "ros", "urdf", "usd", "view"),
         ),
         "nvidia": Group("PyTorch's CUDA build, which PyPI has for Linux", ("triton",), includes=("triton",)),
         "wasm": Group("make viewer", None, ("ziglang",), ()),

@@ -18,7 +18,21 @@ from lock import ROOT, groups, locked
 NOTICE = ROOT / "NOTICE"
 PART = "Part 2. What is installed beside neeco, none of it passed on with it"
 # what neeco imports when it runs; with the rest it is built, tested and looked after
-IMPORTED = ("neeco", "cluster", "cuda", "downstream", "ingest", "triton", "urdf", "view")
+IMPORTED = (
+    "neeco",
+    "cluster",
+    "cuda",
+    "downstream",
+    "hub",
+    "ingest",
+    "lerobot",
+    "rerun",
+    "ros",
+    "triton",
+    "urdf",
+    "usd",
+    "view",
+)
 
 ALLOWED = re.compile(
     r"((the )?mit\b|mit-cmu|apache|(3-clause )?bsd|freebsd|0bsd|isc\b|zlib|cc0|bsl-1|psf|python software foundation"
@@ -29,6 +43,7 @@ ALLOWED = re.compile(
 FOUND = {
     "cuda-toolkit": "NVIDIA's, an empty package that names others",  # its description on PyPI
     "gsplat": "Apache-2.0",  # LICENSE in its wheel
+    "usd-core": "Apache-2.0",  # LICENSE.txt: TOST-1.0, which is Apache-2.0 but for the paragraph on trademarks
     "apsw": "MIT",  # LICENSE: any licence that the OSI approves
 }
 # what a package's own licence does not tell

@@ -34,7 +34,7 @@ from rendered.render import (
 from rendered.textures import remap
 
 BLOCK = 4  # px
-BAND = 1 << 16  # rays that are drawn at a time
+BAND = 1 << 16  # rays that are rendered at a time
 SAMPLES = 3  # a side of the pixels that are sampled again
 RESAMPLED = 0.6  # of a pixel that each of these samples stands for, so that their mean is as sharp as its neighbours
 EDGE_MM = 0.35  # of depth, beyond what a plane would do, that calls for more samples …

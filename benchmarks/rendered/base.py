@@ -32,8 +32,8 @@ def wrong_base(truth: Array, poses: Array, mm: float, degrees: float, seed: int)
 
 def base_errors(found: Array, truth: Array, poses: Array) -> dict[str, float]:
     """What a base [4, 4] is off, of a still scope's camera, over poses [F, 4, 4] in its frame, root mean square: mm by
-    which the instrument is drawn beside its place, across the view and in all, once the best constant offset of its own
-    frame is taken out; mm without that (raw), and what of them lies across the view (seen); and degrees."""
+    which the instrument is rendered beside its place, across the view and in all, once the best constant offset of its
+    own frame is taken out; mm without that (raw), and what of them lies across the view (seen); and degrees."""
     right = truth @ poses
     raw = ((found - truth) @ poses)[:, :3, 3]
     local = np.einsum("fji,fj->fi", right[:, :3, :3], raw)

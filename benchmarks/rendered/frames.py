@@ -126,7 +126,7 @@ def take_shots(trajectory: Trajectory, spec: SceneSpec, every: int = 1) -> list[
 
 @dataclass(frozen=True)
 class Rendered:
-    """One frame as the rest of the pipeline needs it: pixels uint8 [H, W, 3] and the drawing they came from."""
+    """One frame as the rest of the pipeline needs it: pixels uint8 [H, W, 3] and the rendering they came from."""
 
     pixels: Array
     drawing: Drawing
@@ -215,7 +215,7 @@ def moved(place: Place, modes: tuple[Mode, ...], time: float) -> Place:
 
 
 def render_all(renderer: Renderer, shots: list[Shot]) -> Iterator[Rendered]:
-    """All frames in order, drawn by `settings.workers` processes; the same bytes for any number of them."""
+    """All frames in order, rendered by `settings.workers` processes; the same bytes for any number of them."""
     if renderer.settings.workers == 1:
         yield from map(renderer.render, shots)
         return

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from neeco.errors import NeecoError
     from neeco.synthesis.torch_datasets import LabelledImages, LabelledStream, StoredImages, sample_states
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = [
     "Camera",
     "LabelledImages",

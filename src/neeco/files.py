@@ -73,6 +73,38 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             temporary.unlink()
 
 
+def write_unsynced(path: Path, content: bytes) -> None:
+    """Write `content` to `path` as `write_atomically` does, but leave it to the system when it reaches the disk.
+
+    For the many files of a folder that counts as complete only after `sync_disk`: a killed process leaves each whole or
+    absent, a power cut may leave some empty. Raises NeecoError naming `path` when the disk refuses.
+    """
+    temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")
+    flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
+    try:
+        try:
+            handle = os.open(temporary, flags, 0o666)
+        except FileNotFoundError:
+            _make_folders(path.parent)
+            handle = os.open(temporary, flags, 0o666)
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(content)
+            os.replace(temporary, path)
+        except BaseException:
+            with contextlib.suppress(FileNotFoundError):
+                temporary.unlink()
+            raise
+    except OSError as error:
+        raise NeecoError(f"{path}: cannot write: {error.strerror or error}") from error
+
+
+def sync_disk() -> None:
+    """Wait until everything written so far is on disk, where the system can say so (not on Windows)."""
+    if hasattr(os, "sync"):
+        os.sync()
+
+
 def _make_folders(path: Path) -> None:
     """Make folder `path` and those above it, as far as they are missing, so that they outlast a power cut."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]

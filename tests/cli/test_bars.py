@@ -27,7 +27,7 @@ def test_a_file_gets_a_line_at_intervals_with_what_how_far_and_how_long_still(ca
         bars.training(row)
         time.sleep(0.1)
     first, *_, last = capsys.readouterr().err.splitlines()
-    assert first.startswith("training: 25 %, iteration 1234  PSNR 30.0 dB  23456 Gaussians  phase 1, 0:00:00 passed")
+    assert first.startswith("training: 25 %, iteration 1234, PSNR 30.0 dB, 23456 Gaussians, 0:00:00 passed")
     assert first.endswith("left")
     assert last.startswith("training: 25 %")
     assert len(first) > 80

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from neeco.fitting.alignment import AlignConfig, AlignedFrame, align_frame, pose_change
+from neeco.fitting.alignment import STATE_ERRORS, AlignConfig, AlignedFrame, align_frame, pose_change
 
 
 @pytest.fixture(scope="module")
@@ -74,3 +74,14 @@ def test_the_fit_needs_no_gradient_and_leaves_none(scene_and_frame):
     assert not fit.state.instruments["bar"].pose.requires_grad
     assert not fit.camera.world_from_camera.requires_grad
     assert torch.isfinite(fit.camera.world_from_camera).all()
+
+
+def test_large_errors_of_a_recording_are_found_from_as_far(world, scene_and_frame):
+    scene, frame = scene_and_frame
+    wrong = world.moved(frame, world.translation(0.5, yaw=math.radians(6)), world.translation())
+    truth, left = frame.state.instruments["bar"].pose, []
+    for diagnostics in ({}, {STATE_ERRORS: 0.4}):
+        scene.diagnostics = diagnostics
+        left.append(pose_change(truth, align(scene, wrong).state.instruments["bar"].pose)["deg"])
+    scene.diagnostics = {}
+    assert left[1] < 0.8 * left[0]  # a tiny image tells little

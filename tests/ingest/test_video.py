@@ -10,6 +10,7 @@ from PIL import Image
 
 from neeco.errors import NeecoError
 from neeco.ingest.frames.images import read_lens
+from neeco.ingest.readers import video
 from neeco.ingest.readers.video import open_images, open_video
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.timing.reading import read_episodes
@@ -30,6 +31,19 @@ def test_frames_are_read_by_index_in_order(world):
     assert [index for index, _ in frames] == [3, 11, 20]
     assert all(image.shape == (48, 64, 3) and image.dtype == np.uint8 for _, image in frames)
     assert all(abs(left_edge(image) - index) <= 1 for index, image in frames)
+
+
+def test_a_video_is_decoded_once_where_its_frames_fit_into_memory(world, monkeypatch):
+    path = world.video()
+    opened = [open_video(path)]
+    monkeypatch.setattr(video, "MAX_BUFFERED_BYTES", 1000)
+    opened.append(open_video(path))
+    (_, first), (_, second) = (zip(*one.read([3, 11, 20]), strict=True) for one in opened)
+    np.testing.assert_array_equal(first, second)
+    path.unlink()
+    assert len(list(opened[0].read([3, 11, 20]))) == 3
+    with pytest.raises(NeecoError, match="cannot be opened"):
+        next(opened[1].read([3]))
 
 
 def test_a_variable_rate_is_kept(world):

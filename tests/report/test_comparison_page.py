@@ -209,7 +209,7 @@ def test_sentences_go_split_by_split(comparison):
     assert [split for split, _ in reported] == ["test", "unseen", "", ""]
     assert reported[0][1].startswith("kinematic first in PSNR, 24.20 dB, 4.15 dB before 3dgs")
     assert reported[1][1].startswith("kinematic first")
-    assert "level in drawing speed" in reported[2][1]
+    assert "level in rendering speed" in reported[2][1]
 
 
 def test_one_seed_is_said_once(comparison):
@@ -233,6 +233,14 @@ def test_charts_tell_methods_apart_without_colour():
     assert "&lt;b&gt;" in sample
     assert "var(--m1)" in sample
     assert line_chart("t", "x", []) == line_chart("t", "x", [Series("one", 0, ((1.0, 1.0),))]) == ""
+
+
+@pytest.mark.parametrize(("values", "cut"), [((20.0, 31.0), True), ((8.0, 23.0), False), ((-1.0, 2.0), False)])
+def test_a_vertical_axis_begins_at_zero_or_says_that_it_is_cut(values, cut):
+    chart = line_chart("PSNR", "steps", [Series("", 0, tuple(enumerate(values)))])
+    assert ("axis cut" in chart) == cut
+    assert ("vertical axis cut" in chart.partition(">")[0]) == cut
+    assert (">0<" in chart.replace(" ", "").partition("steps")[2]) or cut
 
 
 def test_names_at_the_ends_of_lines_do_not_cover_one_another():

@@ -20,7 +20,8 @@ VOID = {"meta", "img", "br", "link"}
 @pytest.fixture(scope="module")
 def reported(world, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    scene = world.TinyScene(diagnostics={"bar": {"hinge_axis": [0.0, 1.0, 0.0], "verdict": "joint <found>"}})
+    found = {"hinge_axis": [0.0, 1.0, 0.0], "verdict": "joint <found>"}
+    scene = world.TinyScene(diagnostics={"bar": found, "shadow": [{"found_at_mm": [], "iteration": 600}]})
     capture = world.make_capture(folder / "capture", world.TinyScene(), ("train", "test", "test", "unseen"))
     rows = [
         {"iteration": i * 10, "loss": 1 / (i + 1), "psnr": 20 + i / 9, "num_gaussians": 100 + i, "phase": 1 + (i > 20),
@@ -57,6 +58,30 @@ def test_the_page_says_the_numbers_and_the_notes(reported):
         assert f"<td>{evaluation[kind]['test']['mask_recall']:.3f}</td>" in text
     assert "phase 2" in text
     assert "0.4 min" in text
+
+
+def test_every_picture_of_a_frame_says_whether_it_is_recorded_or_rendered(reported):
+    text = reported[-1].read_text()
+    captions = re.findall(r"<figcaption>(.*?)</figcaption>", text)
+    assert set(captions) == {
+        "recorded image",
+        "rendered image",
+        "difference of the two",
+        "recorded image, label over it",
+    }
+
+
+def test_what_training_found_is_folded_away_and_in_words(reported):
+    text = reported[-1].read_text()
+    folded = re.search(r"<details><summary>All that training found.*?</details>", text, re.DOTALL)
+    assert folded is not None
+    assert "<dd>found at mm none, iteration 600</dd>" in folded[0]
+    assert not re.search(r"<dd>[{\[]", text)
+    assert "joint &lt;found&gt;" in text.replace(folded[0], "")
+
+
+def test_tables_that_scroll_are_reached_by_the_keyboard(reported):
+    assert not re.search(r'<div class="scroll[^"]*">', reported[-1].read_text())
 
 
 def test_what_the_user_wrote_is_shown_as_text_not_as_markup(reported):

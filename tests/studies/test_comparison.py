@@ -291,6 +291,6 @@ def test_a_setting_that_cannot_be_shared_is_refused(spec: ComparisonSpec, given:
 def test_a_cluster_without_ray_is_refused_before_anything_is_written(spec: ComparisonSpec, monkeypatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")
     monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(NeecoError, match=r"neeco\[cluster\]"):
+    with pytest.raises(NeecoError, match=r"\[cluster\]"):
         compared(replace(spec, workers=2))
     assert not spec.output.exists()

@@ -178,6 +178,23 @@ def test_yolo_labels_lie_where_tools_look_and_stay_in_range(made, variant, numbe
         assert (coordinates <= 1).all()
 
 
+def test_yolo_has_the_parts_as_classes(made):
+    data = yaml.safe_load((made / "yolo/parts/data.yaml").read_text())
+    assert data["names"] == {0: "rod/shaft", 1: "rod/jaw"}
+    drawn = 0
+    for split in ("train", "val"):
+        for label in sorted((made / "yolo/parts/labels" / split).glob("*.txt")):
+            ids = pixels(made / "parts" / f"{label.stem}.png")
+            rows = {int(row.split()[0]): np.array(row.split()[1:], float) for row in label.read_text().splitlines()}
+            assert {category + 1 for category in rows} == set(np.unique(ids)) - {0}
+            for category, points in rows.items():
+                x, y = (points.reshape(-1, 2) * (64, 48)).T
+                area = abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2
+                assert area == pytest.approx((ids == category + 1).sum(), rel=0.15)
+                drawn += 1
+    assert drawn > COUNT
+
+
 def test_a_yolo_box_is_the_extreme_pixels(made):
     values = np.array((made / "yolo/labels/train/000000.txt").read_text().split()[1:], dtype=float)
     mask = pixels(made / "masks" / "000000.png") > 0
@@ -312,7 +329,7 @@ def test_a_data_set_is_not_continued_with_other_settings(made, run, tmp_path, ot
 
 def test_states_that_are_refused_are_drawn_anew_and_counted(run, tmp_path, monkeypatch):
     refusals = iter(["leaves the image", "enters the tissue", None, None])
-    monkeypatch.setattr(Acceptance, "refusal", lambda self, scene, drawing: next(refusals))
+    monkeypatch.setattr(Acceptance, "refusal", lambda self, drawing: next(refusals))
     summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=2))
     assert summary.refused == {"leaves the image": 1, "enters the tissue": 1}
     assert json.loads((tmp_path / "dataset/dataset.json").read_text())["refused"] == summary.refused

@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import stat
 from dataclasses import replace
 
 import numpy as np
@@ -27,7 +26,7 @@ def contents(folder) -> dict[str, bytes]:
 def refusing(reasons, monkeypatch) -> None:
     """Judge drawn states by `reasons` in turn; None accepts."""
     given = iter(reasons)
-    monkeypatch.setattr(Acceptance, "refusal", lambda self, scene, drawing: next(given))
+    monkeypatch.setattr(Acceptance, "refusal", lambda self, drawing: next(given))
 
 
 def behind_the_camera(state, path) -> str:
@@ -125,15 +124,15 @@ def test_a_full_disk_is_told_with_the_file_and_gone_on_from(run, tmp_path, monke
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     synthesize(run, whole, SETTINGS)
     with monkeypatch.context() as patched:
-        real = os.fsync
-        left = iter(range(10))  # dataset.json, one image's seven files, and two of the next's
+        real = os.replace
+        left = iter(range(11))  # dataset.json, one image's seven files and record, and two of the next's
 
-        def full(descriptor: int) -> None:
-            if stat.S_ISREG(os.fstat(descriptor).st_mode) and next(left, None) is None:
+        def full(source: object, target: object) -> None:
+            if next(left, None) is None:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            real(descriptor)
+            real(source, target)
 
-        patched.setattr(neeco.files.os, "fsync", full)
+        patched.setattr(neeco.files.os, "replace", full)
         with pytest.raises(NeecoError, match=r"000001.*: cannot write: No space left on device"):
             synthesize(run, cut, SETTINGS)
     assert not [path for path in cut.rglob(".*") if path.is_file()]  # no half-written file

@@ -128,3 +128,16 @@ def test_stated_uncertainties_are_the_prior(tmp_path: Path) -> None:
     assert covariance[6, 6].sqrt() == pytest.approx(math.radians(7.0))
     turns = covariance[:3, :3].diagonal().sqrt().rad2deg()
     assert turns.tolist() == pytest.approx([0.5, 0.5, 20.0], rel=0.01)
+    assert search.stated_scale() == 0.0  # by one state of many
+
+
+def test_the_size_of_stated_errors_is_told_in_those_of_a_robot(tmp_path: Path) -> None:
+    for size, stated in (
+        (1.0, Uncertainty((0.4, 0.4, 1.5), (2.0, 2.0, 6.0), {"jaw_angle": 4.0})),
+        (0.125, Uncertainty((0.3, 0.3, 0.3), (0.25, 0.25, 0.25), {"jaw_angle": 0.5})),  # a tracker's
+    ):
+        states = []
+        for state in TRUE:
+            own = replace(state.instruments["grasper"], uncertainty=stated)
+            states.append(replace(state, instruments={"grasper": own}))
+        assert search_of(session_of(tmp_path / str(size), states)).stated_scale() == pytest.approx(size, rel=0.1)

@@ -200,7 +200,7 @@ def test_a_batch_is_of_gaussians_and_at_least_one_frame() -> None:
     assert training_config("3dgs", {"batch_size": 4}).batch_size == 4
     with pytest.raises(NeecoError, match="--batch-size: 0 is too small; give at least 1"):
         training_config("3dgs", {}, ["batch_size=0"])
-    with pytest.raises(NeecoError, match=r"--batch-size: method nerfies draws rays .* deformation\.rays=NUMBER"):
+    with pytest.raises(NeecoError, match=r"--batch-size: method nerfies samples rays .* deformation\.rays=NUMBER"):
         training_config("nerfies", {"batch_size": 2})
 
 

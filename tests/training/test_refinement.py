@@ -206,3 +206,30 @@ def test_a_state_that_is_set_holds_from_the_first_step_on_and_draws_what_is_lear
     assert states[4].instruments["rod"].joints["jaw"] == pytest.approx(0.8)
     assert isinstance(states[4].instruments["rod"].joints["jaw"], float)  # as files need it
     assert states[6].instruments["rod"].joints["jaw"] == 0.5
+
+
+def test_standard_deviations_of_exact_states_are_of_the_size_of_their_corrections() -> None:
+    frames, instrument = on_scopes(apart=False)
+    refinement = Refinement(RefineConfig(frame_poses=True, frame_joints=True), frames, (instrument,), CPU)
+    before = refinement.deviations(0)
+    generator = torch.Generator().manual_seed(0)
+    refinement.frame_steps += 10
+    refinement.poses = 0.2 * refinement.pose_sd * torch.randn(refinement.poses.shape, generator=generator)
+    refinement.joints = 2.0 * refinement.joint_sd * torch.randn(refinement.joints.shape, generator=generator)
+    refinement.set_state(4, frames[4].state, frames[4].state, 3 * before)
+    refinement.scale_deviations(refinement.prior_shares())
+    shares = refinement.deviations(0) / before
+    assert torch.all((shares[:6] > 0.15) & (shares[:6] < 0.4))
+    assert float(shares[6]) == pytest.approx(1.0)  # never larger than the prior
+    assert torch.allclose(refinement.deviations(4), 3 * before)  # a fit has its own
+
+
+def test_standard_deviations_stay_where_nothing_was_corrected() -> None:
+    frames, instrument = on_scopes(apart=False)
+    refinement = Refinement(RefineConfig(frame_poses=True), frames, (instrument,), CPU)
+    assert refinement.prior_shares().tolist() == [1.0, 1.0, 1.0]  # no step was taken
+    refinement.frame_steps += 10
+    refinement.poses += 1e-4
+    shares = refinement.prior_shares().tolist()
+    assert max(shares[:2]) < 0.1
+    assert shares[2] == 1.0  # readings are not learned

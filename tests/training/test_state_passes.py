@@ -22,6 +22,22 @@ def session_of(silhouettes: Silhouettes | None, *, linked: bool, expected: bool)
     )
 
 
+def decided(
+    monkeypatch: pytest.MonkeyPatch, session: Any, mark: float, *, size: float = 0.0, stated: float = 0.0
+) -> bool:
+    """Whether states are fitted after a mark at which images show errors of a size, and the recording states others."""
+    search = SimpleNamespace(
+        session=session, deviations=lambda index, scale: None, stated_scale=lambda: stated, fitted=lambda *given: None
+    )
+    monkeypatch.setattr(module.StateSearch, "of", lambda session, articulated: search)
+    monkeypatch.setattr(module, "size_of_errors", lambda search, doubted: size)
+    monkeypatch.setattr(module, "doubt_states", lambda search, scale, misfits: None)
+    monkeypatch.setattr(module.Misfits, "of", lambda search: module.Misfits({}, 1.0, 1.0))
+    monkeypatch.setattr(module, "CARVED_AT", ())
+    module.fit_states(session, None, mark)  # type: ignore[arg-type]
+    return module.STATE_ERRORS in session.scene.diagnostics
+
+
 @pytest.mark.parametrize(
     ("linked", "observed", "expected", "size", "fitted"),
     [
@@ -37,14 +53,20 @@ def session_of(silhouettes: Silhouettes | None, *, linked: bool, expected: bool)
 def test_errors_are_large_by_what_images_can_tell(
     linked: bool, observed: bool, expected: bool, size: float, fitted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    search = SimpleNamespace(deviations=lambda index, scale: None)
-    monkeypatch.setattr(module.StateSearch, "of", lambda session, articulated: search)
-    monkeypatch.setattr(module, "size_of_errors", lambda search, doubted: size)
-    monkeypatch.setattr(module, "doubt_states", lambda search, scale, misfits: None)
-    monkeypatch.setattr(module.Misfits, "of", lambda search: module.Misfits({}, 1.0, 1.0))
     session = session_of(Silhouettes((), 0.0) if observed else None, linked=linked, expected=expected)
-    module.fit_states(session, None, module.DECIDED_AT)  # type: ignore[arg-type]
-    assert (module.FOUND in session.scene.diagnostics) == fitted
+    assert decided(monkeypatch, session, module.DECIDED_AT[0], size=size) == fitted
+
+
+@pytest.mark.parametrize("stated", [0.1, 1.0])
+def test_stated_errors_are_believed_whatever_images_show(stated: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = session_of(None, linked=True, expected=False)
+    assert decided(monkeypatch, session, module.DECIDED_AT[0], stated=stated) == (stated == 1.0)
+
+
+def test_errors_that_images_show_only_later_are_found_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = session_of(Silhouettes((), 0.0), linked=True, expected=False)
+    assert not decided(monkeypatch, session, module.DECIDED_AT[0], size=0.05)
+    assert decided(monkeypatch, session, module.DECIDED_AT[1], size=0.15)
 
 
 def test_states_that_are_doubted_do_not_count_for_the_size_of_all_errors() -> None:

@@ -111,6 +111,16 @@ def test_joints_follow_the_recording_until_one_is_moved(page: ViewerPage) -> Non
     assert page.value(JAW) == pytest.approx(math.degrees(0.7), abs=0.5)
 
 
+def test_arrows_on_a_focused_slider_turn_no_camera(page: ViewerPage, scene) -> None:
+    page.settled()
+    page.tick("joints as recorded")  # so that the frame is all that changes
+    page._row("frame").get_by_role("slider").first.focus()
+    shown = page.after(lambda: page.page.keyboard.press("ArrowRight", delay=400))
+    frame = page.value("frame")
+    assert frame > 0
+    assert alike(shown, scene, frame, seen_by=round(frame)) > ALIKE_DB
+
+
 def test_the_camera_goes_along_with_the_frames_and_jumps_back_exactly(page: ViewerPage, scene) -> None:
     page.settled()
     shown = page.set("frame", 6.0)

@@ -242,6 +242,17 @@ def test_dragging_turns_the_camera_and_the_button_brings_it_back(page: Page) -> 
     assert np.array_equal(page.drawn()[0], before)
 
 
+def test_sliders_have_names_and_values_with_units_and_keep_their_arrows(page: Page) -> None:
+    jaw = page.page.get_by_role("slider", name="grasper: jaw angle", exact=True)
+    before = float(jaw.input_value())
+    jaw.focus()
+    page.page.keyboard.press("ArrowRight")
+    assert float(jaw.input_value()) > before
+    assert jaw.evaluate("input => input.ariaValueText").endswith("°")
+    assert page.value("frame") == 0.0
+    assert page.page.get_by_role("slider", name="Recording: frame", exact=True).count() == 1
+
+
 def test_views_keys_and_play(page: Page) -> None:
     pictures = [page.drawn(0, view)[0] for view in range(4)]
     for k in range(3):

@@ -154,3 +154,12 @@ def test_an_answer_that_does_not_fit_is_spoken_of(page: Any, server: PosingServe
     saved(page, 6)
     assert "what its neighbours say" in page.inner_text("#said")
     assert page.locator("#said.doubted").count() == 1
+
+
+def test_arrows_on_a_focused_slider_move_that_slider_alone(page: Any) -> None:
+    roll, jaw = (page.get_by_role("slider", name=name, exact=True) for name in ("roll", JOINT.replace("_", " ")))
+    before = float(roll.input_value()), float(jaw.input_value())
+    jaw.focus()
+    page.keyboard.press("ArrowRight")
+    assert (float(roll.input_value()), float(jaw.input_value())) == (before[0], before[1] + 1)
+    assert jaw.evaluate("input => input.ariaValueText").startswith(f"{before[1] + 1:.0f}°")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gzip
 import struct
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
 from neeco.viewer.splats import exported_state, ply_bytes, splats_of, spz_bytes
+from neeco.viewer.usd import write_usd
 
 STATE = grasper_state(pose_of(0.7, -0.4, 1.1, 2.0, 1.0, 60.0), 0.5)
 
@@ -121,6 +124,43 @@ def test_a_ball_survives_in_both_formats_and_the_same_bytes_come_twice() -> None
     assert decibels(rasterize(gaussians_of_spz(small), camera).color, truth) > 38
 
 
+def test_openusd_reads_the_same_gaussians_from_a_prim_of_its_own_schema(tmp_path: Path) -> None:
+    pxr = pytest.importorskip("pxr", reason="the extra usd")
+    scene = lit_scene()
+    splats = splats_of(scene, STATE, CAMERA)
+    write_usd(splats, tmp_path / "scene.usdc")
+    stage = pxr.Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    assert pxr.UsdGeom.GetStageMetersPerUnit(stage) == 0.001
+    field = pxr.UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
+    assert field.GetPrim().IsA("ParticleField3DGaussianSplat")
+    means, scales, opacities = (
+        torch.from_numpy(np.array(attribute.Get()))
+        for attribute in (field.GetPositionsAttr(), field.GetScalesAttr(), field.GetOpacitiesAttr())
+    )
+    quats = torch.tensor([[q.GetReal(), *q.GetImaginary()] for q in field.GetOrientationsAttr().Get()])
+    degree = field.GetRadianceSphericalHarmonicsDegreeAttr().Get()
+    coefficients = torch.from_numpy(np.array(field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get()))
+    read = Gaussians(means, quats, scales, opacities, coefficients.reshape(len(means), (degree + 1) ** 2, 3))
+    with torch.no_grad():
+        assert decibels(rasterize(read, CAMERA).color, scene.render(STATE, CAMERA).color) > 60
+    lowest, highest = np.array(field.GetExtentAttr().Get())
+    assert (lowest < means.numpy()).all()
+    assert (means.numpy() < highest).all()
+
+
+def test_a_missing_or_old_openusd_is_refused_with_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = ball_scene("ball", [(0.0, 0.0, 60.0)])
+    splats = splats_of(scene, *exported_state(scene, 0, None))
+    old = SimpleNamespace(Usd=SimpleNamespace(GetVersion=lambda: (0, 25, 5)), UsdVol=SimpleNamespace())
+    for module, why in ((None, "usdc needs usd-core"), (old, "26.03 or newer, this is 25.5")):
+        monkeypatch.setitem(sys.modules, "pxr", module)
+        with pytest.raises(NeecoError, match=rf"{why}; pip install '.\[usd\]'"):
+            write_usd(splats, tmp_path / "a.usdc")
+    assert not list(tmp_path.iterdir())
+
+
 def test_positions_that_spz_cannot_hold_are_refused() -> None:
     scene = ball_scene("ball", [(0.0, 0.0, 3000.0)])
     with pytest.raises(NeecoError, match=r"--format: spz .* use ply"):
@@ -154,10 +194,10 @@ def test_the_verb_writes_and_refuses(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_the_format_is_that_of_the_ending(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = run_folder(tmp_path / "run", ball_scene("ball", [(0.0, 0.0, 60.0)]))
-    for name, begin in (("a.spz", b"\x1f\x8b"), ("a.PLY", b"ply"), ("a", b"ply")):
+    for name, begin in (("a.spz", b"\x1f\x8b"), ("a.usdc", b"PXR-USDC"), ("a.PLY", b"ply"), ("a", b"ply")):
         assert main(["export", str(run), "--output", str(tmp_path / name)]) == 0
         assert (tmp_path / name).read_bytes().startswith(begin)
-    for words, ends in ((["b.splat"], ".ply or .spz"), (["b.ply", "--format", "spz"], ".spz")):
+    for words, ends in ((["b.splat"], ".ply or .spz or .usdc"), (["b.ply", "--format", "spz"], ".spz")):
         assert main(["export", str(run), "--output", *words]) == 1
         assert (
             f"--output: {words[0]}: another format's name; what is written ends in {ends}\n" in capsys.readouterr().err

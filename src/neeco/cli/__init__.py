@@ -33,7 +33,7 @@ VERBS = {
     "compare": "Train and score several methods under the same budget; tables and a report.",
     "score-masks": "Score a folder of masks from any source against the truth.",
     "view": "Show a run interactively, in a browser or as one file.",
-    "export": "Write a scene in one state for other viewers of Gaussians (PLY, SPZ).",
+    "export": "Write a scene in one state for other viewers of Gaussians (PLY, SPZ, OpenUSD).",
     "synthesize": "Render a labelled data set of states that nobody recorded.",
     "annotate": "Label the recorded frames by the scene, each with its confidence.",
     "track": "Find instruments in footage that has no states, by their learned scene.",

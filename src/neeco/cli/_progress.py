@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from neeco.training.train import ProgressRow
 
 LINE_INTERVAL_S = 30.0  # between two lines about the same work, where no terminal shows bars
+WIDE = 100  # characters of a terminal on which bars are long
 MIN_SHOWN_S = 1.0  # what took less has no last line
 EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
 
@@ -33,14 +34,15 @@ class Bars:
     before there is progress, so that bad input prints its one line alone."""
 
     def __init__(self) -> None:
+        console = whole_lines(stderr=True)
         columns = (
             TextColumn("{task.description}"),
-            BarColumn(bar_width=20),
+            BarColumn(bar_width=20 if console.width >= WIDE else 5),
             TextColumn("{task.fields[text]}"),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        self.bar = Progress(*columns, console=whole_lines(stderr=True))
+        self.bar = Progress(*columns, console=console)
         self.tasks: dict[str, TaskID] = {}
         self.stages: list[TaskID] = []
         self.ended: set[int] = set()
@@ -77,8 +79,8 @@ class Bars:
         if row.note:
             self._print(row.note, style="dim")
             return
-        size = f"  {row.num_gaussians} Gaussians  phase {row.phase}" if row.num_gaussians else ""
-        text = f"iteration {row.iteration}  PSNR {row.psnr:.1f} dB{size}"
+        size = f", {row.num_gaussians} Gaussians" if row.num_gaussians else ""
+        text = f"iteration {row.iteration}, PSNR {row.psnr:.1f} dB{size}"
         self.bar.update(task, completed=row.progress, text=text)
 
     def end(self, title: str) -> None:
@@ -169,7 +171,7 @@ def resumable(how: str, begun: Path | None = None) -> Iterator[None]:
 def train_with_progress(
     capture: Path, output: Path, config: TrainConfig, device: torch.device, *, resume: bool = False
 ) -> Path:
-    """`train` with a bar that shows PSNR, Gaussians, phase and time left. Returns the run's folder."""
+    """`train` with a bar that shows PSNR, Gaussians and time left. Returns the run's folder."""
     from neeco.training.train import train
 
     how = f"go on with: neeco train {shlex.quote(str(capture))} --output {shlex.quote(str(output))} --resume"

@@ -11,7 +11,7 @@ import tyro
 from neeco.errors import NeecoError
 from neeco.settings import Device
 
-Format = Literal["ply", "spz"]
+Format = Literal["ply", "spz", "usdc"]
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,10 @@ class Arguments:
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote."""
     format: Format | None = None
-    """ply: as 3D Gaussian splatting's own code writes it. spz: a tenth of the size, coarser. Default: as --output
-    ends, else ply."""
+    """ply: as 3D Gaussian splatting's own code writes it. spz: a tenth of the size, coarser. usdc: OpenUSD (needs the
+    extra usd). Default: as --output ends, else ply."""
     output: Path | None = None
-    """File to write, .ply or .spz. Default: scene.ply or scene.spz in the run folder."""
+    """File to write, .ply, .spz or .usdc. Default: scene.ply (.spz, .usdc) in the run folder."""
     frame: int = 0
     """Number of the frame, of those trained on, whose state and light are taken."""
     states: Path | None = None
@@ -39,6 +39,7 @@ def run(arguments: Arguments) -> int:
     from neeco.raster.devices import device_of
     from neeco.training.run import open_gaussian_run
     from neeco.viewer.splats import exported_state, splats_of, write_splats
+    from neeco.viewer.usd import require_usd, write_usd
 
     format = arguments.format or "ply"
     if arguments.output is not None:
@@ -46,6 +47,8 @@ def run(arguments: Arguments) -> int:
         require_ending("--output", arguments.output, *(f".{ending}" for ending in endings))
         if arguments.format is None and arguments.output.suffix:
             format = cast(Format, arguments.output.suffix[1:].lower())
+    if format == "usdc":
+        require_usd()
     with open_gaussian_run(arguments.run, "export", device_of(arguments.device)) as trained:
         scene = trained.scene
         frames = len(scene.recorded.states)
@@ -53,6 +56,9 @@ def run(arguments: Arguments) -> int:
             raise NeecoError(f"--frame: {arguments.frame}: the scene was trained on frames 0 to {frames - 1}")
         splats = splats_of(scene, *exported_state(scene, arguments.frame, arguments.states))
     output = arguments.output or arguments.run / f"scene.{format}"
-    write_splats(splats, output, format)
+    if format == "usdc":
+        write_usd(splats, output)
+    else:
+        write_splats(splats, output, format)
     print(f"{output}: {len(splats.means):,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, without joints and labels")
     return 0

@@ -1,4 +1,4 @@
-"""`neeco render`: images, part ids and masks of a split's frames or of given states."""
+"""`neeco render`: images, part ids and masks of a split's frames or of given states; or a video."""
 
 from __future__ import annotations
 
@@ -7,18 +7,23 @@ from pathlib import Path
 
 import tyro
 
+from neeco.errors import NeecoError
 from neeco.settings import Device
 from neeco.synthesis.settings import AS_RECORDED, ImageSettings
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Render frames of a capture, or states from a file, with part ids and masks."""
+    """Render frames of a capture, or states from a file, with part ids and masks; or as a video."""
 
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote."""
-    output: Path
+    output: Path | None = None
     """Folder to write to; pictures go into OUTPUT/SPLIT or OUTPUT/states."""
+    video: Path | None = None
+    """Instead of --output: write the images as an MP4 of 25 images per second (needs the extra ingest)."""
+    frames: int | None = None
+    """With --video: how many images, evenly spread along the path of states and cameras. Default: one for each."""
     capture: Path | None = None
     """Capture whose frames are rendered. Default: the run's own."""
     split: str = "test"
@@ -31,19 +36,37 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Render, and print the folder."""
+    from neeco.cli._output import require_ending
     from neeco.cli._progress import counting
     from neeco.raster.devices import device_of
     from neeco.synthesis.rendered_views import STATES_FOLDER, render, split_views, state_views
+    from neeco.synthesis.video import require_pyav, views_along, write_video
     from neeco.training.run import open_run
 
     arguments.images.check()
+    if (arguments.output is None) == (arguments.video is None):
+        raise NeecoError("render: give --output FOLDER, or --video FILE.mp4; one of the two")
+    if arguments.video is not None:
+        require_ending("--video", arguments.video, ".mp4")
+        require_pyav()
+    elif arguments.frames is not None:
+        raise NeecoError("--frames: goes with --video; leave it out")
+    if arguments.frames is not None and arguments.frames < 2:
+        raise NeecoError(f"--frames: {arguments.frames} is no path; give at least 2")
     with open_run(arguments.run, device_of(arguments.device)) as trained:
         if arguments.states is not None:
-            views, folder = state_views(trained.scene, arguments.states), arguments.output / STATES_FOLDER
+            views, folder = state_views(trained.scene, arguments.states), STATES_FOLDER
         else:
-            views, folder = split_views(trained, arguments.split, arguments.capture), arguments.output / arguments.split
+            views, folder = split_views(trained, arguments.split, arguments.capture), arguments.split
+        if arguments.frames is not None:
+            views = views_along(views, arguments.frames)
         with counting("render", len(views)) as advance:
-            rendered = render(trained.scene, views, folder, advance, arguments.images)
+            if arguments.output is None:
+                assert arguments.video is not None
+                write_video(trained.scene, views, arguments.video, advance, arguments.images)
+                print(f"{len(views)} images in {arguments.video}")
+                return 0
+            rendered = render(trained.scene, views, arguments.output / folder, advance, arguments.images)
     print(f"{rendered.images} images in {rendered.folder}")
     if not rendered.labelled:
         print(f"no part ids and masks: method {trained.scene.method!r} learns no labels")

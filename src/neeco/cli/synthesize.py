@@ -38,6 +38,9 @@ class Arguments:
     """Continue a data set begun with the same settings, or make it larger."""
     workers: int = 1
     """Processes that share the work, here or on RAY_ADDRESS's cluster; the files are the same for any number."""
+    push_to_hub: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Upload the complete data set with its card to this repository (owner/name) of the Hugging Face Hub, private when
+    new; needs the extra hub, and an account (`hf auth login`)."""
     device: Device = "auto"
 
 
@@ -45,7 +48,10 @@ def run(arguments: Arguments) -> int:
     """Make the data set and print where it is."""
     from neeco.api import synthesize
     from neeco.cli._progress import Bars, resumable
+    from neeco.synthesis.hub_upload import check_hub, push_to_hub
 
+    if arguments.push_to_hub is not None:
+        check_hub(arguments.push_to_hub)
     settings = arguments.settings
     tissue, instruments = _runs(arguments)
     with Bars() as bars, resumable("what was rendered is kept; run the same command again with --resume"):
@@ -67,6 +73,8 @@ def run(arguments: Arguments) -> int:
         print(f"refused {times} states: instrument {reason}")
     if made.skipped:
         print(f"skipped given states {made.skipped}: refused from every view tried")
+    if arguments.push_to_hub is not None:
+        print(f"uploaded to {push_to_hub(made.output, arguments.push_to_hub)}")
     return 0
 
 

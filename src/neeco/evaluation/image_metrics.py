@@ -44,7 +44,7 @@ PART_COLORS = np.array(
     ],
     np.float64,
 )
-LEGEND_HEIGHT, LEGEND_FONT = 14, 10  # px
+LEGEND_HEIGHT, LEGEND_FONT, LEGEND_MARGIN = 14, 10, 5  # px
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
@@ -262,7 +262,13 @@ def _legend(width: int, full_scale: float) -> Pixels:
     strip.paste(Image.fromarray(_colored(np.linspace(0, 1, width)[None].repeat(4, 0))), (0, 1))
     pen, font = ImageDraw.Draw(strip), ImageFont.load_default(LEGEND_FONT)
     for place, anchor in ((0.0, "ls"), (0.5, "ms"), (1.0, "rs")):
-        pen.text((round(place * width), LEGEND_HEIGHT - 2), f"{place * full_scale:.3g}", "white", font, anchor)
+        pen.text(
+            (round(LEGEND_MARGIN + place * (width - 2 * LEGEND_MARGIN)), LEGEND_HEIGHT - 2),
+            f"{place * full_scale:.3g}",
+            "white",
+            font,
+            anchor,
+        )
     return np.asarray(strip)
 
 

@@ -48,6 +48,14 @@ class AlignConfig:
     step_deg: float = 0.1
 
 
+# of a scene's diagnostics: how large the errors of its recording's states are, where they are larger than a tracker's
+STATE_ERRORS = "scale_of_state_errors"
+# for such states: priors as wide, and steps enough to come from as far
+WIDE = AlignConfig(
+    sigma_instrument_mm=1.5, sigma_instrument_deg=3.0, sigma_joint_deg=4.0, sigma_joint_mm=1.5, steps=(10, 6, 4)
+)
+
+
 @dataclass(frozen=True)
 class AlignedFrame:
     """A frame's fitted state and camera, and the increments that led to them."""
@@ -98,10 +106,11 @@ def align_frame(
 
     Corrects every instrument's pose, the camera, and every joint in stated kinematics, with Gaussian priors at zero;
     other joints and intrinsics stay. Pixels outside the frame's loss mask do not count. `start`: increments of a
-    neighbouring frame, from which the fit begins where they explain the image better than none. Takes about
-    7 * (6 * instruments + joints + 8) small renderings.
+    neighbouring frame, from which the fit begins where they explain the image better than none. config: by default of
+    a tracker's errors, or WIDE where the scene's recording has larger ones. Takes about 7 * (6 * instruments + joints +
+    8) small renderings (WIDE: three times as many).
     """
-    config = config or AlignConfig()
+    config = config or (WIDE if STATE_ERRORS in scene.diagnostics else AlignConfig())
     instruments = [item for item in scene.instruments if item.name in frame.state.instruments]
     parameters = StateParameters(tuple(map(InstrumentParameters.of, instruments)), joints_last=True, camera=True)
     mask, precision = frame.load_mask(), precision_of(_deviations(parameters, instruments, config))

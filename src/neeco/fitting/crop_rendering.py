@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 
+import cv2
 import torch
 from torch import Tensor
 
@@ -21,6 +23,8 @@ BLOCK_PX = 8  # images are trimmed and crops rounded to multiples of it, so that
 MAX_PIXELS = 160_000  # of images worked on, to which larger ones are reduced
 MIN_OPACITY = 0.2  # of Gaussians that say where the instrument is
 MARGIN_QUANTILE = 0.002  # share of them at each side that a crop need not hold
+
+N_POSED = 8  # states whose posed Gaussians are kept
 
 N_TRIMMINGS = 5  # of pixels that a linear map of colours does not explain: instruments and foreground
 SAME_COLOR = 0.02  # mean difference of colours in [0, 1] below which they are left as they are
@@ -122,8 +126,8 @@ def downsampled(image: Tensor, size: float) -> Tensor:
         return image
     many = round(1 / size)  # divides the size of crops
     height, width = image.shape[0] // many, image.shape[1] // many
-    rows = image.reshape(height, many, -1).sum(1)  # [h, W * C]
-    return rows.view(height, width, many, -1).sum(2) / many**2
+    reduced = cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(reduced).view(height, width, -1)
 
 
 class InstrumentRenderer:
@@ -133,11 +137,19 @@ class InstrumentRenderer:
         self.scene = scene
         self.alone = _without_tissue(scene)
         self._black = scene.canonical.means.new_zeros(3)
+        self._posed: deque[tuple[State, Gaussians]] = deque(maxlen=N_POSED)
 
     @torch.no_grad()
     def pose(self, state: State) -> Gaussians:
-        """Return the instruments' Gaussians in `state`."""
-        return self.alone.at(state)
+        """Return the instruments' Gaussians in `state`. Do not modify: the latest are kept, by the state's identity."""
+        for known, posed in self._posed:
+            if known is state:
+                return posed
+        posed = self.alone.at(state)
+        if posed.headlight is not None:  # nothing receives their shadow
+            posed = replace(posed, headlight=replace(posed.headlight, shadow=None))
+        self._posed.append((state, posed))
+        return posed
 
     def render(self, state: State, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return (colour [h, w, 3] over black, alpha [h, w]) of the instruments in `state`."""
@@ -182,11 +194,12 @@ class InstrumentRenderer:
 
 
 class TissueRenderer:
-    """Renders the tissue of a learned scene, with the shadow that its instruments cast."""
+    """Renders the tissue of a learned scene, with the shadow that its instruments cast. The scene must not change."""
 
-    def __init__(self, scene: GaussianScene) -> None:
+    def __init__(self, scene: GaussianScene, instruments: InstrumentRenderer | None = None) -> None:
         self.scene = scene
-        self._rows = slice(0, scene.canonical.counts[0])
+        self._instruments = instruments or InstrumentRenderer(scene)
+        self._posed: tuple[tuple[float, str | None], Gaussians] | None = None  # by time and tissue
 
     @property
     def shaded(self) -> bool:
@@ -196,12 +209,19 @@ class TissueRenderer:
     @torch.no_grad()
     def render(self, camera: Camera, state: State | None) -> Tensor:
         """Return [h, w, 3] with the shadow of instruments in `state` (None: without)."""
-        gaussians = self.scene.at(self.scene.recorded.states[0] if state is None else state)
-        if state is not None:
-            gaussians = shadowed(gaussians, camera, rasterize)
-        elif gaussians.headlight is not None:
-            gaussians = replace(gaussians, headlight=replace(gaussians.headlight, shadow=None))
-        return rasterize(gaussians.select(self._rows), camera).color.clamp(0, 1).cpu()
+        tissue = self._at(self.scene.recorded.states[0] if state is None else state)
+        if state is not None and self.shaded:
+            tissue = shadowed(tissue, camera, rasterize, self._instruments.pose(state))
+        elif tissue.headlight is not None:
+            tissue = replace(tissue, headlight=replace(tissue.headlight, shadow=None))
+        return rasterize(tissue, camera).color.clamp(0, 1).cpu()
+
+    def _at(self, state: State) -> Gaussians:
+        """Return the tissue at the time of `state`; it depends on nothing else of it."""
+        key = state.time, state.tissue
+        if self._posed is None or self._posed[0] != key:
+            self._posed = key, self.scene.at(state).select(slice(0, self.scene.canonical.counts[0]))
+        return self._posed[1]
 
 
 def _without_tissue(scene: GaussianScene) -> GaussianScene:

@@ -108,16 +108,16 @@ def minimise(
         for _ in range(MAX_TRIALS):
             system = normal + damping * torch.diag(torch.diagonal(normal))
             change = torch.linalg.solve(system, gradient)
-            trial = evaluated(parameters - change)
-            if trial[0] < cost:
+            trial, is_small = evaluated(parameters - change), small is not None and bool((change.abs() < small).all())
+            if trial[0] < cost or is_small:
                 break
             damping *= 10
-        else:
+        if trial[0] >= cost:
             settled = step % linearised_for == 0
             break
         cost, parameters, posed, image = trial
         damping = max(damping / 10, 1e-6)
-        if small is not None and bool((change.abs() < small).all()):
+        if is_small:
             settled = True
             break
     return Minimum(parameters=parameters, cost=cost, posed=posed, image=image, information=information, settled=settled)

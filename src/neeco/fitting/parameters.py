@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
@@ -27,10 +29,23 @@ def moved_pose(pose: Tensor, increment: Tensor, pivot: Tensor | None = None) -> 
 
     increment [6]: rotation vector (rad) about `pivot` [3] mm (None: the origin), then translation (mm).
     """
+    if not (increment.requires_grad or pose.requires_grad) and increment.dtype == torch.float64:
+        return _moved_array(pose, increment, pivot)
     step = rigid_from_vector(increment)
     if pivot is not None:
         step[:3, 3] += pivot - step[:3, :3] @ pivot
     return pose.to(increment) @ step
+
+
+def _moved_array(pose: Tensor, increment: Tensor, pivot: Tensor | None) -> Tensor:
+    """`moved_pose` without gradients, float64, in a tenth of the time."""
+    vector, step = increment.detach().cpu().numpy(), np.eye(4)
+    rotation = Rotation.from_rotvec(vector[:3]).as_matrix()
+    step[:3, :3], step[:3, 3] = rotation, vector[3:]
+    if pivot is not None:
+        place = pivot.cpu().numpy()
+        step[:3, 3] += place - rotation @ place
+    return torch.from_numpy(pose.detach().cpu().double().numpy() @ step).to(increment.device)
 
 
 def moved_camera(camera: Camera, increment: Tensor) -> Camera:

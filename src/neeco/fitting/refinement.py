@@ -29,6 +29,9 @@ ON_CPU = ("frame_steps", "fitted", "weights")  # read in every step
 MM_PER_RAD = 20.0  # motion of a prismatic joint that counts as much as 1 rad of a revolute one
 MAX_SPEEDUP = 10.0  # of the learning rates where a pose is less certain than usual
 MIN_DEVIATION = 1e-4  # rad, mm: a standard deviation of 0 would hold a pose for ever
+MIN_STEPS = 5  # of a state, from which on its correction tells how wrong it was
+MIN_SHARE = 0.05  # of a prior's standard deviations, that remain of a state's
+UNCORRECTED = 1.2  # times what was corrected: errors, as some remain that corrections do not explain
 MAX_NEIGHBOUR_S = 1.0  # s between instants whose unrecorded joints are similar
 MAX_VELOCITY_S = 0.5  # s between frames that velocities are taken from
 
@@ -209,6 +212,34 @@ class Refinement:
         self.pose_sd[instant] = pose
         if self.readings:
             self.joint_sd[instant] = joints
+
+    @torch.no_grad()
+    def prior_shares(self) -> Tensor:
+        """Return how large errors of states that were not fitted are [3], as shares of the priors' standard deviations:
+        of turns, shifts and readings; at most 1.
+
+        Exact states are corrected only by as much as corrections are wrong; of the errors of others most is corrected.
+        """
+        steps = torch.stack([self.frame_steps[frames].sum() for frames in self.frames_of_instant])
+        taken = (steps >= MIN_STEPS) & ~torch.stack([self.fitted[frames[0]] for frames in self.frames_of_instant])
+        used, readings = taken.to(self.poses.device), self.learned[~self.unrecorded[self.learned]]
+        poses, joints = self.poses[used] / self.pose_sd[used], self.joints[used] / self.joint_sd[used]
+        parts = (poses[..., :3], poses[..., 3:], joints[:, readings])
+        corrected = (self.config.frame_poses, self.config.frame_poses, self.config.frame_joints)
+        shares = [
+            part.square().mean().sqrt() if learned and part.numel() else part.new_ones(())
+            for part, learned in zip(parts, corrected, strict=True)
+        ]
+        return (UNCORRECTED * torch.stack(shares)).clamp(MIN_SHARE, 1.0)
+
+    @torch.no_grad()
+    def scale_deviations(self, shares: Tensor) -> None:
+        """Reduce the standard deviations of states that were not fitted by `prior_shares` [3], at the end of a run."""
+        readings = self.learned[~self.unrecorded[self.learned]]
+        for instant, frames in enumerate(self.frames_of_instant):
+            if not self.fitted[frames[0]]:
+                self.pose_sd[instant] *= shares.repeat_interleave(3)[:6]
+                self.joint_sd[instant, readings] *= shares[2]
 
     def deviations(self, index: int) -> Tensor:
         """Return the standard deviations [S] float64 of `layout` of the prior on the corrections of frame `index`."""

@@ -4,6 +4,7 @@ fine."""
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from neeco.capture.model import Frame, State
 from neeco.fitting.crop_rendering import (
+    N_POSED,
     FrameView,
     InstrumentRenderer,
     TissueRenderer,
@@ -63,26 +65,45 @@ class _CropProblem:
     view: FrameView
     size: float
     residual: ImageResidual
-    expected: State
+    moved: MovedStates
     precision: Tensor
 
     def render(self, at: Tensor) -> tuple[Gaussians, Tensor]:
-        posed = self.fitter.instruments.pose(self.fitter.parameters.moved(self.expected, at))
+        return self._rendered(self.moved.at(at))
+
+    def _rendered(self, state: State) -> tuple[Gaussians, Tensor]:
+        posed = self.fitter.instruments.pose(state)
         return posed, downsampled(self.fitter.instruments.composed(posed, self.view), self.size)
 
     def differences(self, at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
-        parameters = self.fitter.parameters
-        state = parameters.moved(self.expected, at)
+        parameters, state = self.fitter.parameters, self.moved.at(at)
         # the pose of a single instrument moves all Gaussians as one
         n_rigid = 6 if len(parameters.instruments) == 1 else 0
         for index, step in enumerate((parameters.vector_from_degrees(*STEPS) / self.size).tolist()):
-            moved, change = at.clone(), step * parameters.step_sign(state, index, step)
-            moved[index] += change
+            increments, change = at.clone(), step * parameters.step_sign(state, index, step)
+            increments[index] += change
+            other = parameters.moved(self.moved.expected, increments)
             if index < n_rigid:
-                other = parameters.moved(self.expected, moved)
                 yield downsampled(self.fitter.instruments.moved(posed, state, other, self.view), self.size), change
             else:
-                yield self.render(moved)[1], change
+                yield self._rendered(other)[1], change
+
+
+class MovedStates:
+    """States moved from an expected one by increments [P], of which the latest are kept, by the tensors' identity."""
+
+    def __init__(self, parameters: StateParameters, expected: State) -> None:
+        self.parameters, self.expected = parameters, expected
+        self._known: deque[tuple[Tensor, State]] = deque(maxlen=N_POSED)
+
+    def at(self, increments: Tensor) -> State:
+        """Return the state moved by increments [P] float64, which must not be modified afterwards."""
+        for known, state in self._known:
+            if known is increments:
+                return state
+        state = self.parameters.moved(self.expected, increments)
+        self._known.append((increments, state))
+        return state
 
 
 @dataclass(frozen=True)
@@ -117,23 +138,23 @@ class Fitter(Generic[P]):
         increments = torch.zeros(parameters.size, dtype=torch.float64)
         if start is not None:
             increments = parameters.increments_between(expected, start)
-        small = parameters.vector_from_degrees(*SMALL_STEP)
+        small, moved = parameters.vector_from_degrees(*SMALL_STEP), MovedStates(parameters, expected)
         cost, information = math.inf, torch.zeros_like(precision)
         for level, count in zip(levels, steps, strict=True):
-            crop = self.crop_around(view, parameters.moved(expected, increments))
+            crop = self.crop_around(view, moved.at(increments))
             if crop is None:
                 return None
             residual = residual_of(crop, level, self.correlation_px)
             for first in range(0, count, STEPS_AT_ONCE):
-                crop = self.with_shadow(crop, parameters.moved(expected, increments))
-                problem = _CropProblem(self, crop, level, residual, expected, precision)
+                crop = self.with_shadow(crop, moved.at(increments))
+                problem = _CropProblem(self, crop, level, residual, moved, precision)
                 max_steps = min(count - first, STEPS_AT_ONCE)
                 found = minimise(problem, [increments], max_steps, small=small, linearised_for=STEPS_AT_ONCE)
                 increments, cost = found.parameters, found.cost
                 information = information if found.information is None else found.information
                 if found.settled:
                     break
-        state = parameters.moved(expected, increments)
+        state = moved.at(increments)
         crop = self.crop_around(view, state)
         if crop is None:
             return None

@@ -33,7 +33,7 @@ class Camera:
         cy: principal point in px from the image's upper edge
         width: of the image in px
         height: of the image in px
-        near: mm; Gaussians whose mean is nearer draw nothing
+        near: mm; Gaussians whose mean is nearer render nothing
         distortion: OpenCV's k1, k2, p1, p2[, k3, ...]
         border: centre x, centre y and radius in px of what the lens shows; None: everything
         learned_fx: focal length in px of the images that Gaussians were learned from; None: of images like this one
@@ -52,7 +52,7 @@ class Camera:
     cy: float  # px from its upper edge
     width: int  # px
     height: int
-    near: float = 0.01  # mm; Gaussians whose mean is nearer draw nothing
+    near: float = 0.01  # mm; Gaussians whose mean is nearer render nothing
     distortion: tuple[float, ...] = ()  # k1, k2, p1, p2[, k3, ...]
     border: tuple[float, float, float] | None = None  # px: centre x, y and radius of what the lens shows
     learned_fx: float | None = None  # px, of the images that Gaussians were learned from; None: of ones like this

@@ -95,7 +95,7 @@ class InstrumentLabel:
 def annotate(
     scene: GaussianScene, drawing: LayeredDrawing, names: tuple[tuple[str, str], ...]
 ) -> list[InstrumentLabel]:
-    """Return the labels of every instrument of a drawing; names: (instrument, part) of its part ids."""
+    """Return the labels of every instrument of a rendering; names: (instrument, part) of its part ids."""
     drawn_at = scene.registered(drawing.state)  # the pose that agrees with the pixels
     parts = drawing.parts.numpy()
     camera_from_world = np.linalg.inv(to_numpy(drawing.camera.world_from_camera))
@@ -359,7 +359,7 @@ class LabelledImage(RGBDImage):
         part_names: tuple[tuple[str, str], ...],
         keypoint_names: tuple[str, ...],
     ) -> LabelledImage:
-        """Make one from a drawing and the `labels` that `annotate` finds in it."""
+        """Make one from a rendering and the `labels` that `annotate` finds in it."""
         return cls.of(
             image=drawing.image,
             depth=torch.from_numpy(drawing.depth),
@@ -420,7 +420,7 @@ def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bo
         rendering = scene.render(state, scene.recorded.as_learned(camera))
         depth = torch.from_numpy(surface_depth(rendering)).float()
         return RGBDImage(rendering.color.clamp(0, 1).cpu(), depth)
-    known = require_gaussians(scene, "draw labels")
+    known = require_gaussians(scene, "render labels")
     labeller = CompositedLabels(known)
     drawing = draw_layers(known, labeller, state, camera, MIN_COMPONENT)
     found = annotate(known, drawing, labeller.names)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -23,6 +24,9 @@ def rasterize_cpu(
     frames = None if gaussians.sh_frames is None else _prepared(gaussians.sh_frames.detach())
     wanted = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     offsets = torch.zeros(len(gaussians), 2, requires_grad=wanted)
+    if not wanted:  # autograd takes a tenth of a small rendering's time
+        _, images = _draw(frames, camera, tensors, keep=False)
+        return Rendering(*images, offsets)
     color, alpha, depth, composited, radii = _Rasterize.apply(offsets, frames, camera, wanted, *tensors)
     return Rendering(color, alpha, depth, composited, radii, offsets)
 
@@ -39,36 +43,44 @@ def _prepared(tensor: Tensor) -> Tensor:
     return tensor.to(torch.float32).contiguous()
 
 
+def _draw(
+    frames: Tensor | None, camera: Camera, tensors: Sequence[Tensor | None], keep: bool
+) -> tuple[Any, tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor]]:
+    """Return the kernel's drawing, which its gradient needs (`keep`), and colour, alpha, depth, channels and radii."""
+    plain = [None if t is None else t.detach() for t in tensors]
+    means, quats, scales, opacities, sh, falloff, channels, left, vignette, world_from_camera, background = plain
+    assert means is not None
+    try:
+        drawing = native().Drawing(
+            means, quats, scales, opacities, sh, frames, falloff, vignette, left, channels, background,
+            world_from_camera,
+            camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
+        )  # fmt: skip
+        height, width = camera.height, camera.width
+        color = torch.empty(height, width, 3)
+        alpha = torch.empty(height, width)
+        depth = torch.empty(height, width)
+        radii = torch.empty(means.shape[0])
+        composited = None if channels is None else torch.empty(height, width, channels.shape[1])
+        drawing.forward(color, alpha, depth, composited, radii, keep)
+    except (ValueError, RuntimeError) as error:
+        raise NeecoError(f"rasterize: {error}") from error
+    return drawing, (color, alpha, depth, composited, radii)
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, offsets: Tensor, frames: Tensor | None, camera: Camera, keep: bool, *tensors: Tensor | None
     ) -> Any:
-        plain = [None if t is None else t.detach() for t in tensors]
-        means, quats, scales, opacities, sh, falloff, channels, left, vignette, world_from_camera, background = plain
-        assert means is not None
-        try:
-            drawing = native().Drawing(
-                means, quats, scales, opacities, sh, frames, falloff, vignette, left, channels, background,
-                world_from_camera,
-                camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
-            )  # fmt: skip
-            height, width = camera.height, camera.width
-            color = torch.empty(height, width, 3)
-            alpha = torch.empty(height, width)
-            depth = torch.empty(height, width)
-            radii = torch.empty(means.shape[0])
-            composited = None if channels is None else torch.empty(height, width, channels.shape[1])
-            drawing.forward(color, alpha, depth, composited, radii, keep)
-        except (ValueError, RuntimeError) as error:
-            raise NeecoError(f"rasterize: {error}") from error
+        drawing, images = _draw(frames, camera, tensors, keep)
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(radii)
+        ctx.mark_non_differentiable(images[-1])
         if keep:
             # saved so that autograd detects a modified input before the backward pass
-            ctx.save_for_backward(alpha, depth, *tensors)
+            ctx.save_for_backward(images[1], images[2], *tensors)
             ctx.drawing = drawing
-        return color, alpha, depth, composited, radii
+        return images
 
     @staticmethod
     @once_differentiable

@@ -33,29 +33,32 @@ MIN_DISTANCE = 1e-3  # mm
 Draw = Callable[[Gaussians, Camera], Rendering]
 
 
-def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
+def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw, casters: Gaussians | None = None) -> Gaussians:
     """Return the Gaussians with the headlight's shadows evaluated as its share `left` at every Gaussian; `draw`
-    rasterizes.
+    rasterizes. `casters`: others that cast the shadow on all; None: those among them that `Shadow.casters` marks do.
 
     Gradients reach the falloff, and the lamps' offsets, strengths and width, but not the casters' shapes.
     """
     light = gaussians.headlight
     if light is None or light.left is not None:
         return gaussians
-    left = None if light.shadow is None else _left_by(light.shadow, gaussians, camera, draw)
+    left = None if light.shadow is None else _left_by(light.shadow, gaussians, camera, draw, casters)
     if camera.world_from_lamps is not None:
         relative = _relative_to_camera(light.falloff, gaussians.means, camera, camera.world_from_lamps)
         left = relative if left is None else left * relative
     return gaussians if left is None else replace(gaussians, headlight=replace(light, shadow=None, left=left))
 
 
-def _left_by(shadow: Shadow, gaussians: Gaussians, camera: Camera, draw: Draw) -> Tensor | None:
+def _left_by(
+    shadow: Shadow, gaussians: Gaussians, camera: Camera, draw: Draw, others: Gaussians | None
+) -> Tensor | None:
     """Return the factor [N] of the Gaussians' stored colours in the shadow; None: no casters, receivers or lamps."""
     casters, lit = shadow.casters, shadow.strengths.detach() > 0
     every, some, *shines = torch.stack([casters.all(), casters.any(), *lit]).tolist()  # read from the device once
+    some = some if others is None else len(others) > 0
     if every or not some or not any(shines):
         return None
-    shares = blocked(Casting.of(gaussians, casters, camera), shadow.width, shadow.offsets, draw, shines)
+    shares = blocked(Casting.of(gaussians, casters, camera, others), shadow.width, shadow.offsets, draw, shines)
     return (1 - shadow.strengths @ shares).clamp_min(MIN_LIGHT) ** (1 / GAMMA)
 
 
@@ -70,18 +73,21 @@ def _relative_to_camera(falloff: Tensor, means: Tensor, camera: Camera, world_fr
 class Casting:
     """Casters and receivers in front of the lamps' camera, the same for every lamp."""
 
-    casters: Tensor  # [N] bool
+    casters: Tensor  # [N] bool, which of the receivers are casters themselves
     bare: Gaussians  # the casters with their opacities, without light and harmonics
     means: Tensor  # [N, 3] mm, of all, world
     camera: Camera
 
     @staticmethod
     @torch.no_grad()
-    def of(gaussians: Gaussians, casters: Tensor, camera: Camera) -> Casting:
-        """Return all Gaussians, of which `casters` [N] bool cast, in front of the camera that the lamps are next to."""
+    def of(gaussians: Gaussians, casters: Tensor, camera: Camera, others: Gaussians | None = None) -> Casting:
+        """Return all Gaussians, of which `casters` [N] bool cast (`others` in their place, where given), in front of
+        the camera that the lamps are next to."""
         if camera.world_from_lamps is not None:
             camera = replace(camera, world_from_camera=camera.world_from_lamps, world_from_lamps=None)
-        bare = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None, background=None).select(casters)
+        cast = gaussians if others is None else others
+        bare = replace(cast, sh=cast.sh[:, :1], headlight=None, background=None)
+        bare = bare.select(casters) if others is None else bare
         return Casting(casters, bare, gaussians.means.detach(), camera)
 
 

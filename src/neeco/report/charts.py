@@ -179,6 +179,7 @@ def line_chart(
     else:
         axes.set_xlim(min(0.0, xs[0]), xs[-1])
         round_ticks(axes.xaxis, 5, short)
+    cut = not logarithmic and _begin_at_zero(axes)
     round_ticks(axes.yaxis, 4, short)
     if logarithmic:
         low, high = axes.get_ylim()
@@ -191,7 +192,7 @@ def line_chart(
         _draw_start(axes, x, words, falling)
     ends = [(item.main[-1][1], item.order, item.name) for item in series if item.main and item.name]
     _draw_names(axes, [*ends, *((level.value, level.order, level.name) for level in levels)])
-    return inline_svg(axes, f"{title} over {over}")
+    return inline_svg(axes, f"{title} over {over}{', vertical axis cut' if cut else ''}")
 
 
 @page_style()
@@ -307,6 +308,20 @@ def _set_logarithmic_x(axes: Axes, xs: Sequence[float]) -> None:
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_locator(FixedLocator(ticks))
     axes.xaxis.set_major_formatter(lambda value, _: short(round(value, 9)))
+
+
+def _begin_at_zero(axes: Axes) -> bool:
+    """Let a vertical axis of positive values begin at zero, or mark its cut where that would flatten the lines."""
+    low, high = axes.get_ylim()
+    if low < high / 2:
+        axes.set_ylim(min(low, 0.0), high)
+        return False
+    stroke: dict[str, Any] = {"transform": axes.transAxes, "color": PALETTE["soft"], "linewidth": 1.2, "gid": "cut"}
+    for height in (0.02, 0.055):
+        axes.plot([-0.012, 0.012], [height - 0.02, height + 0.02], **stroke)
+    place: dict[str, Any] = {"textcoords": "offset points", "va": "top", "fontsize": 9}
+    axes.annotate("axis cut", (0, 0), (-36, -19), "axes fraction", color=PALETTE["soft"], gid="cut", **place)
+    return True
 
 
 def _draw_names(axes: Axes, ends: Sequence[tuple[float, int, str]]) -> None:

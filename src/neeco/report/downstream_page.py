@@ -226,6 +226,7 @@ def difference_chart(experiment: Experiment, model: Row, split: str) -> Markup:
     lines = [(key, row) for key, some in groups.items() if some for row in (None, *some)]
     axes = new_axes((560, 45 + 20 * len(lines)), 300, 20, 5, 40)
     axes.set(xlim=(-reach, reach), ylim=(len(lines) - 0.5, -0.5), yticks=[])
+    axes.locator_params(axis="x", nbins=5)
     axes.set_xlabel(f"difference of {TITLES[MAIN[model['answers']]]}")
     for y, (key, row) in enumerate(lines):
         name, color = QUESTIONS[key], "accent"

@@ -148,15 +148,15 @@ def _figure(
     recorded, image = frame.load_image().numpy(), drawing.image.numpy()
     pictures = [
         ("recorded image", jpeg(to_bytes(recorded))),
-        ("rendered", jpeg(to_bytes(image))),
-        ("difference", difference(image, recorded, frame.load_mask())),
+        ("rendered image", jpeg(to_bytes(image))),
+        ("difference of the two", difference(image, recorded, frame.load_mask())),
     ]
     if drawing.parts is not None:
         overlay = overlay_parts(recorded, drawing.parts.numpy())
         reference = load_reference(capture, frame)
         if reference is not None:
             overlay = overlay_outline(overlay, reference.mask.numpy())
-        pictures.append(("label mask over recorded image", jpeg(overlay)))
+        pictures.append(("recorded image, label over it", jpeg(overlay)))
     scores = [f"{row['psnr']:.2f} dB"]
     if row.get("mask_iou") is not None:
         scores.append(f"IoU {row['mask_iou']:.3f}")
@@ -264,7 +264,10 @@ def _plain(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list | tuple):
-        return ", ".join(_plain(item) for item in value)
+        between = "; " if any(isinstance(item, Mapping) for item in value) else ", "
+        return between.join(_plain(item) for item in value) or "none"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{str(key).replace('_', ' ')} {_plain(item)}" for key, item in value.items())
     return value if isinstance(value, str) else json.dumps(value)
 
 

@@ -116,7 +116,7 @@ def write_comparison_report(output: Path, comparison: ComparisonResult, capture:
     if images:
         text = (
             "The median frame of each split by PSNR over all methods, rendered at the poses the capture states. Under "
-            "each drawing its difference from the recorded image: black is equal, bright is wrong, full scale "
+            "each rendering its difference from the recorded image: black is equal, bright is wrong, full scale "
             f"{FULL_SCALE:g} of the range from black to white. In yellow, where known, the true outline of the "
             "instrument."
         )
@@ -141,7 +141,7 @@ def write_comparison_report(output: Path, comparison: ComparisonResult, capture:
 
 
 def findings(comparison: ComparisonResult) -> list[tuple[str, str]]:
-    """(split or "", sentence): who is first on each split and by how much, who draws fastest, and what failed."""
+    """(split or "", sentence): who is first on each split and by how much, who renders fastest, and what failed."""
     found = []
     for split in comparison.splits:
         rows = [row for row in comparison.summary if row["split"] == split]
@@ -152,7 +152,7 @@ def findings(comparison: ComparisonResult) -> list[tuple[str, str]]:
         if clauses:
             found.append((split, f"{'; '.join(clauses.values())}."))
     first_split = [row for row in comparison.summary if row["split"] == next(iter(comparison.splits), None)]
-    if fastest := leader(first_split, "fps", "drawing speed", " FPS", 1):
+    if fastest := leader(first_split, "fps", "rendering speed", " FPS", 1):
         found.append(("", f"{fastest}."))
     if found and any(row["psnr"]["n"] and row["psnr"]["std"] is None for row in comparison.summary):
         found.append(("", "Of one seed the spread is not known: a small lead may be chance."))
@@ -231,7 +231,7 @@ def _frame_images(comparison: ComparisonResult, capture: Capture, output: Path) 
                 recorded, counted = frame.load_image(), frame.load_mask()
                 score = psnr(torch.from_numpy(image), recorded, counted)
                 pictures = (jpeg(to_bytes(image)), difference(image, recorded.numpy(), counted))
-                alt = f"{name}: drawing and difference, frame {frame.name}"
+                alt = f"{name}: rendering and difference, frame {frame.name}"
                 images[index].append(Images(name, pictures, alt, f"{score:.2f} dB"))
                 place = {"split": frame.split, "frame": frame.name, "name": name, "seed": seed}
                 scores[index].append(place | {"psnr": score})

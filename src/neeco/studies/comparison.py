@@ -400,7 +400,7 @@ def tables_of(comparison: ComparisonResult) -> list[ResultTable]:
         tables.append(table(f"split {split}", (*ours, *MASK_COLUMNS), rows))
     trained, first = comparison.trained, comparison.splits[0]
     rows = [row for row in comparison.summary if row["split"] == first and row["name"] in trained]
-    return [*tables, table("training and drawing", RUN_COLUMNS, rows)]
+    return [*tables, table("training and rendering", RUN_COLUMNS, rows)]
 
 
 def absent_notes(comparison: ComparisonResult) -> list[str]:

@@ -141,8 +141,8 @@ def measure_speed(
         "image": [camera.width, camera.height],
         "frames": len(frames),
         "machine": machine(device),
-        "how": f"Posing and drawing held-out frames in turn, 1 / median, {N_ROUNDS} rounds of up to {TIMED_IMAGES} "
-        f"draws per run after up to {WARM_UP_IMAGES} to warm up",
+        "how": f"Posing and rendering held-out frames in turn, 1 / median, {N_ROUNDS} rounds of up to {TIMED_IMAGES} "
+        f"images per run after up to {WARM_UP_IMAGES} to warm up",
     }
 
 

@@ -78,7 +78,7 @@ def draw_masks(run: TrainedRun, folder: Path, frames: Sequence[Frame]) -> bool:
     write_json(folder / PARTS_FILE, {"ids": ids})
     for frame in frames:
         parts = draw(scene, frame.state, frame.camera).parts
-        assert parts is not None, "a scene with label names draws parts"
+        assert parts is not None, "a scene with label names renders parts"
         write_labels(folder / f"{frame.name}{PARTS_SUFFIX}.png", parts)
     return True
 
@@ -91,7 +91,7 @@ def score_runs(
     device: torch.device,
     report: Callable[[int, int], None],
 ) -> list[Row]:
-    """Draw the masks of every (name, seed, run folder) into `output`/masks/<name>-seed<k>/<split>/ and score them."""
+    """Render the masks of every (name, seed, run folder) into `output`/masks/<name>-seed<k>/<split>/ and score them."""
     rows: list[Row] = []
     for index, (name, seed, path) in enumerate(runs):
         report(index, len(runs))

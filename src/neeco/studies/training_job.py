@@ -64,7 +64,7 @@ class Budget:
     """The training budget of every job: minutes on `clock`, or iterations; the other is None.
 
     "wall" is the time that passes; "processor" is CPU time of all threads of the process, which others' work on the
-    same machine does not change. Drawing the curve is counted by neither.
+    same machine does not change. Rendering the curve is counted by neither.
     """
 
     minutes: float | None

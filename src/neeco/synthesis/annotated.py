@@ -19,7 +19,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import Trust, TypicalErrors, estimate_trust, typical_errors_of
-from neeco.fitting.alignment import AlignConfig, AlignedFrame, align_frame, pose_changes
+from neeco.fitting.alignment import STATE_ERRORS, AlignConfig, AlignedFrame, align_frame, pose_changes
 from neeco.geometry.distortion import field_pinhole
 from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
@@ -28,7 +28,7 @@ from neeco.raster.resampling import resampled, supersampled
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings
-from neeco.synthesis.writers.folder import Record, write_sample, write_skipped
+from neeco.synthesis.writers.folder import Record, encoded_sample, skipped_sample
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
@@ -66,7 +66,7 @@ def annotate_capture(
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Annotated:
     """Label every frame of `capture`, a recording of the run's instruments over its tissue (None: the run's own), and
-    write those that can be trusted as a data set: the recorded images with the labels that the scene draws at poses
+    write those that can be trusted as a data set: the recorded images with the labels that the scene renders at poses
     fitted to them. Both are resized and distorted by the recording's lens as `images` request; what the recorded image
     does not show of the lens's field, since undistorting left it out, is black and ignored.
 
@@ -129,7 +129,7 @@ def annotate_capture(
 
 @dataclass(frozen=True, kw_only=True)
 class _Annotator:
-    """Fits, draws, judges and writes frames."""
+    """Fits, renders, judges and writes frames."""
 
     scene: GaussianScene
     labeller: CompositedLabels
@@ -156,12 +156,13 @@ class _Annotator:
         if trust.value < self.min_trust:
             labels = annotate(self.scene, drawing, self.labeller.names)
             facts["labels"] = [label.to_json() for label in labels]
-            return write_skipped(self.output, index, {NOT_TRUSTED: 1}, facts)
+            return skipped_sample(index, {NOT_TRUSTED: 1}, facts).write(self.output)
         drawing, missing = self._as_written(drawing, image)
         labels = annotate(self.scene, drawing, self.labeller.names)
         if missing is not None:
             labels = [_without_keypoints_in(missing, label) for label in labels]
-        return write_sample(self.output, index, drawing, labels, facts=facts, quality=self.images.jpeg_quality)
+        encoded = encoded_sample(index, drawing, labels, facts=facts, quality=self.images.jpeg_quality)
+        return encoded.write(self.output)
 
     def _as_written(self, drawing: LayeredDrawing, image: Tensor) -> tuple[LayeredDrawing, Tensor | None]:
         """The recorded `image` with the labels of `drawing`, at the requested size and lens, and where it shows nothing
@@ -207,9 +208,10 @@ def _without_keypoints_in(missing: Tensor, label: InstrumentLabel) -> Instrument
 def fitted(
     scene: GaussianScene, labeller: CompositedLabels, frame: Frame, image: Tensor, start: Tensor | None
 ) -> tuple[AlignedFrame, LayeredDrawing]:
-    """The poses of `frame` fitted to its image [H, W, 3], and what the scene draws there; `start`: a neighbour's
+    """The poses of `frame` fitted to its image [H, W, 3], and what the scene renders there; `start`: a neighbour's
     increments, without which the search starts coarse."""
-    fit = align_frame(scene, frame, image, start, None if start is None else FROM_NEIGHBOUR)
+    near = start is not None and STATE_ERRORS not in scene.diagnostics  # errors as large differ between neighbours
+    fit = align_frame(scene, frame, image, start, FROM_NEIGHBOUR if near else None)
     return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.min_component, tissue_image=True)
 
 

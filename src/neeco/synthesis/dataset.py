@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import neeco
 from neeco.errors import NeecoError
-from neeco.files import own_folder, read_begun, require_same, write_json
+from neeco.files import own_folder, read_begun, require_same, sync_disk, write_json
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.drawing import EDGE_WIDTH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels
@@ -286,6 +286,8 @@ class DataSetFolder:
             "skipped": skipped(records),
         }
         write_card(output, info, {name: writer(name).description for name in formats})
+        if complete:
+            sync_disk()  # of what is incomplete, a resumption checks every file
         write_json(output / INFO, info)
 
 

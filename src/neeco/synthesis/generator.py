@@ -41,7 +41,7 @@ from neeco.synthesis.cameras import RECORDED_CAMERAS, DrawnCameras
 from neeco.synthesis.mixing import MixedSampler, Mixture
 from neeco.synthesis.samplers import Sampler, TissueSampler, make_sampler
 from neeco.synthesis.settings import Settings
-from neeco.synthesis.writers.folder import Record, write_sample, write_skipped
+from neeco.synthesis.writers.folder import Encoded, Record, encoded_sample, skipped_sample
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
@@ -221,7 +221,7 @@ class SampleGenerator:
         return self.appearances.draw(rng, width, height)
 
     def _with(self, drawing: LayeredDrawing, appearance: Appearance) -> LayeredDrawing:
-        """Return the drawing in another appearance; the depth of a background is unknown."""
+        """Return the rendering in another appearance; the depth of a background is unknown."""
         image = self._image(drawing.state, drawing.camera, drawing.image, drawing.share, appearance)
         if appearance.background is None:
             return replace(drawing, image=image)
@@ -297,19 +297,29 @@ def limit_threads(threads: int) -> None:
     keep_freed_memory()
 
 
-def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:
-    """Render sample `index` and write it to `output`; returns its record, which for a prescribed state that was refused
-    says so. Raises NeecoError where no random state was acceptable, or the files cannot be written."""
+def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
+    """Render sample `index` as it is written, or, for a prescribed state that was refused, that it was. Raises
+    StatesRefused where no random state was acceptable."""
     try:
         sample = generator.draw(index)
     except StatesRefused as error:
         if generator.sampler.prescribed:
-            return write_skipped(output, index, error.refused)
-        raise NeecoError(f"{output}: {error}") from None
+            return skipped_sample(index, error.refused)
+        raise
     quality = generator.settings.jpeg_quality
-    return write_sample(
-        output, index, sample.drawing, sample.labels, refused=sample.refused, facts=sample.facts, quality=quality
+    return encoded_sample(
+        index, sample.drawing, sample.labels, refused=sample.refused, facts=sample.facts, quality=quality
     )
+
+
+def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:
+    """Render sample `index` and write it to `output`; returns its record. Raises NeecoError where no random state was
+    acceptable, or the files cannot be written."""
+    try:
+        encoded = draw_encoded(generator, index)
+    except StatesRefused as error:
+        raise NeecoError(f"{output}: {error}") from None
+    return encoded.write(output)
 
 
 def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:

@@ -13,19 +13,19 @@ import tempfile
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from neeco.errors import NeecoError
-from neeco.files import read_bytes, sweep_unfinished, write_atomically
+from neeco.files import read_bytes, sweep_unfinished
 from neeco.raster.devices import readable_failures
 from neeco.raster.native import threads
 from neeco.synthesis.backgrounds import ImageFolder
-from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_to_folder, limit_threads
+from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_encoded, draw_to_folder, limit_threads
 from neeco.synthesis.samplers import states_file
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS
-from neeco.synthesis.writers.folder import Record, files_of, load_record, record_path
+from neeco.synthesis.writers.folder import Encoded, Record
 from neeco.workers import Workers, address, run_tasks
 
 TASK_SIZE = 8  # images of a cluster's task
@@ -99,37 +99,22 @@ def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], w
                         f"--workers: workers keep dying over image {tasks[event.index][0]} ({event.value}); is there "
                         "memory enough? use fewer workers and --resume"
                     )
-                for record, files in event.value if event.stage == "done" else ():
-                    place = record_path(Path(), record["index"]).as_posix()
-                    for name in sorted(files, key=lambda name: name == place):  # the record last
-                        write_atomically(output / name, partial(_write_bytes, files[name]))
-                    yield record
+                for found in event.value if event.stage == "done" else ():
+                    yield found.write(output) if isinstance(found, Encoded) else found
     finally:
         sweep_unfinished(output)  # what a worker had half written
 
 
-def _write_bytes(content: bytes, path: Path) -> None:
-    path.write_bytes(content)
-
-
 def _draw(
     shared: tuple[GeneratorSpec | PackedSpec, Path | None], indices: tuple[int, ...], threads: int
-) -> list[tuple[Record, dict[str, bytes]]]:
-    """Render these images in a worker; return their records, and their files unless it wrote them to the output."""
+) -> list[Record] | list[Encoded]:
+    """Render these images in a worker; return their records where it can write to the output, else all of them."""
     spec, output = shared
     with readable_failures():
         generator = _opened(spec, threads)
-        if output is not None:
-            return [(draw_to_folder(generator, output, index), {}) for index in indices]
-        samples = []
-        with tempfile.TemporaryDirectory() as folder:
-            for index in indices:
-                draw_to_folder(generator, Path(folder), index)
-                record = load_record(Path(folder), index)
-                assert record is not None
-                names = [record_path(Path(), index).as_posix(), *(() if record.get("skipped") else files_of(record))]
-                samples.append((record, {name: (Path(folder) / name).read_bytes() for name in names}))
-        return samples
+        if output is None:
+            return [draw_encoded(generator, index) for index in indices]
+        return [draw_to_folder(generator, output, index) for index in indices]
 
 
 @lru_cache(maxsize=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from neeco.files import write_atomically
 from neeco.labels.annotation import OCCLUDED
 from neeco.synthesis.writers.folder import Record, stem
 
-TILES, COLUMNS, TILE_WIDTH, GAP, CAPTION_LINE = 12, 4, 360, 14, 17
+TILES, COLUMNS, TILE_WIDTH, GAP, CAPTION_LINE = 8, 2, 360, 14, 17
+PAIR_WIDTH = 2 * TILE_WIDTH + 4  # the plain image, and the same with its labels
 PAPER, INK, FAINT = (250, 250, 248), (30, 32, 36), (120, 124, 130)
 BOX, RECTANGLE, BONE, HIDDEN = (255, 255, 255), (255, 209, 70), (20, 22, 26), (150, 150, 150)
 Color = str | tuple[int, int, int]
@@ -27,23 +29,23 @@ LABEL_COLUMN = 210
 def write_preview(
     root: Path, records: Sequence[Record], names: Sequence[tuple[str, str]], bones: Sequence[tuple[str, str]]
 ) -> None:
-    """Write preview.png: up to 12 images spread over the data set, parts tinted, with boxes and keypoints."""
+    """Write preview.png: up to 8 images spread over the data set, each plain and with parts, boxes and keypoints."""
     tiles = [draw_tile(root, records[k], bones) for k in evenly_spaced(len(records), TILES, floor=True)]
     columns = min(COLUMNS, len(tiles))
     rows = -(-len(tiles) // columns)
     height = max(tile.height for tile in tiles)
-    legend_rows = -(-(len(names) + 3) // max(columns * (TILE_WIDTH + GAP) // LABEL_COLUMN, 1))
+    legend_rows = -(-(len(names) + 3) // max(columns * (PAIR_WIDTH + GAP) // LABEL_COLUMN, 1))
     header = 26 * legend_rows + GAP
-    sheet = Image.new("RGB", (GAP + columns * (TILE_WIDTH + GAP), header + GAP + rows * (height + GAP)), PAPER)
+    sheet = Image.new("RGB", (GAP + columns * (PAIR_WIDTH + GAP), header + GAP + rows * (height + GAP)), PAPER)
     _legend(ImageDraw.Draw(sheet), names, sheet.width)
     for k, tile in enumerate(tiles):
         row, column = divmod(k, columns)
-        sheet.paste(tile, (GAP + column * (TILE_WIDTH + GAP), header + GAP + row * (height + GAP)))
+        sheet.paste(tile, (GAP + column * (PAIR_WIDTH + GAP), header + GAP + row * (height + GAP)))
     write_atomically(root / "preview.png", lambda temporary: sheet.save(temporary, format="PNG"))
 
 
 def draw_tile(root: Path, record: Record, bones: Sequence[tuple[str, str]] = ()) -> Image.Image:
-    """Return one image with its labels over it, and a caption below; `bones` join keypoints."""
+    """Return one image, beside it the same with its labels, and a caption below; `bones` join keypoints."""
     with Image.open(root / record["image"]) as stored:
         pixels = np.asarray(stored.convert("RGB"), dtype=float)
     with Image.open(root / "parts" / f"{stem(record['index'])}.png") as stored:
@@ -56,10 +58,11 @@ def draw_tile(root: Path, record: Record, bones: Sequence[tuple[str, str]] = ())
     canvas = ImageDraw.Draw(tinted)
     for label in record["labels"]:
         _draw_label(canvas, label, bones, scale)
-    first, second = (wrap(items, size[0], font) for items, font in zip(_caption(record), CAPTION_FONTS, strict=True))
+    first, second = (wrap(items, PAIR_WIDTH, font) for items, font in zip(_caption(record), CAPTION_FONTS, strict=True))
     height = size[1] + 6 + CAPTION_LINE * (len(first) + len(second))
-    tile = Image.new("RGB", (size[0], height), PAPER)
-    tile.paste(tinted)
+    tile = Image.new("RGB", (PAIR_WIDTH, height), PAPER)
+    tile.paste(Image.fromarray(image.astype(np.uint8)))
+    tile.paste(tinted, (PAIR_WIDTH - size[0], 0))
     text = ImageDraw.Draw(tile)
     lines = [(line, INK, CAPTION_FONTS[0]) for line in first] + [(line, FAINT, CAPTION_FONTS[1]) for line in second]
     for k, (line, color, font) in enumerate(lines):
@@ -118,7 +121,11 @@ def draw_name(canvas: ImageDraw.ImageDraw, x: float, y: float, text: str) -> Non
 def _caption(record: Record) -> tuple[list[str], list[str]]:
     """Return two lines: the image with its joint values, and the visible share of each instrument."""
     joints = [
-        f"{joint} {value:.2f}" for instrument in record["instruments"] for joint, value in instrument["joints"].items()
+        f"{joint.removesuffix('_mm')} {value:.1f} mm"
+        if joint.endswith("_mm")
+        else f"{joint} {math.degrees(value):.0f}°"
+        for instrument in record["instruments"]
+        for joint, value in instrument["joints"].items()
     ]
     seen = [f"{label['name']} {label['visibility']:.0%} seen" for label in record["labels"]]
     return [f"{record['index']:06d}", record["split"], *joints], seen

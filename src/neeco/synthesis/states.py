@@ -222,10 +222,15 @@ class PathStates:
             raise NeecoError(f"--states path: its states are over {' and '.join(sorted(tissues))}; a path is over one")
         self.keys, self.count = list(keys), count
 
-    def __call__(self, index: int, rng: Generator) -> State:
+    def place(self, index: int) -> tuple[int, float]:
+        """Return the key state before state `index`, and the share of the way to the next one."""
         position = index / max(self.count - 1, 1) * (len(self.keys) - 1)
         segment = min(int(position), len(self.keys) - 2)
-        return interpolate_state(self.keys[segment], self.keys[segment + 1], position - segment)
+        return segment, position - segment
+
+    def __call__(self, index: int, rng: Generator) -> State:
+        segment, weight = self.place(index)
+        return interpolate_state(self.keys[segment], self.keys[segment + 1], weight)
 
 
 class ListedStates:

@@ -201,13 +201,14 @@ class LabelledImages(_Generated, Dataset[Sample]):
         labels: composited or threshold
         camera_effects: YAML file of blur, noise, smoke and the like
         instruments: runs or scenes whose instruments are rendered over the scene's tissue, instead of its own
-        transform: sample -> sample, such as an augmentation
-        settings: any other option of `neeco synthesize`, such as size="1280x1024", scale=2.0 or lens=True
+        transform: sample -> sample; `neeco.synthesis.augmentation.augment_batch` augments whole batches strongly
+        settings: any other option of `neeco synthesize`, such as size="1280x1024" or scale=2.0; backgrounds and
+            match_colors are folders of frames of the next operation, for a network that is to work there
 
-    Sample `index` is what `neeco synthesize` draws as image `index` for the same settings and seed, before its pixels
+    Sample `index` is what `neeco synthesize` renders as image `index` for the same settings and seed, before its pixels
     are rounded to 8 bits (depth: to 0.05 mm); it is the same in any worker of any DataLoader, forked or spawned. A
-    worker uses one thread; it opens the scene's file when it draws its first sample (a scene without a file is sent to
-    it). Drawing on a GPU needs spawned workers, or none.
+    worker uses one thread; it opens the scene's file when it renders its first sample (a scene without a file is sent
+    to it). Rendering on a GPU needs spawned workers, or none.
 
     Raises NeecoError for a scene or settings that do not fit, and, when a sample is rendered, StatesRefused (a
     NeecoError) where no state is acceptable.
@@ -256,10 +257,9 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
         start: index of the first sample
         shard: (rank, world size) of this process, where several share the samples
 
-    The workers of a DataLoader share the indices: of W workers the k-th draws start + k, start + k + W, ...; processes
-    share them in the same way first. So no sample is rendered twice, and each is the same in any worker. Prescribed
-    states that are refused are left out; path:FILE.jsonl, which has an end, is not
-    for a stream.
+    The workers of a DataLoader share the indices: of W workers the k-th renders start + k, start + k + W, ...;
+    processes share them in the same way first. So no sample is rendered twice, and each is the same in any worker.
+    Prescribed states that are refused are left out; path:FILE.jsonl, which has an end, is not for a stream.
 
         stream = neeco.LabelledStream("runs/sample", seed=1)
         for batch in torch.utils.data.DataLoader(stream, batch_size=2, num_workers=2, collate_fn=stream.collate):

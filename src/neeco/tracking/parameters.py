@@ -81,7 +81,8 @@ def fitter_of(scene: GaussianScene) -> TrackingFitter:
     """Return the fitter of a scene's instruments over its tissue. Raises NeecoError as `TrackedParameters.of`."""
     parameters = TrackedParameters.of(scene)
     scene.visibility()  # by which states are trusted; of the whole scene, where training did not store it
-    return Fitter(InstrumentRenderer(scene), parameters, TissueRenderer(scene))
+    instruments = InstrumentRenderer(scene)
+    return Fitter(instruments, parameters, TissueRenderer(scene, instruments))
 
 
 def _tracked(instrument: Instrument, states: Sequence[State], pivot: Tensor, axis: Tensor) -> TrackedInstrument:

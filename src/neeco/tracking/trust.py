@@ -48,6 +48,8 @@ MIN_OBSERVED = 0.9  # of the share in the worst reference frame, that counts as 
 CONFIDENT = 0.9  # product of the other factors below which another state is searched for
 N_OTHERS_FITTED = 2
 OTHER_PRIOR = (20.0, 5.0, 20.0)  # deg, mm, deg of joints: standard deviations of the other state
+OTHER_LEVELS = ((0.25, 4), (0.5, 2))  # sizes of the images compared, and steps at each
+MAX_OTHER_MISFIT = 2.0  # times that of the fit: of states that are not fitted further
 OTHER_DEG, OTHER_JOINT_DEG = 10.0, 8.0  # closer states are the same
 MISFIT_RATIOS = (1.3, 1.0)  # of another state: where `single` is 1, and where it is lowest
 AMBIGUOUS = 0.6  # by which it is lowered there
@@ -233,9 +235,17 @@ class Judge:
         parameters, best, view = self.fitter.parameters, None, fit.view
         prior = loose_prior(parameters, *OTHER_PRIOR)
         for state in self.fitter.ranked(view, self.search.turned(fit.state), 0.25)[:N_OTHERS_FITTED]:
-            found = self.fitter.fit(view, state, prior, levels=(0.25, 0.5), steps=(4, 2))
-            if found is None or not differ(parameters, found.state, fit.state, OTHER_DEG, OTHER_JOINT_DEG):
-                continue
-            if best is None or found.gain > best.gain:
+            found: StateFit | None = None
+            for level, steps in OTHER_LEVELS:
+                start = state if found is None else found.state
+                found = self.fitter.fit(view, state, prior, start, levels=(level,), steps=(steps,))
+                if (
+                    found is None
+                    or found.misfit > MAX_OTHER_MISFIT * fit.misfit
+                    or not differ(parameters, found.state, fit.state, OTHER_DEG, OTHER_JOINT_DEG)
+                ):
+                    found = None
+                    break
+            if found is not None and (best is None or found.gain > best.gain):
                 best = found
         return best

@@ -277,7 +277,7 @@ def check_ranges(config: TrainConfig) -> None:
         )
     if config.batch_size > 1 and not method_class(config.method).has_gaussians:
         raise NeecoError(
-            f"--batch-size: method {config.method} draws rays of all frames in every step; "
+            f"--batch-size: method {config.method} samples rays of all frames in every step; "
             "use --set deformation.rays=NUMBER"
         )
     options = {"seed": 0, "batch_size": 1, "max_tissue_gaussians": 1, "max_instrument_gaussians": 1}

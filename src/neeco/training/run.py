@@ -95,7 +95,7 @@ def load_run(path: Path, device: torch.device | None = None) -> TrainedRun:
 
 @contextmanager
 def open_run(path: Path, device: torch.device | None = None) -> Iterator[TrainedRun]:
-    """`load_run` for a block that draws: until its end torch uses as many threads as pay for the run's method."""
+    """`load_run` for a block that renders: until its end torch uses as many threads as pay for the run's method."""
     run = load_run(path, device)
     with run.scene.torch_threads():
         yield run

@@ -353,11 +353,13 @@ class GaussianSession(GaussianTraining):
         if scene.recorded.still:
             places = {tuple(camera.world_from_camera.flatten().tolist()) for camera in scene.recorded.cameras}
             known = "measured with a second camera" if len(places) > 1 else "not measured: no view shows it"
-            scene.diagnostics["still_scope"] = f"the tissue's depth is {known}; draw views near the recorded ones"
+            scene.diagnostics["still_scope"] = f"the tissue's depth is {known}; render views near the recorded ones"
         scene.diagnostics["phase_2_began"] = self.schedule.phase_started
         scene.diagnostics["phase_2_forced"] = self.schedule.forced
+        shares = self.refinement.prior_shares()  # before what states predict is taken out of the corrections
         if len(scene.recorded.tissues) < 2:  # corrections are relative to their mean over one tissue
             self._predict_states()
+        self.refinement.scale_deviations(shares)
         scene.deformation.finish(self)
         scene.visibility()
 

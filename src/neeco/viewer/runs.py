@@ -183,7 +183,7 @@ class FrameScore:
     """Score of one rendered frame against the recorded one."""
 
     psnr: float  # dB
-    iou: float | None  # of all instruments together; None: nobody drew a true mask, or the scene has no labels
+    iou: float | None  # of all instruments together; None: there is no true mask, or the scene has no labels
 
 
 @lru_cache(maxsize=4096)

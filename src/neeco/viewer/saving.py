@@ -21,7 +21,7 @@ from neeco.scene.gaussian_scene import require_gaussians
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.settings import RECORDED_SIZE, Settings, SizeSettings
-from neeco.synthesis.writers.folder import load_record, record_path, write_sample
+from neeco.synthesis.writers.folder import encoded_sample, load_record, record_path
 
 if TYPE_CHECKING:
     from neeco.viewer.runs import LoadedRun
@@ -75,7 +75,7 @@ class SavedStates:
             index = 0
             while record_path(root, index).exists() and load_record(root, index) is not None:
                 index += 1
-            record = write_sample(root, index, drawing, labels)
+            record = encoded_sample(index, drawing, labels).write(root)
         return root / record["image"]
 
     def _lines(self, loaded: LoadedRun) -> list[str]:

@@ -35,6 +35,13 @@ MAX_RUNS = 2
 TOKEN_BYTES = 24
 MISSING = f"view: needs viser; {install_hint('view')}"
 MAX_BROWSERS = 32  # at once
+# Keys on a focused slider are the slider's own. viser turns the camera by arrows that are pressed anywhere but in a
+# form; it listens on the document, the slider within.
+SLIDER_KEYS = b"""<script>
+document.documentElement.addEventListener("keydown", event => {
+  if (event.target.closest("[role=slider]")) event.stopPropagation();
+});
+</script>"""
 MAX_MESSAGE = 2**20  # bytes; a browser's messages have some hundred
 
 log = logging.getLogger(__name__)
@@ -172,9 +179,13 @@ def _controlled_sockets(access: AccessControl) -> Iterator[list[bool]]:
             except (LookupError, OSError, ValueError):  # a header given twice, a name that no file can have
                 return connection.respond(http.HTTPStatus.BAD_REQUEST, "neeco view: not understood\n")
             if response is not None:
-                page = response.body
-                if response.headers.get("Content-Encoding") == "gzip":
-                    page = gzip.decompress(page)
+                packed = response.headers.get("Content-Encoding") == "gzip"
+                page = gzip.decompress(response.body) if packed else response.body
+                if b"<head>" in page:
+                    page = page.replace(b"<head>", b"<head>" + SLIDER_KEYS, 1)
+                    response.body = gzip.compress(page) if packed else page
+                    del response.headers["Content-Length"]
+                    response.headers["Content-Length"] = str(len(response.body))
                 for name, value in access.page_headers(request.path, page, headers["host"][0]).items():
                     response.headers[name] = value
             return response

@@ -80,11 +80,7 @@ def splats_of(scene: GaussianScene, state: State, camera: Camera) -> Splats:
 def write_splats(splats: Splats, path: Path, format: Format) -> None:
     """Write a file of that format. Raises NeecoError where the format cannot hold them, or the disk refuses."""
     data = {"ply": ply_bytes, "spz": spz_bytes}[format](splats)
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(data)
-
-    write_atomically(path, write)
+    write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
 def ply_bytes(splats: Splats) -> bytes:

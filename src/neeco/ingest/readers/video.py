@@ -25,6 +25,7 @@ SQUARE = 0.005  # by which a square pixel's width and height may differ: 1 px of
 MAX_RATE = 1000.0  # frames a second, beyond which a file's own number is no rate
 MAX_LEFT_OUT = 0.1  # of a folder's images (or one): more that are missing or of another size are no slip
 SAME_RATE = 2e-4  # relative difference of frame rates that is none
+MAX_BUFFERED_BYTES = 512 * 2**20  # of a video's decoded frames; those of a larger one are decoded at every reading
 
 
 def require_installed(name: str) -> None:
@@ -35,8 +36,8 @@ def require_installed(name: str) -> None:
 
 def open_video(path: Path, fps: float | None = None, part: tuple[float, float] | None = None) -> VideoSource:
     """A video file, or the part of it from one time s to another, without it. Its frames are decoded once to find
-    those that can be, with their own times (`fps`: overrides them). What is damaged is left out and noted; raises
-    NeecoError when nothing can be read."""
+    those that can be, with their own times (`fps`: overrides them), and buffered up to MAX_BUFFERED_BYTES. What is
+    damaged is left out and noted; raises NeecoError when nothing can be read."""
     path = Path(path)
     require_content(path)
     if not path.is_file():
@@ -157,6 +158,7 @@ class _Video(VideoSource):
     threads: str
     part: tuple[float, float] | None = None
     stated_fps: float | None = None
+    buffered: tuple[Any, ...] = ()  # all frames, decoded; empty where they are too large
 
     @property
     def own_fps(self) -> float | None:
@@ -164,7 +166,8 @@ class _Video(VideoSource):
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = {self.stamps[int(index)]: int(index) for index in indices}
-        for number, frame in enumerate(_Scan(self.path, threads=self.threads, part=self.part).decoded()):
+        frames = self.buffered or _Scan(self.path, threads=self.threads, part=self.part).decoded()
+        for number, frame in enumerate(frames):
             if not wanted:
                 return
             index = wanted.pop(number if self.numbered else frame.pts, None)
@@ -193,6 +196,8 @@ class _Scan:
     pixel_aspect: float = 1.0
     others: tuple[str, ...] = ()  # sizes of the video streams besides the one that is read
     promised: int = 0  # frames the file's header speaks of
+    buffered: list[Any] = field(default_factory=list)  # the frames, up to MAX_BUFFERED_BYTES in all
+    buffered_bytes: int = 0
 
     def decoded(self) -> Iterator[Any]:
         """Frames as far as they can be decoded; damaged ones are counted and left out."""
@@ -266,7 +271,16 @@ class _Scan:
             self.stamps.append(frame.pts)
             self.interlaced |= bool(frame.interlaced_frame)
             self.turned = self.turned or int(getattr(frame, "rotation", 0) or 0)
+            self._buffer(frame)
         return self
+
+    def _buffer(self, frame: Any) -> None:
+        """Keep a frame for later readings; none of a video whose frames are too large."""
+        self.buffered_bytes += sum(plane.buffer_size for plane in frame.planes)
+        if self.buffered_bytes <= MAX_BUFFERED_BYTES:
+            self.buffered.append(frame)
+        else:
+            self.buffered.clear()
 
     def finish(self, fps: float | None) -> _Video:
         if self.size is None or len(self.stamps) < MIN_IMAGES:
@@ -294,7 +308,7 @@ class _Scan:
             times = np.array(order) / rate
         return _Video(
             self.path, self.size, tuple(notes), times, stamps=tuple(order), numbered=numbered, threads=self.threads,
-            part=self.part, stated_fps=own, pixel_aspect=self.pixel_aspect,
+            part=self.part, stated_fps=own, pixel_aspect=self.pixel_aspect, buffered=tuple(self.buffered),
         )  # fmt: skip
 
     def _notes(self) -> list[str]:

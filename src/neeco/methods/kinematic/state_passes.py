@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import torch
 
 from neeco.capture.model import evenly_spaced
+from neeco.fitting.alignment import STATE_ERRORS
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.methods.kinematic.contradictions import CONTRADICTING, Misfits, doubt_states
 from neeco.methods.kinematic.discovery import carve_again
@@ -19,44 +20,38 @@ from neeco.methods.kinematic.state_registration import LARGE_ERRORS
 from neeco.methods.kinematic.state_search import LARGEST, StateSearch
 from neeco.training.session import GaussianSession
 
-# share of the run at which errors are sized and wrong states searched: later, the scene has learned from these
-DECIDED_AT = 0.12
+# shares of the run at which errors are sized; wrong states are searched at the first: later, the scene has learned from
+# these. Of errors that only the learned tissue shows, more is seen at the second
+DECIDED_AT = (0.12, 0.32)
 CARVED_AT = (0.2, 0.32, 0.45)  # shares at which states are fitted, and shapes carved anew from them
 FITTED_AT = (0.6, 0.75, 0.9)  # shares at which states are fitted
-MARKS = tuple(sorted({DECIDED_AT, *CARVED_AT, *FITTED_AT}))
+MARKS = tuple(sorted({*DECIDED_AT, *CARVED_AT, *FITTED_AT}))
 N_SAMPLED = 16  # frames by which errors are sized
 LARGE = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
 LARGE_OVER_KNOWN = 0.1  # the same over a tissue that is known well: fits are sharper there
 SCALE = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
-FOUND = "scale_of_state_errors"  # of a scene's diagnostics
 
 
 @torch.no_grad()
 def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, mark: float) -> None:
     """Fit the states of all training frames at a mark of the run where their errors are larger than a tracker's, which
-    is found out at the first.
-
-    Only where silhouettes showed large errors before training, or the learned tissue shows silhouettes: elsewhere
-    shapes that are carved from wrong states take in shadows, and fits follow these."""
+    the recording states, or images show at the first marks (see `_large_errors`)."""
     scene, refinement = session.scene, session.refinement
     several = any(len(frames) > 1 for frames in refinement.frames_of_instant)
     if several or not (scene.instruments and session.config.refine.frame_poses):
         return  # gradients of several cameras' images determine an instant's state better than each image does
-    if mark == DECIDED_AT:
-        search, scale = StateSearch.of(session, articulated), 0.0
-        misfits = Misfits.of(search)
-        linked = any(instrument.kinematics is not None for instrument in scene.instruments)
-        expected = scene.diagnostics.get(LARGE_ERRORS, not linked)
-        if expected or session.silhouettes is not None:
-            scale = size_of_errors(search, misfits.doubted)
-        large = scale > (LARGE if expected else LARGE_OVER_KNOWN)
-        if large:
-            scene.diagnostics[FOUND] = round(scale, 3)
+    if mark in DECIDED_AT and STATE_ERRORS not in scene.diagnostics:
+        search, first = StateSearch.of(session, articulated), mark == DECIDED_AT[0]
+        misfits = Misfits.of(search) if first else None
+        scale = _large_errors(search, misfits.doubted if misfits else (), first=first)
+        if scale is not None:
+            scene.diagnostics[STATE_ERRORS] = round(scale, 3)
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
             for (index,) in refinement.frames_of_instant:
                 refinement.set_deviations(index, search.deviations(index, SCALE))
-        doubt_states(search, SCALE if large else LARGE, misfits)
-    if FOUND not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
+        if misfits is not None:
+            doubt_states(search, LARGE if scale is None else SCALE, misfits)
+    if STATE_ERRORS not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, doubted = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
     for (index,) in refinement.frames_of_instant:
@@ -67,9 +62,35 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
             last = mark == FITTED_AT[-1]
             deviations = fit.deviations if last else search.deviations(index, SCALE)
             refinement.set_state(index, session.recorded.states[index], fit.fit.state, deviations)
-    if mark in CARVED_AT:
+    if mark in CARVED_AT and _is_shown(session):
         with session.searching():
             carve_again(session, articulated)
+
+
+def _is_shown(session: GaussianSession) -> bool:
+    """Return whether images show what an instrument covers: by its colours before training, or by the learned tissue.
+    Elsewhere shapes that are carved from wrong states take in shadows, and fits without a stated size follow these."""
+    return session.silhouettes is not None or _is_expected(session)
+
+
+def _is_expected(session: GaussianSession) -> bool:
+    """Return whether silhouettes showed large errors before training; without stated links none are searched then."""
+    linked = any(instrument.kinematics is not None for instrument in session.scene.instruments)
+    return bool(session.scene.diagnostics.get(LARGE_ERRORS, not linked))
+
+
+def _large_errors(search: StateSearch, doubted: Sequence[int], *, first: bool) -> float | None:
+    """Return how large the states' errors are, times the usual ones of a robot, where they are stated to be larger than
+    a tracker's, or images show that they are; else None. first: whether at the first mark; rough hinges without stated
+    links hide less then."""
+    session = search.session
+    stated = search.stated_scale()
+    if stated > LARGE:
+        return stated
+    if not (_is_shown(session) if first else session.silhouettes or session.scene.diagnostics.get(LARGE_ERRORS)):
+        return None
+    scale = size_of_errors(search, doubted)
+    return scale if scale > (LARGE if _is_expected(session) else LARGE_OVER_KNOWN) else None
 
 
 def size_of_errors(search: StateSearch, doubted: Sequence[int]) -> float:

@@ -25,6 +25,7 @@ from neeco.training.session import GaussianSession
 TILT, ROLL, ACROSS, DEPTH, JOINT = 2.0, 6.0, 0.4, 1.5, 4.0
 LARGEST = 1.5  # times them, of errors that are looked for
 USUAL = 0.15  # times them: a tracker's errors
+COMPARED = (0, 1, 3, 4)  # classes of errors that tell: a tracker's across the view are as large as a robot's
 N_ITERATIONS = 40  # of expectation maximisation
 KEPT_SHARE = 0.85  # of squared corrections that count, without the largest
 CORRELATION_PX = 100.0  # pixels that count as one observation, as the scene is still learned
@@ -140,9 +141,7 @@ class StateSearch:
     def scale_of(self, fits: Sequence[FittedState]) -> float:
         """Return how large errors are, times the usual ones of a robot: the median over the classes of errors of
         variance components by expectation maximisation, about the median correction, which belongs to the shape."""
-        kinds: list[int] = []
-        for item, own in zip(self.session.scene.instruments, self.session.refinement.layout.instruments, strict=True):
-            kinds += [0, 0, 1, 2, 2, 3, *(5 if reading in item.unrecorded else 4 for reading in own.joints)]
+        kinds = self._kinds()
         kind = torch.tensor(kinds)
         observed = []  # information on corrections in units of usual errors, and it times the most likely ones
         for found in fits:
@@ -159,12 +158,29 @@ class StateSearch:
                 each = squares[:, kind == number].flatten().sort().values
                 if len(each):
                     variances[number] = each[: math.ceil(KEPT_SHARE * len(each))].mean()
-        object.__setattr__(self, "classes", variances.sqrt().tolist())
-        # a tracker's errors across the view are as large as a robot's; without stated links, roll, depth and joints
-        # follow the errors of a hinge that is still rough
+        # without stated links, roll, depth and joints follow the errors of a hinge that is still rough
         linked = all(item.kinematics is not None for item in self.session.scene.instruments)
-        counted = (0, 1, 3, 4) if linked else (0,)
+        counted = COMPARED if linked else (0,)
         return float(variances[[number for number in counted if number in kinds]].sqrt().median())
+
+    def stated_scale(self) -> float:
+        """Return how large errors are by the recording's own statement, times the usual ones of a robot: the median
+        over tilt, roll, depth and joints; 0 where less than half of the states say so."""
+        names = [item.name for item in self.session.scene.instruments]
+        states = [frame.state.instruments for frame in self.session.full_views.frames]
+        stated = [k for k, of in enumerate(states) if all(of[name].uncertainty is not None for name in names)]
+        if not stated or 2 * len(stated) < len(states):
+            return 0.0
+        shares = torch.stack([self._deviations(index, 1.0) / self._usual() for index in stated]).median(0).values
+        kinds = torch.tensor(self._kinds())
+        return float(torch.stack([shares[kinds == k].median() for k in COMPARED if bool((kinds == k).any())]).median())
+
+    def _kinds(self) -> list[int]:
+        """Return the class of each correction: tilt 0, roll 1, across 2, depth 3, joints 4, unrecorded ones 5."""
+        kinds: list[int] = []
+        for item, own in zip(self.session.scene.instruments, self.session.refinement.layout.instruments, strict=True):
+            kinds += [0, 0, 1, 2, 2, 3, *(5 if reading in item.unrecorded else 4 for reading in own.joints)]
+        return kinds
 
     def _usual(self) -> Tensor:
         """Return usual errors [P] of a robot's states (rad, mm)."""

@@ -368,7 +368,7 @@ class NerfScene(nn.Module):
         """A field has no Gaussians that could move."""
 
     def torch_threads(self) -> AbstractContextManager[None]:
-        """All of torch's threads: a drawing is a few large products."""
+        """All of torch's threads: an image is a few large products."""
         return nullcontext()
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -28,7 +28,7 @@ def interpreted() -> bool:
 def missing(device: torch.device) -> str | None:
     """Return what Triton lacks on `device`, as far as is known without trying, and the remedy; None: nothing."""
     if not installed():
-        return f"package triton is missing; on Linux {install_hint('triton')}, or draw on the CPU"
+        return f"package triton is missing; on Linux {install_hint('triton')}, or render on the CPU"
     if interpreted():
         return None
     if device.type != "cuda":
@@ -37,8 +37,8 @@ def missing(device: torch.device) -> str | None:
     if capability < OLDEST:
         has, needs = (".".join(map(str, version)) for version in (capability, OLDEST))
         return (
-            f"{device} has compute capability {has}, Triton needs {needs}; {install_hint('cuda')} to draw with gsplat, "
-            "or use --device cpu"
+            f"{device} has compute capability {has}, Triton needs {needs}; {install_hint('cuda')} to render with "
+            "gsplat, or use --device cpu"
         )
     return None
 

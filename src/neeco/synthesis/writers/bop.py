@@ -17,11 +17,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 
-from neeco.capture.images import read_labels, write_labels
+from neeco.capture.images import encoded_png, read_labels
 from neeco.capture.model import InstrumentState, State
-from neeco.files import write_json
+from neeco.files import write_json, write_unsynced
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import INTRINSICS
@@ -102,7 +101,7 @@ def _masks(images: WrittenImages, folder: Path, record: Record) -> list[dict[str
         whole[height : 2 * height, width : 2 * width] = mask
         for kind, pixels in (("mask", mask), ("mask_visib", visible)):
             path = folder / kind / f"{name}_{place:06d}.png"
-            write_labels(path, torch.from_numpy(pixels.astype(np.uint8) * 255))
+            write_unsynced(path, encoded_png(pixels.astype(np.uint8) * 255))
         seen, every = int(visible.sum()), int(whole.sum())
         infos.append(
             {

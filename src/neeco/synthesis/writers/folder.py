@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -17,10 +18,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.capture.images import write_image, write_labels, write_png
+from neeco.capture.images import encoded_image, encoded_png
 from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.errors import NeecoError
-from neeco.files import read_json_lines, read_text, write_atomically, write_text
+from neeco.files import read_json_lines, read_text, write_atomically, write_text, write_unsynced
 from neeco.geometry.lens import Lens
 from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import LayeredDrawing, to_numpy
@@ -57,8 +58,23 @@ def stem(index: int) -> str:
     return f"{index:06d}"
 
 
-def write_sample(
-    root: Path,
+@dataclass(frozen=True)
+class Encoded:
+    """The record of an image and the content of its files, by their names in the data set."""
+
+    record: Record
+    files: Mapping[str, bytes]
+
+    def write(self, root: Path) -> Record:
+        """Write the files and then the record to a data set, unsynced; return the record. Raises NeecoError."""
+        for name, content in self.files.items():
+            write_unsynced(root / name, content)
+        content = json.dumps(self.record | {CHECKSUM: _digest(self.record)}, allow_nan=False).encode()
+        write_unsynced(record_path(root, self.record["index"]), content)
+        return self.record
+
+
+def encoded_sample(
     index: int,
     drawing: LayeredDrawing,
     labels: list[InstrumentLabel],
@@ -66,21 +82,25 @@ def write_sample(
     refused: Mapping[str, int] = MappingProxyType({}),
     facts: Mapping[str, Any] = MappingProxyType({}),
     quality: int | None = None,
-) -> Record:
-    """Write one image, as JPEG of `quality` or as PNG, with all that its pixels say, then its record, to which `facts`
-    are added; returns the record. Raises NeecoError."""
+) -> Encoded:
+    """Encode one image, as JPEG of `quality` or as PNG, with all that its pixels say, and its record, to which `facts`
+    are added."""
     name = f"{stem(index)}.png"
     silhouettes = np.zeros(drawing.depth.shape, np.uint8)
     for k, layer in enumerate(list(drawing.layers.values())[:MAX_INSTRUMENTS]):
         silhouettes |= layer.mask.astype(np.uint8) << k
     image = f"images/{stem(index)}{'.png' if quality is None else '.jpg'}"
-    write_image(root / image, drawing.image, quality)
-    write_labels(root / "masks" / name, (drawing.parts > 0).to(torch.uint8) * 255)
-    write_labels(root / "soft" / name, (drawing.share / SHARE_PER_COUNT).round().to(torch.uint8))
-    write_labels(root / "ignore" / name, drawing.ignored.to(torch.uint8) * IGNORED)
-    write_labels(root / "parts" / name, drawing.parts)
-    write_png(root / "depth" / name, np.clip(np.round(drawing.depth / DEPTH_MM_PER_COUNT), 0, 65535).astype(np.uint16))
-    write_labels(root / "silhouettes" / name, torch.from_numpy(silhouettes))
+    parts = drawing.parts.numpy()
+    planes = {
+        "masks": (parts > 0).astype(np.uint8) * 255,
+        "soft": (drawing.share / SHARE_PER_COUNT).round().to(torch.uint8).numpy(),
+        "ignore": drawing.ignored.numpy().astype(np.uint8) * IGNORED,
+        "parts": parts,
+        "depth": np.clip(np.round(drawing.depth / DEPTH_MM_PER_COUNT), 0, 65535).astype(np.uint16),
+        "silhouettes": silhouettes,
+    }
+    files = {image: encoded_image(drawing.image, quality)}
+    files |= {f"{folder}/{name}": encoded_png(pixels) for folder, pixels in planes.items()}
     camera = drawing.camera
     record = {
         "index": index,
@@ -96,22 +116,14 @@ def write_sample(
         **facts,
         "refused": dict(sorted(refused.items())),
     }
-    record["files"] = {file: (root / file).stat().st_size for file in files_of(record)}
-    _write_record(root, record)
-    return record
+    record["files"] = {file: len(files[file]) for file in files_of(record)}
+    return Encoded(record, files)
 
 
-def write_skipped(
-    root: Path, index: int, refused: Mapping[str, int], facts: Mapping[str, Any] = MappingProxyType({})
-) -> Record:
-    """Record that `index` has no image, and why; `facts` are added."""
-    record: Record = {"index": index, "skipped": True, **facts, "refused": dict(sorted(refused.items())), "files": {}}
-    _write_record(root, record)
-    return record
-
-
-def _write_record(root: Path, record: Record) -> None:
-    write_text(record_path(root, record["index"]), json.dumps(record | {CHECKSUM: _digest(record)}, allow_nan=False))
+def skipped_sample(index: int, refused: Mapping[str, int], facts: Mapping[str, Any] = MappingProxyType({})) -> Encoded:
+    """The record that `index` has no image, and why; `facts` are added."""
+    found = {"index": index, "skipped": True, **facts, "refused": dict(sorted(refused.items())), "files": {}}
+    return Encoded(found, {})
 
 
 def _digest(record: Record) -> str:

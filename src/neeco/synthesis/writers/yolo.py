@@ -6,29 +6,35 @@ no hard links), never symbolic ones.
 
     yolo/{data.yaml, images/{train,val}, labels/{train,val}}     detect
     yolo/segment/…   yolo/pose/…   yolo/obb/…                    the same for the other tasks
+    yolo/parts/…                                                 parts as classes, to segment or to detect
+
+Classes are instruments; those of yolo/parts/ are the part ids of dataset.json, less one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from neeco.files import write_text
+from neeco.files import write_text, write_unsynced
 from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import link, stem
+from neeco.synthesis.writers.folder import Record, link, stem
 
 Row = Callable[[dict[str, Any], np.ndarray], list[float]]  # (label, image size [2]) -> numbers after the class
+Shapes = Callable[[WrittenImages, Record], Iterator[tuple[int, dict[str, Any]]]]  # (class, label) of all in an image
 
 
 class Yolo(Writer):
     """Boxes, polygons, keypoints and oriented boxes; coordinates are shares of the image's width and height."""
 
     format = "yolo"
-    description = "`yolo/` to detect, `yolo/segment/`, `yolo/pose/` and `yolo/obb/`"
+    description = (
+        "`yolo/` to detect, `yolo/segment/`, `yolo/pose/` and `yolo/obb/`; `yolo/parts/` with parts as classes"
+    )
 
     def write(self, images: WrittenImages) -> None:
         """(Re)write every variant. Raises NeecoError."""
@@ -36,6 +42,8 @@ class Yolo(Writer):
         _write_variant(images, folder, detect_row, {})
         _write_variant(images, folder / "segment", segment_row, {})
         _write_variant(images, folder / "obb", oriented_row, {})
+        names = {k: f"{instrument}/{part}" for k, (instrument, part) in enumerate(images.part_names)}
+        _write_variant(images, folder / "parts", segment_row, {"names": names}, visible_parts)
         if keypoints:
             mirrored = [
                 name.replace("left", "\0").replace("right", "left").replace("\0", "right") for name in keypoints
@@ -44,6 +52,20 @@ class Yolo(Writer):
             extra: dict[str, Any] = {"kpt_shape": [len(keypoints), 3], "flip_idx": flip}
             extra["kpt_names"] = {k: list(keypoints) for k in range(len(images.instruments))}
             _write_variant(images, folder / "pose", _pose_row(keypoints), extra)
+
+
+def visible_instruments(images: WrittenImages, record: Record) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield class and label of every instrument that the image shows."""
+    for label in record["labels"]:
+        if label["area"] > 0:
+            yield images.instruments.index(label["name"]), label
+
+
+def visible_parts(images: WrittenImages, record: Record) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield class and shape of every part that the image shows."""
+    for label in record["labels"]:
+        for part, shape in label["parts"].items():
+            yield images.part_names.index((label["name"], part)), shape
 
 
 def detect_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
@@ -88,24 +110,25 @@ def _shares(points: np.ndarray, size: np.ndarray) -> list[float]:
     return np.clip(points / size, 0, 1).ravel().tolist()
 
 
-def _write_variant(images: WrittenImages, folder: Path, row: Row, extra: dict[str, Any]) -> None:
-    records, instruments = images.records, images.instruments
+def _write_variant(
+    images: WrittenImages, folder: Path, row: Row, extra: dict[str, Any], shapes: Shapes = visible_instruments
+) -> None:
+    records = images.records
     for record in records:
         name, split = stem(record["index"]), record["split"]
         size = np.array([record["width"], record["height"]], dtype=float)
         lines = [
-            " ".join([str(instruments.index(label["name"])), *(f"{value:.6g}" for value in row(label, size))])
-            for label in record["labels"]
-            if label["area"] > 0
+            " ".join([str(category), *(f"{value:.6g}" for value in row(shape, size))])
+            for category, shape in shapes(images, record)
         ]
-        write_text(folder / "labels" / split / f"{name}.txt", "".join(f"{line}\n" for line in lines))
+        write_unsynced(folder / "labels" / split / f"{name}.txt", "".join(f"{line}\n" for line in lines).encode())
         link(images.root / record["image"], folder / "images" / split / Path(record["image"]).name)
     has_validation = any(record["split"] == "val" for record in records)
     # without "path", tools take the folder of data.yaml itself, wherever the data set is moved
     data = {
         "train": "images/train",
         "val": "images/val" if has_validation else "images/train",
-        "names": dict(enumerate(instruments)),
+        "names": dict(enumerate(images.instruments)),
         **extra,
     }
     write_text(folder / "data.yaml", yaml.safe_dump(data, sort_keys=False))

@@ -70,10 +70,11 @@ class Panel {
   }
 
   slider(group, name, low, high, step, written, read, write) {
-    const input = made("input", { type: "range", min: low, max: high, step, name }), output = made("output");
+    const spoken = name.replaceAll("_", " "), within = group.querySelector("legend").textContent;
+    const input = made("input", { type: "range", min: low, max: high, step, name, ariaLabel: `${within}: ${spoken}` }), output = made("output");
     input.oninput = () => { write(Number(input.value)); this.page.moved(); };
-    group.append(made("label", {}, name.replaceAll("_", " "), output, input));
-    this.sliders.push(() => { input.value = read(); output.textContent = written(read()); });
+    group.append(made("label", {}, spoken, output, input));
+    this.sliders.push(() => { input.value = read(); input.ariaValueText = output.textContent = written(read()); });
   }
 
   // Shows the requested state.

@@ -148,9 +148,10 @@ function draw() {
 
 function slider(label, kind, low, high, value, change, deviation) {
   const row = document.createElement("label"), said = document.createElement("output"), input = document.createElement("input");
-  row.append(label, said, input);
-  Object.assign(input, { type: "range", min: low, max: high, step: 1, value, className: kind });
-  const show = () => said.textContent = `${Math.round(input.value)}°` + (deviation ? `  (expected ± ${Math.round(deviation)}°)` : "");
+  const name = label.replaceAll("_", " ");
+  row.append(name, said, input);
+  Object.assign(input, { type: "range", min: low, max: high, step: 1, value, className: kind, ariaLabel: name });
+  const show = () => input.ariaValueText = said.textContent = `${Math.round(input.value)}°` + (deviation ? `  (expected ± ${Math.round(deviation)}°)` : "");
   input.oninput = () => { change(Number(input.value)); show(); draw(); haunt(); };
   show();
   return row;
@@ -316,6 +317,8 @@ function say(text, warned) {
 function keep() {
   lines.hinge = Number($("hinge").value);
   lines.share = Number($("share").value);
+  $("hinge").ariaValueText = `${lines.hinge.toFixed(1)} mm`;
+  $("share").ariaValueText = `${lines.share} percent`;
   $("hinge-value").textContent = lines.hinge.toFixed(1);
   $("share-value").textContent = lines.share;
   localStorage.setItem(`neeco ${overview.capture} ${overview.instrument}`, JSON.stringify(lines));
@@ -343,6 +346,7 @@ $("canvas").addEventListener("wheel", event => { event.preventDefault(); turn("r
 new ResizeObserver(() => frame && picture && draw()).observe($("stage"));
 addEventListener("keydown", event => {
   if (!frame || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (event.target.type === "range" && event.key.startsWith("Arrow")) return;  // the slider's own
   const step = event.shiftKey ? LEAP : STEP;
   const keys = {
     ArrowLeft: () => turn("roll", -step), ArrowRight: () => turn("roll", step),
