@@ -84,6 +84,7 @@ def test_a_joint_is_a_finite_number(value):
         ({"height": -48}, "image size 64 x -48 is not usable"),
         ({"width": 64.5}, "image size 64.5 x 48 is not usable"),
         ({"fx": math.nan}, "not all positive and finite"),
+        ({"fx": -290.0}, "-290 px, .* are not all positive and finite"),
         ({"near": 0.0}, "not all positive and finite"),
         ({"cy": math.inf}, "cx, cy: 32 and inf px are not finite"),
         ({"cx": "middle"}, "expected numbers"),

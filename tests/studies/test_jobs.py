@@ -89,6 +89,21 @@ def test_a_begun_run_keeps_what_its_processor_decided(make_job) -> None:
         make_job(config=training_config("nps", {}, ["deformation.half=true"])).check()
 
 
+def test_a_finished_job_of_a_methods_former_name_is_not_done_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = training_config("nps", {}, ["deformation.width=16", "deformation.depth=2"])
+    job = make_job(config=small)
+    first = job.run()
+    for name in ("job.json", "config.yaml"):  # as version 0.2 wrote them
+        text = (job.folder / name).read_text()
+        assert "nps" in text
+        (job.folder / name).write_text(
+            text.replace('"method": "nps"', '"method": "neeco"').replace("method: nps", "method: neeco")
+        )
+    monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
+    with pytest.warns(FutureWarning, match="method neeco is now called nps"):
+        assert make_job(config=small).run() == first | {"method": "neeco"}
+
+
 def test_the_numbers_of_a_capture_that_changed_are_not_given_again(make_job) -> None:
     job = make_job()
     job.run()
