@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -29,33 +29,50 @@ MAX_NAMED = 8  # frames in a line
 FITTED_ANEW, LEFT_OUT = "fitted anew", "left out"
 
 
+@dataclass(frozen=True)
+class Misfits:
+    """Misfits of training frames in their present states, infinite outside of the image, and from which on a state is
+    doubted, and on which a frame that no state explains is left out."""
+
+    of_frame: dict[int, float]
+    limit: float
+    hopeless: float
+
+    @classmethod
+    def of(cls, search: StateSearch) -> Misfits:
+        """Measure them. With few frames, or where half of them would be, none is doubted."""
+        count = len(search.session.recorded.names)
+        misfits = {index: search.misfit(index, search.state(index)) for index in range(count)}
+        shown = torch.tensor([misfit for misfit in misfits.values() if math.isfinite(misfit)])
+        if len(shown) < MIN_FRAMES:
+            return cls(misfits, math.inf, math.inf)
+        logs = shown.clamp(1e-3, 1e3).log()
+        spread = max(1.4826 * float((logs - logs.median()).abs().median()), MIN_SPREAD)
+        limits = (max(float(logs.median()) + many * spread, math.log(EXPLAINED)) for many in (OUTLYING, HOPELESS))
+        found = cls(misfits, *map(math.exp, limits))
+        return cls(misfits, math.inf, math.inf) if len(found.doubted) > len(shown) // 2 else found
+
+    @property
+    def doubted(self) -> list[int]:
+        """Frames whose states leave much more unexplained than those of the others."""
+        return [index for index, misfit in self.of_frame.items() if self.limit < misfit < math.inf]
+
+
 @torch.no_grad()
-def doubt_states(search: StateSearch, scale: float) -> None:
-    """Fit states that leave their images unexplained from other starts, or leave them out; note them in the scene's
-    diagnostics. scale: of the errors of all states (see `StateSearch.fitted`). States that place the instruments
-    outside of the image are not doubted."""
+def doubt_states(search: StateSearch, scale: float, misfits: Misfits) -> None:
+    """Fit doubted states from other starts, or leave them out; note them in the scene's diagnostics. scale: of the
+    errors of all states (see `StateSearch.fitted`)."""
     session, refinement = search.session, search.session.refinement
-    states = {index: search.state(index) for index in range(len(session.recorded.names))}
-    found_misfits = {index: search.misfit(index, state) for index, state in states.items()}
-    first = [index for index, misfit in found_misfits.items() if math.isfinite(misfit)]
-    if len(first) < MIN_FRAMES:
-        return
-    misfits = torch.tensor([found_misfits[index] for index in first])
-    logs = misfits.clamp(1e-3, 1e3).log()
-    spread = max(1.4826 * float((logs - logs.median()).abs().median()), MIN_SPREAD)
-    middle = float(logs.median())
-    limit, hopeless = (math.exp(max(middle + many * spread, math.log(EXPLAINED))) for many in (OUTLYING, HOPELESS))
-    doubted = [index for index, misfit in zip(first, misfits.tolist(), strict=True) if misfit > limit]
-    if len(doubted) > len(first) // 2:
-        return
-    others = [states[index] for index in first if index not in doubted]
+    doubted, limit = misfits.doubted, misfits.limit
+    usual = [index for index, misfit in misfits.of_frame.items() if misfit <= limit]
+    others = [search.state(index) for index in usual]
     others = [others[place] for place in evenly_spaced(len(others), N_OTHERS)]
     noted: dict[str, str] = dict(session.scene.diagnostics.get(CONTRADICTING, {}))
     for index in doubted:
         if session.recorded.names[index] in noted:
             continue
         own, given = search.fitted(index, scale), session.recorded.states[index]
-        misfit = found_misfits[index] if own is None else own.fit.misfit
+        misfit = misfits.of_frame[index] if own is None else own.fit.misfit
         if misfit <= limit:
             continue
         found = _from_other_starts(search, index, others)
@@ -65,7 +82,7 @@ def doubt_states(search: StateSearch, scale: float) -> None:
             if float((apart @ search.precision(index, scale) @ apart) / len(apart)) > MIN_DISTANCE**2:
                 verdict = FITTED_ANEW if found[0].misfit < limit else LEFT_OUT
                 refinement.set_state(index, given, found[0].state, found[1])
-        elif misfit > hopeless:
+        elif misfit > misfits.hopeless:
             verdict = LEFT_OUT
         if verdict == LEFT_OUT:
             refinement.weights[index] = 0

@@ -16,11 +16,9 @@ from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.state_registration import corrected_evidence, register_states
 from neeco.methods.kinematic.stated_links import StatedLinks
-from neeco.methods.space_carving import Evidence, carved_shape, gather_evidence, pad_and_stack
-from neeco.methods.static import Static
+from neeco.methods.space_carving import Evidence, carve_along, carved_shape, frame_along, pad_and_stack
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
-from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.training.session import GaussianSession
 
@@ -48,26 +46,25 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
 def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Replace the instruments' Gaussians by seeds on shapes carved anew, at the states as corrected so far: what the
     former states taught is forgotten. The session's views are those of searches."""
-    scene = session.scene
-    tissue = scene.canonical.map(
+    scene, breathing = session.scene, articulated.breathing if isinstance(articulated, BreathingTissue) else None
+    scene.canonical = tissue = scene.canonical.map(
         lambda tensor: tensor[scene.canonical.body(0)].detach().clone(), scene.canonical.counts[:1]
     )
-    alone = GaussianScene(Static.method, tissue, Static(), (), Recorded(tissues=scene.recorded.tissues), scene.center)
-    alone.background, alone.sh_degree = scene.background, scene.sh_degree
-    linked = any(instrument.kinematics is not None for instrument in scene.instruments)
-    evidence = gather_evidence(alone, session.views, session.config.deformation.carving, unshaded=linked)
+    with torch.enable_grad():  # tissue learned together with an instrument leaves much more unexplained
+        fitted = fit_tissue(scene, session.views, session.config, breathing=breathing)
+        evidence = tissue_evidence(scene, session.views, session.config, fitted)
     if session.silhouettes is not None:
         numbers = {frame.name: number for number, frame in enumerate(session.views.frames)}
         hits = [session.silhouettes.instrument(numbers[frame.name]) for frame in evidence.frames]
         evidence = replace(evidence, hits=pad_and_stack(hits, 0.0).to(evidence.hits))
     evidence = corrected_evidence(session, evidence)
     with torch.no_grad():
-        scene.canonical = tissue
-        learned = [articulation.axes(articulation.shaft()) for articulation in articulated.articulations]
+        shafts = [articulation.shaft() for articulation in articulated.articulations]
+        axes = [articulation.axes(shaft) for articulation, shaft in zip(articulated.articulations, shafts, strict=True)]
         for articulation in articulated.articulations:
             articulation.shaft_tilt.zero_()
             articulation.shaft_shift.zero_()
-        scene.canonical = _with_instruments(session, articulated, evidence, learned)
+        scene.canonical = _with_instruments(session, articulated, evidence, list(zip(shafts, axes, strict=True)))
     rows = torch.arange(len(scene.canonical), device=scene.center.device)
     fresh = rows >= len(tissue)
     session.adam.select_rows(list(scene.canonical.tensors()), torch.where(fresh, 0, rows), fresh)
@@ -78,11 +75,11 @@ def _with_instruments(
     session: GaussianSession,
     articulated: ArticulatedInstruments,
     recorded: Evidence,
-    learned: Sequence[tuple[Tensor, Tensor]] | None = None,
+    learned: Sequence[tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]] | None = None,
 ) -> CanonicalGaussians:
     """Return the Gaussians of the session's tissue and of every instrument on its carved shape, and start the joints.
-    learned: the axes of joints so far (see `Articulation.axes`); None: they are searched for, poses of stated links
-    corrected."""
+    learned: shaft and axes of each so far (see `Articulation`), which hinges keep; None: hinges are searched for, and
+    poses of stated links corrected."""
     scene, evidence = session.scene, recorded
     generator = torch.Generator().manual_seed(session.config.seed)
     bodies = [scene.canonical]
@@ -98,6 +95,9 @@ def _with_instruments(
                 evidence = replace(recorded, frames=tuple(corrected))
                 shape = carved_shape(session, evidence, instrument.name, generator)
                 shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
+        elif learned is not None:  # carving few frames anew may take the rear end for the jaws
+            base, settings = frame_along(*learned[index][0]), session.config.deformation.carving
+            shape = carve_along(evidence, instrument.name, base, shape.level, generator, settings) or shape
         articulation.base.copy_(shape.instrument_from_shaft)
         articulation.extent.copy_(torch.tensor([shape.near, shape.tip]))
         articulation.radius.fill_(shape.radius)
@@ -108,11 +108,7 @@ def _with_instruments(
             )
         else:
             assert isinstance(articulation, Hinges)
-            axes = (
-                learned[index]
-                if learned is not None and session.iteration > scene.deformation.start_iteration
-                else None
-            )
+            axes = None if learned is None else learned[index][1]
             seeds, logits = start_hinges(
                 session, articulation, evidence, instrument.name, shape, axes, columns=columns, generator=generator
             )
