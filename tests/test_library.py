@@ -249,7 +249,8 @@ def test_python_blocks_of_the_pages_pass_a_type_checker(tmp_path: Path) -> None:
     ]  # as `make lint`, whose cache serves
     settings += '[[tool.mypy.overrides]]\nmodule = ["fiftyone.*", "datasets.*"]\nignore_missing_imports = true\n'
     (tmp_path / "pyproject.toml").write_text(settings, encoding="utf-8")
-    options = ["--config-file", str(tmp_path / "pyproject.toml")]
+    # torch leaves Tensor.backward without types
+    options = ["--config-file", str(tmp_path / "pyproject.toml"), "--untyped-calls-exclude", "torch"]
     pages = sorted(str(page) for page in tmp_path.glob("*_page.py"))
     environment = os.environ | {"MYPYPATH": "src"}
     command = [sys.executable, "-m", "mypy", *options, *pages]
