@@ -259,7 +259,7 @@ def test_unknown_and_missing_backends_are_named() -> None:
     with pytest.raises(NeecoError, match="unknown"):
         rasterize(gaussians, camera, backend="metal")
     if not torch.cuda.is_available():
-        with pytest.raises(NeecoError, match=r"neeco\[cuda\]"):
+        with pytest.raises(NeecoError, match=r"\.\[cuda\]"):
             rasterize(gaussians, camera, backend="cuda")
 
 
