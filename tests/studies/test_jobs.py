@@ -318,7 +318,7 @@ def test_budgets_that_cannot_be_spent_are_refused(budget: Budget, reported: str,
 def test_a_cluster_without_ray_is_refused_with_the_remedy(make_job, monkeypatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")
     monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(NeecoError, match=r"install neeco\[cluster\]"):
+    with pytest.raises(NeecoError, match=r"\.\[cluster\]"):
         run_jobs([make_job()], workers=2)
 
 
