@@ -177,7 +177,7 @@ def line_chart(
     if over_logarithmic:
         _set_logarithmic_x(axes, xs)
     else:
-        axes.set_xlim(min(0.0, xs[0]), xs[-1])
+        axes.set_xlim(min(0.0, xs[0]), xs[-1] if xs[-1] > min(0.0, xs[0]) else None)
         round_ticks(axes.xaxis, 5, short)
     cut = not logarithmic and _begin_at_zero(axes)
     round_ticks(axes.yaxis, 4, short)
