@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from neeco.fitting.alignment import STATE_ERRORS, AlignConfig, AlignedFrame, align_frame, pose_change
+from neeco.fitting.parameters import moved_pose
+from neeco.geometry.rotations import rigid_from_vector
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +87,12 @@ def test_large_errors_of_a_recording_are_found_from_as_far(world, scene_and_fram
         left.append(pose_change(truth, align(scene, wrong).state.instruments["bar"].pose)["deg"])
     scene.diagnostics = {}
     assert left[1] < 0.8 * left[0]  # a tiny image tells little
+
+
+@pytest.mark.parametrize("pivot", [None, torch.tensor([3.0, -40.0, 12.0], dtype=torch.float64)])
+@pytest.mark.parametrize("turn", [0.0, 1e-9, 0.2, 3.1])
+def test_a_pose_moves_alike_with_and_without_gradients(turn, pivot):
+    pose = rigid_from_vector(torch.tensor([0.3, -0.5, 0.2, 10.0, -4.0, 80.0], dtype=torch.float64))
+    increment = torch.tensor([0.6 * turn, 0.0, -0.8 * turn, 0.5, -0.2, 1.5], dtype=torch.float64)
+    expected = moved_pose(pose, increment.clone().requires_grad_(), pivot).detach()
+    torch.testing.assert_close(moved_pose(pose, increment, pivot), expected, rtol=0, atol=1e-9)

@@ -61,12 +61,14 @@ def run(arguments: Arguments) -> int:
         if arguments.frames is not None:
             views = views_along(views, arguments.frames)
         with counting("render", len(views)) as advance:
-            if arguments.output is None:
-                assert arguments.video is not None
+            if arguments.video is not None:
                 write_video(trained.scene, views, arguments.video, advance, arguments.images)
-                print(f"{len(views)} images in {arguments.video}")
-                return 0
-            rendered = render(trained.scene, views, arguments.output / folder, advance, arguments.images)
+            else:
+                assert arguments.output is not None
+                rendered = render(trained.scene, views, arguments.output / folder, advance, arguments.images)
+    if arguments.video is not None:
+        print(f"{len(views)} images in {arguments.video}")
+        return 0
     print(f"{rendered.images} images in {rendered.folder}")
     if not rendered.labelled:
         print(f"no part ids and masks: method {trained.scene.method!r} learns no labels")
