@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import InstrumentState, State, Uncertainty
 from neeco.fitting.state_fitter import StateFit
-from neeco.methods.kinematic.contradictions import CONTRADICTING, Misfits, doubt_states
+from neeco.methods.kinematic.contradictions import CONTRADICTING, Misfits, refit_outliers
 from neeco.methods.kinematic.state_passes import LARGE
 from neeco.methods.kinematic.state_search import JOINT, LARGEST, FittedState, StateSearch
 from neeco.scene import Recorded
@@ -103,7 +103,7 @@ def test_a_wrong_state_contradicts_the_others_and_is_found_from_one_of_theirs(tm
     states[3] = replace(TRUE[10], time=TRUE[3].time)
     session = session_of(tmp_path, states)
     search = search_of(session)
-    doubt_states(search, LARGE, Misfits.of(search))
+    refit_outliers(search, LARGE, Misfits.of(search))
     assert session.scene.diagnostics[CONTRADICTING] == {"000003": "fitted anew"}
     found = session.refinement.state(3, states[3])
     assert session.refinement.layout.increments_between(TRUE[3], found)[3:6].norm() < 0.7
@@ -114,7 +114,7 @@ def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
     frame = session.full_views.frames[5]
     world.write_image(frame.image_path, torch.rand(64, 96, 3, generator=torch.Generator().manual_seed(0)))
     search = search_of(session)
-    doubt_states(search, LARGE, Misfits.of(search))
+    refit_outliers(search, LARGE, Misfits.of(search))
     assert session.scene.diagnostics[CONTRADICTING] == {"000005": "left out"}
     assert session.refinement.weights.tolist() == [float(index != 5) for index in range(len(TRUE))]
 

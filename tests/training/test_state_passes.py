@@ -30,8 +30,8 @@ def decided(
         session=session, deviations=lambda index, scale: None, stated_scale=lambda: stated, fitted=lambda *given: None
     )
     monkeypatch.setattr(module.StateSearch, "of", lambda session, articulated: search)
-    monkeypatch.setattr(module, "size_of_errors", lambda search, doubted: size)
-    monkeypatch.setattr(module, "doubt_states", lambda search, scale, misfits: None)
+    monkeypatch.setattr(module, "size_of_errors", lambda search, outliers: size)
+    monkeypatch.setattr(module, "refit_outliers", lambda search, scale, misfits: None)
     monkeypatch.setattr(module.Misfits, "of", lambda search: module.Misfits({}, 1.0, 1.0))
     monkeypatch.setattr(module, "CARVED_AT", ())
     module.fit_states(session, None, mark)  # type: ignore[arg-type]
@@ -69,7 +69,7 @@ def test_errors_that_images_show_only_later_are_found_then(monkeypatch: pytest.M
     assert decided(monkeypatch, session, module.DECIDED_AT[1], size=0.15)
 
 
-def test_states_that_are_doubted_do_not_count_for_the_size_of_all_errors() -> None:
+def test_outliers_do_not_count_for_the_size_of_all_errors() -> None:
     tried: list[int] = []
     session = SimpleNamespace(
         full_views=SimpleNamespace(frames=[None] * 12), refinement=SimpleNamespace(fitted=[False] * 12)

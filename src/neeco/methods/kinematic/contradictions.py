@@ -15,9 +15,9 @@ from neeco.methods.kinematic.state_search import LEVELS, STEPS, StateSearch
 from neeco.training.session import GaussianSession
 
 CONTRADICTING = "contradicting_states"  # of a scene's diagnostics: what became of each, by the frame's name
-OUTLYING = 3.0  # robust standard deviations of a log misfit from which on a state is doubted
-HOPELESS = 6.0  # from which on a frame that no state explains is left out
-BETTER = 0.6  # of a doubted state's misfit: that of another which refutes it
+OUTLYING = 3.0  # robust standard deviations of a log misfit above which a state is an outlier
+REJECTED = 6.0  # above which a frame that no state explains is left out
+BETTER = 0.6  # of an outlier's misfit: that of another state which refutes it
 MIN_DISTANCE = 3.0  # standard deviations of the prior, root mean square, of a state that is another one
 EXPLAINED = 1.0  # misfit up to which a state explains its image
 MIN_SPREAD = 0.25  # standard deviation of log misfits, at least
@@ -31,16 +31,16 @@ FITTED_ANEW, LEFT_OUT = "fitted anew", "left out"
 
 @dataclass(frozen=True)
 class Misfits:
-    """Misfits of training frames in their present states, infinite outside of the image, and from which on a state is
-    doubted, and on which a frame that no state explains is left out."""
+    """Misfits of training frames in their present states, infinite where no instrument is in the image; `limit` above
+    which a state is an outlier, `rejection_limit` above which a frame that no other state explains is left out."""
 
     of_frame: dict[int, float]
     limit: float
-    hopeless: float
+    rejection_limit: float
 
     @classmethod
     def of(cls, search: StateSearch) -> Misfits:
-        """Measure them. With few frames, or where half of them would be, none is doubted."""
+        """Measure them. With few frames, or where half of them would be, there are no outliers."""
         count = len(search.session.recorded.names)
         misfits = {index: search.misfit(index, search.state(index)) for index in range(count)}
         shown = torch.tensor([misfit for misfit in misfits.values() if math.isfinite(misfit)])
@@ -48,27 +48,27 @@ class Misfits:
             return cls(misfits, math.inf, math.inf)
         logs = shown.clamp(1e-3, 1e3).log()
         spread = max(1.4826 * float((logs - logs.median()).abs().median()), MIN_SPREAD)
-        limits = (max(float(logs.median()) + many * spread, math.log(EXPLAINED)) for many in (OUTLYING, HOPELESS))
+        limits = (max(float(logs.median()) + many * spread, math.log(EXPLAINED)) for many in (OUTLYING, REJECTED))
         found = cls(misfits, *map(math.exp, limits))
-        return cls(misfits, math.inf, math.inf) if len(found.doubted) > len(shown) // 2 else found
+        return cls(misfits, math.inf, math.inf) if len(found.outliers) > len(shown) // 2 else found
 
     @property
-    def doubted(self) -> list[int]:
+    def outliers(self) -> list[int]:
         """Frames whose states leave much more unexplained than those of the others."""
         return [index for index, misfit in self.of_frame.items() if self.limit < misfit < math.inf]
 
 
 @torch.no_grad()
-def doubt_states(search: StateSearch, scale: float, misfits: Misfits) -> None:
-    """Fit doubted states from other starts, or leave them out; note them in the scene's diagnostics. scale: of the
-    errors of all states (see `StateSearch.fitted`)."""
+def refit_outliers(search: StateSearch, scale: float, misfits: Misfits) -> None:
+    """Fit states that are outliers from other starts, or leave them out; note them in the scene's diagnostics. scale:
+    of the errors of all states (see `StateSearch.fitted`)."""
     session, refinement = search.session, search.session.refinement
-    doubted, limit = misfits.doubted, misfits.limit
+    outliers, limit = misfits.outliers, misfits.limit
     usual = [index for index, misfit in misfits.of_frame.items() if misfit <= limit]
     others = [search.state(index) for index in usual]
     others = [others[place] for place in evenly_spaced(len(others), N_OTHERS)]
     noted: dict[str, str] = dict(session.scene.diagnostics.get(CONTRADICTING, {}))
-    for index in doubted:
+    for index in outliers:
         if session.recorded.names[index] in noted:
             continue
         own, given = search.fitted(index, scale), session.recorded.states[index]
@@ -82,7 +82,7 @@ def doubt_states(search: StateSearch, scale: float, misfits: Misfits) -> None:
             if float((apart @ search.precision(index, scale) @ apart) / len(apart)) > MIN_DISTANCE**2:
                 verdict = FITTED_ANEW if found[0].misfit < limit else LEFT_OUT
                 refinement.set_state(index, given, found[0].state, found[1])
-        elif misfit > misfits.hopeless:
+        elif misfit > misfits.rejection_limit:
             verdict = LEFT_OUT
         if verdict == LEFT_OUT:
             refinement.weights[index] = 0

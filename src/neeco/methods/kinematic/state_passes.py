@@ -14,7 +14,7 @@ import torch
 from neeco.capture.model import evenly_spaced
 from neeco.fitting.alignment import STATE_ERRORS
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.methods.kinematic.contradictions import CONTRADICTING, Misfits, doubt_states
+from neeco.methods.kinematic.contradictions import CONTRADICTING, Misfits, refit_outliers
 from neeco.methods.kinematic.discovery import carve_again
 from neeco.methods.kinematic.state_registration import LARGE_ERRORS
 from neeco.methods.kinematic.state_search import LARGEST, StateSearch
@@ -43,19 +43,19 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
     if mark in DECIDED_AT and STATE_ERRORS not in scene.diagnostics:
         search, first = StateSearch.of(session, articulated), mark == DECIDED_AT[0]
         misfits = Misfits.of(search) if first else None
-        scale = _large_errors(search, misfits.doubted if misfits else (), first=first)
+        scale = _large_errors(search, misfits.outliers if misfits else (), first=first)
         if scale is not None:
             scene.diagnostics[STATE_ERRORS] = round(scale, 3)
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
             for (index,) in refinement.frames_of_instant:
                 refinement.set_deviations(index, search.deviations(index, SCALE))
         if misfits is not None:
-            doubt_states(search, LARGE if scale is None else SCALE, misfits)
+            refit_outliers(search, LARGE if scale is None else SCALE, misfits)
     if STATE_ERRORS not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
-    search, doubted = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
+    search, contradicting = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
     for (index,) in refinement.frames_of_instant:
-        known = search.state(index) if session.recorded.names[index] in doubted else None
+        known = search.state(index) if session.recorded.names[index] in contradicting else None
         fit = search.fitted(index, SCALE, known) if refinement.weights[index] > 0 else None
         if fit is not None:
             # until the last fit, gradients go on with the uncertainty of recorded states
@@ -79,7 +79,7 @@ def _is_expected(session: GaussianSession) -> bool:
     return bool(session.scene.diagnostics.get(LARGE_ERRORS, not linked))
 
 
-def _large_errors(search: StateSearch, doubted: Sequence[int], *, first: bool) -> float | None:
+def _large_errors(search: StateSearch, outliers: Sequence[int], *, first: bool) -> float | None:
     """Return how large the states' errors are, times the usual ones of a robot, where they are stated to be larger than
     a tracker's, or images show that they are; else None. first: whether at the first mark; rough hinges without stated
     links hide less then."""
@@ -89,16 +89,16 @@ def _large_errors(search: StateSearch, doubted: Sequence[int], *, first: bool) -
         return stated
     if not (_is_shown(session) if first else session.silhouettes or session.scene.diagnostics.get(LARGE_ERRORS)):
         return None
-    scale = size_of_errors(search, doubted)
+    scale = size_of_errors(search, outliers)
     return scale if scale > (LARGE if _is_expected(session) else LARGE_OVER_KNOWN) else None
 
 
-def size_of_errors(search: StateSearch, doubted: Sequence[int]) -> float:
-    """Return how large the errors of a sample of states are, times the usual ones of a robot; without `doubted` ones,
+def size_of_errors(search: StateSearch, outliers: Sequence[int]) -> float:
+    """Return how large the errors of a sample of states are, times the usual ones of a robot; without `outliers`,
     which may be wrong altogether."""
     refinement = search.session.refinement
     fits = []
-    usual = [index for index in range(len(search.session.full_views.frames)) if index not in doubted]
+    usual = [index for index in range(len(search.session.full_views.frames)) if index not in outliers]
     for index in (usual[place] for place in evenly_spaced(len(usual), N_SAMPLED)):
         # states that were fitted before training are judged by what is left of their errors
         fit = search.fitted(index, LARGEST, search.state(index) if refinement.fitted[index] else None)
