@@ -205,7 +205,7 @@ def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any
     module = importlib.import_module(f"{__name__}.{words[0].replace('-', '_')}")
     arguments = next(iter(get_type_hints(module.run).values()))
     if not {"-h", "--help"}.isdisjoint(words):
-        from neeco.cli._help import state_defaults
+        from neeco.cli._output import state_defaults
 
         state_defaults(arguments)
     return module.run, arguments
