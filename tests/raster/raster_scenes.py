@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import Camera, Gaussians, Headlight, Rendering, rasterize
 from neeco.raster.reference import (
     MAX_ALPHA,
@@ -16,7 +17,6 @@ from neeco.raster.reference import (
     camera_from_world,
     depth_keys,
     project,
-    rotation_matrices,
     usable_gaussians,
 )
 
@@ -59,7 +59,7 @@ def make_scene(
     if channels:
         tensors["channels"] = normal(count, channels)
     pose = torch.eye(4)
-    pose[:3, :3] = rotation_matrices(torch.nn.functional.normalize(torch.tensor([[1.0, 0.05, -0.08, 0.1]]), dim=-1))[0]
+    pose[:3, :3] = quat_to_matrix(torch.nn.functional.normalize(torch.tensor([[1.0, 0.05, -0.08, 0.1]]), dim=-1))[0]
     pose[:3, 3] = torch.tensor([3.0, -5.0, 2.0])
     tensors["world_from_camera"] = pose
     return Scene(tensors, width, height)
