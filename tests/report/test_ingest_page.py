@@ -374,7 +374,7 @@ def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(tmp_path, 
         write_ingest_page(result, path)
         return path.read_text()
 
-    check_hostile_names(write, VOID, scripts=1)
+    check_hostile_names(write, VOID)
 
 
 @pytest.mark.parametrize(
