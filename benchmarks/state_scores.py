@@ -42,12 +42,12 @@ POSE_SD = "refinement/pose_sd"  # of a checkpoint; runs of older versions have n
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """Training states of a capture or run: what refined them, and the standard deviations stated, one [6 + J] per frame
-    and instrument, or None."""
+    """Training states of a capture or run: what refined them, and the standard deviations stated, of the pose [6] and
+    of every joint, per frame and instrument, or None."""
 
     capture: Capture
     states: list[State]
-    sds: list[dict[str, np.ndarray]] | None = None
+    sds: list[dict[str, tuple[np.ndarray, dict[str, float]]]] | None = None
 
 
 def main() -> int:
@@ -93,7 +93,7 @@ def of_run(path: Path) -> States:
             own = refinement.deviations(index).numpy()
             sds.append(
                 {
-                    item.name: np.append(own[pose], own[joints])
+                    item.name: (own[pose], dict(zip(item.joints, own[joints].tolist(), strict=True)))
                     for item, (pose, joints) in zip(layout.instruments, layout.rows, strict=True)
                 }
             )
@@ -119,7 +119,8 @@ def print_rows(title: str, found: States, instrument: Instrument, each: bool) ->
         } | {joint: rms(errors.values[rows, k] * units[k]) for k, joint in enumerate(errors.joints)}
         shown = ", ".join(f"{key} {value:.2f}" for key, value in cells.items())
         if found.sds is not None:
-            sds = np.stack([own[instrument.name] for own in found.sds])
+            stated = [own[instrument.name] for own in found.sds]
+            sds = np.stack([np.append(pose, [joints[name] for name in errors.joints]) for pose, joints in stated])
             over = (errors.in_instrument() / sds)[rows]
             parts = (over[:, :3], over[:, 3:6], over[:, 6:])
             shown += "; / sd " + " ".join(f"{rms(part):.2f}" for part in parts)
