@@ -63,7 +63,10 @@ def measured(search: StateSearch, scale: float) -> list[FittedState]:
         precision = search.precision(index, LARGEST)
         most_likely = layout.increments_between(wrong, TRUE[index]) + noise
         correction = torch.linalg.solve(information + precision, information @ most_likely)
-        fit = StateFit(state=wrong, cost=0.0, gain=0.0, misfit=1.0, information=information, view=search.view(0, None))
+        view = search.view(0, None)
+        fit = StateFit(
+            state=wrong, cost=0.0, gain=0.0, misfit=1.0, observations=1.0, information=information, view=view
+        )
         fits.append(FittedState(index=index, fit=fit, precision=precision, correction=correction))
     return fits
 
