@@ -91,6 +91,8 @@ def of_run(path: Path) -> States:
         layout = refinement.layout
         for index in range(len(frames)):
             own = refinement.deviations(index).numpy()
+            if not refinement.weights[index] > 0:
+                own[:] = np.nan  # left out: none are stated
             sds.append(
                 {
                     item.name: (own[pose], dict(zip(item.joints, own[joints].tolist(), strict=True)))
@@ -123,7 +125,7 @@ def print_rows(title: str, found: States, instrument: Instrument, each: bool) ->
             sds = np.stack([np.append(pose, [joints[name] for name in errors.joints]) for pose, joints in stated])
             over = (errors.in_instrument() / sds)[rows]
             parts = (over[:, :3], over[:, 3:6], over[:, 6:])
-            shown += "; / sd " + " ".join(f"{rms(part):.2f}" for part in parts)
+            shown += "; / sd " + " ".join(f"{rms(part[np.isfinite(part)]):.2f}" for part in parts)
         print(f"{title} {instrument.name}{kind} ({int(rows.sum())} frames): {shown}")
     for k, frame in enumerate(frames) if each else ():
         numbers = (*errors.shifts[k], *tilt[k], roll[k], *(errors.values[k] * units))

@@ -101,6 +101,20 @@ def test_a_joint_is_fitted_to_its_image(tmp_path: Path) -> None:
     assert found.deviations[6] < math.radians(3.5) < math.radians(JOINT)
 
 
+def test_a_fitted_state_is_no_surer_for_more_pixels_with_the_same_residuals(tmp_path: Path) -> None:
+    search = search_of(session_of(tmp_path, TRUE))
+    fit = replace(measured(search, 1.0)[0].fit, misfit=0.5, observations=40.0)
+    no_prior = torch.zeros_like(fit.information)
+    usual = fit.deviations(no_prior)
+    nearer = replace(fit, information=4 * fit.information, observations=160.0)
+    assert torch.allclose(nearer.deviations(no_prior), usual)
+    assert torch.allclose(replace(fit, misfit=2.0).deviations(no_prior), 2 * usual)
+    # images that are explained exactly count as the fit took them
+    exact = replace(fit, misfit=1e-6).deviations(no_prior)
+    assert torch.allclose(exact, torch.linalg.inv(fit.information).diagonal().sqrt())
+    assert torch.all(usual > exact)
+
+
 def test_a_wrong_state_contradicts_the_others_and_is_found_from_one_of_theirs(tmp_path: Path) -> None:
     states = list(TRUE)
     states[3] = replace(TRUE[10], time=TRUE[3].time)
