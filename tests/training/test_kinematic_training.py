@@ -93,8 +93,7 @@ def test_with_two_instruments_each_has_its_own_parts_and_both_cast_a_shadow(capt
         frame["instruments"].append({"name": "rod", "pose": frame["instruments"][0]["pose"], "joints": {}})
     (both / "transforms.json").write_text(json.dumps(transforms))
 
-    few = training_config("kinematic", {"iterations": 40}, [*EARLY, "deformation.carving.seeds=600"])
-    scene = load_scene(train(both, tmp_path / "run", few) / "scene.safetensors")
+    scene = load_scene(train(both, tmp_path / "run", CONFIG) / "scene.safetensors")
     assert [name for name, _ in scene.label_names].count("rod") == 1
     assert "shadow" in scene.diagnostics
     with torch.no_grad():
