@@ -42,6 +42,15 @@ def state_defaults(kind: Any) -> None:
             kind.__annotations__[field.name] = changed
 
 
+def option_names(kind: Any) -> list[str]:
+    """Return the options of a dataclass of arguments, such as `--output`; nested ones add theirs."""
+    names = []
+    for name, hint in typing.get_type_hints(kind, include_extras=True).items():
+        bare = typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint
+        names += option_names(bare) if dataclasses.is_dataclass(bare) else [f"--{name.replace('_', '-')}"]
+    return names
+
+
 def print_settings(title: str, kind: type[Any], note: str) -> None:
     """Print a table of the fields of the dataclass `kind`, if it has any, and a line below it."""
     console = Console(highlight=False, markup=False)
