@@ -177,9 +177,9 @@ def find_base(
 
     masks: foreground bool [F, h, w], through a pinhole of `intrinsics` (fx, fy, cx, cy px of the masks);
     camera_from_world [F, 4, 4]; poses_at(s): base_from_instrument [F, 4, 4] mm of the frames as the log has them s
-    seconds later, NaN where it has none; times [F] s; readings [F, J] of its joints; hidden: bool [h, w], beyond a
-    round border; images: uint8 [F, h, w, 3], whose texture along the instrument shows how far in it is. Raises
-    NeecoError, naming the instrument, where the foreground is not the instrument.
+    seconds later, NaN where it has none; times [F] s; readings [F, J] of its joints, NaN where a log has none; hidden:
+    bool [h, w], beyond a round border; images: uint8 [F, h, w, 3], whose texture along the instrument shows how far in
+    it is. Raises NeecoError, naming the instrument, where the foreground is not the instrument.
     """
     generator = np.random.default_rng(seed)
     problem = _problem(masks, intrinsics, camera_from_world, poses_at, readings=readings, hidden=hidden, images=images)
@@ -225,9 +225,11 @@ def _problem(
 ) -> SilhouetteProblem:
     """The frames whose poses are known at all clocks tried, at most FIT_FRAMES."""
     poses = np.stack([poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
-    rows = np.flatnonzero(np.isfinite(poses).all((0, 2, 3)) & masks.any((1, 2)))
+    values = np.zeros((len(masks), 0)) if readings is None else np.asarray(readings, np.float64)
+    known = np.isfinite(poses).all((0, 2, 3)) & np.isfinite(values).all(1)
+    rows = np.flatnonzero(known & masks.any((1, 2)))
     rows = rows[evenly_spaced(len(rows), FIT_FRAMES)] if len(rows) else rows
-    values = np.zeros((len(rows), 0)) if readings is None else np.asarray(readings, np.float64)[rows]
+    values = values[rows]
     if len(rows):
         moving = values.std(0) > 1e-3
         values = (values[:, moving] - values[:, moving].mean(0)) / values[:, moving].std(0)
