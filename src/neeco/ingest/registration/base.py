@@ -198,7 +198,7 @@ def find_base(
         known = BasePrior(prior[0], np.radians(prior[2]), prior[1], clock_sd)
     starts = _starts(few, known, _distance(problem, prior), generator)
     if not starts:
-        raise NeecoError(unmoved(name))
+        raise NeecoError(unmoved(name, stated=prior is not None))
     best = max((fit_silhouettes(few, known, start) for start in starts), key=lambda fit: overlap(few, fit))
     radius = float(np.median(best.shape[len(best.shape) // 2 :, 0, 0]))
     if not RADIUS_RANGE_MM[0] < radius < RADIUS_RANGE_MM[1]:
@@ -353,19 +353,25 @@ def _filled(left: np.ndarray, right: np.ndarray, shape: tuple[int, ...]) -> np.n
 def _require_moved(name: str, problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> None:
     """Raise NeecoError where poses of other moments, or none, explain the masks as well."""
     if not (fit.residual_px < MAX_RESIDUAL_PX * problem.px_scale and overlap(problem, fit) > MIN_OVERLAP):
-        raise NeecoError(unmoved(name))
+        raise NeecoError(unmoved(name, stated=known.sd_mm is not None))
     for share in EXCHANGED_SHARES:
         exchanged = replace(problem, poses=np.roll(problem.poses, round(share * len(problem.blocks)), axis=1))
         other = refine(exchanged, replace(known, sd_clock=0.0), fit, 12)
         if other.cost < MIN_EXCHANGED_COST * fit.cost:
-            raise NeecoError(unmoved(name))
+            raise NeecoError(unmoved(name, stated=known.sd_mm is not None))
 
 
-def unmoved(name: str) -> str:
-    """Error where nothing in the images moves as an instrument's log says."""
+def unmoved(name: str, *, stated: bool) -> str:
+    """Error where nothing in the images moves as an instrument's log says; stated: whether its base was, roughly."""
+    if stated:
+        return (
+            f"instrument {name!r}: camera_from_base: nothing in the images moves with its poses; check which arm and "
+            "which clock its log is of, or give the exact transform"
+        )
     return (
-        f"instrument {name!r}: camera_from_base: nothing in the images moves with its poses; check which arm and which "
-        "clock its log is of, or give the exact transform"
+        f"instrument {name!r}: camera_from_base: of all bases none was found from which its poses explain what moves; "
+        "state it as far as it is known (transform, sd_mm, sd_deg), which a wrist that bends needs, or check which arm "
+        "and which clock its log is of"
     )
 
 
