@@ -118,7 +118,9 @@ def test_the_pose_of_a_tip_is_turned_into_the_shafts_with_readings_of_the_same_m
     tips = Rotation.from_quat(log.quats[:, [1, 2, 3, 0]]) * Rotation.from_rotvec(yaw[:, None] * [0.0, 1.0, 0.0])
     late = log.times > 0.5
     joint = ReadingLog(Path("yaw.csv"), "ros", log.times[late], yaw[late])
-    item = InstrumentLogs("psm1", base=StatedBase(), kinematics=tree, joints={"yaw": JointColumns(Path("yaw.csv"), "ros")})
+    item = InstrumentLogs(
+        "psm1", base=StatedBase(), kinematics=tree, joints={"yaw": JointColumns(Path("yaw.csv"), "ros")}
+    )
     part = replace(
         part,
         poses={"psm1": replace(log, quats=tips.as_quat()[:, [3, 0, 1, 2]])},
