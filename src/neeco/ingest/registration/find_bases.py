@@ -109,6 +109,9 @@ def find_bases(
         if clock.source not in KNOWN:
             clock = replace(clock.later(registration.clock_s), sd=registration.clock_sd_s, source=FOUND)
         data = data.with_base(name, registration.world_from_base).with_moved_clock(logs[name].clock, clock)
+        if arm.item.kinematics is not None:  # found with readings of the same clock, where they have none of their own
+            for own in {log.clock for log in data.parts[0].joints[name].values()}:
+                data = data if data.clock(own) is not None else data.with_moved_clock(own, clock)
         data.notes.add(describe(name, registration))
         for place, doubt in enumerate(registration.doubts):
             data.notes.contradict(f"base of {name}, {place}", f"instrument {name!r}: {doubt}", severe=True)
