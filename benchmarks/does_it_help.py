@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from result_plots import GREY, PAGE, write
 
 from neeco.files import read_json
-from neeco.studies.downstream.conditions import BASELINES, PERMUTED, REAL
+from neeco.studies.downstream.conditions import BASELINES, PERMUTED
 from neeco.studies.downstream.experiment import FILE
 from neeco.studies.downstream.intervals import Arm, Scores
 
@@ -64,7 +64,7 @@ def rows_of(pair: str, study: dict[str, Any]) -> list[dict[str, Any]]:
     the right ones; synthetic images alone with BASELINES and with cut-and-paste at each number of labelled frames."""
     scores, rows = Scores([joined(job) for job in study["jobs"] if "error" not in job]), []
     arms = list(scores.jobs)
-    counts = sorted({arm.real for arm in arms if arm.condition == REAL})
+    counts = sorted({arm.real for arm in arms if arm.condition in BASELINES})
 
     def of(condition: str, count: int) -> list[Arm]:
         return [arm for arm in arms if (arm.condition, arm.real) == (condition, count)]
