@@ -216,7 +216,7 @@ def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any
     module = importlib.import_module(f"{__name__}.{words[0].replace('-', '_')}")
     arguments = next(iter(get_type_hints(module.run).values()))
     if _asks_for_help(words):
-        from neeco.cli._help import state_defaults
+        from neeco.cli._output import state_defaults
 
         state_defaults(arguments)
     return module.run, arguments
@@ -229,7 +229,7 @@ def _asks_for_help(words: Sequence[str]) -> bool:
 def _misspelt_options(words: Sequence[str], arguments: Callable[..., Any]) -> None:
     """Print a line for every option that a verb does not have and that is nearly one, before tyro's list of what is
     missing, which does not connect the two. That list then shows values as `--help` does."""
-    from neeco.cli._help import option_names, state_defaults
+    from neeco.cli._output import option_names, state_defaults
 
     state_defaults(arguments)
     known = [*option_names(arguments), "--help"]
