@@ -176,7 +176,7 @@ def uncertain_edge(share: np.ndarray, mask: np.ndarray) -> np.ndarray:
     margin = math.ceil(reach)
     near = slice(max(0, y - margin), y + height + margin), slice(max(0, x - margin), x + width + margin)
     edge = border.copy()
-    edge[near] |= unclear[near] & (_distance_to(border[near]) <= reach)
+    edge[near] |= unclear[near] & (distances_to(border[near]) <= reach)
     return edge
 
 
@@ -225,7 +225,7 @@ def without_components(share: np.ndarray, remaining: np.ndarray, dropped: np.nda
     """
     if not dropped.any():
         return share
-    fading = ~remaining & (share < CLEAR_SHARES[1]) & (_distance_to(dropped) < _distance_to(remaining))
+    fading = ~remaining & (share < CLEAR_SHARES[1]) & (distances_to(dropped) < distances_to(remaining))
     return np.where(dropped | fading, np.float32(0), share)
 
 
@@ -253,6 +253,7 @@ def shows_any(parts: np.ndarray, ids: Sequence[int]) -> np.ndarray:
     return chosen[parts]
 
 
-def _distance_to(pixels: np.ndarray) -> np.ndarray:
-    """Return distances [H, W] px, between centres, to the nearest of the pixels (bool [H, W], at least one)."""
+def distances_to(pixels: np.ndarray) -> np.ndarray:
+    """Return distances [H, W] px, between centres, to the nearest of the pixels (bool [H, W], at least one); exact
+    (Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012)."""
     return cv2.distanceTransform((~pixels).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

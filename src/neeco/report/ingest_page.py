@@ -234,7 +234,7 @@ def _unregistered(result: IngestResult, frame: Frame, row: int) -> dict[str, Ten
 
 
 def _tracks(capture: Capture) -> dict[str, Any]:
-    """Two fixed views of the tracks, what the one that turns needs, and whose line has which colour."""
+    """Two views of the tracks, and whose line has which colour."""
     tracks = figures.read_tracks(capture)
     right, down, forward = np.eye(3)
     return {
@@ -242,7 +242,6 @@ def _tracks(capture: Capture) -> dict[str, Any]:
             figures.view(tracks, "from above (away from the camera is up)", right, -forward),
             figures.view(tracks, "from the side (away from the camera is right)", forward, down),
         ],
-        "turning": figures.turning_data(tracks),
         "lines": [
             (figures.LINE_COLORS[index % len(figures.LINE_COLORS)], name)
             for index, name in enumerate(tracks.instruments)

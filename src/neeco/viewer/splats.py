@@ -20,6 +20,7 @@ from torch.nn.functional import normalize
 from neeco.capture.model import Camera, State
 from neeco.capture.readers import read_states
 from neeco.errors import NeecoError, install_hint
+from neeco.evaluation.image_metrics import to_uint8
 from neeco.files import write_atomically
 from neeco.geometry.rotations import quat_to_matrix, spread_directions
 from neeco.raster import rasterize
@@ -110,10 +111,10 @@ def spz_bytes(splats: Splats) -> bytes:
     ]  # w follows from the rest, and is positive
     columns = (
         positions,
-        _byte(255 / (1 + np.exp(-splats.logits.astype(np.float64)))),
-        _byte(splats.sh[:, 0] * (SPZ_COLOR * 255) + 127.5),
-        _byte((splats.log_scales + 10) * 16),
-        _byte(quats * 127.5 + 127.5),
+        to_uint8(255 / (1 + np.exp(-splats.logits.astype(np.float64)))),
+        to_uint8(splats.sh[:, 0] * (SPZ_COLOR * 255) + 127.5),
+        to_uint8((splats.log_scales + 10) * 16),
+        to_uint8(quats * 127.5 + 127.5),
         _harmonics(splats.sh[:, 1:]),
     )
     body = header + b"".join(np.ascontiguousarray(column).tobytes() for column in columns)
@@ -125,10 +126,6 @@ def _harmonics(rest: np.ndarray) -> np.ndarray:
     steps = np.repeat(SPZ_STEPS, (3, 5, 7))[: rest.shape[1], None]
     whole = np.rint(rest * 128) + 128
     return np.clip((whole + steps // 2) // steps * steps, 0, 255).astype(np.uint8)
-
-
-def _byte(values: np.ndarray) -> np.ndarray:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def _in_world(posed: Gaussians) -> Tensor:

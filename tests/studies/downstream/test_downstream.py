@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from downstream_world import Pixels, bar_parts, read_grey, save_grey, write_set
 from torch import Tensor
 
@@ -42,7 +41,6 @@ class Corners(Pixels):
 
 @pytest.fixture(autouse=True)
 def small_models(monkeypatch: pytest.MonkeyPatch) -> None:
-    torch.set_num_threads(1)
     known = models_module.find_models() | {"pixels": Pixels, "corners": Corners}
     monkeypatch.setattr(models_module, "find_models", lambda: known)
 
