@@ -1,5 +1,5 @@
-// Some of a drawn frame's Gaussians without the others: alpha and depth. Projection and lists are those of the frame, and
-// where a tile lists nothing else, so are the pixels.
+// Alpha and depth of a frame's Gaussians, or of some without the others. Projection and lists are those of the frame, and
+// where a tile lists nothing but the chosen, so are the pixels of one that was drawn.
 #pragma once
 
 #include <vector>
@@ -10,7 +10,7 @@ namespace neeco {
 namespace NEECO_VARIANT {
 
 static void composite_alone(Frame& frame, const bool* chosen, const float* drawn_alpha, const float* drawn_depth, float* alpha, float* depth) {
-    constexpr int V = 4;
+    constexpr int V = 1, kDepthValue = 3;
     const int tiles = frame.tiles();
     auto body = [&](int group) {
         TileState<V> state;
@@ -21,10 +21,11 @@ static void composite_alone(Frame& frame, const bool* chosen, const float* drawn
             const Pair* list = frame.list.data();
             const uint32_t start = frame.tile_start.data()[number], end = frame.tile_start.data()[number + 1];
             own.clear();
-            for (uint32_t k = start; k < end; k++)
+            for (uint32_t k = start; chosen && k < end; k++)
                 if (chosen[list[k].gaussian]) own.push_back(list[k]);
-            const bool all_of_it = own.size() == end - start;
-            if (!all_of_it) blend_tile<V, false>(frame, tile, own.data(), (int)own.size(), state);
+            const bool all_of_it = chosen && own.size() == end - start;
+            if (!chosen) blend_tile<V, false, kDepthValue>(frame, tile, list + start, (int)(end - start), state);
+            else if (!all_of_it) blend_tile<V, false, kDepthValue>(frame, tile, own.data(), (int)own.size(), state);
             for (int y = 0; y < tile.height; y++) {
                 const size_t at = (size_t)(tile.y + y) * frame.camera.width + tile.x;
                 if (all_of_it) {
@@ -37,7 +38,7 @@ static void composite_alone(Frame& frame, const bool* chosen, const float* drawn
                 for (int x = 0; x < tile.width; x++) {
                     const float opacity = sums[V][lane + x];
                     alpha[at + x] = opacity;
-                    depth[at + x] = opacity > 0.f ? sums[3][lane + x] / opacity : 0.f;
+                    depth[at + x] = opacity > 0.f ? sums[0][lane + x] / opacity : 0.f;
                 }
             }
         }

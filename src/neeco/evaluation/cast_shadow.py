@@ -13,7 +13,7 @@ from neeco.capture.model import Capture, Frame, State
 from neeco.files import require_inside
 from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import field_pinhole
-from neeco.raster import rasterize
+from neeco.raster import depth_maps, rasterize
 from neeco.raster.resampling import of_learned_size
 from neeco.raster.shadow import GAMMA, shadowed
 from neeco.scene.gaussian_scene import GaussianScene
@@ -45,7 +45,7 @@ def rendered_shadow(scene: GaussianScene, state: State, camera: Camera) -> Tenso
     pinhole = replace(field_pinhole(of_learned_size(camera)), learned_fx=None)
     shares = []
     for lit in (light, replace(light, shadow=None)):
-        found = shadowed(replace(posed, headlight=lit), pinhole, rasterize).headlight
+        found = shadowed(replace(posed, headlight=lit), pinhole, depth_maps).headlight
         left = None if found is None else found.left
         shares.append(torch.ones_like(posed.opacities) if left is None else left)
     tissue = ~scene.canonical.of_instruments
