@@ -95,14 +95,13 @@ NEECO_INLINE void transpose_bits(uint32_t* words) {
     swap_bits<1>(words, 0x55555555);
 }
 
-// First: the value that is composited first, where not all are.
-template <int V, int First>
+template <int V>
 static void load_batch(const Frame& frame, const Tile& tile, const Pair* list, int from, int count, Batch<V>& batch) {
     uint32_t blocks[2][32] = {};
     const vs columns = strip_iota();
     for (int i = 0; i < lower(kBatch, count - from); i++) {
         const Pair& pair = list[from + i];
-        if (from + i + kAhead < count) prefetch_record(frame, list[from + i + kAhead].gaussian, First + V);
+        if (from + i + kAhead < count) prefetch_record(frame, list[from + i + kAhead].gaussian, V);
         const float* record = frame.records.data() + (size_t)pair.gaussian * frame.record_stride;
         const Record& g = *(const Record*)record;
         typename Batch<V>::Entry& entry = batch.entry[i];
@@ -111,7 +110,7 @@ static void load_batch(const Frame& frame, const Tile& tile, const Pair* list, i
         entry.linear = g.b * dx;
         entry.y = g.y;
         entry.c = g.c;
-        for (int c = 0; c < V; c++) entry.values[c] = record[kRecordHead + First + c];
+        for (int c = 0; c < V; c++) entry.values[c] = record[kRecordHead + c];
         blocks[i / 32][i % 32] = blocks_of(pair);
     }
     for (auto& half : blocks) transpose_bits(half);
@@ -149,7 +148,7 @@ NEECO_INLINE bool blend_block(const Tile& tile, const Batch<V>& batch, int block
     return any(takes);
 }
 
-template <int V, bool Keep, int First = 0>
+template <int V, bool Keep>
 static void blend_tile(const Frame& frame, const Tile& tile, const Pair* list, int count, TileState<V>& s) {
     for (int i = 0; i < kTilePixels; i++) {
         s.open[i] = i % kStrip < tile.width && i / kStrip < tile.height ? 1.f : 0.f;
@@ -160,7 +159,7 @@ static void blend_tile(const Frame& frame, const Tile& tile, const Pair* list, i
     Batch<V> batch;
     uint32_t live = 0xffffffffu >> (32 - (tile.height + kRows - 1) / kRows);
     for (int from = 0; from < count && live; from += kBatch) {
-        load_batch<V, First>(frame, tile, list, from, count, batch);
+        load_batch(frame, tile, list, from, count, batch);
         for (uint32_t left = live; left; left &= left - 1) {
             const int block = __builtin_ctz(left);
             if (batch.of_block[block] && !blend_block<V, Keep>(tile, batch, block, from, s)) live &= ~(1u << block);

@@ -10,7 +10,7 @@ namespace neeco {
 namespace NEECO_VARIANT {
 
 static void composite_alone(Frame& frame, const bool* chosen, const float* drawn_alpha, const float* drawn_depth, float* alpha, float* depth) {
-    constexpr int V = 1, kDepthValue = 3;
+    constexpr int V = 4;  // as where colours are drawn: the same function and so the same bits
     const int tiles = frame.tiles();
     auto body = [&](int group) {
         TileState<V> state;
@@ -23,9 +23,10 @@ static void composite_alone(Frame& frame, const bool* chosen, const float* drawn
             own.clear();
             for (uint32_t k = start; chosen && k < end; k++)
                 if (chosen[list[k].gaussian]) own.push_back(list[k]);
+            const Pair* from = chosen ? own.data() : list + start;
+            const int count = chosen ? (int)own.size() : (int)(end - start);
             const bool all_of_it = chosen && own.size() == end - start;
-            if (!chosen) blend_tile<V, false, kDepthValue>(frame, tile, list + start, (int)(end - start), state);
-            else if (!all_of_it) blend_tile<V, false, kDepthValue>(frame, tile, own.data(), (int)own.size(), state);
+            if (!all_of_it && count) blend_tile<V, false>(frame, tile, from, count, state);
             for (int y = 0; y < tile.height; y++) {
                 const size_t at = (size_t)(tile.y + y) * frame.camera.width + tile.x;
                 if (all_of_it) {
@@ -33,12 +34,17 @@ static void composite_alone(Frame& frame, const bool* chosen, const float* drawn
                     copy_strip_row(depth + at, drawn_depth + at, tile.width);
                     continue;
                 }
+                if (!count) {
+                    std::memset(alpha + at, 0, 4 * tile.width);
+                    std::memset(depth + at, 0, 4 * tile.width);
+                    continue;
+                }
                 const float(*sums)[W] = state.sums[y / kRows];
                 const int lane = y % kRows * kStrip;
                 for (int x = 0; x < tile.width; x++) {
                     const float opacity = sums[V][lane + x];
                     alpha[at + x] = opacity;
-                    depth[at + x] = opacity > 0.f ? sums[0][lane + x] / opacity : 0.f;
+                    depth[at + x] = opacity > 0.f ? sums[3][lane + x] / opacity : 0.f;
                 }
             }
         }

@@ -70,8 +70,8 @@ def composited_labels(rendering: Rendering, threshold: float) -> tuple[Tensor, T
     share = _sum_of_columns(channels)
     parts = torch.zeros_like(share, dtype=torch.uint8)
     if channels.shape[-1] > 0:
-        chosen = share > threshold
-        parts[chosen] = (channels[chosen].argmax(dim=-1) + 1).to(torch.uint8)  # of few pixels: argmax is slow
+        chosen = (share > threshold).flatten().nonzero()[:, 0]  # argmax is slow: of few pixels
+        parts.view(-1)[chosen] = (channels.flatten(0, 1)[chosen].argmax(dim=-1) + 1).to(torch.uint8)
     return parts, share
 
 

@@ -108,10 +108,10 @@ class Acceptance:
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
         unobserved = drawing.unobserved.numpy() > MAX_UNOBSERVED
-        if unobserved.mean() > MAX_UNOBSERVED_SHARE:
+        if unobserved.mean(dtype=np.float32) > MAX_UNOBSERVED_SHARE:
             return UNOBSERVED_TISSUE
         labelled = drawing.parts.numpy() > 0
-        if labelled.any() and unobserved[labelled].mean() > self.max_unobserved:
+        if labelled.any() and unobserved[labelled].mean(dtype=np.float32) > self.max_unobserved:
             return UNOBSERVED_SIDE
         if any(_intersect(drawing, a, b) for a, b in combinations(self.recorded_together, 2)):
             return ENTERS_ANOTHER

@@ -113,9 +113,7 @@ class Hinges(Articulation):
         from_closed = self.gains[joint] * (reading - self.closed[joint])
         return torch.where(self.closed[joint].isnan(), self.turns(joint, reading), from_closed)
 
-    def _tips(
-        self, joint: int, reading: float, shaft: tuple[Tensor, Tensor], pivots: Tensor, axes: Tensor
-    ) -> Tensor:
+    def _tips(self, joint: int, reading: float, shaft: tuple[Tensor, Tensor], pivots: Tensor, axes: Tensor) -> Tensor:
         """Return the tips [2, 3] mm of a joint's left and right jaw, instrument frame. A tip that was not measured lies
         at the shaft's end when the joint is closed."""
         origin, direction = shaft
