@@ -39,8 +39,8 @@ FrameStore& store() {
     return *frames;
 }
 
-// m: world_from_camera [4, 4].
-Camera camera_from(const float* m, float fx, float fy, float cx, float cy, int width, int height, float nearest) {
+Camera camera_from(const Array& world_from_camera, float fx, float fy, float cx, float cy, int width, int height, float nearest) {
+    const float* m = sized(world_from_camera, 16, "world_from_camera");
     if (width <= 0 || height <= 0) throw std::invalid_argument("camera: width and height must be positive");
     Camera c;
     for (int i = 0; i < 3; i++) {
@@ -120,7 +120,7 @@ public:
         background_ = sized(background, 3, "background");
         for (const MaybeArray& a : {sh_frames, falloff, vignette, gains, channels, background})
             if (a) arrays_.push_back(*a);
-        frame_->camera = camera_from(sized(world_from_camera, 16, "world_from_camera"), fx, fy, cx, cy, width, height, nearest);
+        frame_->camera = camera_from(world_from_camera, fx, fy, cx, cy, width, height, nearest);
     }
     ~Drawing() {
         if (frame_) store().give(std::move(frame_));
@@ -177,33 +177,6 @@ private:
     const Kernels* kernels_ = nullptr;
 };
 
-// Alpha and depth [L, H, W] from poses [L, 4, 4] (world_from_camera) of one camera: numbers [5] are fx, fy, cx, cy and nearest.
-void draw_depths(Array means, Array quats, Array scales, Array opacities, Array sh, Array poses, Array numbers, Array alpha, Array depth) {
-    const size_t n = opacities.size(), count = poses.size() / 16;
-    if (alpha.ndim() != 3 || alpha.shape(0) != count) throw std::invalid_argument("alpha: must be [L, H, W]");
-    const int height = static_cast<int>(alpha.shape(1)), width = static_cast<int>(alpha.shape(2));
-    GaussianInputs in;
-    in.count = static_cast<int>(n);
-    in.sh_count = 1;
-    in.means = sized(means, 3 * n, "means");
-    in.quats = sized(quats, 4 * n, "quats");
-    in.scales = sized(scales, 3 * n, "scales");
-    in.opacities = opacities.data();
-    in.sh = sized(sh, 3 * n, "sh");
-    const float *from = sized(poses, 16 * count, "poses"), *at = sized(numbers, 5, "numbers");
-    float *to_alpha = alpha.data(), *to_depth = sized(depth, alpha.size(), "depth");
-    const Kernels& k = kernels();
-    nb::gil_scoped_release release;
-    auto frame = store().take();
-    std::vector<float> radii(n);
-    const size_t pixels = static_cast<size_t>(width) * height;
-    for (size_t i = 0; i < count; i++) {
-        frame->camera = camera_from(from + 16 * i, at[0], at[1], at[2], at[3], width, height, at[4]);
-        draw_depth(*frame, k, in, radii.data(), to_alpha + i * pixels, to_depth + i * pixels);
-    }
-    store().give(std::move(frame));
-}
-
 }  // namespace
 
 void bind_raster(nb::module_& m) {
@@ -216,7 +189,6 @@ void bind_raster(nb::module_& m) {
         .def("alone", &Drawing::alone)
         .def("backward", &Drawing::backward, nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg(),
              nb::arg());
-    m.def("draw_depths", &draw_depths);
     m.def("last_statistics", &last_statistics);
     m.def("keep_freed_memory", &keep_freed_memory);
     m.def("thread_count", &thread_count);

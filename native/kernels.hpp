@@ -98,7 +98,7 @@ struct Kernels {
                           float* to);
     void (*pose)(const Body&, const PosedRows&);
     void (*pose_backward)(const Body&, const PosedRows& from, const PosedRows& to, Buffer<double>& partial, float* to_numbers);
-    // chosen: [N], of a frame that was drawn, whose alpha and depth [H, W] are given; or null: all, of one that was listed
+    // chosen: [N]; of the frame that was drawn last, whose alpha and depth [H, W] are given
     void (*composite_alone)(Frame&, const bool* chosen, const float* drawn_alpha, const float* drawn_depth, float* alpha, float* depth);
     void (*unobserved)(const ViewInputs&, float* to);  // [N]
 };
@@ -123,8 +123,6 @@ void group_by_band(Frame& frame, int chunk);
 void list_per_tile(Frame& frame);
 
 void draw(Frame& frame, const Kernels& k, const GaussianInputs& in, const Images& out, bool keep);
-// Alpha and depth [H, W] alone; radii: room for [N].
-void draw_depth(Frame& frame, const Kernels& k, const GaussianInputs& in, float* radii, float* alpha, float* depth);
 void draw_backward(Frame& frame, const Kernels& k, const GaussianInputs& in, const ImageGradients& from,
                    const GaussianGradients& to);
 

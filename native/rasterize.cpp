@@ -63,13 +63,6 @@ void draw(Frame& f, const Kernels& k, const GaussianInputs& in, const Images& ou
     f.milliseconds[kComposite] = watch.lap();
 }
 
-void draw_depth(Frame& f, const Kernels& k, const GaussianInputs& in, float* radii, float* alpha, float* depth) {
-    lay_out(f, k, in);
-    k.project(f, in, radii);
-    list_per_tile(f);
-    k.composite_alone(f, nullptr, nullptr, nullptr, alpha, depth);
-}
-
 void draw_backward(Frame& f, const Kernels& k, const GaussianInputs& in, const ImageGradients& from, const GaussianGradients& to) {
     Stopwatch watch;
     k.composite_backward(f, from, in.channel_count);

@@ -1,5 +1,5 @@
-// Alpha and depth of a frame's Gaussians, or of some without the others. Projection and lists are those of the frame, and
-// where a tile lists nothing but the chosen, so are the pixels of one that was drawn.
+// Some of a drawn frame's Gaussians without the others: alpha and depth. Projection and lists are those of the frame, and
+// where a tile lists nothing else, so are the pixels.
 #pragma once
 
 #include <vector>
@@ -10,7 +10,7 @@ namespace neeco {
 namespace NEECO_VARIANT {
 
 static void composite_alone(Frame& frame, const bool* chosen, const float* drawn_alpha, const float* drawn_depth, float* alpha, float* depth) {
-    constexpr int V = 4;  // as where colours are drawn: the same function and so the same bits
+    constexpr int V = 4;
     const int tiles = frame.tiles();
     auto body = [&](int group) {
         TileState<V> state;
@@ -21,22 +21,15 @@ static void composite_alone(Frame& frame, const bool* chosen, const float* drawn
             const Pair* list = frame.list.data();
             const uint32_t start = frame.tile_start.data()[number], end = frame.tile_start.data()[number + 1];
             own.clear();
-            for (uint32_t k = start; chosen && k < end; k++)
+            for (uint32_t k = start; k < end; k++)
                 if (chosen[list[k].gaussian]) own.push_back(list[k]);
-            const Pair* from = chosen ? own.data() : list + start;
-            const int count = chosen ? (int)own.size() : (int)(end - start);
-            const bool all_of_it = chosen && own.size() == end - start;
-            if (!all_of_it && count) blend_tile<V, false>(frame, tile, from, count, state);
+            const bool all_of_it = own.size() == end - start;
+            if (!all_of_it) blend_tile<V, false>(frame, tile, own.data(), (int)own.size(), state);
             for (int y = 0; y < tile.height; y++) {
                 const size_t at = (size_t)(tile.y + y) * frame.camera.width + tile.x;
                 if (all_of_it) {
                     copy_strip_row(alpha + at, drawn_alpha + at, tile.width);
                     copy_strip_row(depth + at, drawn_depth + at, tile.width);
-                    continue;
-                }
-                if (!count) {
-                    std::memset(alpha + at, 0, 4 * tile.width);
-                    std::memset(depth + at, 0, 4 * tile.width);
                     continue;
                 }
                 const float(*sums)[W] = state.sums[y / kRows];

@@ -47,20 +47,6 @@ def _alone(drawing: Any, sets: Sequence[Tensor], alpha: Tensor, depth: Tensor) -
     return layers
 
 
-def depth_maps_cpu(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[Layer, ...]:
-    """`depth_maps` with neeco's own C++ kernels."""
-    camera, count = cameras[0], len(cameras)
-    given = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh[:, :1])
-    poses = torch.stack([each.world_from_camera for each in cameras])
-    numbers = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, camera.near])
-    alpha, depth = (torch.empty(count, camera.height, camera.width) for _ in range(2))
-    try:
-        native().draw_depths(*(_prepared(t.detach()) for t in (*given, poses, numbers)), alpha, depth)
-    except (ValueError, RuntimeError) as error:
-        raise NeecoError(f"rasterize: {error}") from error
-    return tuple(Layer(*images) for images in zip(alpha, depth, strict=True))
-
-
 def last_statistics() -> dict[str, float]:
     """Return stage times in ms, visible Gaussians and (tile, Gaussian) pairs of the latest rendering and its
     gradient."""

@@ -79,14 +79,10 @@ def rasterize(
 
 @torch.no_grad()
 def depth_maps(gaussians: Gaussians, cameras: Sequence[Camera], backend: str = "auto") -> tuple[Layer, ...]:
-    """Render alpha and depth of Gaussians from several pinholes that differ in their poses alone; without gradient.
+    """Render alpha and depth of Gaussians from several pinholes; without gradient.
 
     backend: as `rasterize` takes it.
     """
-    if cameras and (backend == "cpu" or (backend == "auto" and runs_native(gaussians.means))):
-        from neeco.raster.cpu_backend import depth_maps_cpu
-
-        return depth_maps_cpu(gaussians, cameras)
     return tuple(_alone(gaussians, camera, backend) for camera in cameras)
 
 
