@@ -68,7 +68,7 @@ def composited_labels(rendering: Rendering, threshold: float) -> tuple[Tensor, T
         )
     channels = channels.detach()
     share = _sum_of_columns(channels)
-    parts = torch.zeros_like(share, dtype=torch.uint8)
+    parts = torch.zeros(share.shape, dtype=torch.uint8, device=share.device)
     if channels.shape[-1] > 0:
         chosen = (share > threshold).flatten().nonzero()[:, 0]  # argmax is slow: of few pixels
         parts.view(-1)[chosen] = (channels.flatten(0, 1)[chosen].argmax(dim=-1) + 1).to(torch.uint8)
