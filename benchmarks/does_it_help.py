@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from result_plots import GREY, PAGE, write
 
 from neeco.files import read_json
-from neeco.studies.downstream.conditions import BASELINES, PERMUTED, REAL
+from neeco.studies.downstream.conditions import BASELINES, PERMUTED
 from neeco.studies.downstream.experiment import FILE
 from neeco.studies.downstream.intervals import Arm, Scores
 
@@ -28,14 +28,16 @@ COMPARISON = ("against", "against labelled", "difference", "difference low", "di
 TESTS = {"across": ("across",), "within": ("test", "unseen")}  # of the page: of the study
 PASTED = "real+paste+strong"
 FEW, ALL = 10, 86  # labelled frames in the upper panels
-CUT = 0.75  # the axis of IoU begins here
+CUT, CUT_APART = 0.75, 0.25  # the axis of IoU begins here; that of the last panel
 APART = "back"  # the pair that no choice was made by; the last panel
 CURVES = (  # of it, by labelled frames: conditions, colour, marker, name
-    ("recipe+strong", "#009E73", "*", "synthetic alone: no labelled frame"),
-    ("real+strong", "#999999", "o", "labelled frames, strong augmentation"),
-    ("real+match+strong", "#7F3C8D", "D", "the same in the next colours"),
+    ("recipe+strong", "#009E73", "*", "synthetic alone (the recipe): no labelled frame"),
+    (PASTED, "#CC79A7", "P", "labelled, pasted over the next operation's tissue"),
+    ("real+match+strong", "#7F3C8D", "D", "labelled, strong augmentation, in the next colours"),
+    ("real+strong", "#999999", "o", "labelled, strong augmentation"),
+    ("real", "#E69F00", "s", "labelled, no augmentation"),
     ("recipe+real+strong", "#0072B2", "v", "synthetic, then labelled frames"),
-    ("recipe+real+strong+permuted", "#D55E00", "X", "labels of other images"),
+    ("recipe+real+strong+permuted", "#D55E00", "X", "the same, labels of other images"),
 )
 TITLES = {"across": "The next operation: another recording", "within": "The same recording"}
 # what the figure shows of the table: colour (Okabe and Ito, "Color universal design", 2008), marker, name
@@ -63,7 +65,7 @@ def rows_of(pair: str, study: dict[str, Any]) -> list[dict[str, Any]]:
     the right ones; synthetic images alone with BASELINES and with cut-and-paste at each number of labelled frames."""
     scores, rows = Scores([joined(job) for job in study["jobs"] if "error" not in job]), []
     arms = list(scores.jobs)
-    counts = sorted({arm.real for arm in arms if arm.condition == REAL})
+    counts = sorted({arm.real for arm in arms if arm.condition in BASELINES})
 
     def of(condition: str, count: int) -> list[Arm]:
         return [arm for arm in arms if (arm.condition, arm.real) == (condition, count)]
@@ -132,29 +134,36 @@ def curves(axes: Axes, rows: list[dict[str, str]]) -> None:
         found = [(n, point) for n, point in of.items() if point is not None]
         if [n for n, _ in found] == [0]:
             found = [(n, found[0][1]) for n in (counts[0], counts[-1])]
-        found = [(n * 1.08 ** (k - 1), point) for n, point in found]  # beside each other
+        if not found:
+            continue
+        found = [(n * 1.06 ** (k - 3), point) for n, point in found]  # beside each other
         for n, (_, low, high, _) in found:
             axes.plot([n, n], [low, high], color=colour, linewidth=1.6, alpha=0.5)
         line = [n for n, _ in found], [point[0] for _, point in found]
-        axes.plot(*line, f"{marker}-", color=colour, linewidth=1.6, markersize=6, markerfacecolor="white", label=name)
-    axes.legend(fontsize=7, frameon=False, loc="lower right")
+        face = "white" if any(point[3] == 1 for _, point in found) else colour
+        axes.plot(*line, f"{marker}-", color=colour, linewidth=1.6, markersize=6, markerfacecolor=face, label=name)
+    legend_below(axes, 0.2)
     axes.set_xlim(counts[0] / 1.3, ALL * 1.3)
-    axes.set_ylim(0, 1)
+    axes.set_ylim(CUT_APART, 1)
     axes.set_xscale("log")
     axes.set_xticks(counts, [str(count) for count in counts])
     axes.set_xticks([], minor=True)
     axes.set_xlabel("labelled frames", fontsize=8, color=GREY)
     axes.set_title("The next operation, pair kept apart", fontsize=10, color=GREY, loc="left", fontweight="bold")
-    axes.set_ylabel("IoU", fontsize=8, color=GREY)
+    axes.set_ylabel(f"IoU (axis from {CUT_APART})", fontsize=8, color=GREY)
     axes.tick_params(colors=GREY, labelsize=9)
     axes.grid(axis="y", color=GREY, alpha=0.25, linewidth=0.5)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(GREY)
 
 
+def legend_below(axes: Axes, distance: float, **handles: Sequence[Line2D]) -> None:
+    axes.legend(**handles, fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(-0.15, -distance))
+
+
 def draw(rows: list[dict[str, str]]) -> None:
     """Write the figure: narrow, so that it is read on a phone without shrinking."""
-    figure = Figure(figsize=(4.1, 8.4), layout="constrained")
+    figure = Figure(figsize=(4.1, 9.2), layout="constrained")
     *panels, last = figure.subplots(3, 1)
     for axes, test in zip(panels, TESTS, strict=True):
         panel(axes, [row for row in rows if row["pair"] != APART], test)
@@ -163,7 +172,7 @@ def draw(rows: list[dict[str, str]]) -> None:
         Line2D([], [], color=colour, marker=marker, linewidth=1.6, markersize=9 if marker == "*" else 6, label=name)
         for colour, marker, name in SHOWN.values()
     ]
-    figure.legend(handles=handles, fontsize=8, frameon=False, loc="outside lower left")
+    legend_below(panels[-1], 0.13, handles=handles)
     write(figure, TABLE.with_suffix(".svg"))
 
 

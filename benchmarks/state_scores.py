@@ -42,12 +42,12 @@ POSE_SD = "refinement/pose_sd"  # of a checkpoint; runs of older versions have n
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """Training states of a capture or run: what refined them, and the standard deviations stated, one [6 + J] per frame
-    and instrument, or None."""
+    """Training states of a capture or run: what refined them, and the standard deviations stated, of the pose [6] and
+    of every joint, per frame and instrument, or None."""
 
     capture: Capture
     states: list[State]
-    sds: list[dict[str, np.ndarray]] | None = None
+    sds: list[dict[str, tuple[np.ndarray, dict[str, float]]]] | None = None
 
 
 def main() -> int:
@@ -91,9 +91,11 @@ def of_run(path: Path) -> States:
         layout = refinement.layout
         for index in range(len(frames)):
             own = refinement.deviations(index).numpy()
+            if not refinement.weights[index] > 0:
+                own[:] = np.nan  # left out: none are stated
             sds.append(
                 {
-                    item.name: np.append(own[pose], own[joints])
+                    item.name: (own[pose], dict(zip(item.joints, own[joints].tolist(), strict=True)))
                     for item, (pose, joints) in zip(layout.instruments, layout.rows, strict=True)
                 }
             )
@@ -119,10 +121,11 @@ def print_rows(title: str, found: States, instrument: Instrument, each: bool) ->
         } | {joint: rms(errors.values[rows, k] * units[k]) for k, joint in enumerate(errors.joints)}
         shown = ", ".join(f"{key} {value:.2f}" for key, value in cells.items())
         if found.sds is not None:
-            sds = np.stack([own[instrument.name] for own in found.sds])
+            stated = [own[instrument.name] for own in found.sds]
+            sds = np.stack([np.append(pose, [joints[name] for name in errors.joints]) for pose, joints in stated])
             over = (errors.in_instrument() / sds)[rows]
             parts = (over[:, :3], over[:, 3:6], over[:, 6:])
-            shown += "; / sd " + " ".join(f"{rms(part):.2f}" for part in parts)
+            shown += "; / sd " + " ".join(f"{rms(part[np.isfinite(part)]):.2f}" for part in parts)
         print(f"{title} {instrument.name}{kind} ({int(rows.sum())} frames): {shown}")
     for k, frame in enumerate(frames) if each else ():
         numbers = (*errors.shifts[k], *tilt[k], roll[k], *(errors.values[k] * units))

@@ -16,6 +16,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+# Before anything imports torch: threads that share a small operation wait for each other longer than they work, and
+# pytest-xdist's workers and the processes that tests start fill the cores already. Tests of threads ask for their own.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 os.fsync = lambda descriptor: None  # no test's files need to outlast a power cut, and a sync takes milliseconds
 
 WORLDS = Path(__file__).resolve().parent / "evaluation" / "worlds.py"

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -35,14 +34,11 @@ def rendered_module(name: str) -> ModuleType:
 @pytest.fixture(scope="module")
 def benchmarks() -> Iterator[ModuleType]:
     """Makes `benchmarks/` importable; gives the script that renders captures."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # for images this small threads only wait for each other
     sys.path.insert(0, str(BENCHMARKS))
     try:
         yield importlib.import_module("rendered_captures")
     finally:
         sys.path.remove(str(BENCHMARKS))
-        torch.set_num_threads(threads)
 
 
 def truth_of(capture: Path) -> dict[str, Any]:

@@ -117,7 +117,6 @@ class FakeRun:
 
 @pytest.fixture(scope="session")
 def scene() -> GaussianScene:
-    torch.set_num_threads(1)
     return make_scene()
 
 

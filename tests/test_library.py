@@ -13,6 +13,7 @@ import sys
 import textwrap
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -46,16 +47,27 @@ def example(name: str) -> ModuleType:
     return module
 
 
+def search_less(patch: pytest.MonkeyPatch) -> None:
+    """Have `neeco.train` look for the instrument in less steps than it does by itself, before its first."""
+    patch.setattr(neeco, "train", partial(neeco.train, deformation__carving__tissue_steps=150))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as the docstrings' examples expect it, with a run that the first program trained."""
+    """A folder as the docstrings' examples expect it, with a run that the first program trained on a third of the
+    sample's frames."""
     folder = tmp_path_factory.mktemp("library")
-    (folder / "samples").mkdir()
-    (folder / "samples" / "liver-mini").symlink_to(SAMPLE)
-    (folder / "my-capture").symlink_to(SAMPLE)
-    capture = neeco.read_capture(SAMPLE)
+    capture, sample = neeco.read_capture(SAMPLE), folder / "samples" / "liver-mini"
+    third = {frame.name for split in ("train", "test", "unseen") for frame in capture.split(split)[::3]}
+    write_capture(replace(capture, frames=tuple(frame for frame in capture.frames if frame.name in third)), sample)
+    shutil.copytree(SAMPLE / "truth", sample / "truth")
+    (folder / "my-capture").symlink_to(sample)
     write_capture(replace(capture, frames=capture.frames[:1]), folder / "footage")
-    example("01_train_and_draw").main(folder / "runs" / "sample", iterations=60)
+    program = example("01_train_and_draw")
+    program.SAMPLE = sample
+    with pytest.MonkeyPatch.context() as patch:
+        search_less(patch)
+        program.main(folder / "runs" / "sample", iterations=60)
     synthesize(load_run(folder / "runs" / "sample"), folder / "dataset", Settings(count=4, min_share=0.0))
     return folder
 
@@ -102,8 +114,8 @@ def test_the_example_of_every_name_runs(name: str, folder: Path, monkeypatch: py
     monkeypatch.chdir(folder)
     if name == "train":
         code = code.replace("minutes=2", 'iterations=5, method="3dgs"').replace("runs/sample", "runs/again")
-    code = code.replace("num_workers=2", "num_workers=0").replace('"samples/liver-mini"', f'"{SAMPLE}"')
-    code = code.replace('start="first"', 'start="first", min_trust=0.0').replace('"recording.yaml"', f'"{SAMPLE}"')
+    code = code.replace("num_workers=2", "num_workers=0").replace("recording.yaml", "samples/liver-mini")
+    code = code.replace('start="first"', 'start="first", min_trust=0.0')
     exec(compile(code, f"<example of {name}>", "exec"), {"neeco": neeco, "np": np, "torch": torch})
 
 
@@ -133,6 +145,7 @@ def test_python_of_the_first_pages_runs_as_written(page: str, folder: Path, monk
         assert written in code or page == "README.md"
         code = code.replace(written, run)
     monkeypatch.chdir(folder)
+    search_less(monkeypatch)
     names: dict[str, object] = {}
     exec(compile(code, page, "exec"), names)
     images = names["images"]
@@ -162,7 +175,8 @@ def test_what_a_notebook_shows_of_an_object_is_one_short_line(folder: Path) -> N
         assert "\n" not in shown
         assert "tensor" not in shown
         assert "array" not in shown
-    assert repr(capture) == f"Capture('{SAMPLE}', 96 frames (72 train, 12 test, 12 unseen), maryland)"
+    counts = "32 frames (24 train, 4 test, 4 unseen)"
+    assert repr(capture) == f"Capture('{folder / 'samples' / 'liver-mini'}', {counts}, maryland)"
     assert re.fullmatch(r"Camera\(240x192 px, fx=217.5, fy=217.5, at \(.*\) mm\)", repr(camera))
     assert repr(neeco.State({}, 1.5)) == "State(time=1.5 s)"
 
@@ -249,14 +263,16 @@ def test_python_blocks_of_the_pages_pass_a_type_checker(tmp_path: Path) -> None:
     ]  # as `make lint`, whose cache serves
     settings += '[[tool.mypy.overrides]]\nmodule = ["fiftyone.*", "datasets.*"]\nignore_missing_imports = true\n'
     (tmp_path / "pyproject.toml").write_text(settings, encoding="utf-8")
-    # torch leaves Tensor.backward without types
-    options = ["--config-file", str(tmp_path / "pyproject.toml"), "--untyped-calls-exclude", "torch"]
+    options = ["--config-file", str(tmp_path / "pyproject.toml")]  # a flag for torch would make that cache useless
     pages = sorted(str(page) for page in tmp_path.glob("*_page.py"))
     environment = os.environ | {"MYPYPATH": "src"}
     command = [sys.executable, "-m", "mypy", *options, *pages]
     checked = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT)
-    assert checked.returncode == 0, checked.stdout + checked.stderr
-    assert f"no issues found in {len(pages)} source files" in checked.stdout
+    lines = [line for line in checked.stdout.splitlines() if "error:" in line]
+    # torch leaves Tensor.backward without types
+    assert [line for line in lines if 'untyped function "backward"' not in line] == []
+    ended = f"(checked {len(pages)} source files)" if lines else f"no issues found in {len(pages)} source files"
+    assert ended in checked.stdout, checked.stdout + checked.stderr
     assert len(pages) >= 6
 
 
@@ -282,7 +298,7 @@ def test_a_scene_draws_states_given_as_arrays_tensors_and_lists_alike(folder: Pa
 
 def test_a_run_evaluates_as_the_command_does(folder: Path) -> None:
     scores = neeco.load(folder / "runs" / "sample").evaluate(["test"])
-    assert scores["given"]["test"]["frames"] == 12
+    assert scores["given"]["test"]["frames"] == 4
     with pytest.raises(neeco.NeecoError, match="nowhere"):
         neeco.load(folder / "runs" / "sample").evaluate(["nowhere"])
 

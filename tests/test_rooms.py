@@ -57,6 +57,7 @@ def imports_of(source: str, package: str, known: set[str]) -> set[str]:
     return found & known
 
 
+@functools.cache
 def modules() -> dict[str, Path]:
     names = {}
     for path in sorted((SOURCE / "neeco").rglob("*.py")):
@@ -65,6 +66,7 @@ def modules() -> dict[str, Path]:
     return names
 
 
+@functools.cache
 def graph() -> Graph:
     paths = modules()
     return {

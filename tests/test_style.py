@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,6 +31,7 @@ PRIVATE_IN_TESTS = {  # at most ten
 }
 
 
+@functools.cache
 def modules() -> dict[str, ast.Module]:
     """Syntax trees of the package's modules by name; a package's own is named by its folder."""
     trees = {}
@@ -88,32 +90,35 @@ def private_imports(tree: ast.Module, importer: str, known: set[str]) -> Iterato
                 yield f"{node.lineno}: {module}"
 
 
-TREES = modules()
-KNOWN = {*TREES, "neeco._native"}
+def known_modules() -> set[str]:
+    return {*modules(), "neeco._native"}
 
 
 def test_no_call_has_more_than_six_positional_arguments() -> None:
-    ours = {name: tree for name, tree in TREES.items() if not name.startswith(TRITON)}
+    ours = {name: tree for name, tree in modules().items() if not name.startswith(TRITON)}
     assert [f"{name}:{item}" for name, tree in ours.items() for item in long_calls(tree)] == []
 
 
 def test_a_dataclass_of_more_than_six_fields_is_keyword_only() -> None:
-    found = [(name, item) for name, tree in TREES.items() for item in long_dataclasses(tree)]
+    found = [(name, item) for name, tree in modules().items() for item in long_dataclasses(tree)]
     assert [f"{name}:{item}" for name, item in found if f"{name}.{item.split(': ')[1]}" not in PUBLIC_LONG] == []
 
 
 def test_what_is_private_is_not_imported_from_outside() -> None:
-    assert [f"{name}:{item}" for name, tree in TREES.items() for item in private_imports(tree, name, KNOWN)] == []
+    assert [
+        f"{name}:{item}" for name, tree in modules().items() for item in private_imports(tree, name, known_modules())
+    ] == []
 
 
 def private_names_in(tree: ast.Module) -> Iterator[str]:
     """Private names of ours that a test imports, patches or reads from a module of ours, `line: name`."""
-    yield from (item for item in private_imports(tree, "tests", KNOWN) if not item.endswith(" neeco._native"))
+    known = known_modules()
+    yield from (item for item in private_imports(tree, "tests", known) if not item.endswith(" neeco._native"))
     ours = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.level == 0:
             names = {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
-            ours.update({name: full for name, full in names.items() if full in KNOWN})
+            ours.update({name: full for name, full in names.items() if full in known})
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and node.attr.startswith("_") and node.attr[:2] != "__":
             if isinstance(node.value, ast.Name) and node.value.id in ours:
@@ -161,7 +166,7 @@ def fragments(tree: ast.Module) -> Iterator[str]:
 
 
 def test_a_docstring_begins_with_a_verb_or_names_its_result() -> None:
-    assert [f"{name}:{item}" for name, tree in TREES.items() for item in fragments(tree)] == []
+    assert [f"{name}:{item}" for name, tree in modules().items() for item in fragments(tree)] == []
 
 
 def test_a_fragment_is_found() -> None:

@@ -32,7 +32,7 @@ from neeco.training.train import ProgressRow
 from neeco.training.train import train as train_run
 
 if TYPE_CHECKING:
-    from neeco.report.ingested import Ingested
+    from neeco.report.ingest_page import Ingested
     from neeco.tracking.track import Tracked
 
 PathLike = str | os.PathLike[str]
@@ -421,7 +421,7 @@ def ingest(
     """
     from neeco.ingest.convert import convert_folder
     from neeco.ingest.sources import folder_to_convert, read_recordings, recording_from_flags
-    from neeco.report.ingested import Ingested, ingest_and_report
+    from neeco.report.ingest_page import Ingested, ingest_and_report
 
     sources, output, report = [Path(path) for path in recordings], Path(output), progress or _silent
     if (folder := folder_to_convert(sources)) is not None:

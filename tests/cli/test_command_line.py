@@ -103,6 +103,25 @@ def test_a_verb_that_is_nearly_one_is_answered_with_that_one(
     assert f"{wrong}: no such verb; did you mean {right}?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "wrong", "right"),
+    [
+        (["train", "somewhere", "--ouptut", "run"], "--ouptut", "--output"),
+        (["synthesize", "run", "--output", "set", "--cuont=4"], "--cuont", "--count"),
+        (["synthesize", "run", "--output", "set", "--count", "4", "--vews", "orbit"], "--vews", "--views"),
+    ],
+)
+def test_a_misspelt_option_is_answered_with_the_one_that_is_meant(
+    words: list[str], wrong: str, right: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(words)
+    assert left.value.code == 2
+    printed = capsys.readouterr().err
+    assert f"neeco: error: {wrong}: no such option of {words[0]}; did you mean {right}?" in printed
+    assert "{None}" not in printed
+
+
 def test_completion_knows_the_options_of_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
         cli.main(["--tyro-print-completion", "bash"])

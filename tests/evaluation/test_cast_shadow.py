@@ -10,7 +10,7 @@ from rod_world import CAMERA, make_scene, rod_state
 
 from neeco.capture.images import write_labels
 from neeco.capture.model import Capture, Frame
-from neeco.evaluation.cast_shadow import labelled_shadow, load_shadow, rendered_shadow
+from neeco.evaluation.evaluate import labelled_shadow, load_shadow, rendered_shadow
 from neeco.labels.drawing import draw
 
 

@@ -12,11 +12,6 @@ from device_params import DEVICES
 sys.path.insert(0, str(Path(__file__).parents[1] / "training"))  # for its captures
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
-
-
 @pytest.fixture(scope="session", params=DEVICES)
 def word(request: pytest.FixtureRequest) -> str:
     """What `--device` is given."""

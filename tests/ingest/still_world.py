@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 import yaml
 
-from neeco.capture.images import write_image
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.result import IngestResult
 
 WIDTH, HEIGHT, FOCAL, FRAMES, RATE = 160, 128, 150.0, 40, 25.0
 BAR, TISSUE, BASELINE = 60.0, 100.0, 8.0  # mm: depths of a bar and of the tissue behind it, between two cameras
+
+
+@cache
+def encoded(begins: float, seed: int, right: bool) -> tuple[bytes, ...]:
+    """The images of a theatre's camera, as PNG files."""
+    theatre = Theatre(Path(), begins, seed)
+    frames = [np.ascontiguousarray(theatre.image(number, right)[..., ::-1]) for number in range(FRAMES)]
+    return tuple(cv2.imencode(".png", frame)[1].tobytes() for frame in frames)
 
 
 @dataclass
@@ -51,9 +58,9 @@ class Theatre:
     def write(self, **changes: object) -> Path:
         """recording.yaml with everything it names; `changes` to its keys (None: left out)."""
         for name, right in (("left", False), ("right", True))[: 2 if "stereo" in changes else 1]:
-            for number in range(FRAMES):
-                pixels = torch.from_numpy(self.image(number, right).astype(np.float32) / 255)
-                write_image(self.folder / name / f"{number:03d}.png", pixels)
+            (self.folder / name).mkdir(exist_ok=True)
+            for number, file in enumerate(encoded(self.begins, self.seed, right)):
+                (self.folder / name / f"{number:03d}.png").write_bytes(file)
         stamps = np.arange(-0.1, FRAMES / RATE + 0.1, 0.02)
         rows = [(time, *self.place(self.begins + time), 1, 0, 0, 0) for time in stamps]
         lines = ["t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz", *(",".join(f"{value:.5f}" for value in row) for row in rows)]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
-from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, WORLD_FROM_BASE, World, make_world, rigid
+from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, WORLD_FROM_BASE, make_world, rigid
 
 from neeco.geometry.projection import project
 from neeco.ingest.foreground.silhouettes import silhouettes_of
@@ -24,8 +25,10 @@ FRAMES = 20
 RING_MM = 40.0  # behind the tip, where the shaft turns from light to dark
 
 
-def _fitted(world: World) -> tuple[SilhouetteProblem, SilhouetteFit]:
+@functools.cache
+def _fitted() -> tuple[SilhouetteProblem, SilhouetteFit]:
     """The problem of a world, and a fit at its true base, along the axis of its shaft."""
+    world = make_world(FRAMES)
     poses = np.stack([world.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
     problem = SilhouetteProblem(
         silhouettes=silhouettes_of(world.masks, INTRINSICS), camera_from_world=world.camera_from_world, poses=poses,
@@ -51,7 +54,7 @@ def _painted(problem: SilhouetteProblem, fit: SilhouetteFit) -> np.ndarray:
 
 
 def test_a_ring_about_a_shaft_is_found_where_it_is_in_every_frame():
-    problem, fit = _fitted(make_world(FRAMES))
+    problem, fit = _fitted()
     marked, found = with_marks(replace(problem, images=_painted(problem, fit)), fit)
     assert marked.marks is not None
     off, _ = marks_off(marked, found, reach(marked, found)[1])
@@ -60,7 +63,7 @@ def test_a_ring_about_a_shaft_is_found_where_it_is_in_every_frame():
 
 
 def test_an_instrument_of_one_colour_has_no_marks():
-    problem, fit = _fitted(make_world(FRAMES))
+    problem, fit = _fitted()
     images = np.where(problem.silhouettes.masks[..., None], np.uint8(120), np.uint8(0)) * np.ones(3, np.uint8)
     marked, _ = with_marks(replace(problem, images=images), fit)
     assert marked.marks is None

@@ -15,6 +15,8 @@ from neeco.capture.readers import read_capture
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.ingest.readers import read_table, recording_formats
+from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.recording.file import read_recording
 
 pytest.importorskip("av")
 
@@ -39,22 +41,20 @@ def write_pose_lines(table: Path) -> Path:
 
 
 def test_ingest_reads_the_logs_of_an_installed_format(recorded, site, tmp_path) -> None:
-    install_plugin(site, tmp_path)
+    install_plugin(site)
     plain = recorded.folder / "recording.yaml"
     other = recorded.folder / "other.yaml"
     write_pose_lines(recorded.folder / "instrument.csv")
     other.write_text(plain.read_text().replace("instrument.csv", "instrument.poselines"))
-    captures = []
-    for recording, name in ((plain, "one"), (other, "two")):
-        assert main(["ingest", str(recording), "--output", str(tmp_path / name)]) == 0
-        captures.append(read_capture(tmp_path / name))
-    states = [[frame.state.instruments["grasper"] for frame in capture.frames] for capture in captures]
-    for one, two in zip(*states, strict=True):
-        np.testing.assert_allclose(one.pose, two.pose, atol=1e-6)
+    logs = [read_pose_log(read_recording(path).instruments[0].poses) for path in (plain, other)]
+    for values in ("times", "positions", "quats"):
+        np.testing.assert_allclose(*(getattr(log, values) for log in logs), atol=1e-9)
+    assert main(["ingest", str(other), "--output", str(tmp_path / "capture")]) == 0
+    assert all("grasper" in frame.state.instruments for frame in read_capture(tmp_path / "capture").frames)
 
 
 def test_a_damaged_line_of_an_installed_format_is_named(site, tmp_path) -> None:
-    install_plugin(site, tmp_path)
+    install_plugin(site)
     log = tmp_path / "log.poselines"
     log.write_text('{"t": 0}\n')
     with pytest.raises(NeecoError, match=r"log\.poselines: line 1: is no pose"):

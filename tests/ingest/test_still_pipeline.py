@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from neeco.capture import read_capture, write_capture
 from neeco.capture.checks import inspect_capture
 from neeco.errors import NeecoError
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.result import IngestResult
 from neeco.ingest.timing import reading
 
 
@@ -23,11 +25,20 @@ def theatre(tmp_path: Path) -> Theatre:
     return Theatre(tmp_path)
 
 
+@pytest.fixture(scope="module")
+def ingested(tmp_path_factory: pytest.TempPathFactory) -> tuple[Theatre, IngestResult]:
+    """A recording as it stands and what becomes of it, not to be changed."""
+    theatre = Theatre(tmp_path_factory.mktemp("theatre"))
+    return theatre, theatre.ingest()
+
+
 STEREO = {"images": {"folder": "right", "fps": RATE}, "calibration": "stereo.yaml"}
 
 
-def test_a_still_scopes_frame_is_the_world_and_poses_in_it_stay_as_they_are(theatre: Theatre) -> None:
-    result = theatre.ingest()
+def test_a_still_scopes_frame_is_the_world_and_poses_in_it_stay_as_they_are(
+    ingested: tuple[Theatre, IngestResult],
+) -> None:
+    theatre, result = ingested
     capture = read_capture(result.capture)
     assert capture.still
     assert capture.registered
@@ -39,8 +50,10 @@ def test_a_still_scopes_frame_is_the_world_and_poses_in_it_stay_as_they_are(thea
     assert not [problem for problem in inspect_capture(result.capture).problems if problem.severity == "error"]
 
 
-def test_the_tissue_lies_behind_every_place_of_the_instrument_and_shows_none_of_it(theatre: Theatre) -> None:
-    result = theatre.ingest()
+def test_the_tissue_lies_behind_every_place_of_the_instrument_and_shows_none_of_it(
+    ingested: tuple[Theatre, IngestResult],
+) -> None:
+    theatre, result = ingested
     points = read_capture(result.capture).points
     assert points.positions[:, 2].min() > BAR
     assert len(points.positions) > 1000
@@ -89,8 +102,10 @@ def test_poses_in_an_unknown_frame_stay_unregistered_and_the_notes_say_so(theatr
     assert "100 mm" in str(result.depth_source)
 
 
-def test_a_still_capture_has_few_cameras_and_check_says_so(theatre: Theatre) -> None:
-    root = theatre.ingest().capture
+def test_a_still_capture_has_few_cameras_and_check_says_so(
+    ingested: tuple[Theatre, IngestResult], tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(ingested[1].capture, tmp_path / "capture"))
     assert inspect_capture(root).summary.still
     document = json.loads((root / "transforms.json").read_text())
     for number, frame in enumerate(document["frames"]):
@@ -101,10 +116,11 @@ def test_a_still_capture_has_few_cameras_and_check_says_so(theatre: Theatre) -> 
     assert "camera_motion: is 'still', but the frames have" in wrong[0]
 
 
-def test_a_still_capture_stays_one_when_it_is_written_again(theatre: Theatre) -> None:
-    capture = read_capture(theatre.ingest().capture)
-    write_capture(capture, theatre.folder / "again")
-    assert read_capture(theatre.folder / "again").still
+def test_a_still_capture_stays_one_when_it_is_written_again(
+    ingested: tuple[Theatre, IngestResult], tmp_path: Path
+) -> None:
+    write_capture(read_capture(ingested[1].capture), tmp_path / "again")
+    assert read_capture(tmp_path / "again").still
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import Camera, Gaussians, Headlight, Rendering, rasterize
 from neeco.raster.reference import (
     MAX_ALPHA,
@@ -16,7 +17,6 @@ from neeco.raster.reference import (
     camera_from_world,
     depth_keys,
     project,
-    rotation_matrices,
     usable_gaussians,
 )
 
@@ -59,7 +59,7 @@ def make_scene(
     if channels:
         tensors["channels"] = normal(count, channels)
     pose = torch.eye(4)
-    pose[:3, :3] = rotation_matrices(torch.nn.functional.normalize(torch.tensor([[1.0, 0.05, -0.08, 0.1]]), dim=-1))[0]
+    pose[:3, :3] = quat_to_matrix(torch.nn.functional.normalize(torch.tensor([[1.0, 0.05, -0.08, 0.1]]), dim=-1))[0]
     pose[:3, 3] = torch.tensor([3.0, -5.0, 2.0])
     tensors["world_from_camera"] = pose
     return Scene(tensors, width, height)
@@ -124,10 +124,27 @@ def error(actual: Tensor, expected: Tensor) -> float:
     return float((actual.detach().cpu().double() - expected).norm() / (scale if scale > 1e-9 else 1.0))
 
 
+_drawn: dict[tuple, tuple[Tensor, Rendering, dict[str, Tensor]]] = {}
+
+
+def reference_of(scene: Scene) -> tuple[Tensor, Rendering, dict[str, Tensor]]:
+    """The decided pixels, and there the image and the gradients that the definition gives.
+
+    The last ones are kept: every instruction set draws the same scenes.
+    """
+    values = [(name, tuple(tensor.shape), tensor.numpy().tobytes()) for name, tensor in scene.tensors.items()]
+    key = (scene.width, scene.height, scene.focal, scene.near, *values)
+    if key not in _drawn:
+        while len(_drawn) > 64:
+            del _drawn[next(iter(_drawn))]
+        decided = decided_pixels(scene)
+        _drawn[key] = (decided, *draw(scene, torch.float64, "reference", decided))
+    return _drawn[key]
+
+
 def assert_same_as_reference(scene: Scene, backend: str = "cpu", tolerance: float = TOLERANCE) -> None:
     """Image, visibility and every gradient, where no cut-off leaves the choice to rounding."""
-    decided = decided_pixels(scene)
-    expected, expected_gradients = draw(scene, torch.float64, "reference", decided)
+    decided, expected, expected_gradients = reference_of(scene)
     actual, gradients = draw(scene, torch.float32, backend, decided)
     for name in ("color", "alpha", "depth", "channels"):
         image, wanted = getattr(actual, name), getattr(expected, name)

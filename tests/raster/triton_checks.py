@@ -69,7 +69,7 @@ def test_without_sh_frames_or_headlight(frames: bool, light: bool) -> None:
     same(scene_of(24, 9, 1, seed=5, frames=frames, light=light))
 
 
-@settings(max_examples=7, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=5, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     count=st.sampled_from([0, 1, 2, 7, 40]),
     sh_count=st.sampled_from([1, 4, 9, 16]),

@@ -32,13 +32,13 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
 
-def check_hostile_names(write: Callable[[], str], void, scripts: int = 0) -> None:
+def check_hostile_names(write: Callable[[], str], void) -> None:
     """Pages that `write` makes of data with HOSTILE in it show it as text, and are equal to the last byte."""
     text = write()
     page = Page(void)
     page.feed(text)
     assert page.open == []
-    assert page.tags.count("script") == scripts
+    assert "script" not in page.tags
     assert "onload" not in page.attributes
     assert HOSTILE not in text
     assert HOSTILE in unescape(text)

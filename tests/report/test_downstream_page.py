@@ -174,6 +174,23 @@ def test_no_difference_and_harm_stand_as_plainly(capture, output):
     assert '<b class="soft">no difference shown</b>' in text
 
 
+def test_the_answer_is_by_recording_and_of_sets_alone_too(capture, output, monkeypatch):
+    """Split `unseen` stands for another recording."""
+    jobs = jobs_of(capture, output, models=("unet",), counts=(5,), gain={"kinematic+real": -0.2})
+    monkeypatch.setattr(
+        "neeco.report.downstream_examples.test_samples",
+        lambda own, split, others, classes: recorded_samples(own, split, classes),
+    )
+    experiment = experiment_of(capture, jobs) | {"tests": {"unseen": "/far"}}
+    for row in experiment["paired"]:
+        if row["split"] == "unseen":
+            row |= {"low": 0.1, "high": 0.2}
+    text, _ = page_of(output, experiment, capture)
+    assert "alone and augmented, synthetic images hurt in 1 of 1 comparisons in the same recording" in text
+    assert "alone and augmented, synthetic images help in 1 of 1 comparisons in another recording" in text
+    assert text.count("Without any label, against the better of all labelled frames") == 2
+
+
 def test_one_fold_is_no_answer(capture, output):
     experiment = experiment_of(capture, jobs_of(capture, output, folds=1), folds=1)
     text, _ = page_of(output, experiment, capture)

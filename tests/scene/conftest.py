@@ -1,15 +1,9 @@
 from __future__ import annotations
 
 import pytest
-import torch
 from scene_worlds import make_scene
 
 from neeco.scene import GaussianScene
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
 
 
 @pytest.fixture

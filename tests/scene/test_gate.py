@@ -12,8 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from scene_worlds import GRASPER, grasper_state, make_scene, pose_of, random_canonical, rounding
 
 from neeco.errors import NeecoError
-from neeco.methods.nps import NPS, NPSSettings
-from neeco.methods.swept_volume import SweptVolume
+from neeco.methods.nps import NPS, NPSSettings, SweptVolume
 from neeco.scene import GaussianScene
 from neeco.scene.deformation import mark_moving
 from neeco.scene.io import load_scene, save_scene

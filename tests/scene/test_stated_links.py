@@ -67,7 +67,7 @@ def test_the_axes_given_to_other_renderers_move_what_is_posed(kind: str) -> None
         parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
     points, logits = 8 * torch.randn(50, 3, generator=generator), 2 * torch.randn(50, 4, generator=generator)
     quats = torch.tensor([[1.0, 0, 0, 0]]).expand(50, 4).contiguous()
-    body = links.body(torch.eye(4), READINGS)
+    body = links.resting_body()(world_from_body=torch.eye(4), values=links.values(READINGS))
     posed = pose_bodies(points, quats, torch.zeros(50, 3), links.positioned_logits(points, logits), (50,), (body,))[0]
     axes, amounts = links.motion(links.link_weights(points, logits))
     assert [item.reading for item in axes] == ["jaw", "yaw", "pitch"]

@@ -19,6 +19,7 @@ from neeco.settings import plain
 from neeco.studies import ablation_study, training_job
 from neeco.studies.ablation_study import (
     chosen_ablations,
+    derive_capture,
     direction,
     distinct_variants,
     phase_1_psnr,
@@ -28,7 +29,6 @@ from neeco.studies.ablation_study import (
 )
 from neeco.studies.ablation_tables import ablation_csv, agreement, grid, markdown, write_tables
 from neeco.studies.ablations import CHECKPOINTS, AblationPlan, Derived, Variant, all_ablations
-from neeco.studies.derived import derive_capture
 from neeco.studies.tables import latex_table
 from neeco.training.run import read_config
 

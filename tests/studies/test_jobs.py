@@ -73,8 +73,13 @@ def test_a_job_leaves_a_run_its_curve_and_its_numbers(make_job) -> None:
     assert final == pytest.approx(result["splits"]["test"]["psnr"], abs=1e-3)  # every frame is in the curve here
 
 
-def test_a_finished_job_is_not_done_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = make_job().run()
+def result_of(job) -> dict:
+    """What a finished job said."""
+    return json.loads((job.folder / "job.json").read_text())
+
+
+def test_a_finished_job_is_not_done_again(finished_job, make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = result_of(finished_job)
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
     monkeypatch.setattr(module, "evaluate_run", lambda *_, **__: pytest.fail("scored again"))
     assert make_job().run() == first
@@ -104,17 +109,18 @@ def test_a_finished_job_of_a_methods_former_name_is_not_done_again(make_job, mon
         assert make_job(config=small).run() == first | {"method": "neeco"}
 
 
-def test_the_numbers_of_a_capture_that_changed_are_not_given_again(make_job) -> None:
-    job = make_job()
-    job.run()
+def test_the_numbers_of_a_capture_that_changed_are_not_given_again(finished_job) -> None:
+    job = finished_job
     config = job.folder / "config.yaml"
     config.write_text(re.sub("capture_sha256: .*", "capture_sha256: of another capture", config.read_text()))
     with pytest.raises(NeecoError, match=f"{job.capture} has changed since this run was begun"):
         job.run()
 
 
-def test_other_splits_are_scored_without_training_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = make_job().run()
+def test_other_splits_are_scored_without_training_again(
+    finished_job, make_job, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = result_of(finished_job)
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
     again = make_job(splits=("unseen",)).run()
     assert list(again["splits"]) == ["unseen"]
@@ -124,11 +130,9 @@ def test_other_splits_are_scored_without_training_again(make_job, monkeypatch: p
 
 @pytest.mark.parametrize("stop", [1, 7, 12])
 def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
-    stop: int, make_job, tmp_path, monkeypatch: pytest.MonkeyPatch
+    stop: int, trained_job, make_job, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = make_job(folder=tmp_path / "whole")
-    expected = whole.run()
-    cut = make_job(folder=tmp_path / "cut")
+    whole, cut = trained_job, make_job(folder=tmp_path / "cut")
     step = GaussianSession.step
 
     def interrupted(session: GaussianSession):
@@ -143,7 +147,7 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
             run_jobs([cut])
     assert not (cut.folder / "job.json").exists()
     result = run_jobs([cut])[0]
-    assert without_times(result) == without_times(expected)
+    assert without_times(result) == without_times(result_of(whole))
     assert result["seconds"] > 0 or stop == 1
     assert (cut.folder / "scene.safetensors").read_bytes() == (whole.folder / "scene.safetensors").read_bytes()
     iterations = [row["iteration"] for row in curve_of(cut) if row["split"] == "test"]
@@ -162,9 +166,8 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
         ("begun.json", {"budget": {"minutes": None, "iterations": None, "clock": "wall"}}, "budget: give minutes or"),
     ],
 )
-def test_a_damaged_job_is_reported_by_file_and_field(name: str, change: dict, reported: str, make_job) -> None:
-    job = make_job()
-    job.run()
+def test_a_damaged_job_is_reported_by_file_and_field(name: str, change: dict, reported: str, finished_job) -> None:
+    job = finished_job
     file = job.folder / name
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     if name == "begun.json":
@@ -173,9 +176,8 @@ def test_a_damaged_job_is_reported_by_file_and_field(name: str, change: dict, re
         job.run()
 
 
-def test_a_damaged_curve_is_reported_by_its_line(make_job) -> None:
-    job = make_job()
-    job.run()
+def test_a_damaged_curve_is_reported_by_its_line(finished_job) -> None:
+    job = finished_job
     (job.folder / "job.json").unlink()
     with (job.folder / "curve.jsonl").open("a") as stream:
         stream.write("[[[")
@@ -210,9 +212,8 @@ def test_kinematic_finishes_where_no_wrist_is_found(make_job) -> None:
     assert result["splits"]["test"]["psnr"] > 5
 
 
-def test_drawing_the_curve_changes_no_bit_of_the_scene(make_job, tmp_path) -> None:
-    job = make_job()
-    job.run()
+def test_drawing_the_curve_changes_no_bit_of_the_scene(trained_job, tmp_path) -> None:
+    job = trained_job
     plain = train_module.train(job.capture, tmp_path / "plain", job.train_config)
     assert (plain / "scene.safetensors").read_bytes() == (job.folder / "scene.safetensors").read_bytes()
 
@@ -285,18 +286,16 @@ def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytes
         ),
     ],
 )
+@pytest.mark.usefixtures("finished_job")
 def test_a_folder_of_another_job_is_refused_before_any_work(make_job, changes, reported, monkeypatch) -> None:
-    make_job().run()
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained"))
     with pytest.raises(NeecoError, match=f"{reported}; give another --output"):
         run_jobs([make_job(seed=1), make_job(**changes)])
 
 
-def test_a_run_of_another_capture_is_refused(make_job, tmp_path) -> None:
-    job = make_job()
-    job.run()
+def test_a_run_of_another_capture_is_refused(finished_job, tmp_path) -> None:
     with pytest.raises(NeecoError, match="capture: begun with"):
-        run_jobs([replace(job, capture=tmp_path / "other")])
+        run_jobs([replace(finished_job, capture=tmp_path / "other")])
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.synthesis.hub_upload import check_hub, push_to_hub
+from neeco.synthesis.writers.hub import check_hub, push_to_hub
 
 TOKEN = "hf_of_nobody"
 

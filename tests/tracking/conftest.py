@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -17,7 +16,6 @@ from neeco.capture.model import Capture
 
 @pytest.fixture(scope="session")
 def tracked_run(tmp_path_factory: pytest.TempPathFactory) -> world.RecordedRun:
-    torch.set_num_threads(1)
     return world.make_run(tmp_path_factory.mktemp("tracking") / "run")
 
 

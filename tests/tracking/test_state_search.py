@@ -63,7 +63,10 @@ def measured(search: StateSearch, scale: float) -> list[FittedState]:
         precision = search.precision(index, LARGEST)
         most_likely = layout.increments_between(wrong, TRUE[index]) + noise
         correction = torch.linalg.solve(information + precision, information @ most_likely)
-        fit = StateFit(state=wrong, cost=0.0, gain=0.0, misfit=1.0, information=information, view=search.view(0, None))
+        view = search.view(0, None)
+        fit = StateFit(
+            state=wrong, cost=0.0, gain=0.0, misfit=1.0, observations=1.0, information=information, view=view
+        )
         fits.append(FittedState(index=index, fit=fit, precision=precision, correction=correction))
     return fits
 
@@ -96,6 +99,20 @@ def test_a_joint_is_fitted_to_its_image(tmp_path: Path) -> None:
     error = found.fit.state.instruments["grasper"].joints["jaw_angle"] - given.joints["jaw_angle"]
     assert abs(error) < 1.5 * found.deviations[6]
     assert found.deviations[6] < math.radians(3.5) < math.radians(JOINT)
+
+
+def test_a_fitted_state_is_no_surer_for_more_pixels_with_the_same_residuals(tmp_path: Path) -> None:
+    search = search_of(session_of(tmp_path, TRUE))
+    fit = replace(measured(search, 1.0)[0].fit, misfit=0.5, observations=40.0)
+    no_prior = torch.zeros_like(fit.information)
+    usual = fit.deviations(no_prior)
+    nearer = replace(fit, information=4 * fit.information, observations=160.0)
+    assert torch.allclose(nearer.deviations(no_prior), usual)
+    assert torch.allclose(replace(fit, misfit=2.0).deviations(no_prior), 2 * usual)
+    # images that are explained exactly count as the fit took them
+    exact = replace(fit, misfit=1e-6).deviations(no_prior)
+    assert torch.allclose(exact, torch.linalg.inv(fit.information).diagonal().sqrt())
+    assert torch.all(usual > exact)
 
 
 def test_a_wrong_state_contradicts_the_others_and_is_found_from_one_of_theirs(tmp_path: Path) -> None:

@@ -129,6 +129,14 @@ def test_an_instrument_that_only_changes_its_place_need_not_be_posed_again(track
     assert (moved - drawer.composed(drawer.pose(one), view)).abs().max() > 0.1
 
 
+def test_instruments_are_posed_after_others_as_they_are_by_themselves(tracked_run: RecordedRun) -> None:
+    drawer, other = InstrumentRenderer(tracked_run.scene), grasper_state(2, -1, 68, 0.2, 0.4, 0.7)
+    drawer.pose(grasper_state())
+    kept, alone = drawer.pose(other), drawer.alone.at(other)
+    for name in ("means", "quats", "scales", "opacities", "sh", "sh_frames"):
+        assert torch.equal(getattr(kept, name), getattr(alone, name)), name
+
+
 def test_a_fit_leaves_the_bound_of_a_joint(tracked_run: RecordedRun) -> None:
     fitter, true = fitter_of(tracked_run.scene), grasper_state(jaw=0.8)
     frame = record(tracked_run.scene, tracked_run.path / "at-bound", [true], "new").frames[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -32,8 +33,9 @@ MOUNTINGS = {
 }
 
 
+@cache
 def found(mounting: str) -> tuple[Evidence, CarvedShape, Tensor]:
-    """(evidence, carved shape, true-shaft-frame from carved-shaft-frame)."""
+    """(evidence, carved shape, true-shaft-frame from carved-shaft-frame); not to be changed."""
     shaft_from_sensor = MOUNTINGS[mounting]
     evidence = make_evidence(shaft_from_sensor)
     shape = carve(evidence, "tool", torch.Generator().manual_seed(0), SEARCH)

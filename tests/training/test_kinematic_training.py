@@ -50,16 +50,15 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_grasper(tmp_path_factory.mktemp("grasper") / "capture", sizes=SIZES)
 
 
-def test_two_runs_and_an_interrupted_one_give_the_same_bytes(capture: Path, tmp_path: Path) -> None:
+def test_a_run_and_an_interrupted_one_give_the_same_bytes(capture: Path, tmp_path: Path) -> None:
     def interrupt(row: ProgressRow) -> None:
         if row.iteration == 23 and not row.note:  # after the hinges began to move and density control acted
             os.kill(os.getpid(), signal.SIGINT)
 
-    first, second = (train(capture, tmp_path / name, CONFIG) for name in ("first", "second"))
+    first = train(capture, tmp_path / "first", CONFIG)
     with pytest.raises(KeyboardInterrupt, match="at iteration 23"):
         train(capture, tmp_path / "cut", CONFIG, progress=interrupt)
     cut = train(capture, tmp_path / "cut", CONFIG, resume=True)
-    assert (first / "scene.safetensors").read_bytes() == (second / "scene.safetensors").read_bytes()
     assert (first / "scene.safetensors").read_bytes() == (cut / "scene.safetensors").read_bytes()
 
     scene = load_scene(first / "scene.safetensors")
@@ -94,9 +93,7 @@ def test_with_two_instruments_each_has_its_own_parts_and_both_cast_a_shadow(capt
         frame["instruments"].append({"name": "rod", "pose": frame["instruments"][0]["pose"], "joints": {}})
     (both / "transforms.json").write_text(json.dumps(transforms))
 
-    first, second = (train(both, tmp_path / name, CONFIG) for name in ("first", "second"))
-    assert (first / "scene.safetensors").read_bytes() == (second / "scene.safetensors").read_bytes()
-    scene = load_scene(first / "scene.safetensors")
+    scene = load_scene(train(both, tmp_path / "run", CONFIG) / "scene.safetensors")
     assert [name for name, _ in scene.label_names].count("rod") == 1
     assert "shadow" in scene.diagnostics
     with torch.no_grad():

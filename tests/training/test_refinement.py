@@ -202,6 +202,11 @@ def test_a_state_that_is_set_holds_from_the_first_step_on_and_draws_what_is_lear
     assert kept["fitted"]
     assert kept["instruments"]["rod"]["joints"]["jaw"] == pytest.approx(0.8)
     assert kept["instruments"]["rod"]["uncertainty"]["translation_mm"] == pytest.approx([0.1] * 3)
+    refinement.weights[6:8] = 0  # both cameras
+    left_out = refinement.to_json(recorded)[frames[6].name]
+    assert left_out["left_out"]
+    assert not kept["left_out"]
+    assert "uncertainty" not in left_out["instruments"]["rod"]  # nothing is known of a state that nothing explains
     states = refinement.found(recorded, (instrument,)).states
     assert states[4].instruments["rod"].joints["jaw"] == pytest.approx(0.8)
     assert isinstance(states[4].instruments["rod"].joints["jaw"], float)  # as files need it

@@ -46,7 +46,6 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(capture: Path) -> Path:
-    torch.set_num_threads(1)
     return train(capture, capture.parent / "run", CONFIG)
 
 

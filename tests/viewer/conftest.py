@@ -7,22 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from viewer_page import CHROMIUM, SOFTWARE
 from viewer_world import grasper_scene, write_recorded_images, write_run
 
 from neeco.viewer.server import ViewerServer
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
-
-
 @pytest.fixture(scope="session")
 def made_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run; tests that change its folder take a copy."""
-    torch.set_num_threads(1)
     root = tmp_path_factory.mktemp("viewer")
     scene = grasper_scene()
     return write_run(scene, root / "run", write_recorded_images(scene, root / "capture"))

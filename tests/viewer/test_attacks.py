@@ -7,7 +7,7 @@ import logging
 import shutil
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -43,6 +43,14 @@ CAMERA = {
 }
 
 
+@pytest.fixture(scope="module")
+def shared(made_run: Path) -> Iterator[ViewerServer]:
+    """One server for all tests that leave it as it is."""
+    viewer = ViewerServer([made_run])
+    yield viewer
+    viewer.stop()
+
+
 def port_of(viewer: ViewerServer) -> int:
     return int(viewer.address.split(":")[2].split("/")[0])
 
@@ -69,11 +77,11 @@ def exhaust(connection: ClientConnection) -> None:
         connection.recv(timeout=20)
 
 
-def client_of(viewer: ViewerServer, known: int = 0) -> Any:
-    """The newest of more than `known` browsers, once it has its panel."""
+def client_of(viewer: ViewerServer, known: Collection[Any] = ()) -> Any:
+    """The newest browser, once it has its panel; known: the sessions of those before."""
     until = time.monotonic() + 20
     while time.monotonic() < until:
-        if len(viewer.render_thread.sessions) > known:
+        if set(viewer.render_thread.sessions) - set(known):
             clients = viewer._server.get_clients()
             return clients[max(clients)]
         time.sleep(0.02)
@@ -116,8 +124,8 @@ def is_served(viewer: ViewerServer) -> bool:
         b"Host: 127.0.0.1:%d\r\nOrigin:",
     ],
 )
-def test_odd_hosts_and_origins_are_refused(made_run: Path, serve: Serve, header: bytes, caplog) -> None:
-    port = port_of(serve(made_run))
+def test_odd_hosts_and_origins_are_refused(shared: ViewerServer, header: bytes, caplog) -> None:
+    port = port_of(shared)
     sent = header.replace(b"%d", str(port).encode())
     assert answer(port, b"GET / HTTP/1.1", sent).split(b" ")[1] == b"403"
     assert not [record for record in caplog.records if record.exc_info]
@@ -137,8 +145,8 @@ def test_odd_hosts_and_origins_are_refused(made_run: Path, serve: Serve, header:
         b"/assets",
     ],
 )
-def test_only_the_pages_own_files_are_served(made_run: Path, serve: Serve, path: bytes, caplog) -> None:
-    port = port_of(serve(made_run))
+def test_only_the_pages_own_files_are_served(shared: ViewerServer, path: bytes, caplog) -> None:
+    port = port_of(shared)
     status = answer(port, b"GET " + path + b" HTTP/1.1", f"Host: 127.0.0.1:{port}".encode())
     assert status.split(b" ")[1] in (b"400", b"404")
     assert not [record for record in caplog.records if record.exc_info]
@@ -167,18 +175,17 @@ def test_a_token_of_odd_bytes_is_wrong_and_no_trouble(made_run: Path, serve: Ser
     ],
 )
 def test_what_is_not_understood_ends_that_connection_alone(
-    made_run: Path, serve: Serve, message: str | bytes, caplog, capfd
+    shared: ViewerServer, message: str | bytes, caplog, capfd
 ) -> None:
-    viewer = serve(made_run)
-    with opened(port_of(viewer)) as other:
+    with opened(port_of(shared)) as other:
         looks(other)
-        with opened(port_of(viewer)) as connection:
+        with opened(port_of(shared)) as connection:
             looks(connection)
             connection.send(message)
             with pytest.raises(ConnectionClosed):
                 exhaust(connection)
         other.ping().wait(20)
-    assert is_served(viewer)
+    assert is_served(shared)
     assert not [record for record in caplog.records if record.exc_info and record.levelno >= logging.WARNING]
     assert "Traceback" not in capfd.readouterr().err
 
@@ -211,30 +218,28 @@ def test_the_buttons_of_a_page_save_states_and_images(made_run: Path, serve: Ser
         for _ in range(2):
             press(connection, client, "keep this state")
         wait_until(lambda: "kept: 2 in" in session._panel.saved.content)
-        press(connection, client, "forget the last kept")
-        wait_until(lambda: "kept: 1 in" in session._panel.saved.content)
         press(connection, client, "save labelled image")
         wait_until(lambda: "written:" in session._panel.saved.content)
         press(connection, client, "show", "unobserved")
         wait_until(lambda: "magenta: unobserved" in session._panel.status.content)
         press(connection, client, "back to the recording")
         wait_until(lambda: session.overlays.gizmo_pose("grasper") is None)
-    assert len((run / "kept" / "states.jsonl").read_text().splitlines()) == 1
+    assert len((run / "kept" / "states.jsonl").read_text().splitlines()) == 2
     assert not [record for record in caplog.records if record.exc_info]
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e300, 1e9])
-def test_a_place_that_is_none_does_not_end_the_others_pictures(made_run: Path, serve: Serve, value: float) -> None:
-    viewer = serve(made_run)
-    with opened(port_of(viewer)) as connection:
+def test_a_place_that_is_none_does_not_end_the_others_pictures(shared: ViewerServer, value: float) -> None:
+    known = set(shared.render_thread.sessions)
+    with opened(port_of(shared)) as connection:
         looks(connection)
-        client = client_of(viewer)
+        client = client_of(shared, known)
         for label, number in (("frame", value), ("along shaft (mm)", value), ("play", True)):
             press(connection, client, label, number)
         press(connection, client, "go to this frame's camera")
-        time.sleep(0.5)
-        assert viewer.render_thread._thread.is_alive()
-        assert is_served(viewer)
+        time.sleep(0.2)
+        assert shared.render_thread._thread.is_alive()
+        assert is_served(shared)
 
 
 @pytest.mark.parametrize(
@@ -251,24 +256,21 @@ def test_a_place_that_is_none_does_not_end_the_others_pictures(made_run: Path, s
         {"image_height": 0, "image_width": 0},
     ],
 )
-def test_a_camera_that_is_none_does_not_end_the_others_pictures(
-    made_run: Path, serve: Serve, changed: dict[str, Any]
-) -> None:
-    viewer = serve(made_run)
-    with opened(port_of(viewer)) as connection:
+def test_a_camera_that_is_none_does_not_end_the_others_pictures(shared: ViewerServer, changed: dict[str, Any]) -> None:
+    known = set(shared.render_thread.sessions)
+    with opened(port_of(shared)) as connection:
         looks(connection)
-        client_of(viewer)
+        client_of(shared, known)
         looks(connection, **changed)
-        time.sleep(0.3)
-        assert is_served(viewer)
+        time.sleep(0.2)
+        assert is_served(shared)
 
 
-def test_a_storm_of_messages_leaves_the_others_their_pictures(made_run: Path, serve: Serve) -> None:
-    viewer = serve(made_run)
-    with opened(port_of(viewer)) as connection:
+def test_a_storm_of_messages_leaves_the_others_their_pictures(shared: ViewerServer) -> None:
+    with opened(port_of(shared)) as connection:
         for step in range(3000):
             looks(connection, position=[0.001 * step, 0.0, 0.0])
-        assert is_served(viewer)
+        assert is_served(shared)
 
 
 def test_more_browsers_than_there_is_room_for_are_told_so(

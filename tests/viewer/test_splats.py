@@ -20,8 +20,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.image_metrics import psnr
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
-from neeco.viewer.splats import exported_state, ply_bytes, splats_of, spz_bytes
-from neeco.viewer.usd import write_usd
+from neeco.viewer.splats import exported_state, ply_bytes, splats_of, spz_bytes, write_usd
 
 STATE = grasper_state(pose_of(0.7, -0.4, 1.1, 2.0, 1.0, 60.0), 0.5)
 

@@ -175,10 +175,21 @@ def _dispatch(words: list[str]) -> int:
         else (_verb([name])[1] if complete else _named_only(name, line))
         for name, line in VERBS.items()
     }
-    try:
-        parsed = tyro.extras.subcommand_cli_from_dict(
-            choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
+
+    def parse(shown: bool) -> Any:
+        config = (tyro.conf.FlagCreatePairsOff,)
+        return tyro.extras.subcommand_cli_from_dict(
+            choices, prog="neeco", description=DESCRIPTION, args=words, config=config, console_outputs=shown
         )
+
+    try:
+        try:
+            parsed = parse(shown=arguments is None or _asks_for_help(words))
+        except SystemExit as end:
+            if not end.code or arguments is None:
+                raise
+            _misspelt_options(words, arguments)
+            parsed = parse(shown=True)
     except SystemExit as end:
         if not end.code and words[:1] == ["train"]:
             importlib.import_module(f"{__name__}.train").explain(words)
@@ -204,11 +215,29 @@ def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any
     """The first word's `run` and the dataclass of its arguments, which is what `run` takes."""
     module = importlib.import_module(f"{__name__}.{words[0].replace('-', '_')}")
     arguments = next(iter(get_type_hints(module.run).values()))
-    if not {"-h", "--help"}.isdisjoint(words):
-        from neeco.cli._help import state_defaults
+    if _asks_for_help(words):
+        from neeco.cli._output import state_defaults
 
         state_defaults(arguments)
     return module.run, arguments
+
+
+def _asks_for_help(words: Sequence[str]) -> bool:
+    return not {"-h", "--help"}.isdisjoint(words)
+
+
+def _misspelt_options(words: Sequence[str], arguments: Callable[..., Any]) -> None:
+    """Print a line for every option that a verb does not have and that is nearly one, before tyro's list of what is
+    missing, which does not connect the two. That list then shows values as `--help` does."""
+    from neeco.cli._output import option_names, state_defaults
+
+    state_defaults(arguments)
+    known = [*option_names(arguments), "--help"]
+    for word in words:
+        option = word.partition("=")[0]
+        meant = nearest(option, known)
+        if option.startswith("--") and option not in known and meant is not None:
+            _print_error(f"{option}: no such option of {words[0]}; did you mean {meant}?")
 
 
 def _named_only(name: str, line: str) -> Callable[..., Any]:

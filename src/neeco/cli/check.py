@@ -60,7 +60,7 @@ def _print(problems: list[Problem], errors: int, summary: CaptureSummary) -> Non
 
 
 def _summary_lines(summary: CaptureSummary) -> list[str]:
-    from neeco.capture.checks.expectation import expected_labels
+    from neeco.capture.checks.inspection import expected_labels
 
     frames = ", ".join(f"{count} {name!r}" for name, count in summary.splits.items()) or "none"
     lines = [f"frames: {frames}", f"sparse points: {summary.points}"]

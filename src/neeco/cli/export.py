@@ -38,8 +38,7 @@ def run(arguments: Arguments) -> int:
     from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
     from neeco.training.run import open_gaussian_run
-    from neeco.viewer.splats import exported_state, splats_of, write_splats
-    from neeco.viewer.usd import require_usd, write_usd
+    from neeco.viewer.splats import exported_state, require_usd, splats_of, write_splats, write_usd
 
     format = arguments.format or "ply"
     if arguments.output is not None:

@@ -65,7 +65,7 @@ def run(args: Ingest) -> int:
     from neeco.ingest.convert import convert_folder
     from neeco.ingest.sources import folder_to_convert
     from neeco.report.choice_picture import write_draft
-    from neeco.report.ingested import ingest_and_report
+    from neeco.report.ingest_page import ingest_and_report
 
     if args.formats:
         _refuse_others(args, "--formats", keep=("formats",))

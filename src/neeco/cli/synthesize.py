@@ -48,7 +48,7 @@ def run(arguments: Arguments) -> int:
     """Make the data set and print where it is."""
     from neeco.api import synthesize
     from neeco.cli._progress import Bars, resumable
-    from neeco.synthesis.hub_upload import check_hub, push_to_hub
+    from neeco.synthesis.writers.hub import check_hub, push_to_hub
 
     if arguments.push_to_hub is not None:
         check_hub(arguments.push_to_hub)

@@ -79,7 +79,7 @@ def run(args: Arguments) -> int:
 
 def explain(words: Sequence[str]) -> None:
     """Print the settings of the method that `words` name, a table behind `--help`."""
-    from neeco.cli._help import print_settings
+    from neeco.cli._output import print_settings
     from neeco.scene.method_registry import DEFAULT, method_class, methods
 
     named = [word.removeprefix("--method=") for before, word in pairwise(["", *words]) if _names_method(before, word)]

@@ -234,7 +234,7 @@ def overlay_parts(image: np.ndarray, parts: np.ndarray, opacity: float = 0.45) -
     inside = parts > 0
     pixels[inside] = (1 - opacity) * pixels[inside] + opacity * colors[inside]
     pixels[outline(inside)] = 255
-    return _to_uint8(pixels)
+    return to_uint8(pixels)
 
 
 def overlay_outline(image: Pixels, mask: np.ndarray, color: tuple[int, int, int] = (255, 255, 0)) -> Pixels:
@@ -253,7 +253,7 @@ def _colored(fraction: np.ndarray) -> Pixels:
     """Return the colours of values [H, W], which are clipped to [0, 1]."""
     position = np.clip(fraction, 0, 1)
     stops = np.linspace(0, 1, len(_COLORS))
-    return _to_uint8(np.stack([np.interp(position, stops, _COLORS[:, channel]) for channel in range(3)], axis=-1))
+    return to_uint8(np.stack([np.interp(position, stops, _COLORS[:, channel]) for channel in range(3)], axis=-1))
 
 
 def _legend(width: int, full_scale: float) -> Pixels:
@@ -272,7 +272,8 @@ def _legend(width: int, full_scale: float) -> Pixels:
     return np.asarray(strip)
 
 
-def _to_uint8(pixels: np.ndarray) -> Pixels:
+def to_uint8(pixels: np.ndarray) -> Pixels:
+    """Round values in [0, 255], clipped, to 8 bits."""
     return np.clip(np.rint(pixels), 0, 255).astype(np.uint8)
 
 

@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-import cv2
 import numpy as np
 import torch
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import maximum_bipartite_matching
 from torch import Tensor
+
+from neeco.labels.drawing import distances_to
 
 _LEFT = re.compile(r"(?:^|_)left(?=_|$)")
 BOUNDARY_TOLERANCE = 0.008  # of the image's diagonal, as DAVIS
@@ -123,15 +124,10 @@ def assigned_pairs(
             (mean_iou(right, left), mean_iou(left, right)),
             (mean_iou(left, left), mean_iou(right, right)),
         )
-        is_better = _total(swapped) > _total(named)
+        is_better = np.nansum(swapped) > np.nansum(named)
         assignment[pair] = "swapped" if is_better else "as named"
         swap |= {left: right, right: left} if is_better else {}
     return swap, assignment
-
-
-def _total(values: Iterable[float]) -> float:
-    """Return the sum of the values that are numbers."""
-    return sum(value for value in values if not math.isnan(value))
 
 
 def mean_of(values: Sequence[float | None]) -> float:
@@ -173,12 +169,6 @@ def boundary_f(
     precision = int((first & inside & near_second).sum()) / judged[0]
     recall = int((second & inside & near_first).sum()) / judged[1]
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
-
-
-def distances_to(mask: np.ndarray) -> np.ndarray:
-    """Distance, in px, of every pixel [H, W] to the nearest of `mask` [H, W] bool, which has at least one; exact
-    (Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012)."""
-    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
 def boxes_of(mask: np.ndarray, components: bool = False) -> np.ndarray:

@@ -11,10 +11,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
 Posed = TypeVar("Posed")  # what is rendered
+BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 MAX_TRIALS = 3  # steps tried from one linearisation, each damped ten times more
 
 
@@ -37,8 +40,9 @@ class ImageResidual:
 
     def errors(self, image: Tensor) -> Tensor:
         """Return the Huber error [h, w, 3] of every value of a rendering."""
-        residual = self.of(image).abs()
-        return torch.where(residual < self.huber, 0.5 * residual**2, self.huber * (residual - 0.5 * self.huber))
+        residual = self.of(image).abs_()
+        squared = residual.clamp_max(self.huber)  # what costs its square; the rest costs linearly
+        return residual.sub_(squared, alpha=0.5).mul_(squared)
 
 
 class FitProblem(Protocol[Posed]):
@@ -94,17 +98,17 @@ def minimise(
     damping, information, settled = 1e-3, None, False
     for step in range(max_steps):
         off = residual.of(image)
-        weight = residual.scale / (off.abs() / residual.huber).clamp_min(1.0)
         if step % linearised_for == 0:
-            columns = [
-                weighted_blur(moved - image, residual.weight).flatten() / change
-                for moved, change in problem.differences(parameters, posed)
-            ]
-            jacobian = torch.stack(columns)  # [P, h * w * 3]
-        weighted = jacobian * weight.flatten()
+            columns = np.empty((len(parameters), *image.shape), np.float32)
+            for row, (moved, change) in enumerate(problem.differences(parameters, posed)):
+                columns[row] = weighted_blur((moved - image).div_(change), residual.weight)
+            touched = np.flatnonzero(columns.any(0))  # values that no parameter changes have no derivative
+            jacobian = torch.from_numpy(columns.reshape(len(parameters), -1).take(touched, 1))  # [P, values]
+        off = torch.from_numpy(off.numpy().take(touched))
+        weighted = jacobian * (residual.scale / (off.abs() / residual.huber).clamp_min(1.0))
         information = (weighted @ jacobian.T).double()
         normal = information + precision
-        gradient = (weighted @ off.flatten()).double() + precision @ parameters
+        gradient = (weighted @ off).double() + precision @ parameters
         for _ in range(MAX_TRIALS):
             system = normal + damping * torch.diag(torch.diagonal(normal))
             change = torch.linalg.solve(system, gradient)
@@ -126,11 +130,5 @@ def minimise(
 def weighted_blur(difference: Tensor, weight: Tensor) -> Tensor:
     """Return a difference [h, w, 3] times its weight [h, w], blurred (3x3 binomial): an edge's residual stays linear
     over a larger shift."""
-    counted = (difference * weight[..., None]).flatten(1)  # [h, w * 3]
-    down = counted + counted
-    down[1:] += counted[:-1]
-    down[:-1] += counted[1:]
-    across = down + down
-    across[:, 3:] += down[:, :-3]
-    across[:, :-3] += down[:, 3:]
-    return across.mul_(1 / 16).view_as(difference)
+    counted = difference.numpy() * cv2.merge([weight.numpy()] * 3)
+    return torch.from_numpy(cv2.sepFilter2D(counted, -1, BINOMIAL, BINOMIAL, borderType=cv2.BORDER_CONSTANT))

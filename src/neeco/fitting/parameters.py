@@ -19,7 +19,7 @@ from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.geometry.camera import Camera
-from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
+from neeco.geometry.rotations import rigid_from_vector
 
 DEG = math.pi / 180
 
@@ -150,11 +150,14 @@ class StateParameters:
         found = torch.zeros(self.size, dtype=torch.float64)
         for item, (pose, joints) in zip(self.instruments, self.rows, strict=True):
             a, b = state.instruments[item.name], other.instruments[item.name]
-            step = torch.linalg.inv(a.pose.double()) @ b.pose.double()
+            one, two = (each.pose.detach().cpu().double().numpy() for each in (a, b))
+            step = np.linalg.inv(one) @ two
             shift = step[:3, 3]
             if item.pivot is not None:
-                shift = shift - item.pivot + step[:3, :3] @ item.pivot
-            found[pose] = torch.cat([vector_from_rotation(step[:3, :3]), shift])
+                pivot = item.pivot.cpu().numpy()
+                shift = shift - pivot + step[:3, :3] @ pivot
+            vector = Rotation.from_matrix(step[:3, :3]).as_rotvec()
+            found[pose] = torch.from_numpy(np.concatenate([vector, shift]))
             found[joints] = torch.tensor([b.joints[name] - a.joints[name] for name in item.joints], dtype=torch.float64)
         return found
 

@@ -340,7 +340,8 @@ class Refinement:
 
     def to_json(self, recorded: Recorded) -> dict[str, Any]:
         """Return the corrected state of every training frame, with its standard deviations as `uncertainty`, and
-        whether it was fitted to the image (`fitted`; else the deviations are the prior's)."""
+        whether it was fitted to the image (`fitted`; else the deviations are the prior's) or left out (`left_out`: it
+        contradicts the others, and no deviations are stated)."""
         found: dict[str, Any] = {}
         for index, (name, given, camera) in enumerate(
             zip(recorded.names, recorded.states, recorded.cameras, strict=True)
@@ -356,13 +357,18 @@ class Refinement:
                 instruments[item.name] = {
                     "pose": own.pose.cpu().double().tolist(),
                     "joints": {joint: float(value) for joint, value in own.joints.items()},
-                    "uncertainty": {
+                }
+                if self.weights[index] > 0:
+                    instruments[item.name]["uncertainty"] = {
                         "translation_mm": shifts.tolist(),
                         "rotation_deg": deviations[pose][:3].rad2deg().tolist(),
                         "joints_deg": dict(zip(item.joints, units, strict=True)),
-                    },
-                }
-            found[name] = {"instruments": instruments, "fitted": bool(self.fitted[index])}
+                    }
+            found[name] = {
+                "instruments": instruments,
+                "fitted": bool(self.fitted[index]),
+                "left_out": not bool(self.weights[index] > 0),
+            }
         return found
 
     def tensors(self) -> dict[str, Tensor]:

@@ -53,8 +53,18 @@ class StateFit:
     gain: float  # by how much pixels cost less than with the tissue alone; comparable between crops
     # Huber error on and close by the instrument, without foreground, per pixel of instrument; 1: of residuals of HUBER
     misfit: float
+    observations: float  # independent ones that the information takes the instrument's pixels for
     information: Tensor  # [P, P] of the pixels on the parameters
     view: FrameView  # the crop about the instruments, with the shadow of `state`
+
+    def deviations(self, precision: Tensor) -> Tensor:
+        """Return the standard deviations [P] of the state, with a prior of such `precision` [P, P].
+
+        Errors of a learned shape move all residuals of an instrument at once, however many pixels it covers: the frame
+        counts as one observation, of its residuals' own variance, and never for more than the fit took it for.
+        """
+        share = 1 / max(1.0, self.observations * self.misfit)
+        return torch.linalg.inv(share * self.information + precision).diagonal().sqrt()
 
 
 @dataclass(frozen=True)
@@ -159,8 +169,16 @@ class Fitter(Generic[P]):
         if crop is None:
             return None
         crop = self.with_shadow(crop, state)
-        gain, misfit = self._explained(crop, state)
-        return StateFit(state=state, cost=cost, gain=gain, misfit=misfit, information=information, view=crop)
+        gain, misfit, pixels = self._explained(crop, state)
+        return StateFit(
+            state=state,
+            cost=cost,
+            gain=gain,
+            misfit=misfit,
+            observations=pixels / self.correlation_px,
+            information=information,
+            view=crop,
+        )
 
     def ranked(self, view: FrameView, states: Iterable[State], size: float) -> list[State]:
         """Return states, the best first, by how well they explain a view reduced to `size`."""
@@ -187,8 +205,9 @@ class Fitter(Generic[P]):
                 return view
         return replace(view, tissue=self.tissue.render(view.camera, state), shadow_of=state)
 
-    def _explained(self, view: FrameView, state: State) -> tuple[float, float]:
-        """Return `gain` and `misfit` (see `StateFit`) of a state before a view that holds all of the instruments."""
+    def _explained(self, view: FrameView, state: State) -> tuple[float, float, float]:
+        """Return `gain` and `misfit` (see `StateFit`) of a state before a view that holds all of the instruments, and
+        the pixels of instrument that count."""
         color, alpha = self.instruments.render(state, view.camera)
         residual = residual_of(view, 1.0, self.correlation_px)
         with_it, without = (
@@ -201,8 +220,8 @@ class Fitter(Generic[P]):
         if float(opaque[hidden].sum()) > MAX_HIDDEN * float(opaque.sum()):
             hidden = torch.zeros_like(hidden)
         near = widened(alpha > 0.5, round(NEIGHBOURHOOD * view.diagonal)) & ~hidden
-        pixels = float(opaque[~hidden].sum())
-        return gain, float(with_it[near].sum()) / (0.5 * HUBER**2 * 3 * max(pixels, 1.0))
+        pixels = max(float(opaque[~hidden].sum()), 1.0)
+        return gain, float(with_it[near].sum()) / (0.5 * HUBER**2 * 3 * pixels), pixels
 
 
 def wide_areas(mask: Tensor, pixels: int) -> Tensor:

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from neeco.capture.documents import ProblemReport, condensed
-from neeco.capture.images import read_mask, write_image, write_labels
-from neeco.capture.masks import masks_fault, measure_hidden
+from neeco.capture.images import masks_fault, measure_hidden, read_mask, write_image, write_labels
 from neeco.capture.model import Capture, Frame, evenly_spaced
 from neeco.capture.points import measured_sample
 from neeco.capture.readers import capture_of, parse_capture

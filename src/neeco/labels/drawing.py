@@ -175,7 +175,7 @@ def uncertain_edge(share: np.ndarray, mask: np.ndarray) -> np.ndarray:
     border = cv2.dilate(pixels, NEIGHBOURS) != cv2.erode(pixels, NEIGHBOURS) if width else pixels.astype(bool)
     if border.any():
         unclear = (share[near] > CLEAR_SHARES[0]) & (share[near] < CLEAR_SHARES[1])
-        edge[near] = border | (unclear & (_distance_to(border) <= reach))
+        edge[near] = border | (unclear & (distances_to(border) <= reach))
     return edge
 
 
@@ -229,7 +229,7 @@ def without_components(share: np.ndarray, remaining: np.ndarray, dropped: np.nda
     """
     if not dropped.any():
         return share
-    fading = ~remaining & (share < CLEAR_SHARES[1]) & (_distance_to(dropped) < _distance_to(remaining))
+    fading = ~remaining & (share < CLEAR_SHARES[1]) & (distances_to(dropped) < distances_to(remaining))
     return np.where(dropped | fading, np.float32(0), share)
 
 
@@ -259,6 +259,7 @@ def shows_any(parts: np.ndarray, ids: Sequence[int]) -> np.ndarray:
     return cv2.LUT(parts, chosen).view(bool)
 
 
-def _distance_to(pixels: np.ndarray) -> np.ndarray:
-    """Return distances [H, W] px, between centres, to the nearest of the pixels (bool [H, W], at least one)."""
+def distances_to(pixels: np.ndarray) -> np.ndarray:
+    """Return distances [H, W] px, between centres, to the nearest of the pixels (bool [H, W], at least one); exact
+    (Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012)."""
     return cv2.distanceTransform((~pixels).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import field_slopes
+from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster.types import Gaussians, Headlight, Rendering
 
 LOW_PASS = 0.3  # px^2 added to projected covariances
@@ -91,7 +92,7 @@ def project(
         [camera.fx / z, zero, -camera.fx * slope_x / z, zero, camera.fy / z, -camera.fy * slope_y / z], dim=-1
     ).reshape(-1, 2, 3)
     quats = torch.nn.functional.normalize(gaussians.quats, dim=-1)
-    u = jacobian @ rotation @ (rotation_matrices(quats) * gaussians.scales[:, None, :])  # [N, 2, 3]
+    u = jacobian @ rotation @ (quat_to_matrix(quats) * gaussians.scales[:, None, :])  # [N, 2, 3]
     covariances = u @ u.transpose(1, 2) + LOW_PASS * torch.eye(2, dtype=u.dtype, device=u.device)
     return Projection(centers, covariances, z)
 
@@ -180,17 +181,6 @@ SH_C0 = 0.28209479177387814  # the constant harmonic
 COLOR_OFFSET = 0.5 / SH_C0  # colour 0.5, which is added to the harmonics, as a constant harmonic
 
 
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """Return rotation matrices [N, 3, 3] of quaternions [N, 4] wxyz, taken as unit."""
-    w, x, y, z = quats.unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
-
-
 def sh_basis(directions: Tensor, count: int) -> Tensor:
     """Return real spherical harmonics [N, count] at unit directions [N, 3], constants and signs of 3D Gaussian
     Splatting."""
@@ -232,7 +222,7 @@ def sh_colors(sh: Tensor, means: Tensor, camera_centre: Tensor, sh_frames: Tenso
     world."""
     directions = torch.nn.functional.normalize(means - camera_centre, dim=-1)
     if sh_frames is not None:
-        world_from_sh = rotation_matrices(sh_frames.detach())
+        world_from_sh = quat_to_matrix(sh_frames.detach())
         directions = torch.einsum("nij,ni->nj", world_from_sh, directions)
     return torch.einsum("nk,nkc->nc", sh_basis(directions, sh.shape[1]), sh) + 0.5
 

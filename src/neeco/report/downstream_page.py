@@ -54,6 +54,10 @@ QUESTIONS = {  # what a paired difference answers, as `question` finds it
     "match": "labelled frames in another recording's colours, against the better of them alone and augmented",
     "augmentation": "strong augmentation against none",
 }
+HEADLINES = {  # of questions: how the sentence begins
+    "beside": "Against the better of the same labelled frames alone and augmented",
+    "alone": "Without any label, against the better of all labelled frames alone and augmented",
+}
 MAX_REACH = 3.0  # times the largest difference that an interval is shown to: those of two folds would hide the rest
 
 Experiment = Mapping[str, Any]
@@ -110,24 +114,31 @@ def question(row: Row, experiment: Experiment) -> str:
 
 
 def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
-    """Return the headlines: effect of synthetic images with labelled frames against these alone, and what is
-    missing."""
+    """Return the headlines: effect of synthetic images with and without labelled frames against these, in the same and
+    in other recordings, and what is missing."""
     sentences = [] if experiment["complete"] else ["Not all trainings are finished: these are the numbers so far."]
-    rows = [row for pair in models_and_splits(experiment) for row in main_differences(experiment, *pair)]
-    counts = Counter(verdict(row) for row in rows if question(row, experiment) == "beside")
-    if not counts:
+    verdicts: dict[tuple[str, bool], list[str]] = {}
+    for model, split in models_and_splits(experiment):
+        for row in main_differences(experiment, model, split):
+            verdicts.setdefault((question(row, experiment), split in experiment["tests"]), []).append(verdict(row))
+    found = [
+        (start, other, counts)
+        for asked, start in HEADLINES.items()
+        for other in (True, False)
+        if (counts := Counter(verdicts.get((asked, other), ())))
+    ]
+    if not any(asked == "beside" for asked, _ in verdicts):
         sentences.append("No condition has synthetic images with labelled frames to compare with these frames alone.")
-    elif set(counts) == {""}:
+    if found and all(set(counts) == {""} for _, _, counts in found):
         sentences.append("One fold: whether synthetic images help cannot be distinguished from chance; give --folds 5.")
-    else:
-        verbs = {HELPS: "help", HURTS: "hurt", NONE_SHOWN: "show no difference"}
+        found = []
+    for start, other, counts in found:
+        verbs = {HELPS: "help", HURTS: "hurt", NONE_SHOWN: "show no difference", "": "have one fold"}
         parts = [f"{verb} in {counts[word]}" for word, verb in verbs.items() if counts[word]]
         kind = {(True, False): "yes", (False, True): "no"}.get((counts[HELPS] > 0, counts[HURTS] > 0), "")
-        sentence = (
-            "Against the better of the same labelled frames alone and augmented, synthetic images {} of {} comparisons."
-        )
-        text = Markup(f'<b class="{{}}">{sentence}</b>').format(kind, ", ".join(parts), sum(counts.values()))
-        sentences.append(text)
+        place = (" in another recording" if other else " in the same recording") if experiment["tests"] else ""
+        text = Markup('<b class="{}">{}, synthetic images {} of {} comparisons{}.</b>')
+        sentences.append(text.format(kind, start, ", ".join(parts), sum(counts.values()), place))
     if failed:
         sentences.append(f"{len(failed)} training{'s' if len(failed) > 1 else ''} failed; they are listed below.")
     return sentences
@@ -168,7 +179,7 @@ def _order(condition: str, experiment: Experiment) -> int:
 def _results(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
     """For every model and split its scores, as a table and over labelled frames, and their differences."""
     known = families(experiment)
-    key = legend(known, [name for name in known if REAL in name.split("+")])
+    key = legend(known, known)
     sections, known_scores = [], Scores(experiment["jobs"])
     for model in experiment["models"]:
         charts = [score_chart(experiment, model, split, known_scores) for split in experiment["splits"]]
@@ -183,7 +194,7 @@ def _results(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
                 sections.append(Section(title=table.title, split=split, level=3, results=table, figures=figures))
     text = (
         "Curves: the mean over folds with its interval; dashed from side to side a set alone, without any labelled "
-        "frame, in the colour it has with labelled frames. Intervals hold the mean, or the difference on the same "
+        "frame; with labelled frames it has the same colour. Intervals hold the mean, or the difference on the same "
         f"folds and frames, with {CONFIDENCE:.0%} confidence: a bootstrap over seeds and blocks of neighbouring "
         "frames. A difference whose interval reaches 0 shows none, green is better than its reference, red is worse. "
         f"Of {FALSE_POSITIVES} comparisons that differ in nothing about one is called a difference all the same."
@@ -231,7 +242,7 @@ def difference_chart(experiment: Experiment, model: Row, split: str) -> Markup:
     for y, (key, row) in enumerate(lines):
         name, color = QUESTIONS[key], "accent"
         if row is not None:
-            reference = f" − {row['against']}" if key in ("sets", "use", "control") else ""
+            reference = f" − {row['against']}" if key in ("sets", "use") else ""
             name = (title_of(row["condition"], row["real"]) + reference)[:45]
             color = {HELPS: "good", HURTS: "bad"}.get(verdict(row), "soft")
             _draw_interval(axes, y, row, reach, PALETTE[color])

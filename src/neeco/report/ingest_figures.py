@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -29,7 +28,7 @@ ORIGIN = np.zeros((1, 3))
 SHAFT_DIAMETERS = 30.0  # length shown of a shaft found in video
 
 WIDTH, HEIGHT, MARGIN = 420, 320, 16  # of a view of the tracks, view box units
-MAX_SVG_POINTS, MAX_CANVAS_POINTS = 1500, 4000
+MAX_SVG_POINTS = 1500
 STRAY = 0.01  # share of the points at either end that may lie outside the view
 GAP = 4.0  # median time steps: a longer one breaks the line
 N_RAYS = 10  # cameras shown with their viewing direction
@@ -205,7 +204,6 @@ class Tracks:
     """Tracks and points in the mean camera's axes (x right, y down, z forward), mm."""
 
     points: np.ndarray  # [P, 3]
-    colors: np.ndarray  # [P, 3] in [0, 1]
     camera: np.ndarray  # [F, 3] in order of time
     looking: np.ndarray  # [F, 3] unit
     breaks: np.ndarray  # [F - 1] bool: time jumps after this frame
@@ -230,7 +228,6 @@ def read_tracks(capture: Capture) -> Tracks:
         instruments[instrument.name] = (track - middle) @ axes
     return Tracks(
         points=(capture.points.positions.astype(np.float64) - middle) @ axes,
-        colors=np.asarray(capture.points.colors, dtype=np.float64),
         camera=(poses[:, :3, 3] - middle) @ axes,
         looking=poses[:, :3, 2] @ axes,
         breaks=steps > GAP * max(float(np.median(steps)), 1e-9) if len(steps) else np.zeros(0, dtype=bool),
@@ -304,25 +301,3 @@ def round_length(wanted: float) -> float:
     """Return the greatest of 1, 2, 5, 10, 20, ... that is not above `wanted`."""
     power = 10.0 ** np.floor(np.log10(max(wanted, 1e-9)))
     return float(max(step * power for step in (1, 2, 5) if step * power <= wanted * 1.000001))
-
-
-def turning_data(tracks: Tracks) -> dict[str, object]:
-    """Return the data of the canvas that turns when it is dragged (templates/turning.js)."""
-    step = -(-len(tracks.points) // MAX_CANVAS_POINTS) or 1
-    low, high = _extent(tracks, np.eye(3))
-    centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-9)
-
-    def packed(positions: np.ndarray) -> str:
-        """Return positions as little-endian int16 in units of size / 16000; unknown ones as -32768."""
-        units = np.clip((positions - centre) / size * 16000, -32000, 32000)
-        whole = np.where(np.isfinite(units), np.rint(np.nan_to_num(units)), -32768).astype("<i2")
-        return base64.b64encode(whole.tobytes()).decode("ascii")
-
-    colors = to_bytes(tracks.colors[::step])
-    return {
-        "points": packed(tracks.points[::step]),
-        "colors": base64.b64encode(colors.tobytes()).decode("ascii"),
-        "lines": [packed(tracks.camera), *(packed(track) for track in tracks.instruments.values())],
-        "breaks": np.flatnonzero(tracks.breaks).tolist(),
-        "names": ["--accent", *(f"--{color}" for color in LINE_COLORS)],
-    }

@@ -17,7 +17,7 @@ from torch import Tensor
 import neeco
 from neeco.capture.model import Capture
 from neeco.errors import NeecoError
-from neeco.evaluation.image_metrics import difference_map
+from neeco.evaluation.image_metrics import difference_map, to_uint8
 from neeco.files import write_text
 
 REPORT_FILE = "report.html"
@@ -82,7 +82,7 @@ def _data_uri(image: Image.Image, form: str, max_width: int = MAX_WIDTH, **optio
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
     """uint8 [H, W, 3] of an image in [0, 1]."""
-    return np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)
+    return to_uint8(image * 255)
 
 
 @cache

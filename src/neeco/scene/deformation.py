@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -99,6 +100,10 @@ class Deformation(nn.Module, Method):
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         """Return the posed geometry of `canonical` in `state`."""
         raise NotImplementedError
+
+    def poser(self, canonical: CanonicalGaussians) -> Callable[[State], Posed]:
+        """Return `pose` as a function of the state alone, valid while neither `canonical` nor this module changes."""
+        return partial(self.pose, canonical)
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
         """Return the soft membership [N, len(label_names)] in [0, 1]; the remainder to 1 is tissue."""

@@ -12,6 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.geometry.lines import frame_about
 from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
 from neeco.scene.gaussian_scene import is_gaussian
@@ -133,7 +134,7 @@ def _moved(recorded: InstrumentState, shaft: Shaft, controls: InstrumentControls
     """Roll about the shaft, then pitch and yaw about its end, then slide along where it pointed before."""
     if not controls.departs:
         return recorded
-    side, up = perpendicular_axes(shaft.along)
+    side, up, _ = frame_about(shaft.along).T
     turns = (
         Rotation.from_rotvec(controls.yaw * up)
         * Rotation.from_rotvec(controls.pitch * side)
@@ -144,11 +145,3 @@ def _moved(recorded: InstrumentState, shaft: Shaft, controls: InstrumentControls
     with np.errstate(invalid="ignore"):  # a browser may send infinity: nothing can be rendered there
         offset = rigid(np.eye(3), controls.slide * shaft.along) @ turn_about(shaft.end, turns.as_rotvec())
         return InstrumentState(torch.from_numpy(pose @ offset), joints)
-
-
-def perpendicular_axes(along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit directions [3] at right angles to `along` and each other; which two depends on `along` alone."""
-    least = np.eye(3)[np.argmin(np.abs(along))]
-    side = np.cross(along, least)
-    side /= np.linalg.norm(side)
-    return side, np.cross(along, side)

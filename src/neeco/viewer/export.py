@@ -28,13 +28,14 @@ import neeco
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.files import read_json, write_text
+from neeco.geometry.lines import frame_about
 from neeco.labels.labellers import threshold_of
 from neeco.raster.reference import SH_C0
 from neeco.scene import DrawableScene, GaussianScene
 from neeco.scene.drawable import ArticulatedMotion
 from neeco.scene.gaussian_scene import over_one, require_gaussians
 from neeco.training.run import TrainedRun, load_run
-from neeco.viewer.controls import perpendicular_axes, shafts_of, slider_ranges
+from neeco.viewer.controls import shafts_of, slider_ranges
 
 SCHEMA = "neeco-page/1"
 SCRIPTS = ("scene.js", "states.js", "drawing.js", "camera.js", "panel.js", "main.js")  # in this order, as one module
@@ -278,7 +279,7 @@ def _instruments(scene: GaussianScene, motion: ArticulatedMotion) -> list[dict[s
             slides = instrument.slides(name)
             joints.append({"name": name, "range": [span.lower, span.upper], "slides": slides})
         shaft = shafts[instrument.name]
-        side, up = perpendicular_axes(shaft.along)
+        side, up, _ = frame_about(shaft.along).T
         vectors = {"end": shaft.end, "along": shaft.along, "side": side, "up": up}
         found.append(
             {

@@ -19,7 +19,8 @@ from torch.nn.functional import normalize
 
 from neeco.capture.model import Camera, State
 from neeco.capture.readers import read_states
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, install_hint
+from neeco.evaluation.image_metrics import to_uint8
 from neeco.files import write_atomically
 from neeco.geometry.rotations import quat_to_matrix, spread_directions
 from neeco.raster import depth_maps
@@ -110,10 +111,10 @@ def spz_bytes(splats: Splats) -> bytes:
     ]  # w follows from the rest, and is positive
     columns = (
         positions,
-        _byte(255 / (1 + np.exp(-splats.logits.astype(np.float64)))),
-        _byte(splats.sh[:, 0] * (SPZ_COLOR * 255) + 127.5),
-        _byte((splats.log_scales + 10) * 16),
-        _byte(quats * 127.5 + 127.5),
+        to_uint8(255 / (1 + np.exp(-splats.logits.astype(np.float64)))),
+        to_uint8(splats.sh[:, 0] * (SPZ_COLOR * 255) + 127.5),
+        to_uint8((splats.log_scales + 10) * 16),
+        to_uint8(quats * 127.5 + 127.5),
         _harmonics(splats.sh[:, 1:]),
     )
     body = header + b"".join(np.ascontiguousarray(column).tobytes() for column in columns)
@@ -127,10 +128,6 @@ def _harmonics(rest: np.ndarray) -> np.ndarray:
     return np.clip((whole + steps // 2) // steps * steps, 0, 255).astype(np.uint8)
 
 
-def _byte(values: np.ndarray) -> np.ndarray:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
-
-
 def _in_world(posed: Gaussians) -> Tensor:
     """[N, K, 3] harmonics rotated out of the frames of their parts: a least-squares fit over DIRECTIONS directions."""
     count = posed.sh.shape[1]
@@ -142,3 +139,52 @@ def _in_world(posed: Gaussians) -> Tensor:
     local = torch.einsum("fij,di->fdj", quat_to_matrix(frames), directions)  # [F, D, 3]
     turned = back @ sh_basis(local.reshape(-1, 3), count).reshape(*local.shape[:2], count)  # [F, K, K]
     return torch.einsum("nkl,nlc->nkc", turned[which], posed.sh)
+
+
+# UsdVol of OpenUSD 26.03 and newer: openusd.org/release/api/class_usd_vol_particle_field3_d_gaussian_splat.html
+SCHEMA = "ParticleField3DGaussianSplat"
+PRIM = "/Scene"
+METERS_PER_UNIT = 0.001
+EXTENT_SD = 3.0  # standard deviations to which a Gaussian counts for the stage's extent
+
+
+def require_usd() -> None:
+    """Raise NeecoError where OpenUSD is missing, or older than the schema."""
+    try:
+        from pxr import Usd, UsdVol
+    except ImportError:
+        raise NeecoError(f"--format: usdc needs usd-core; {install_hint('usd')}") from None
+    if not hasattr(UsdVol, SCHEMA):
+        version = ".".join(map(str, Usd.GetVersion()[1:]))
+        raise NeecoError(f"--format: usdc needs OpenUSD 26.03 or newer, this is {version}; {install_hint('usd')}")
+
+
+def write_usd(splats: Splats, path: Path) -> None:
+    """Write a binary file, .usdc. Raises NeecoError where OpenUSD is missing or too old, or the disk refuses."""
+    require_usd()
+    from pxr import Sdf, Tf, Usd, UsdGeom, UsdVol, Vt
+
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(stage, METERS_PER_UNIT)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, Sdf.Path(PRIM))
+    stage.SetDefaultPrim(field.GetPrim())
+    scales = np.exp(splats.log_scales)
+    reach = EXTENT_SD * scales.max(1, keepdims=True)
+    extent = np.stack([(splats.means - reach).min(0), (splats.means + reach).max(0)])
+    degree = int(splats.sh.shape[1] ** 0.5) - 1
+    field.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(splats.means))
+    field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(splats.quats[:, [1, 2, 3, 0]]))  # stored with w last
+    field.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
+    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(1 / (1 + np.exp(-splats.logits))))
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(degree)
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(splats.sh.reshape(-1, 3)))
+    field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
+
+    def write(temporary: Path) -> None:
+        try:
+            stage.GetRootLayer().Export(str(temporary))
+        except Tf.ErrorException as error:
+            raise OSError(f"OpenUSD: {str(error).splitlines()[-1]}") from error
+
+    write_atomically(path, write)

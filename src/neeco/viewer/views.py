@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import State
-from neeco.evaluation.image_metrics import Pixels, difference_map, overlay_parts
+from neeco.evaluation.image_metrics import Pixels, difference_map, overlay_parts, to_uint8
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import surface_depth
 from neeco.labels.labellers import composited_parts, threshold_of
@@ -88,8 +88,8 @@ def picture(scene: DrawableScene, state: State, camera: Camera, view: str, label
         assert rendering.channels is not None
         share = rendering.channels[..., -1:].clamp(0, 1).cpu().numpy()
         note = f"magenta: unobserved; {share.mean():.1%} of the picture"
-        return Picture(_uint8((1 - share) * color * 255 + share * UNOBSERVED_COLOR), depth, note)
-    return Picture(_uint8(color * 255), depth)
+        return Picture(to_uint8((1 - share) * color * 255 + share * UNOBSERVED_COLOR), depth, note)
+    return Picture(to_uint8(color * 255), depth)
 
 
 @torch.no_grad()
@@ -111,7 +111,7 @@ def difference(scene: DrawableScene, state: State, recorded_by: Camera, image: n
 
 def dimmed(shown: Picture) -> Picture:
     """Darken a picture that is not the requested one."""
-    return replace(shown, pixels=_uint8(shown.pixels * DIMMED))
+    return replace(shown, pixels=to_uint8(shown.pixels * DIMMED))
 
 
 def side_by_side(pictures: list[Picture]) -> Picture:
@@ -192,12 +192,8 @@ def _depth_picture(depth: np.ndarray) -> Picture:
     near, far = np.percentile(depth[there], DEPTH_PERCENTILES)
     grey = np.clip((far - depth) / max(far - near, 1e-6), 0, 1) * there
     note = f"white {near:.1f} mm or nearer, black {far:.1f} mm"
-    return Picture(_uint8(np.repeat(grey[..., None], 3, 2) * 255), depth, note)
+    return Picture(to_uint8(np.repeat(grey[..., None], 3, 2) * 255), depth, note)
 
 
 def _joined_notes(pictures: list[Picture]) -> str:
     return "; ".join(dict.fromkeys(shown.note for shown in pictures if shown.note))
-
-
-def _uint8(pixels: np.ndarray) -> Pixels:
-    return np.clip(np.rint(pixels), 0, 255).astype(np.uint8)

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from downstream_world import Pixels, bar_parts, read_grey, save_grey, write_set
 from torch import Tensor
 
@@ -42,7 +41,6 @@ class Corners(Pixels):
 
 @pytest.fixture(autouse=True)
 def small_models(monkeypatch: pytest.MonkeyPatch) -> None:
-    torch.set_num_threads(1)
     known = models_module.find_models() | {"pixels": Pixels, "corners": Corners}
     monkeypatch.setattr(models_module, "find_models", lambda: known)
 
@@ -258,6 +256,23 @@ def test_more_folds_sets_conditions_models_and_frames_are_added(spec: Downstream
     assert len(after) == len(result["jobs"])
     assert {name: after[name] for name in before} == before
     assert [entry["images"] for entry in result["sets"]] == [6, 3]
+
+
+def test_other_conditions_of_a_folder_stay_in_its_results(spec: DownstreamSettings) -> None:
+    """Two commands, each with its own number of folds, give the results of one; jobs of other steps are left out."""
+    few = trained(replace(spec, conditions=("kin",), num_real=("0",), folds=1))
+    assert few["labelled"] == 0
+    trained(replace(spec, conditions=("real",), num_real=("6",), steps=2, output=spec.output.with_name("other")))
+    shutil.copytree(spec.output.with_name("other") / "jobs", spec.output / "jobs", dirs_exist_ok=True)
+    assert len(trained(replace(spec, conditions=("kin",), num_real=("0",)))["jobs"]) == 2  # not those of 2 steps
+    for wrong in spec.output.glob("jobs/pixels-real-*"):
+        shutil.rmtree(wrong)
+    trained(replace(spec, conditions=("real",)))
+    last = trained(replace(spec, conditions=("kin",), num_real=("0",), folds=1))
+    assert (last["folds"], last["labelled"]) == (2, 10)
+    by_hand = trained(replace(spec, conditions=("real", "kin"), output=spec.output.with_name("whole")))
+    for key in ("summary", "paired", "answers"):
+        assert sorted(map(str, last[key])) == sorted(map(str, by_hand[key]))
 
 
 def test_more_splits_are_tested_after_teaching_again(spec: DownstreamSettings) -> None:

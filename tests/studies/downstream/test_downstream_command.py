@@ -11,7 +11,6 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-import torch
 from downstream_world import read_grey, save_grey
 
 from neeco.cli import main
@@ -24,8 +23,7 @@ PAGE = "neeco.report.downstream_page"
 
 @pytest.fixture(autouse=True)
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One thread, a small model, and a page even where there is none to write."""
-    torch.set_num_threads(1)
+    """A small model, and a page even where there is none to write."""
     monkeypatch.setattr("neeco.studies.downstream.models.unet.UNet.channels", (4, 4, 8, 8, 8))
     monkeypatch.setenv("COLUMNS", "160")
     if importlib.util.find_spec(PAGE) is None:

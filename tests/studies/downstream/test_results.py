@@ -223,7 +223,7 @@ def test_synthetic_images_are_judged_against_the_better_baseline_and_wrong_label
     told = sentence("20 labelled frames and 1,200 synthetic (kin):", of=results)
     assert "; hurts against real+strong, 20 labelled (-0.197, " in told
     wrong = sentence("kin+real+permuted against the right labels, kin+real", of=results)
-    assert wrong.endswith("below by more than the interval at 1 of 1 numbers of labelled frames (-0.407 to -0.407)")
+    assert wrong.endswith("below by more than the interval at 1 of 1 numbers of labelled frames (-0.407 at 20)")
 
 
 def test_as_good_as_is_over_the_folds_that_both_finished() -> None:
@@ -235,7 +235,16 @@ def test_as_good_as_is_over_the_folds_that_both_finished() -> None:
         job("real", 20, 1, None),
     ]
     told = sentence("20 labelled frames and 1,200 synthetic (kin)", of=results)
-    assert "IoU 0.500, as good as about 32 labelled frames alone" in told  # halfway from 20 to 50 along log frames
+    assert (
+        "IoU 0.500, as good as about 32 labelled frames without synthetic images" in told
+    )  # halfway from 20 to 50 along log frames
+
+
+def test_what_augmentation_gains_is_no_gain_of_synthetic_images() -> None:
+    results = jobs(real_10=(0.3, 0.3), real_strong_10=(0.7, 0.7), real_80=(0.5, 0.5), kin_real_10=(0.69, 0.71))
+    assert "at least as good as 80 labelled frames without" in sentence("10 labelled frames and 1,200", of=results)
+    results += jobs(real_strong_80=(0.8, 0.8))
+    assert ", as good as about 10 labelled frames without" in sentence("10 labelled frames and 1,200", of=results)
 
 
 def test_nothing_learned_at_all_is_no_share() -> None:

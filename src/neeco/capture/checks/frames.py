@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from neeco.capture.documents import Node, printable
-from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, is_repeated
-from neeco.capture.masks import Hidden, masks_fault, measure_hidden
+from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, Hidden, is_repeated, masks_fault, measure_hidden
 from neeco.capture.model import Frame
 from neeco.capture.points import measured_sample
 from neeco.capture.readers.parsed import Parsed

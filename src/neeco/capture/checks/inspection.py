@@ -122,3 +122,25 @@ def _travel(parsed: Parsed, instrument: str) -> float:
     """Diagonal, mm, of the box that an instrument's origin moves in."""
     origins = [state.pose[:3, 3].numpy() for _, state in parsed.states_of(instrument)]
     return float(np.linalg.norm(np.ptp(np.stack(origins), axis=0))) if origins else 0.0
+
+
+# Training frames -> label IoU on seen and on unseen states, of the capture that looks most like a real recording; the
+# commands are in notes/2026-11-26-results-quality.md, "Few frames".
+LABEL_IOU = {10: (0.91, 0.82), 15: (0.94, 0.88), 60: (0.97, 0.93)}
+
+
+def expected_labels(frames: int) -> str | None:
+    """Return one line on what labels so many training frames gave, and a larger number; None where no more are needed.
+
+    The numbers are those of the nearest measured count that is not larger, or of the smallest.
+    """
+    counts = sorted(LABEL_IOU)
+    if not 0 < frames < counts[-1]:
+        return None
+    index = max(0, sum(count <= frames for count in counts) - 1)
+    gave = [
+        f"{count} training frames gave IoU {LABEL_IOU[count][0]:.2f} on seen and {LABEL_IOU[count][1]:.2f} on unseen "
+        "states"
+        for count in counts[index : index + 2]
+    ]
+    return f"labels to expect: with exact states, {', '.join(gave)}"

@@ -30,13 +30,10 @@ CHUNK = 300_000  # window samples worked on at once
 
 @dataclass(frozen=True)
 class Smoothing:
-    """Half widths s of the windows for positions (or readings) and rotations; 0: through the samples. noise: standard
-    deviation of a sample about its neighbours' fit, mm (or rad) per axis and rad per axis."""
+    """Half widths s of the windows for positions (or readings) and rotations; 0: through the samples."""
 
     position_s: float
     rotation_s: float
-    position_noise: float
-    rotation_noise: float
 
 
 def poses_at(log: PoseLog, times: np.ndarray, smooth_s: float | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -46,7 +43,7 @@ def poses_at(log: PoseLog, times: np.ndarray, smooth_s: float | None = None) -> 
     Outside the log and inside its gaps poses are NaN.
     """
     times = np.asarray(times, dtype=np.float64)
-    widths = pose_smoothing(log) if smooth_s is None else Smoothing(smooth_s, smooth_s, 0.0, 0.0)
+    widths = pose_smoothing(log) if smooth_s is None else Smoothing(smooth_s, smooth_s)
     positions, rotations = _Series(log, log.positions), _RotationSeries(log, log.quats)
     valid = positions.covers(times)
     poses = np.full((len(times), 4, 4), np.nan)
@@ -60,7 +57,7 @@ def poses_at(log: PoseLog, times: np.ndarray, smooth_s: float | None = None) -> 
 def readings_at(log: ReadingLog, times: np.ndarray, smooth_s: float | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return readings [N] rad at times [N] on the log's clock, and bool [N] where the log has any; see `poses_at`."""
     times = np.asarray(times, dtype=np.float64)
-    width = reading_smoothing(log).position_s if smooth_s is None else smooth_s
+    width = reading_smoothing(log) if smooth_s is None else smooth_s
     series = _Series(log, log.values[:, None])
     valid = series.covers(times)
     values = np.full(len(times), np.nan)
@@ -71,16 +68,13 @@ def readings_at(log: ReadingLog, times: np.ndarray, smooth_s: float | None = Non
 @lru_cache(maxsize=32)
 def pose_smoothing(log: PoseLog) -> Smoothing:
     """Choose the windows that best predict each sample of this log from its neighbours (leave-one-out validation)."""
-    position_s, position_noise = _Series(log, log.positions).best_width()
-    rotation_s, rotation_noise = _RotationSeries(log, log.quats).best_width()
-    return Smoothing(position_s, rotation_s, position_noise / 3**0.5, rotation_noise / 3**0.5)
+    return Smoothing(_Series(log, log.positions).best_width(), _RotationSeries(log, log.quats).best_width())
 
 
 @lru_cache(maxsize=32)
-def reading_smoothing(log: ReadingLog) -> Smoothing:
-    """`pose_smoothing` of readings (the rotation's fields are 0)."""
-    width, noise = _Series(log, log.values[:, None]).best_width()
-    return Smoothing(width, 0.0, noise, 0.0)
+def reading_smoothing(log: ReadingLog) -> float:
+    """Half width s of the window of readings, as `pose_smoothing` chooses it."""
+    return _Series(log, log.values[:, None]).best_width()
 
 
 class _Series:
@@ -143,12 +137,12 @@ class _Series:
         """Weighted means [N, D] of values [N, K, D]."""
         return np.asarray((values * weights[..., None]).sum(1) / weights.sum(1)[:, None])
 
-    def best_width(self) -> tuple[float, float]:
-        """Return the half width s with the smallest prediction errors, and their root mean square."""
+    def best_width(self) -> float:
+        """Return the half width s with the smallest prediction errors."""
         inner = np.arange(len(self.times))
         inner = inner[(inner > self.first) & (inner < self.last - 1)]  # never the end of a stretch
         if not len(inner):
-            return 0.0, 0.0
+            return 0.0
         chosen = inner[evenly_spaced(len(inner), N_VALIDATED, floor=True)]
         widths = [steps * self.step for steps in WIDTHS if steps == WIDTHS[0] or steps * self.step <= MAX_WIDTH_S]
         widths = [0.0, *widths]
@@ -157,8 +151,7 @@ class _Series:
         # outliers do not count for one width or another
         limit = 5 * max(float(np.median(errors[0])), 1e-12)
         scores = [float(np.mean(np.minimum(error, limit) ** 2)) for error in errors]
-        best = int(np.argmin(scores))
-        return widths[best], float(np.sqrt(scores[best]))
+        return widths[int(np.argmin(scores))]
 
     def _windows(
         self, times: np.ndarray, width: float, leave_out: np.ndarray | None

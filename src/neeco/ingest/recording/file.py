@@ -13,7 +13,7 @@ from neeco.capture.kinematics import KinematicTree
 from neeco.capture.readers import read_dvrk_tool, read_urdf
 from neeco.capture.readers.dvrk import READINGS as DVRK_READINGS
 from neeco.capture.readers.kinematics import parse_kinematics
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, nearest
 from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers import format_of
@@ -39,7 +39,6 @@ from neeco.ingest.recording.sections import (
     MAX_NUMBER,
     Fault,
     RecordingLoader,
-    close_match,
     columns,
     existing_file,
     faults_in,
@@ -447,7 +446,7 @@ def _clock_of(place: str, name: str, clocks: tuple[str, ...]) -> str | None:
     longer = [clock for clock in clocks if clock.startswith(name + "_")]
     if len(longer) == 1:
         return longer[0]
-    likely = close_match(name, clocks)
+    likely = nearest(name, clocks)
     if likely or len(longer) > 1:
         meant = likely or " or ".join(longer)
         raise Fault(place, f"no log has the clock {printable(name)}; did you mean {meant}?")

@@ -8,9 +8,8 @@ null count as absent. A class attribute `shorthand` names the field that a value
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
@@ -23,7 +22,7 @@ from cattrs.errors import AttributeValidationNote, BaseValidationError
 from cattrs.gen import make_dict_structure_fn, override
 
 from neeco.capture.documents import Node, ProblemReport, printable
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, nearest
 from neeco.files import YamlLoader
 
 T = TypeVar("T")
@@ -167,11 +166,6 @@ def ranges(node: Node) -> tuple[tuple[int, int], ...]:
     return tuple(found)
 
 
-def close_match(name: str, names: Iterable[str]) -> str | None:
-    """Return the name that a misspelt one probably means."""
-    return next(iter(difflib.get_close_matches(name, list(names), n=1, cutoff=0.6)), None)
-
-
 def join_places(*places: str, join: str = ".") -> str:
     """Return one place: `instruments[0].poses` of `instruments` and `[0].poses`."""
     return join.join(place for place in places if place).replace(".[", "[")
@@ -225,7 +219,7 @@ def _section_hook(converter: cattrs.Converter, kind: type[Any], file: str) -> Ca
             value = {shorthand: value}
         for key in value:
             if key not in names:
-                likely = close_match(str(key), names)
+                likely = nearest(str(key), names)
                 hint = f"did you mean {likely}?" if likely else f"the keys here are {', '.join(names)}"
                 raise Fault(key if isinstance(key, str) else printable(key), f"unknown key; {hint}")
         return build({key: item for key, item in value.items() if item is not None}, kind)

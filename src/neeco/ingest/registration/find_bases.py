@@ -10,7 +10,7 @@ import numpy as np
 
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
-from neeco.geometry.trocar import line_through_trocar
+from neeco.geometry.lines import line_through_trocar
 from neeco.ingest.frames.views import StageProgress, Views, reduced
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.interpolate import poses_at, readings_at

@@ -71,55 +71,99 @@ def register_with_laparoscope(
     kept; else it is estimated, with a rate where that differs from 1 by RATE_SIGNIFICANCE. Raises
     NeecoError when the scope moved too little.
     """
-    settings = settings or IngestSettings()
     clock = clock_from_turning(world_from_camera, times, log) if known is None else known
-    start = _closed_form(world_from_camera, times, log, clock)
-    first_scale, first_rotation, first_translation, first_hand, first_lever = start
-    # centred, so that scale and translation decouple, as lag and stretch do
-    centre, now = world_from_camera[:, :3, 3].mean(0), float(times.mean())
-    arms = world_from_camera[:, :3, 3] - centre
-    turns = Rotation.from_matrix(world_from_camera[:, :3, :3])
-    middle = first_scale * first_rotation.apply(centre) + first_translation
-    _, valid = _sensor_poses(times, log, clock)
-    # on the video's clock: seconds since 1970 leave too few digits for derivatives
-    gaps = tuple((float(before), float(after)) for before, after in clock.video_times(np.reshape(log.gaps, (-1, 2))))
-    near = replace(log, times=clock.video_times(log.times), gaps=gaps)
+    problem = _HandEye(world_from_camera, times, log, clock, settings or IngestSettings())
+    if known is not None:
+        solution, covariance, _ = problem.solve(problem.start, (LAG, STRETCH))
+    else:
+        solution, covariance, sd = problem.solve(problem.start, ())
+        rate = clock.rate * (1 + solution[STRETCH])
+        if abs(rate - 1) < RATE_SIGNIFICANCE * clock.rate * sd[1]:
+            solution[STRETCH], rate = 1 / clock.rate - 1, 1.0
+            solution, covariance, sd = problem.solve(solution, (STRETCH,))
+        seconds = clock.seconds + clock.rate * solution[LAG] + (clock.rate - rate) * problem.now
+        off = float(np.hypot(sd[0], sd[1] * times.std()))
+        clock = ClockOffset(float(seconds), off, SCOPE_MOTION, float(rate), float(sd[1]))
+    scale, rotation, origin, hand, lever, _, _ = problem.unpack(solution)
+    position, turn, keep = problem.errors(solution)
+    used = np.flatnonzero(keep)
+    return Registration(
+        scale=scale,
+        rotation=rotation.as_matrix(),
+        translation=origin - scale * rotation.apply(problem.centre),
+        camera_from_sensor=rigid(hand.as_matrix(), lever),
+        clock=clock,
+        scale_sd=float(np.sqrt(max(covariance[0, 0], 0.0))),
+        position_residual=np.linalg.norm(position[used], axis=1),
+        rotation_residual=np.linalg.norm(turn[used], axis=1),
+        used=used,
+    )
 
-    @lru_cache(maxsize=4)  # most columns of the Jacobian leave the clock alone
-    def sensor_poses(lag: float, stretch: float) -> tuple[np.ndarray, np.ndarray]:
-        return poses_at(near, times + lag + stretch * (times - now))
 
-    hats = _hat_functions(times, KNOT_SPACING_S)  # [N, K]
-    knots = hats.shape[1]
+class _HandEye:
+    """The least-squares problem: unknowns [U] about the closed form, the last of them the drift at its knots."""
 
-    def unpack(x: np.ndarray) -> tuple[float, Rotation, np.ndarray, Rotation, np.ndarray, float, float]:
+    def __init__(
+        self,
+        world_from_camera: np.ndarray,
+        times: np.ndarray,
+        log: PoseLog,
+        clock: ClockOffset,
+        settings: IngestSettings,
+    ) -> None:
+        first_scale, first_rotation, first_translation, *_ = self.first = _closed_form(
+            world_from_camera, times, log, clock
+        )
+        self.times, self.settings = times, settings
+        # centred, so that scale and translation decouple, as lag and stretch do
+        self.centre, self.now = world_from_camera[:, :3, 3].mean(0), float(times.mean())
+        self.arms = world_from_camera[:, :3, 3] - self.centre
+        self.turns = Rotation.from_matrix(world_from_camera[:, :3, :3])
+        self.middle = first_scale * first_rotation.apply(self.centre) + first_translation
+        _, self.valid = _sensor_poses(times, log, clock)
+        # on the video's clock: seconds since 1970 leave too few digits for derivatives
+        gaps = tuple((float(start), float(end)) for start, end in clock.video_times(np.reshape(log.gaps, (-1, 2))))
+        near = replace(log, times=clock.video_times(log.times), gaps=gaps)
+        # most columns of the Jacobian leave the clock alone
+        self.sensor_poses = lru_cache(maxsize=4)(
+            lambda lag, stretch: poses_at(near, times + lag + stretch * (times - self.now))
+        )
+        knots = np.arange(times[0] - KNOT_SPACING_S / 2, times[-1] + 1.5 * KNOT_SPACING_S, KNOT_SPACING_S)
+        # [N, K] weights of piecewise linear interpolation between knots
+        self.hats = np.maximum(0.0, 1 - np.abs(times[:, None] - knots) / KNOT_SPACING_S)
+        self.start = np.zeros(N_UNKNOWNS + 3 * len(knots))
+
+    def unpack(self, x: np.ndarray) -> tuple[float, Rotation, np.ndarray, Rotation, np.ndarray, float, float]:
+        """Scale, rotation, translation of the centre, camera_from_sensor's rotation and lever mm, lag s and stretch."""
+        first_scale, first_rotation, _, first_hand, first_lever = self.first
         rotation = Rotation.from_rotvec(x[1:4]) * first_rotation
         hand = first_hand * Rotation.from_rotvec(x[7:10])
-        origin, lever = middle + x[4:7], first_lever + x[10:13]
+        origin, lever = self.middle + x[4:7], first_lever + x[10:13]
         return first_scale * np.exp(x[0]), rotation, origin, hand, lever, float(x[LAG]), float(x[STRETCH])
 
-    def errors(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def errors(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Position error [N, 3] mm (drift not yet taken off), rotation error [N, 3] rad, on the log [N]."""
-        scale, rotation, origin, hand, lever, lag, stretch = unpack(x)
-        poses, still = sensor_poses(lag, stretch)
-        placed = rotation * turns
-        position = scale * rotation.apply(arms) + origin + placed.apply(lever) - poses[:, :3, 3]
+        scale, rotation, origin, hand, lever, lag, stretch = self.unpack(x)
+        poses, still = self.sensor_poses(lag, stretch)
+        placed = rotation * self.turns
+        position = scale * rotation.apply(self.arms) + origin + placed.apply(lever) - poses[:, :3, 3]
         sensors = Rotation.from_matrix(np.where(still[:, None, None], poses[:, :3, :3], np.eye(3)))
-        return position, ((placed * hand).inv() * sensors).as_rotvec(), still & valid
+        return position, ((placed * hand).inv() * sensors).as_rotvec(), still & self.valid
 
-    def residuals(x: np.ndarray) -> np.ndarray:
-        position, turn, keep = errors(x)
-        drift = x[N_UNKNOWNS:].reshape(knots, 3)
+    def residuals(self, x: np.ndarray) -> np.ndarray:
+        """Weighted residuals [Q]: positions and rotations of the frames, then the drift's priors."""
+        position, turn, keep = self.errors(x)
+        drift = x[N_UNKNOWNS:].reshape(-1, 3)
         # a frame that slid off the log counts as wrong by the noise, so that sliding off is never a gain
         rows = [
-            np.where(keep[:, None], (position - hats @ drift) / settings.tracker_noise_mm, 1.0)[valid],
-            np.where(keep[:, None], turn / settings.tracker_noise_rad, 1.0)[valid],
-            drift / settings.tracker_drift_mm,
-            np.diff(drift, axis=0) / (0.5 * settings.tracker_drift_mm),
+            np.where(keep[:, None], (position - self.hats @ drift) / self.settings.tracker_noise_mm, 1.0)[self.valid],
+            np.where(keep[:, None], turn / self.settings.tracker_noise_rad, 1.0)[self.valid],
+            drift / self.settings.tracker_drift_mm,
+            np.diff(drift, axis=0) / (0.5 * self.settings.tracker_drift_mm),
         ]
         return np.concatenate(rows).ravel()
 
-    def solve(x: np.ndarray, held: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def solve(self, x: np.ndarray, held: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Solve all unknowns [U] from `x` on, except `held`; return them, their covariance, and the standard deviations
         [2] of LAG and STRETCH."""
         free = np.setdiff1d(np.arange(len(x)), held)
@@ -127,41 +171,13 @@ def register_with_laparoscope(
         def of_free(values: np.ndarray) -> np.ndarray:
             changed = x.copy()
             changed[free] = values
-            return residuals(changed)
+            return self.residuals(changed)
 
-        solved = least_squares(of_free, x[free], loss="soft_l1", max_nfev=settings.registration_steps)
+        solved = least_squares(of_free, x[free], loss="soft_l1", max_nfev=self.settings.registration_steps)
         found, covariance, jacobian = x.copy(), np.zeros((len(x), len(x))), np.zeros((len(solved.fun), len(x)))
         found[free], jacobian[:, free] = solved.x, solved.jac
         covariance[np.ix_(free, free)] = np.linalg.pinv(solved.jac.T @ solved.jac)
-        return found, covariance, _clock_deviations(solved.fun, jacobian, covariance, times[valid])
-
-    unknowns = np.zeros(N_UNKNOWNS + 3 * knots)
-    if known is not None:
-        solution, covariance, _ = solve(unknowns, (LAG, STRETCH))
-    else:
-        solution, covariance, sd = solve(unknowns, ())
-        rate = clock.rate * (1 + solution[STRETCH])
-        if abs(rate - 1) < RATE_SIGNIFICANCE * clock.rate * sd[1]:
-            solution[STRETCH], rate = 1 / clock.rate - 1, 1.0
-            solution, covariance, sd = solve(solution, (STRETCH,))
-        seconds = clock.seconds + clock.rate * solution[LAG] + (clock.rate - rate) * now
-        off = float(np.hypot(sd[0], sd[1] * times.std()))
-        clock = ClockOffset(float(seconds), off, SCOPE_MOTION, float(rate), float(sd[1]))
-    scale, rotation, origin, hand, lever, _, _ = unpack(solution)
-    position, turn, keep = errors(solution)
-    used = np.flatnonzero(keep)
-    camera_from_sensor = rigid(hand.as_matrix(), lever)
-    return Registration(
-        scale=scale,
-        rotation=rotation.as_matrix(),
-        translation=origin - scale * rotation.apply(centre),
-        camera_from_sensor=camera_from_sensor,
-        clock=clock,
-        scale_sd=float(np.sqrt(max(covariance[0, 0], 0.0))),
-        position_residual=np.linalg.norm(position[used], axis=1),
-        rotation_residual=np.linalg.norm(turn[used], axis=1),
-        used=used,
-    )
+        return found, covariance, _clock_deviations(solved.fun, jacobian, covariance, self.times[self.valid])
 
 
 def _clock_deviations(
@@ -226,9 +242,3 @@ def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog,
             f"{log.path}: the laparoscope travelled too little to tell the scale; move it by 20 mm or more"
         )
     return float(solution[0]), world_from_sfm, solution[1:4], camera_from_sensor, solution[4:]
-
-
-def _hat_functions(times: np.ndarray, spacing: float) -> np.ndarray:
-    """Weights [N, K] of piecewise linear interpolation between knots every `spacing` s."""
-    knots = np.arange(times[0] - spacing / 2, times[-1] + 1.5 * spacing, spacing)
-    return np.maximum(0.0, 1 - np.abs(times[:, None] - knots) / spacing)

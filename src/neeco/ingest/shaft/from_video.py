@@ -13,8 +13,15 @@ from neeco.errors import NeecoError
 from neeco.geometry.lines import distances_to_lines, unit
 from neeco.ingest.foreground.silhouettes import shaft_lines
 from neeco.ingest.shaft.axis import ShaftAxes, ShaftEdges, ShaftVideo, across_axes, edge_distances, solve_axes
-from neeco.ingest.shaft.edges import BLURS, outline_edges, shaded_edges, with_shafts
-from neeco.ingest.shaft.end import axis_coordinates, shaft_ends, tips_along
+from neeco.ingest.shaft.edges import (
+    BLURS,
+    axis_coordinates,
+    outline_edges,
+    shaded_edges,
+    shaft_ends,
+    tips_along,
+    with_shafts,
+)
 
 # what is asked of a recording
 MIN_DIAMETERS, MIN_SHARE = 2.0, 0.6  # of visible shaft, and the share of the frames that show them

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -91,15 +92,15 @@ class Articulation(nn.Module):
         """Return the position [] mm along the shaft up to which everything is spun with it."""
         return self.wrist_start
 
-    def body(self, world_from_instrument: Tensor, readings: Mapping[str, float], roll: float = 0.0) -> ArticulatedBody:
-        """Return the instrument's body at these readings, the round part of its shaft spun by `roll` rad."""
+    def resting_body(self, roll: float = 0.0) -> Callable[..., ArticulatedBody]:
+        """Return the instrument's body, the round part of its shaft spun by `roll` rad, as a function of what the state
+        determines: `world_from_body` and `values`."""
         shaft, gate = self.shaft(), self._gate()
         origins, axes = self.axes(shaft)
-        return ArticulatedBody(
-            world_from_body=world_from_instrument,
+        return partial(
+            ArticulatedBody,
             origins=origins,
             axes=axes,
-            values=self.values(readings),
             shaft_origin=shaft[0],
             shaft_direction=shaft[1],
             spin_end=self.round_until(),

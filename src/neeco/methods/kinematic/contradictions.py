@@ -120,5 +120,5 @@ def _from_other_starts(search: StateSearch, index: int, others: Sequence[State])
         precision = search.precision(index, START_SCALE)
         fit = search.fitter.fit(view, start, precision, levels=LEVELS, steps=STEPS)
         if fit is not None and (best is None or fit.misfit < best[0].misfit):
-            best = fit, torch.linalg.inv(fit.information + precision).diagonal().sqrt()
+            best = fit, fit.deviations(precision)
     return best

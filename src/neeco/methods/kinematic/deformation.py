@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -154,14 +154,26 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         """Pose every instrument as an articulated body: its readings become joint values, these move its links."""
-        roll = perturbation.shaft_roll if isinstance(perturbation, Spin) else 0.0
-        bodies: list[ArticulatedBody | None] = [None]  # tissue is no articulated body
-        for instrument, articulation in zip(self.instruments, self.articulations, strict=True):
-            given = state_of(instrument, state)
-            bodies.append(articulation.body(given.pose.to(canonical.means), given.joints, roll))
+        return self._poser(canonical, perturbation.shaft_roll if isinstance(perturbation, Spin) else 0.0)(state)
+
+    @torch.no_grad()
+    def poser(self, canonical: CanonicalGaussians) -> Callable[[State], Posed]:
+        return self._poser(canonical, 0.0)
+
+    def _poser(self, canonical: CanonicalGaussians, roll: float) -> Callable[[State], Posed]:
         logits = self.positioned_logits(canonical)
-        means = self.breathed(canonical.means, canonical.counts[0], state.time)
-        return Posed(*pose_bodies(means, canonical.quats, canonical.log_scales, logits, canonical.counts, bodies))
+        resting = [articulation.resting_body(roll) for articulation in self.articulations]
+
+        def pose(state: State) -> Posed:
+            bodies: list[ArticulatedBody | None] = [None]  # tissue is no articulated body
+            for instrument, articulation, body in zip(self.instruments, self.articulations, resting, strict=True):
+                given = state_of(instrument, state)
+                values = articulation.values(given.joints)
+                bodies.append(body(world_from_body=given.pose.to(canonical.means), values=values))
+            means = self.breathed(canonical.means, canonical.counts[0], state.time)
+            return Posed(*pose_bodies(means, canonical.quats, canonical.log_scales, logits, canonical.counts, bodies))
+
+        return pose
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
         labels = canonical.means.new_zeros(len(canonical), len(self.label_names))

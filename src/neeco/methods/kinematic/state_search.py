@@ -29,7 +29,6 @@ COMPARED = (0, 1, 3, 4)  # classes of errors that tell: a tracker's across the v
 N_ITERATIONS = 40  # of expectation maximisation
 KEPT_SHARE = 0.85  # of squared corrections that count, without the largest
 CORRELATION_PX = 100.0  # pixels that count as one observation, as the scene is still learned
-OWN_SHARE = 0.25  # of an image's information that counts for standard deviations: the learned shape has errors, too
 BEYOND_LIMITS = 0.5  # of the range of a joint's limits, by which readings may be off
 LEVELS, STEPS = (0.25, 0.5, 1.0), (4, 4, 4)
 
@@ -46,7 +45,7 @@ class FittedState:
     @property
     def deviations(self) -> Tensor:
         """Standard deviations [P] of the state."""
-        return torch.linalg.inv(OWN_SHARE * self.fit.information + self.precision).diagonal().sqrt()
+        return self.fit.deviations(self.precision)
 
 
 @dataclass(frozen=True)

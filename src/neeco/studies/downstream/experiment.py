@@ -228,20 +228,22 @@ def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | 
     """Train and test every model in every condition on every fold; writes downstream.json, and returns what it holds.
 
     Started again after an interruption it continues where it stopped; started again with more models, sets, conditions,
-    labelled frames or folds, it adds them. A failed job is reported in its place.
+    labelled frames or folds, it adds them. Results of earlier commands stay, where models, sets and tests are the same.
+    A failed job is reported in its place.
     """
     file, jobs = plan.settings.output / FILE, plan.jobs
     with own_folder(plan.settings.output):
         paths = {index: job.folder / JOB_FILE for index, job in enumerate(jobs)}
         finished = {index: read_json(path) for index, path in paths.items() if path.exists()}
         captures = {plan.settings.capture: plan.capture}
+        earlier = _finished_earlier(plan)
         written, known = 0.0, list[Mapping[str, Any]]()
 
         def record(results: Sequence[Mapping[str, Any]]) -> None:
             nonlocal written
-            known[:] = results
+            known[:] = [*results, *earlier]
             if time.monotonic() > written + WRITE_EVERY_S:
-                write_json(file, document(plan, results))
+                write_json(file, document(plan, known))
                 written = time.monotonic()
 
         try:
@@ -250,9 +252,27 @@ def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | 
             if known:
                 write_json(file, document(plan, known))
             raise
-        result = document(plan, results) | {"complete": True}
+        result = document(plan, [*results, *earlier]) | {"complete": True}
         write_json(file, result)
     return result
+
+
+def _finished_earlier(plan: DownstreamPlan) -> list[Mapping[str, Any]]:
+    """Return the results of other commands in the study's folder: jobs that differ from those of the plan only in
+    condition, number of labelled frames and fold."""
+    settings, planned = plan.settings, {job.folder for job in plan.jobs}
+    found = []
+    for file in sorted(settings.output.glob(f"jobs/*/{JOB_FILE}")):
+        stored = read_json(file)
+        try:
+            condition = parse_condition(stored["condition"], [data.name for data in settings.sets])
+            job = DownstreamJob(settings, stored["model"], condition, stored["real"], stored["fold"])
+            job.check()
+        except (NeecoError, KeyError):  # of other settings, sets or models
+            continue
+        if job.folder not in planned and job.model in settings.models and set(job.tests) <= stored["splits"].keys():
+            found.append(stored)
+    return sorted(found, key=lambda stored: stored["fold"])
 
 
 def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -262,6 +282,9 @@ def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict
     predicts = {name: kind.predicts for name, kind in kinds.items()}
     threads = threads_per_worker(settings.workers) if settings.workers > 1 else None
     tests = [*settings.splits, *(test.name for test in settings.tests)]
+    labelled = plan.labelled
+    if not labelled and any(job["real"] for job in results):  # the plan's are sets alone
+        labelled = len(recorded_samples(plan.capture, "train", settings.classes, settings.labels))
     made: dict[str, Any] = {
         "schema": SCHEMA,
         "version": __version__,
@@ -286,8 +309,8 @@ def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict
         "classes": list(class_names(plan.capture, settings.classes)),
         "splits": tests,
         "tests": {test.name: str(test.path.absolute()) for test in settings.tests},
-        "folds": settings.folds,
-        "labelled": plan.labelled,
+        "folds": max([settings.folds, *(job["fold"] + 1 for job in results)]),
+        "labelled": labelled,
         "sets": [
             data.described() | {"images": plan.images[data.name], "made_by": _made_by(data)} for data in settings.sets
         ],

@@ -202,10 +202,10 @@ def _control(condition: str, experiment: Document, model: Document, split: str) 
     if not rows:
         return None
     worse = sum(verdict(row) == HURTS for row in rows)
-    ends = sorted(row["difference"] for row in rows)
+    each = ", ".join(f"{row['difference']:+.3f} at {row['real']}" for row in rows)
     return (
         f"{condition} against the right labels, {rows[0]['against']}: below by more than the interval at {worse} of "
-        f"{len(rows)} numbers of labelled frames ({ends[0]:+.3f} to {ends[-1]:+.3f})"
+        f"{len(rows)} numbers of labelled frames ({each})"
     )
 
 
@@ -233,20 +233,21 @@ def _finding(key: tuple[str, int], scores: FoldScores, experiment: Document, mod
     sentence = f"{real} labelled frames and {count}: {metric} {value:.3f}"
     curve = real_curve(scores, key)
     if len(curve) > 1 and verdict(row) != HURTS:
-        sentence += f", {equivalent(curve, value)} labelled frames alone"
+        sentence += f", {equivalent(curve, value)} labelled frames without synthetic images"
     return f"{sentence}; {against}"
 
 
 def real_curve(scores: FoldScores, key: tuple[str, int]) -> list[tuple[int, float]]:
-    """(labelled frames, score) of labelled frames alone, each set off from the score of `key` by their difference over
-    the folds that both finished."""
+    """(labelled frames, score) of the better of labelled frames alone and strongly augmented, each set off from the
+    score of `key` by their difference over the folds that both finished."""
     own = scores[key]
-    value, curve = float(np.mean(list(own.values()))), []
+    value, curve = float(np.mean(list(own.values()))), dict[int, float]()
     for (condition, count), others in sorted(scores.items()):
         folds = own.keys() & others.keys()
-        if condition == REAL and folds:
-            curve.append((count, value - float(np.mean([own[fold] - others[fold] for fold in sorted(folds)]))))
-    return curve
+        if set(condition.split("+")) in map(set, (name.split("+") for name in BASELINES)) and folds:
+            score = value - float(np.mean([own[fold] - others[fold] for fold in sorted(folds)]))
+            curve[count] = max(score, curve.get(count, score))
+    return sorted(curve.items())
 
 
 def verdict(row: Document) -> str:

@@ -1,4 +1,5 @@
-"""Formats of dataset hubs: `imagefolder/` (Hugging Face) and WebDataset shards.
+"""Formats of dataset hubs: `imagefolder/` (Hugging Face) and WebDataset shards; uploads to the Hugging Face Hub, whose
+account huggingface_hub knows (`hf auth login` or HF_TOKEN; HF_ENDPOINT names another hub).
 
 imagefolder/{train,validation}/metadata.jsonl next to the images and their masks:
                                              datasets.load_dataset("imagefolder", data_dir="DATASET/imagefolder")
@@ -12,10 +13,12 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+from neeco.errors import NeecoError, install_hint
 from neeco.files import write_atomically, write_text
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import Record, link, public_record, stem
@@ -86,3 +89,50 @@ def _write_shard(root: Path, records: Sequence[Record], path: Path) -> None:
                 entry = tarfile.TarInfo(f"{key}.{ending}")  # dated 1970 and nobody's: bytes depend on content alone
                 entry.size = len(content)
                 tar.addfile(entry, io.BytesIO(content))
+
+
+OPTION = "--push-to-hub"
+LEFT_OUT = (".*", "*/.*")  # what a data set is continued from
+
+
+def check_hub(name: str) -> None:
+    """Raise NeecoError where huggingface_hub is missing, nobody is logged in, or `name` cannot be a repository's."""
+    with _failures(name):
+        from huggingface_hub import HfApi
+        from huggingface_hub.utils import validate_repo_id
+
+        validate_repo_id(name)
+        HfApi().whoami()
+
+
+def push_to_hub(folder: Path, name: str) -> str:
+    """Upload the data set in `folder` to the repository `name` ("owner/name", or "name" of one's own) and return its
+    address. A repository that does not exist is made, private. Raises NeecoError."""
+    with _failures(name):
+        from huggingface_hub import HfApi
+
+        hub = HfApi(library_name="neeco")
+        repository = hub.create_repo(name, repo_type="dataset", private=True, exist_ok=True)
+        message = "Add data set rendered by neeco"
+        hub.upload_folder(
+            repo_id=repository.repo_id,
+            repo_type="dataset",
+            folder_path=folder,
+            commit_message=message,
+            ignore_patterns=list(LEFT_OUT),
+        )
+        return str(repository)
+
+
+@contextmanager
+def _failures(name: str) -> Iterator[None]:
+    """Put failures of the hub, of the network and of the name into one line."""
+    try:
+        from huggingface_hub.errors import HTTPError
+    except ImportError:
+        raise NeecoError(f"{OPTION}: needs huggingface_hub; {install_hint('hub')}") from None
+    try:
+        yield
+    except (HTTPError, OSError, ValueError) as error:  # no connection; refused, not logged in; not a name
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".: ")
+        raise NeecoError(f"{OPTION} {name}: {reason}; log in with `hf auth login`, or try again") from error
