@@ -10,7 +10,7 @@ from neeco.errors import NeecoError
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
 from neeco.ingest.registration import base
 from neeco.ingest.registration.base import find_base
-from neeco.ingest.registration.silhouette_search import ShaftViews, search, uniform_rotations
+from neeco.ingest.registration.silhouette_search import Candidates, ShaftViews, search, uniform_rotations
 
 FRAMES = 44
 ROUGH = (5.0, 3.0)  # sd mm, deg of the prior: errors of 8 mm and 5 degrees are within
@@ -63,7 +63,8 @@ def test_masks_in_which_nothing_moves_with_the_pose_end_in_one_line():
 
 def test_a_base_of_which_nothing_is_known_and_none_fits_asks_for_a_rough_one(monkeypatch):
     world = make_world(14)
-    monkeypatch.setattr(base, "_starts", lambda *arguments: [])
+    far = Candidates(np.array([1e9]), np.eye(4)[None], np.zeros((1, 3)), np.zeros((1, 3)))
+    monkeypatch.setattr(base, "search", lambda *arguments: far)
     with pytest.raises(NeecoError, match=r"of all bases none .* state it as far as it is known"):
         _find(world, None)
 
