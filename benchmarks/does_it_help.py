@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from result_plots import GREY, PAGE, write
 
 from neeco.files import read_json
-from neeco.studies.downstream.conditions import BASELINES, PERMUTED, REAL
+from neeco.studies.downstream.conditions import BASELINES, PERMUTED
 from neeco.studies.downstream.experiment import FILE
 from neeco.studies.downstream.intervals import Arm, Scores
 
@@ -32,6 +32,7 @@ CUT, CUT_APART = 0.75, 0.25  # the axis of IoU begins here; that of the last pan
 APART = "back"  # the pair that no choice was made by; the last panel
 CURVES = (  # of it, by labelled frames: conditions, colour, marker, name
     ("recipe+strong", "#009E73", "*", "synthetic alone (the recipe): no labelled frame"),
+    (PASTED, "#CC79A7", "P", "labelled, pasted over the next operation's tissue"),
     ("real+match+strong", "#7F3C8D", "D", "labelled, strong augmentation, in the next colours"),
     ("real+strong", "#999999", "o", "labelled, strong augmentation"),
     ("real", "#E69F00", "s", "labelled, no augmentation"),
@@ -64,7 +65,7 @@ def rows_of(pair: str, study: dict[str, Any]) -> list[dict[str, Any]]:
     the right ones; synthetic images alone with BASELINES and with cut-and-paste at each number of labelled frames."""
     scores, rows = Scores([joined(job) for job in study["jobs"] if "error" not in job]), []
     arms = list(scores.jobs)
-    counts = sorted({arm.real for arm in arms if arm.condition == REAL})
+    counts = sorted({arm.real for arm in arms if arm.condition in BASELINES})
 
     def of(condition: str, count: int) -> list[Arm]:
         return [arm for arm in arms if (arm.condition, arm.real) == (condition, count)]
@@ -135,7 +136,7 @@ def curves(axes: Axes, rows: list[dict[str, str]]) -> None:
             found = [(n, found[0][1]) for n in (counts[0], counts[-1])]
         if not found:
             continue
-        found = [(n * 1.06 ** (k - 2), point) for n, point in found]  # beside each other
+        found = [(n * 1.06 ** (k - 3), point) for n, point in found]  # beside each other
         for n, (_, low, high, _) in found:
             axes.plot([n, n], [low, high], color=colour, linewidth=1.6, alpha=0.5)
         line = [n for n, _ in found], [point[0] for _, point in found]

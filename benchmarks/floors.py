@@ -30,7 +30,7 @@ from torch import Tensor
 from neeco.capture.images import encoded_image, encoded_png, image_files, image_size
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
-from neeco.raster import rasterize
+from neeco.raster import depth_maps
 from neeco.raster.cpu_backend import last_statistics, rasterize_cpu
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.raster.shadow import Casting, light_camera, shadowed
@@ -114,7 +114,7 @@ def of_rendering(args: Floors, bandwidth: float, flops: float) -> list[Row]:
     posed, canonical = scene.at(state), scene.canonical
     unobserved = scene.unobserved(posed, camera)
     channels = torch.cat([labeller.channels, unobserved[:, None]], 1)
-    lit = shadowed(posed, camera, rasterize)
+    lit = shadowed(posed, camera, depth_maps)
     stages: dict[str, list[float]] = {"project": [], "bin": [], "composite": []}
     for _ in range(args.repeats):
         rendering = rasterize_cpu(lit, camera, channels, None)
@@ -136,7 +136,7 @@ def of_rendering(args: Floors, bandwidth: float, flops: float) -> list[Row]:
     maps = (
         sum(blended_pairs(casting.bare, light_camera(camera, scene.shadow_offsets[k])) for k in lamps) * FLOPS_FORWARD
     )
-    shadow = least(lambda: shadowed(posed, camera, rasterize), args.repeats)
+    shadow = least(lambda: shadowed(posed, camera, depth_maps), args.repeats)
     whole = least(lambda: draw_layers(scene, labeller, state, camera, 0.01), args.repeats)
     once = copied(3 * geometry + images + seen + light) + 1e3 * (work + maps) / flops
     return [

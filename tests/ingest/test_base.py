@@ -8,8 +8,9 @@ from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, WORLD_FROM_BASE, disturb
 
 from neeco.errors import NeecoError
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
+from neeco.ingest.registration import base
 from neeco.ingest.registration.base import find_base
-from neeco.ingest.registration.silhouette_search import ShaftViews, search, uniform_rotations
+from neeco.ingest.registration.silhouette_search import Candidates, ShaftViews, search, uniform_rotations
 
 FRAMES = 44
 ROUGH = (5.0, 3.0)  # sd mm, deg of the prior: errors of 8 mm and 5 degrees are within
@@ -58,6 +59,14 @@ def test_masks_in_which_nothing_moves_with_the_pose_end_in_one_line():
     with pytest.raises(NeecoError, match=r"'psm1'.*nothing in the images moves with its poses; check") as raised:
         _find(world, (disturbed(8, 5, 1, world), *ROUGH))
     assert "\n" not in str(raised.value)
+
+
+def test_a_base_of_which_nothing_is_known_and_none_fits_asks_for_a_rough_one(monkeypatch):
+    world = make_world(14)
+    far = Candidates(np.array([1e9]), np.eye(4)[None], np.zeros((1, 3)), np.zeros((1, 3)))
+    monkeypatch.setattr(base, "search", lambda *arguments: far)
+    with pytest.raises(NeecoError, match=r"of all bases none .* state it as far as it is known"):
+        _find(world, None)
 
 
 def test_masks_without_a_shaft_end_in_one_line():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from ingest.base_world import (
@@ -19,11 +22,14 @@ from ingest.base_world import (
 )
 from scipy.spatial.transform import Rotation
 
+from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
-from neeco.ingest.readers.logs import PoseLog
+from neeco.ingest.readers.logs import PoseLog, ReadingLog
 from neeco.ingest.recording.base import StatedBase
-from neeco.ingest.recording.model import InstrumentLogs
+from neeco.ingest.recording.model import InstrumentLogs, JointColumns
+from neeco.ingest.registration import find_bases as module
+from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.find_bases import find_bases
 
 LENS = Lens(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (), (WIDTH, HEIGHT))
@@ -97,3 +103,46 @@ def test_a_base_stated_to_the_world_is_not_taken_for_one_to_the_camera():
     data = _data(world, StatedBase(WORLD_FROM_BASE, to_world=True))
     placed, _ = find_bases(data, _black(world, np.linalg.inv(world.camera_from_world)), _no_masks, silent)
     assert np.array_equal(placed.world_from_base["psm1"], WORLD_FROM_BASE)
+
+
+def test_the_pose_of_a_tip_is_turned_into_the_shafts_with_readings_of_the_same_moment(monkeypatch):
+    """At every clock that is tried, and where the joint's log begins later than the video: no frame of the tip is ever
+    taken for one of the shaft."""
+    world = make_world(44)
+    tree = KinematicTree(
+        (Link("shaft"), Link("tip", "shaft", REVOLUTE, np.eye(4), np.array([0.0, 1.0, 0.0]), {"yaw": 1.0})), "tip"
+    )
+    data = _data(world, StatedBase())
+    part = data.parts[0]
+    log = part.poses["psm1"]
+    yaw = 0.8 * np.sin(3 * log.times)
+    tips = Rotation.from_quat(log.quats[:, [1, 2, 3, 0]]) * Rotation.from_rotvec(yaw[:, None] * [0.0, 1.0, 0.0])
+    late = log.times > 0.5
+    joint = ReadingLog(Path("yaw.csv"), "encoder", log.times[late], yaw[late])
+    item = InstrumentLogs(
+        "psm1", base=StatedBase(), kinematics=tree, joints={"yaw": JointColumns(Path("yaw.csv"), "encoder")}
+    )
+    part = replace(
+        part,
+        poses={"psm1": replace(log, quats=tips.as_quat()[:, [3, 0, 1, 2]])},
+        joints={"psm1": {"yaw": joint}},
+        recording=replace(part.recording, instruments=(item,)),
+    )
+    seen = {}
+
+    def find_base(name, masks, intrinsics, cameras, poses_at, times, **others):
+        seen.update(poses_at=poses_at, readings=others["readings"], times=times)
+        return BaseRegistration(
+            world_from_base=WORLD_FROM_BASE, clock_s=0.03, clock_sd_s=0.005, covariance=np.eye(6), open_directions=(),
+            frames=44, from_masks=True,
+        )  # fmt: skip
+
+    monkeypatch.setattr(module, "find_base", find_base)
+    placed, _ = find_bases(replace(data, parts=(part,)), _black(world), lambda rows: world.masks[rows], silent)
+    assert placed.clock("encoder").seconds == placed.clock("ros").seconds == 0.03  # as the readings were moved
+    for shift in (0.0, 0.04):
+        found, expected = seen["poses_at"](shift), world.poses_at(shift)
+        known = np.isfinite(found).all((1, 2))
+        assert (known == (seen["times"] + shift >= joint.times[0])).all()
+        assert np.abs(found[known] - expected[known]).max() < 0.05
+    assert seen["readings"].shape == (44, 1)  # frames without a reading are left out, not the joint

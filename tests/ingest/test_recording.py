@@ -54,6 +54,17 @@ def test_flags(folder):
     assert len(read_reading_log(instrument.joints["jaw_angle"]).times) == 200
 
 
+def test_init_offers_every_angle_of_a_robots_table_as_a_joint_on_the_clock_of_its_poses(folder):
+    (folder / "logs/jaw.csv").unlink()
+    rows = "".join(f"{0.01 * k:.2f},0.1,{0.2 + 0.001 * k:.3f}\n" for k in range(20))
+    (folder / "logs/joints.csv").write_text("t_s,wrist_pitch_rad,jaw_rad\n" + rows)
+    (folder / "recording.yaml").write_text(write_template(folder))
+    [instrument] = read_recording(folder / "recording.yaml").instruments
+    assert sorted(instrument.joints) == ["jaw", "wrist_pitch"]
+    assert {joint.clock for joint in instrument.joints.values()} == {"em"}
+    assert read_reading_log(instrument.joints["jaw"]).values[0] == pytest.approx(0.2)
+
+
 def test_init_writes_what_the_flags_say(folder):
     (folder / "recording.yaml").write_text(write_template(folder))
     recording = read_recording(folder / "recording.yaml")

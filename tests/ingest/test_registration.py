@@ -7,12 +7,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.registration.hand_eye import register_with_laparoscope
-from neeco.ingest.timing.clock_search import GIVEN, STEP_S, ClockOffset, best_rate, clock_from_instrument, correlate
+from neeco.ingest.timing.clock_search import (
+    GIVEN,
+    MIN_SIGNIFICANCE,
+    STEP_S,
+    ClockOffset,
+    best_rate,
+    clock_from_instrument,
+    correlate,
+    significance,
+)
 
 HAND_EYE = np.eye(4)
 HAND_EYE[:3, :3] = Rotation.from_euler("xyz", [20, -10, 35], degrees=True).as_matrix()
@@ -168,6 +178,33 @@ def test_rates_are_found_in_long_recordings_too() -> None:
     rate, lags, scores = best_rate(video, speed)
     assert rate == pytest.approx(1.01, abs=0.001)
     assert lags[scores.argmax()] * STEP_S == pytest.approx(20, abs=0.1)
+
+
+def test_a_correlation_counts_by_how_many_independent_samples_it_has() -> None:
+    """Six seconds of smooth motion fit by chance at one of many offsets; a minute of the same correlation does not."""
+    rng = np.random.default_rng(1)
+    one, other = (np.interp(np.arange(0, 60, STEP_S), np.arange(181) / 3, rng.normal(size=181)) for _ in range(2))
+    short = significance(one[:300], other[:300], 0, 0.64)
+    assert 1 < short < MIN_SIGNIFICANCE < 2 * short < significance(one, other, 0, 0.64)
+
+
+def test_a_trackers_slow_errors_count_in_where_the_cameras_stand() -> None:
+    """They last for half a second each: taken for independent ones, the turn would seem to be known far better."""
+    offs, stated = [], []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        times, log = recorded(0.0, noise=0.0)
+        slow = gaussian_filter1d(rng.normal(size=(len(log.times), 6)), 10, axis=0)
+        slow *= np.repeat([0.005, 0.2], 3) / slow.std(0)
+        turns = Rotation.from_quat(log.quats, scalar_first=True) * Rotation.from_rotvec(slow[:, :3])
+        log = replace(log, quats=turns.as_quat(scalar_first=True), positions=log.positions + slow[:, 3:])
+        keep = times < 6
+        cameras = scope_path(times[keep])
+        found = register_with_laparoscope(cameras, times[keep], log, ClockOffset(0.0, 0.0, GIVEN))
+        off = Rotation.from_matrix(found.rotation).as_rotvec(degrees=True)
+        offs.append(np.linalg.norm(off))
+        stated.append(found.placement_sd(cameras[:, :3, 3])[1])
+    assert 0.4 < np.sqrt(np.mean(np.square(offs))) / np.mean(stated) < 1.6
 
 
 def test_motion_of_something_else_tells_no_clock() -> None:

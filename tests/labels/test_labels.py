@@ -11,10 +11,11 @@ from neeco.labels.labellers import (
     CompositedLabels,
     DeltaThresholds,
     ThresholdLabels,
+    composited_labels,
     find_thresholds,
     otsu_of_magnitudes,
 )
-from neeco.raster import rasterize
+from neeco.raster import Rendering, rasterize
 from neeco.synthesis.generator import UNOBSERVED_SIDE, UNOBSERVED_TISSUE, Acceptance
 
 
@@ -254,3 +255,17 @@ def test_a_drawing_and_its_layers_agree(scene, state, camera):
     drawing = draw(scene, state(), camera)
     assert (drawing.image == layered.image).all()
     assert (drawing.parts == layered.parts).all()
+
+
+@pytest.mark.parametrize("columns", [1, 2, 3, 4, 5])
+def test_a_share_is_the_sum_of_its_columns_and_a_part_the_largest_bit_for_bit(columns):
+    channels = torch.rand(13, 17, columns + 1, generator=torch.Generator().manual_seed(columns))
+    none = torch.zeros(13, 17)
+    rendering = Rendering(
+        torch.zeros(13, 17, 3), none, none, channels[..., :columns], torch.zeros(0), torch.zeros(0, 2)
+    )
+    parts, share = composited_labels(rendering, 0.4 * columns)
+    assert torch.equal(share, channels[..., :columns].sum(-1))
+    expected = torch.where(share > 0.4 * columns, channels[..., :columns].argmax(-1) + 1, 0)
+    assert torch.equal(parts, expected.to(torch.uint8))
+    assert 0 < int((parts > 0).sum()) < parts.numel()

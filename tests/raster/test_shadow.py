@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -11,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from neeco.raster import Camera, Gaussians, Headlight, Rendering, kernels, rasterize
+from neeco.raster import Camera, Gaussians, Headlight, depth_maps, kernels, rasterize
 from neeco.raster.native import Family, set_threads
 from neeco.raster.shadow import GAMMA, MIN_WINDOW_SD, Casting, blocked, blocked_reference, blur, light_camera
-from neeco.raster.types import Shadow
+from neeco.raster.types import Layer, Shadow
 
 CAMERA = Camera(torch.eye(4), fx=80.0, fy=80.0, cx=40.0, cy=32.0, width=80, height=64)
 WALL, ROD = 100.0, 60.0  # mm, depths
@@ -206,9 +207,9 @@ def test_the_kernel_finds_behind_what_the_reference_finds(
     depth = 40 + 30 * torch.rand(shape, generator=g)
     weights, found = torch.rand(count, generator=g), []
 
-    def draw(gaussians: Gaussians, seen_by: Camera) -> Rendering:
-        assert (seen_by.height, seen_by.width) == shape
-        return Rendering(torch.zeros(*shape, 3), alpha, depth, None, torch.zeros(0, 2), torch.zeros(0))
+    def draw(gaussians: Gaussians, seen_by: Sequence[Camera]) -> list[Layer]:
+        assert [(lamp.height, lamp.width) for lamp in seen_by] == [shape]
+        return [Layer(alpha, depth)]
 
     for dtype in (torch.float32, torch.float64):
         among = Casting(casters, scene(), means.to(dtype), camera)
@@ -230,9 +231,9 @@ def test_a_lamp_that_does_not_shine_is_not_drawn() -> None:
     among = Casting.of(gaussians, gaussians.headlight.shadow.casters, CAMERA)
     drawn = []
 
-    def draw(bare: Gaussians, camera: Camera) -> Rendering:
-        drawn.append(camera)
-        return rasterize(bare, camera)
+    def draw(bare: Gaussians, cameras: Sequence[Camera]) -> tuple[Layer, ...]:
+        drawn.extend(cameras)
+        return depth_maps(bare, cameras)
 
     for family in ("native", "torch"):
         with kernels(family):
@@ -249,7 +250,7 @@ def _found(offsets: Tensor, family: Family = "native") -> list[Tensor]:
     among = Casting.of(gaussians, gaussians.headlight.shadow.casters, CAMERA)
     width, places = torch.tensor(0.02, requires_grad=True), offsets.clone().requires_grad_()
     with kernels(family):
-        shares = blocked(among, width, places, lambda bare, camera: rasterize(bare, camera, backend="cpu"))
+        shares = blocked(among, width, places, partial(depth_maps, backend="cpu"))
         (shares * torch.linspace(-1, 2, len(gaussians))).sum().backward()
     return [shares.detach(), width.grad, places.grad]
 
@@ -283,3 +284,15 @@ def test_a_blur_moves_light_and_loses_none(height: int, width: int, sigma: float
     spread = (out.sum(0) * (torch.arange(width) - width // 2) ** 2).sum().sqrt()
     assert float(spread) <= max(sigma, MIN_WINDOW_SD) + 1e-9
     assert torch.equal(out, out.clamp(0, 1))
+
+
+def test_depth_maps_are_alpha_and_depth_of_the_whole_rendering(simd: str) -> None:
+    gaussians = scene()
+    poses = [torch.eye(4), torch.eye(4)]
+    poses[1][:3, 3] = torch.tensor([20.0, -5.0, 2.0])
+    cameras = [replace(CAMERA, world_from_camera=pose, width=77, height=61) for pose in poses]
+    for layer, camera in zip(depth_maps(gaussians, cameras), cameras, strict=True):
+        whole = rasterize(replace(gaussians, headlight=None), camera)
+        assert float(whole.alpha.max()) > 0.9
+        assert torch.equal(layer.alpha, whole.alpha)
+        assert torch.equal(layer.depth, whole.depth)

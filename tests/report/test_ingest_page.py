@@ -55,7 +55,7 @@ def made(folder: Path, **changes) -> IngestResult:
     registration = Registration(
         scale=4.4, rotation=np.eye(3), translation=np.zeros(3), camera_from_sensor=np.eye(4), clock=clock,
         scale_sd=0.004, position_residual=np.full(count, 0.5), rotation_residual=np.full(count, 0.003),
-        used=np.arange(count),
+        used=np.arange(count), origin=np.zeros(3), covariances=np.zeros((3, 7, 7)),
     )  # fmt: skip
     dropped = tuple(
         (frame, DropReason(f"blurred: {frame % 50}% of its neighbours' sharpness")) for frame in (96, 97, 98, 105)
@@ -247,6 +247,15 @@ def test_the_verdict_names_what_is_doubtful(changes, level, piece):
     verdict = assess_ingest(made(SAMPLE, **changes), read_capture(SAMPLE))
     assert verdict.level == level
     assert piece in " ".join([verdict.headline, *verdict.warnings])
+
+
+def test_small_residuals_of_a_scope_that_turned_little_do_not_make_a_good_verdict():
+    loose = np.diag([1e-4, *[4e-4] * 3, *[0.2] * 3])  # 1.1 degrees, 0.4 mm
+    result = made(SAMPLE)
+    result = replace(result, registration=replace(result.registration, covariances=np.stack([loose] * 3)))
+    verdict = assess_ingest(result, read_capture(SAMPLE))
+    assert verdict.level == "careful"
+    assert "the place of instruments in the images is known to ±1.1°" in " ".join(verdict.facts)
 
 
 @pytest.mark.parametrize(

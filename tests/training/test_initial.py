@@ -39,6 +39,21 @@ def test_a_joint_that_follows_from_the_pose_moves_no_part_and_is_named(cameras: 
     assert told == ["arm: joint insertion follows from the pose; it moves no part of its own"]
 
 
+def test_a_jaw_that_moves_smoothly_for_five_seconds_does_not_follow_from_the_pose_by_chance() -> None:
+    """Fifty frames of it have as few independent values as a pose has numbers."""
+    rng = np.random.default_rng(0)
+    phases, rates = rng.uniform(0, 6, 7), rng.uniform(0.5, 3, 7)
+    taken = []
+    for time in np.arange(50) / 10:
+        motion = np.sin(rates * time + phases)
+        pose = rigid_from_vector(torch.from_numpy(motion[:6] * [0.4, 0.4, 1.5, 15, 15, 10]))
+        state = State({"arm": InstrumentState(pose, {"jaw": 0.4 + 0.3 * float(motion[6])})}, float(time))
+        taken.append(Frame(Path(f"{time}.png"), CAMERA, state, "train"))
+    told: list[str] = []
+    assert moving_joints(Instrument("arm", {"jaw": None}), tuple(taken), TrainConfig(), told.append) == ("jaw",)
+    assert told == []
+
+
 def test_joints_that_are_asked_for_are_taken_as_given() -> None:
     told: list[str] = []
     assert moving_joints(ARM, frames(), TrainConfig(joints=("insertion",)), told.append) == ("insertion",)

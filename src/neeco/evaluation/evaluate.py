@@ -35,7 +35,7 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import field_pinhole
 from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
-from neeco.raster import rasterize
+from neeco.raster import depth_maps, rasterize
 from neeco.raster.native import synchronise
 from neeco.raster.resampling import of_learned_size
 from neeco.raster.shadow import GAMMA, shadowed
@@ -72,7 +72,7 @@ def rendered_shadow(scene: GaussianScene, state: State, camera: Camera) -> Tenso
     pinhole = replace(field_pinhole(of_learned_size(camera)), learned_fx=None)
     shares = []
     for lit in (light, replace(light, shadow=None)):
-        found = shadowed(replace(posed, headlight=lit), pinhole, rasterize).headlight
+        found = shadowed(replace(posed, headlight=lit), pinhole, depth_maps).headlight
         left = None if found is None else found.left
         shares.append(torch.ones_like(posed.opacities) if left is None else left)
     tissue = ~scene.canonical.of_instruments

@@ -21,7 +21,7 @@ from neeco.fitting.crop_rendering import MAX_PIXELS
 from neeco.fitting.minimise import ImageResidual, minimise
 from neeco.fitting.parameters import InstrumentParameters, StateParameters, moved_camera, precision_of
 from neeco.geometry.camera import Camera
-from neeco.raster import rasterize
+from neeco.raster import depth_maps, rasterize
 from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
 
@@ -89,7 +89,7 @@ class _AlignmentProblem:
 
     def differences(self, at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
         # shadows, which move as little as what casts them, are rendered once for all differences
-        still = shadowed(posed, _camera_at(self.camera, at), rasterize)
+        still = shadowed(posed, _camera_at(self.camera, at), depth_maps)
         for index, step in enumerate(self.steps.tolist()):
             moved = at.clone()
             moved[index] += step

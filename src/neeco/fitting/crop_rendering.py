@@ -15,7 +15,7 @@ from neeco.capture.images import area_averaged
 from neeco.capture.model import Frame, State
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_world
-from neeco.raster import rasterize
+from neeco.raster import depth_maps, rasterize
 from neeco.raster.shadow import GAMMA, shadowed
 from neeco.raster.types import Gaussians
 from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
@@ -233,7 +233,7 @@ class TissueRenderer:
         """Return [h, w, 3] with the shadow of instruments in `state` (None: without)."""
         tissue = self._at(self.scene.recorded.states[0] if state is None else state)
         if state is not None and self.shaded:
-            tissue = shadowed(tissue, camera, rasterize, self._instruments.pose(state))
+            tissue = shadowed(tissue, camera, depth_maps, self._instruments.pose(state))
         elif tissue.headlight is not None:
             tissue = replace(tissue, headlight=replace(tissue.headlight, shadow=None))
         return rasterize(tissue, camera).color.clamp(0, 1).cpu()

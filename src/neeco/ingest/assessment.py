@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -12,12 +12,14 @@ from neeco.capture.documents import Problem
 from neeco.capture.model import UNKNOWN_DEG, Capture
 from neeco.geometry.lines import frame_about
 from neeco.ingest.registration.base import BaseRegistration
+from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.result import IngestResult
 from neeco.plausible import FEW_TRAIN_FRAMES
 
 # Limits above which there is a warning: conventions, not measurements.
 POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.015, 0.5
 BASE_MM, BASE_DEG = 2.0, 1.5  # standard deviations of a base
+PLACED_MM, PLACED_DEG = 1.0, 0.7  # standard deviations of the cameras' place in the tracker's frame
 SEVERE = 3.0  # times the limit
 MIN_POINTS = 100
 # Of a base's outline with what moves: right bases reach 0.92 to 0.97 (benchmarks/base_calibration.py)
@@ -174,6 +176,7 @@ def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
         says = f"lengths are known to {registration.scale_sd:.1%} (usual: {SCALE:.1%} or less)"
         warning = f"Lengths are known to {registration.scale_sd:.1%} only: the scope travelled too little."
         found.append(_Evidence.measured(says, registration.scale_sd, SCALE, warning))
+        found += _placed(registration, capture, result.bases)
     for name, clock in result.clocks.items():
         moved = clock_cost_mm(name, clock.sd, capture)
         if moved is not None:
@@ -185,6 +188,26 @@ def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
     few = train < FEW_TRAIN_FRAMES
     found.append(_Evidence(fact, 2 if few else 0, f"Only {train} frames are left to train on."))
     found.append(_Evidence(f"{result.points:,} tissue points (usual: {MIN_POINTS} or more)", 0))
+    return found
+
+
+def _placed(registration: Registration, capture: Capture, found_in_images: Collection[str]) -> list[_Evidence]:
+    """Return how well the cameras' place in the tracker's frame is known where instruments are, but for those whose
+    bases were found in the images. Residuals do not show it: where a scope turns little, they are small far off."""
+    places = [
+        state.pose[:3, 3].numpy()
+        for frame in capture.frames
+        for name, state in frame.state.instruments.items()
+        if name not in found_in_images
+    ]
+    if not places:
+        return []
+    sds = registration.placement_sd(np.stack(places))
+    found = []
+    for sd, unit, limit in zip(sds, (" mm", "°"), (PLACED_MM, PLACED_DEG), strict=True):
+        known = f"the place of instruments in the images is known to ±{sd:.1f}{unit}"
+        warning = f"{known[0].upper()}{known[1:]} only (hand-eye calibration): record more turns of the scope."
+        found.append(_Evidence(f"{known} (usual: {limit:g} or less)", 0 if sd <= limit else 1, warning))
     return found
 
 

@@ -201,7 +201,7 @@ def any_in_image(camera: Camera, points: Mapping[str, Sequence[np.ndarray]]) -> 
 
 def bounding_box(mask: np.ndarray) -> tuple[int, int, int, int]:
     """Return the box (x, y, width, height) of the extreme pixels of a mask [H, W]; all 0 for an empty mask."""
-    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
     return x, y, width, height
 
 

@@ -166,23 +166,22 @@ def uncertain_edge(share: np.ndarray, mask: np.ndarray) -> np.ndarray:
     ([H, W] in [0, 1]) jumps, or are within EDGE_WIDTH of it with a share between CLEAR_SHARES. The image's own border
     is not an edge.
     """
-    pixels = mask.astype(np.uint8)
-    border = cv2.dilate(pixels, NEIGHBOURS) != cv2.erode(pixels, NEIGHBOURS)
-    if not border.any():
-        return border
-    unclear = (share > CLEAR_SHARES[0]) & (share < CLEAR_SHARES[1])
+    edge = np.zeros(mask.shape, dtype=bool)
     reach = float(EDGE_WIDTH * np.hypot(*mask.shape))
-    x, y, width, height = cv2.boundingRect(border.astype(np.uint8))
-    margin = math.ceil(reach)
+    x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
+    margin = math.ceil(reach) + 1  # the border is up to a pixel outside
     near = slice(max(0, y - margin), y + height + margin), slice(max(0, x - margin), x + width + margin)
-    edge = border.copy()
-    edge[near] |= unclear[near] & (distances_to(border[near]) <= reach)
+    pixels = mask[near].astype(np.uint8)
+    border = cv2.dilate(pixels, NEIGHBOURS) != cv2.erode(pixels, NEIGHBOURS) if width else pixels.astype(bool)
+    if border.any():
+        unclear = (share[near] > CLEAR_SHARES[0]) & (share[near] < CLEAR_SHARES[1])
+        edge[near] = border | (unclear & (distances_to(border) <= reach))
     return edge
 
 
 def without_small_components(mask: np.ndarray, share: float) -> np.ndarray:
     """Return the mask without the (edge-connected) components smaller than `share` of its largest."""
-    count, components, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    count, components, statistics, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=4)
     if count < 3:  # the background is the first
         return mask
     areas = statistics[:, cv2.CC_STAT_AREA]
@@ -200,8 +199,12 @@ def without_part_islands(parts: np.ndarray, ids: Sequence[int], share: float) ->
     smallest = share * shows_any(parts, ids).sum()
     cleaned = parts.copy()
     for part in ids:
-        mask = (parts == part).astype(np.uint8)
-        _, components, statistics, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+        mask = (parts == part).view(np.uint8)
+        x, y, width, height = cv2.boundingRect(mask)
+        if not width:
+            continue
+        box = slice(max(0, y - 1), y + height + 1), slice(max(0, x - 1), x + width + 1)
+        _, components, statistics, _ = cv2.connectedComponentsWithStats(mask[box], connectivity=4)
         areas = statistics[1:, cv2.CC_STAT_AREA]
         small = areas < smallest
         if small.any():
@@ -210,10 +213,11 @@ def without_part_islands(parts: np.ndarray, ids: Sequence[int], share: float) ->
             x, y, width, height = statistics[k, : cv2.CC_STAT_AREA]
             around = slice(max(0, y - 1), y + height + 1), slice(max(0, x - 1), x + width + 1)
             island = components[around] == k
-            nearby = cleaned[around][cv2.dilate(island.astype(np.uint8), NEIGHBOURS).astype(bool) & ~island]
-            nearby = nearby[shows_any(nearby, ids)]
+            surrounded = cleaned[box][around]
+            nearby = surrounded[cv2.dilate(island.astype(np.uint8), NEIGHBOURS).astype(bool) & ~island]
+            nearby = nearby[np.isin(nearby, ids)]
             if len(nearby):
-                cleaned[around][island] = np.bincount(nearby).argmax()
+                surrounded[island] = np.bincount(nearby).argmax()
     return cleaned
 
 
@@ -236,7 +240,9 @@ def _drop_small_components(
     for instrument in instruments_of(names):
         ids = [k + 1 for k, (owner, _) in enumerate(names) if owner == instrument]
         mask = shows_any(found, ids)
-        x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+        x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
+        if not width:
+            continue
         box = slice(y, y + height), slice(x, x + width)
         own = np.where(without_small_components(mask[box], min_component), found[box], 0)
         own = without_part_islands(own, ids, min_component)
@@ -248,9 +254,9 @@ def _drop_small_components(
 
 def shows_any(parts: np.ndarray, ids: Sequence[int]) -> np.ndarray:
     """Return bool [H, W]: the pixels of a part image (uint8 [H, W]) that have one of these ids."""
-    chosen = np.zeros(256, dtype=bool)
-    chosen[list(ids)] = True
-    return chosen[parts]
+    chosen = np.zeros(256, dtype=np.uint8)
+    chosen[list(ids)] = 1
+    return cv2.LUT(parts, chosen).view(bool)
 
 
 def distances_to(pixels: np.ndarray) -> np.ndarray:

@@ -65,7 +65,7 @@ def rasterize(
         return replace(rendering, channels=rendering.color.new_zeros((camera.height, camera.width, 0)))
     if camera.is_resampled:
         return draw_through(camera, partial(_rasterize_resized, gaussians, channels, background, alone, backend))
-    gaussians = shadowed(gaussians, camera, partial(rasterize, backend=backend))
+    gaussians = shadowed(gaussians, camera, partial(depth_maps, backend=backend))
     if backend == "auto":
         on_cpu = "cpu" if runs_native(gaussians.means) else "reference"
         backend = cuda_backend() if gaussians.means.is_cuda else on_cpu
@@ -75,6 +75,15 @@ def rasterize(
         return rasterize_cpu(gaussians, camera, channels, background, alone)
     rendering = _rasterize_by(backend, gaussians, camera, channels, background)
     return replace(rendering, alone=tuple(_alone(gaussians.select(chosen), camera, backend) for chosen in alone))
+
+
+@torch.no_grad()
+def depth_maps(gaussians: Gaussians, cameras: Sequence[Camera], backend: str = "auto") -> tuple[Layer, ...]:
+    """Render alpha and depth of Gaussians from several pinholes; without gradient.
+
+    backend: as `rasterize` takes it.
+    """
+    return tuple(_alone(gaussians, camera, backend) for camera in cameras)
 
 
 def _rasterize_by(
@@ -119,7 +128,8 @@ def _rasterize_resized(
     """`rasterize` for a pinhole of the learned size or a larger one; shadows are as soft as they were learned."""
     draw = partial(rasterize, backend=backend)
     pinhole = replace(camera, learned_fx=None)
-    gaussians = shadowed(gaussians, replace(of_learned_size(camera), learned_fx=None), draw)
+    at_learned_size = replace(of_learned_size(camera), learned_fx=None)
+    gaussians = shadowed(gaussians, at_learned_size, partial(depth_maps, backend=backend))
     return draw(widened(gaussians, camera), pinhole, channels=channels, background=background, alone=alone)
 
 

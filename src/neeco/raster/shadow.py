@@ -20,7 +20,7 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project
 from neeco.raster.devices import constant
 from neeco.raster.native import all_run_native, native
-from neeco.raster.types import Gaussians, Rendering, Shadow
+from neeco.raster.types import Gaussians, Layer, Shadow
 
 MAP_SCALE = 0.5  # resolution of the map relative to the image
 MAP_MARGIN = 0.15  # of the image's size, to each side: casters may be outside the image
@@ -30,12 +30,13 @@ MIN_OPACITY = 1e-4  # of the blurred map: less casts no shadow
 MIN_DEPTH = 1e-6  # mm, and smallest opacity that depths are divided by
 MIN_DISTANCE = 1e-3  # mm
 
-Draw = Callable[[Gaussians, Camera], Rendering]
+Draw = Callable[[Gaussians, Sequence[Camera]], Sequence[Layer]]  # as `depth_maps`
 
 
 def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw, casters: Gaussians | None = None) -> Gaussians:
     """Return the Gaussians with the headlight's shadows evaluated as its share `left` at every Gaussian; `draw`
-    rasterizes. `casters`: others that cast the shadow on all; None: those among them that `Shadow.casters` marks do.
+    renders the lamps' maps. `casters`: others that cast the shadow on all; None: those among them that
+    `Shadow.casters` marks do.
 
     Gradients reach the falloff, and the lamps' offsets, strengths and width, but not the casters' shapes.
     """
@@ -106,8 +107,7 @@ def blocked(among: Casting, width: Tensor, offsets: Tensor, draw: Draw, shines: 
 def _blocked_by(among: Casting, width: Tensor, offset: Tensor, draw: Draw) -> Tensor:
     """`blocked` of one lamp, [N]. Any float type and device."""
     at_light = light_camera(among.camera, offset.detach())
-    with torch.no_grad():
-        from_light = draw(among.bare, at_light)
+    (from_light,) = draw(among.bare, [at_light])
     return blocked_reference(from_light.alpha, from_light.depth, width, offset, among, at_light)
 
 
@@ -147,9 +147,8 @@ class _Blocked(torch.autograd.Function):
         shares = torch.zeros(len(offsets), len(means))
         ctx.lamps = []
         ctx.save_for_backward(width, offsets, means, among.casters, shares)
-        for lamp in lamps:
-            at_light = light_camera(among.camera, offsets[lamp])
-            from_light = draw(among.bare, at_light)
+        cameras = [light_camera(among.camera, offsets[lamp]) for lamp in lamps]
+        for lamp, at_light, from_light in zip(lamps, cameras, draw(among.bare, cameras), strict=True):
             maps = torch.empty(3, at_light.height, at_light.width)
             focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy, float(width) * at_light.fx, MIN_DISTANCE)
             given = torch.tensor([*view, *offsets[lamp].tolist(), *focus], dtype=torch.float32)

@@ -52,6 +52,14 @@ class Headlight:
         return Headlight(self.falloff[rows], self.vignette, shadow, left)
 
 
+def _rows(chosen: Tensor) -> Tensor | slice:
+    """Return the indices of what is chosen (bool [N]); on the CPU neighbours, as all instruments are, as a slice."""
+    rows = chosen.nonzero()[:, 0]  # waits for the device once
+    if chosen.device.type == "cpu" and len(rows) and int(rows[-1] - rows[0]) == len(rows) - 1:
+        return slice(int(rows[0]), int(rows[-1]) + 1)
+    return rows
+
+
 @dataclass(frozen=True)
 class Gaussians:
     """Posed Gaussians (world frame, lengths in mm).
@@ -76,7 +84,7 @@ class Gaussians:
 
     def select(self, chosen: Tensor | slice) -> Gaussians:
         """Return the chosen Gaussians (bool [N], or a slice, which is not copied)."""
-        rows = chosen.nonzero()[:, 0] if isinstance(chosen, Tensor) else chosen  # waits for the device once
+        rows = _rows(chosen) if isinstance(chosen, Tensor) else chosen
         columns: dict[str, Any] = {
             name: getattr(self, name)[rows] for name in ("means", "quats", "scales", "opacities", "sh")
         }

@@ -107,10 +107,11 @@ class Acceptance:
             return LEAVES_IMAGE
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
-        unobserved = drawing.unobserved > MAX_UNOBSERVED
-        if float(unobserved.float().mean()) > MAX_UNOBSERVED_SHARE:
+        unobserved = drawing.unobserved.numpy() > MAX_UNOBSERVED
+        if unobserved.mean(dtype=np.float32) > MAX_UNOBSERVED_SHARE:
             return UNOBSERVED_TISSUE
-        if float(unobserved[drawing.parts > 0].float().mean()) > self.max_unobserved:
+        labelled = drawing.parts.numpy() > 0
+        if labelled.any() and unobserved[labelled].mean(dtype=np.float32) > self.max_unobserved:
             return UNOBSERVED_SIDE
         if any(_intersect(drawing, a, b) for a, b in combinations(self.recorded_together, 2)):
             return ENTERS_ANOTHER

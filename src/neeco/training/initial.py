@@ -21,6 +21,7 @@ from neeco.training.config import TrainConfig
 from neeco.training.session import new_session
 
 MAX_POSE_EXPLAINED = 0.98  # share of a joint's variance that its instrument's pose may explain
+N_STRETCHES, MIN_HELD_OUT_EXPLAINED = 4, 0.5  # of the recording, held out in turn, and the share explained there
 
 
 def begin_session(
@@ -146,19 +147,31 @@ def moving_joints(
         return wanted
     states = [frame.state.instruments[instrument.name] for frame in frames]
     poses = np.stack([state.pose[:3].double().numpy().ravel() for state in states])
-    distinct, first = np.unique(np.round(poses, 6), axis=0, return_index=True)
-    design = np.column_stack([distinct - distinct.mean(0), np.ones(len(distinct))])
+    _, first = np.unique(np.round(poses, 6), axis=0, return_index=True)
+    first = first[np.argsort([frames[i].state.time for i in first], kind="stable")]
+    design = np.column_stack([poses[first] - poses[first].mean(0), np.ones(len(first))])
     moving = []
     for joint in instrument.joints:
         if joint in instrument.unrecorded:
             report(f"{instrument.name}: joint {joint} is not recorded; only with its kinematics can it be found")
             continue
         reading = np.array([states[i].joints[joint] for i in first])
-        spread = reading.var()
-        fitted = design @ np.linalg.lstsq(design, reading, rcond=1e-6)[0]
-        explained = 1 - (reading - fitted).var() / spread if spread > 1e-8 else 0.0
-        if explained > MAX_POSE_EXPLAINED:
+        if (
+            reading.var() > 1e-8
+            and _explained(design, reading, 1) > MAX_POSE_EXPLAINED
+            and _explained(design, reading, N_STRETCHES) > MIN_HELD_OUT_EXPLAINED
+        ):
             report(f"{instrument.name}: joint {joint} follows from the pose; it moves no part of its own")
         else:
             moving.append(joint)
     return tuple(moving)
+
+
+def _explained(design: np.ndarray, values: np.ndarray, stretches: int) -> float:
+    """Return the share of the variance of values [N] that a linear fit to design [N, P] explains, of each of several
+    stretches by the fit to the others: dozens of smooth frames fit a dozen numbers of a pose by chance."""
+    left = np.zeros(len(values))
+    for held in np.array_split(np.arange(len(values)), stretches):
+        use = np.setdiff1d(np.arange(len(values)), held) if stretches > 1 else held
+        left[held] = values[held] - design[held] @ np.linalg.lstsq(design[use], values[use], rcond=1e-6)[0]
+    return 1 - float(np.square(left).mean() / values.var())

@@ -23,7 +23,7 @@ from neeco.errors import NeecoError, install_hint
 from neeco.evaluation.image_metrics import to_uint8
 from neeco.files import write_atomically
 from neeco.geometry.rotations import quat_to_matrix, spread_directions
-from neeco.raster import rasterize
+from neeco.raster import depth_maps
 from neeco.raster.reference import brightened, headlight_factor, sh_basis
 from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
@@ -67,7 +67,7 @@ def splats_of(scene: GaussianScene, state: State, camera: Camera) -> Splats:
     """The scene in `state`, over its tissue, lit as `camera` has it."""
     if state.tissue is not None and len(scene.recorded.tissues) > 1:
         scene = scene.over(state.tissue)
-    posed = shadowed(scene.at(state), camera, rasterize)
+    posed = shadowed(scene.at(state), camera, depth_maps)
     sh = _in_world(posed)
     if posed.headlight is not None:
         view = camera.world_from_camera.to(posed.means)

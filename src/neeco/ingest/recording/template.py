@@ -307,6 +307,8 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
         found.poses.append((replace(log, meaning=meaning), pose))
     elif value and when.time:
         found.joints.append((log, when, value, None))
+    elif when.time and len(angles) > 1:
+        found.joints += [(log, when, column, _joint_of(column)) for column in angles]
     elif len(columns) == 2 and angles and not when.time and len(table.rows) <= MAX_CALIBRATION_ROWS:
         found.calibrations.append((name, table.header))
     elif not (when.time and len(columns) <= 2):
@@ -351,7 +353,7 @@ def _instruments(
             {
                 "name": name,
                 "poses": _pose_lines(*poses[index]) if poses else None,
-                "joints": [(joint, _joint_lines(found, *log[:3])) for joint, log in zip(joints, logs, strict=True)],
+                "joints": [(joint, _joint_lines(found, *log)) for joint, log in zip(joints, logs, strict=True)],
                 "hints": poses[index][0].hints if poses else (),
                 "in_base": to_camera and bool(poses) and poses[index][0].in_base,
                 "wristed": set(DVRK_WRIST) <= set(joints),
@@ -382,9 +384,12 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     return lines + _unit_lines(columns, {"length": of_length})
 
 
-def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value: str) -> list[str]:
+def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value: str, named: str | None) -> list[str]:
     time = [f"  time: {_list(when.time)}"] if when.time and log.stream is None else []
-    lines = [*log.lines(), "columns:", *time, f"  value: {_scalar(value)}"]
+    # a table of several joints is a robot's, as its poses are
+    clock = ["clock: em   # that of the poses: correct it where another computer logged it"]
+    lines = [*log.lines(), *(clock if named and log.stream is None else []), "columns:", *time]
+    lines.append(f"  value: {_scalar(value)}")
     stem = log.stem.lower()
     tables = [name for name, header in found.calibrations if value in header]
     tables += [name for name, _ in found.calibrations if Path(name).stem.lower().startswith(stem)]
@@ -425,9 +430,13 @@ def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | 
 
 def _joint_name(log: _Log, value: str) -> str:
     if log.stream is not None:
-        return re.sub(r"[^A-Za-z0-9_]+", "_", split_unit(value, "angle")[0]).strip("_")
+        return _joint_of(value)
     stem = re.sub(r"[^A-Za-z0-9_]+", "_", log.stem)
     return stem if stem.endswith("angle") else f"{stem}_angle"
+
+
+def _joint_of(column: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_]+", "_", split_unit(column, "angle")[0]).strip("_")
 
 
 def _unique(names: list[str]) -> list[str]:

@@ -106,7 +106,7 @@ def find_articulated_base(
     fits = _fits(problem)
     best = fits[0]
     if best.residual_px > MAX_RESIDUAL_PX or overlap(problem, best) < LEAST_OVERLAP or _exchangeable(problem, best):
-        raise NeecoError(unmoved(name))
+        raise NeecoError(unmoved(name, stated=True))
     return _result(problem, fits, motion)
 
 

@@ -177,9 +177,9 @@ def find_base(
 
     masks: foreground bool [F, h, w], through a pinhole of `intrinsics` (fx, fy, cx, cy px of the masks);
     camera_from_world [F, 4, 4]; poses_at(s): base_from_instrument [F, 4, 4] mm of the frames as the log has them s
-    seconds later, NaN where it has none; times [F] s; readings [F, J] of its joints; hidden: bool [h, w], beyond a
-    round border; images: uint8 [F, h, w, 3], whose texture along the instrument shows how far in it is. Raises
-    NeecoError, naming the instrument, where the foreground is not the instrument.
+    seconds later, NaN where it has none; times [F] s; readings [F, J] of its joints, NaN where a log has none; hidden:
+    bool [h, w], beyond a round border; images: uint8 [F, h, w, 3], whose texture along the instrument shows how far in
+    it is. Raises NeecoError, naming the instrument, where the foreground is not the instrument.
     """
     generator = np.random.default_rng(seed)
     problem = _problem(masks, intrinsics, camera_from_world, poses_at, readings=readings, hidden=hidden, images=images)
@@ -198,7 +198,7 @@ def find_base(
         known = BasePrior(prior[0], np.radians(prior[2]), prior[1], clock_sd)
     starts = _starts(few, known, _distance(problem, prior), generator)
     if not starts:
-        raise NeecoError(unmoved(name))
+        raise NeecoError(unmoved(name, stated=prior is not None))
     best = max((fit_silhouettes(few, known, start) for start in starts), key=lambda fit: overlap(few, fit))
     radius = float(np.median(best.shape[len(best.shape) // 2 :, 0, 0]))
     if not RADIUS_RANGE_MM[0] < radius < RADIUS_RANGE_MM[1]:
@@ -225,9 +225,11 @@ def _problem(
 ) -> SilhouetteProblem:
     """The frames whose poses are known at all clocks tried, at most FIT_FRAMES."""
     poses = np.stack([poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
-    rows = np.flatnonzero(np.isfinite(poses).all((0, 2, 3)) & masks.any((1, 2)))
+    values = np.zeros((len(masks), 0)) if readings is None else np.asarray(readings, np.float64)
+    known = np.isfinite(poses).all((0, 2, 3)) & np.isfinite(values).all(1)
+    rows = np.flatnonzero(known & masks.any((1, 2)))
     rows = rows[evenly_spaced(len(rows), FIT_FRAMES)] if len(rows) else rows
-    values = np.zeros((len(rows), 0)) if readings is None else np.asarray(readings, np.float64)[rows]
+    values = values[rows]
     if len(rows):
         moving = values.std(0) > 1e-3
         values = (values[:, moving] - values[:, moving].mean(0)) / values[:, moving].std(0)
@@ -351,19 +353,25 @@ def _filled(left: np.ndarray, right: np.ndarray, shape: tuple[int, ...]) -> np.n
 def _require_moved(name: str, problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> None:
     """Raise NeecoError where poses of other moments, or none, explain the masks as well."""
     if not (fit.residual_px < MAX_RESIDUAL_PX * problem.px_scale and overlap(problem, fit) > MIN_OVERLAP):
-        raise NeecoError(unmoved(name))
+        raise NeecoError(unmoved(name, stated=known.sd_mm is not None))
     for share in EXCHANGED_SHARES:
         exchanged = replace(problem, poses=np.roll(problem.poses, round(share * len(problem.blocks)), axis=1))
         other = refine(exchanged, replace(known, sd_clock=0.0), fit, 12)
         if other.cost < MIN_EXCHANGED_COST * fit.cost:
-            raise NeecoError(unmoved(name))
+            raise NeecoError(unmoved(name, stated=known.sd_mm is not None))
 
 
-def unmoved(name: str) -> str:
-    """Error where nothing in the images moves as an instrument's log says."""
+def unmoved(name: str, *, stated: bool) -> str:
+    """Error where nothing in the images moves as an instrument's log says; stated: whether its base was, roughly."""
+    if stated:
+        return (
+            f"instrument {name!r}: camera_from_base: nothing in the images moves with its poses; check which arm and "
+            "which clock its log is of, or give the exact transform"
+        )
     return (
-        f"instrument {name!r}: camera_from_base: nothing in the images moves with its poses; check which arm and which "
-        "clock its log is of, or give the exact transform"
+        f"instrument {name!r}: camera_from_base: of all bases none was found from which its poses explain what moves; "
+        "state it as far as it is known (transform, sd_mm, sd_deg), which a wrist that bends needs, or check which arm "
+        "and which clock its log is of"
     )
 
 

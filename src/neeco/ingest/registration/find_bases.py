@@ -27,6 +27,7 @@ from neeco.ingest.timing.episodes import Episode, Episodes
 
 N_FRAMES = 140  # searched, evenly spaced
 MIN_BEND_MM = 2.0  # from the root to the logged link: nearer, nothing bends there
+MIN_READ_SHARE = 0.5  # of the frames, that a joint's log has to cover: those without a reading are left out
 MIN_TRAVEL_MM = 2.0  # root mean square, from which an arm counts as moving
 KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
 
@@ -108,6 +109,9 @@ def find_bases(
         if clock.source not in KNOWN:
             clock = replace(clock.later(registration.clock_s), sd=registration.clock_sd_s, source=FOUND)
         data = data.with_base(name, registration.world_from_base).with_moved_clock(logs[name].clock, clock)
+        if arm.item.kinematics is not None:  # found with readings of the same clock, where they have none of their own
+            for own in {log.clock for log in data.parts[0].joints[name].values()}:
+                data = data if data.clock(own) is not None else data.with_moved_clock(own, clock)
         data.notes.add(describe(name, registration))
         for place, doubt in enumerate(registration.doubts):
             data.notes.contradict(f"base of {name}, {place}", f"instrument {name!r}: {doubt}", severe=True)
@@ -197,24 +201,28 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
             found[joint] = readings_at(reading, own.at(times) + later)[0]
         return found
 
-    readings = {joint: values for joint, values in readings_later(0.0).items() if np.isfinite(values).all()}
+    readings = {
+        joint: values for joint, values in readings_later(0.0).items() if np.isfinite(values).mean() > MIN_READ_SHARE
+    }
     tree = item.kinematics
-    bends = tree is not None and tree.pose_of is not None and set(tree.readings) <= set(readings)
-    states = [{joint: float(values[row]) for joint, values in readings.items()} for row in range(len(times))]
+    end = None if tree is None else tree.pose_of
+
+    def root_from_logged(shift: float) -> np.ndarray:
+        """[F, 4, 4] of the link whose pose is logged, with readings of the same moments; NaN where one is missing."""
+        assert tree is not None
+        assert end is not None
+        values, needed = readings_later(shift), tree.readings_of(end)
+        states = [{name: float(values[name][row]) for name in needed} for row in range(len(times))]
+        rest = dict.fromkeys(tree.readings, 0.0)  # of links beyond
+        return np.stack([tree.poses(rest | state)[end] for state in states])
 
     def base_from_shaft(shift: float) -> np.ndarray:
         poses, _ = poses_at(log, clock.at(times) + shift)
-        if not bends:
-            return poses
-        assert tree is not None
-        return np.stack([tree.world_from_root(pose, state) for pose, state in zip(poses, states, strict=True)])
+        return poses if end is None else poses @ np.linalg.inv(root_from_logged(shift))
 
-    wrists = None
-    if bends:
-        assert tree is not None
-        assert tree.pose_of is not None
-        wrists = np.stack([tree.poses(state)[tree.pose_of][:3, 3] for state in states])
-        wrists = wrists if np.linalg.norm(wrists, axis=1).min() > MIN_BEND_MM else None
+    wrists = None if end is None else root_from_logged(0.0)[:, :3, 3]
+    if wrists is not None and not np.nanmin(np.linalg.norm(wrists, axis=1), initial=np.inf) > MIN_BEND_MM:
+        wrists = None
     prior = None
     if stated.matrix is not None:
         assert stated.sd_mm is not None

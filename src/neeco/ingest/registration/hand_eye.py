@@ -41,6 +41,10 @@ class Registration:
     camera_from_sensor: np.ndarray  # [4, 4] hand-eye, mm
     clock: ClockOffset
     scale_sd: float  # relative, one standard deviation
+    origin: np.ndarray  # [3] mm, world: about which the scale and the rotation may be off
+    covariances: (
+        np.ndarray
+    )  # [3, 7, 7] of ln scale, turn (rad) and shift (mm) of SfM's world, as `_covariances` has them
     position_residual: np.ndarray  # [N] mm, per frame used
     rotation_residual: np.ndarray  # [N] rad
     used: np.ndarray  # [N] indices of the frames used
@@ -51,6 +55,17 @@ class Registration:
         placed[:, :3, :3] = self.rotation @ placed[:, :3, :3]
         placed[:, :3, 3] = self.points(placed[:, :3, 3])
         return placed
+
+    def placement_sd(self, places: np.ndarray) -> tuple[float, float]:
+        """Standard deviations, mm and degrees, by which cameras and tissue together may be off the tracker's frame at
+        places [N, 3] mm of it, in the worst direction: by as much instruments are rendered beside their place."""
+        arms = places - self.origin
+        moves = np.zeros((len(places), 3, 7))
+        moves[:, :, 0], moves[:, :, 4:] = arms, np.eye(3)
+        moves[:, :, 1:4] = np.cross(np.eye(3), arms[:, None]).transpose(0, 2, 1)
+        shifts = np.einsum("nij,kjl,nml->kim", moves, self.covariances, moves) / max(len(places), 1)
+        sds = [np.sqrt(np.linalg.eigvalsh(part)[:, -1].max()) for part in (shifts, self.covariances[:, 1:4, 1:4])]
+        return float(sds[0]), float(np.degrees(sds[1]))
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Transform points [P, 3] from the SfM gauge to the world, mm."""
@@ -74,13 +89,15 @@ def register_with_laparoscope(
     clock = clock_from_turning(world_from_camera, times, log) if known is None else known
     problem = _HandEye(world_from_camera, times, log, clock, settings or IngestSettings())
     if known is not None:
-        solution, covariance, _ = problem.solve(problem.start, (LAG, STRETCH))
+        solution, covariances = problem.solve(problem.start, (LAG, STRETCH))
     else:
-        solution, covariance, sd = problem.solve(problem.start, ())
+        solution, covariances = problem.solve(problem.start, ())
+        sd = _clock_deviations(covariances)
         rate = clock.rate * (1 + solution[STRETCH])
         if abs(rate - 1) < RATE_SIGNIFICANCE * clock.rate * sd[1]:
             solution[STRETCH], rate = 1 / clock.rate - 1, 1.0
-            solution, covariance, sd = problem.solve(solution, (STRETCH,))
+            solution, covariances = problem.solve(solution, (STRETCH,))
+            sd = _clock_deviations(covariances)
         seconds = clock.seconds + clock.rate * solution[LAG] + (clock.rate - rate) * problem.now
         off = float(np.hypot(sd[0], sd[1] * times.std()))
         clock = ClockOffset(float(seconds), off, SCOPE_MOTION, float(rate), float(sd[1]))
@@ -93,7 +110,9 @@ def register_with_laparoscope(
         translation=origin - scale * rotation.apply(problem.centre),
         camera_from_sensor=rigid(hand.as_matrix(), lever),
         clock=clock,
-        scale_sd=float(np.sqrt(max(covariance[0, 0], 0.0))),
+        scale_sd=float(np.sqrt(max(covariances[0, 0, 0], 0.0))),
+        origin=origin,
+        covariances=covariances[:, :7, :7],
         position_residual=np.linalg.norm(position[used], axis=1),
         rotation_residual=np.linalg.norm(turn[used], axis=1),
         used=used,
@@ -163,9 +182,8 @@ class _HandEye:
         ]
         return np.concatenate(rows).ravel()
 
-    def solve(self, x: np.ndarray, held: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Solve all unknowns [U] from `x` on, except `held`; return them, their covariance, and the standard deviations
-        [2] of LAG and STRETCH."""
+    def solve(self, x: np.ndarray, held: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Solve all unknowns [U] from `x` on, except `held`; return them and their `_covariances`."""
         free = np.setdiff1d(np.arange(len(x)), held)
 
         def of_free(values: np.ndarray) -> np.ndarray:
@@ -177,25 +195,40 @@ class _HandEye:
         found, covariance, jacobian = x.copy(), np.zeros((len(x), len(x))), np.zeros((len(solved.fun), len(x)))
         found[free], jacobian[:, free] = solved.x, solved.jac
         covariance[np.ix_(free, free)] = np.linalg.pinv(solved.jac.T @ solved.jac)
-        return found, covariance, _clock_deviations(solved.fun, jacobian, covariance, self.times[self.valid])
+        return found, _covariances(solved.fun, jacobian, covariance, self.times[self.valid])
 
 
-def _clock_deviations(
-    residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, times: np.ndarray
-) -> np.ndarray:
-    """Standard deviations [2] of LAG, s, and STRETCH: the larger of those by the stated noise and by residuals
-    that are correlated over CORRELATED_S (Newey & West 1987).
+def _covariances(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Covariances [3, U, U] of the unknowns, of which the largest holds: by the stated noise; by residuals that are
+    correlated over CORRELATED_S (Newey & West 1987); and by noise of the residuals' size and autocorrelation: a
+    tracker's slow errors, which a few unknowns absorb, leave few residuals.
 
     residuals [Q] and jacobian [Q, U] as `least_squares` returns them: the first are not yet weighted by the soft-L1
     loss. times [N] s of the frames, whose positions and rotations come first.
     """
-    clock = [LAG, STRETCH]
     weighted = residuals * (1 + residuals**2) ** 0.25
-    influence = covariance[clock] @ (jacobian * weighted[:, None]).T  # [2, Q]
-    frames = influence[:, : 6 * len(times)].reshape(2, 2, len(times), 3).sum((1, 3))  # [2, N]
-    near = np.clip(1 - np.abs(times[:, None] - times) / CORRELATED_S, 0, None)
-    correlated = np.einsum("kn,nm,km->k", frames, near, frames)
-    return np.sqrt(np.maximum.reduce([correlated, covariance[clock, clock], np.zeros(2)]))
+    count, unknowns = len(times), len(covariance)
+    gain = (covariance @ jacobian.T)[:, : 6 * count].reshape(unknowns, 2, count, 3)
+    errors = weighted[: 6 * count].reshape(2, count, 3)
+    frames = (gain * errors).sum((1, 3))  # [U, N]
+    apart = np.abs(times[:, None] - times)
+    near = np.clip(1 - apart / CORRELATED_S, 0, None)
+    modelled = np.zeros_like(covariance)
+    some = (apart > 0.1 * CORRELATED_S) & (apart < 0.4 * CORRELATED_S)
+    for kind in range(2):  # positions, rotations
+        products = errors[kind] @ errors[kind].T
+        size = float(np.trace(products))
+        slow = float(products[some].mean() / near[some].mean() * count / size) if some.any() and size > 0 else 0.0
+        slow = float(np.clip(slow, 0, 1))
+        alike = size / (3 * count) * (slow * near + (1 - slow) * np.eye(count))
+        modelled += np.einsum("unk,nm,vmk->uv", gain[:, kind], alike, gain[:, kind], optimize=True)
+    return np.stack([covariance, frames @ near @ frames.T, modelled])
+
+
+def _clock_deviations(covariances: np.ndarray) -> np.ndarray:
+    """Standard deviations [2] of LAG, s, and STRETCH."""
+    clock = [LAG, STRETCH]
+    return np.asarray(np.sqrt(np.maximum(covariances[:2, clock, clock].max(0), 0.0)))
 
 
 def _sensor_poses(times: np.ndarray, log: PoseLog, clock: ClockOffset) -> tuple[np.ndarray, np.ndarray]:

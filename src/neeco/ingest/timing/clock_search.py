@@ -22,6 +22,7 @@ MIN_CORRELATION = 0.6  # of two recordings of one motion
 SAME_MOTION = 0.95  # from which on no other rate is tried: ends are off by less than a lobe
 MIN_LEAD = 0.08  # by how much the best offset must beat every other, apart from its own lobe
 LOBE_S = 0.3  # s
+MIN_SIGNIFICANCE = 3.5  # standard deviations of chance: the best of tens of offsets in a short recording has 3
 MIN_OVERLAP = 0.6  # of the video, that the log covers
 MAX_LENGTH_S = 24 * 3600.0  # s that a recording may last: a longer log or video has stray stamps
 MAX_RATE = 2.5  # s of a log in one second of the video: 60 frames a second taken for 25
@@ -108,8 +109,14 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
     if rate != 1:
         rate = _finer_rate(observed, tracked, rate)
         lags, scores = correlate(_stretched(observed, rate), tracked)
-    best, length = _peak(lags, scores, rate, log), grid[-1] - grid[0]
-    sd = _spread_of_parts(_stretched(observed, rate), tracked, best)
+    best, length, stretched = _peak(lags, scores, rate, log), grid[-1] - grid[0], _stretched(observed, rate)
+    if (sds := significance(stretched, tracked, best, float(scores.max()))) < MIN_SIGNIFICANCE:
+        raise NeecoError(
+            f"{log.path}: its clock cannot be determined from the images: in so short a recording the best offset's "
+            f"correlation of {scores.max():.2f} is {sds:.1f} standard deviations of chance, of {MIN_SIGNIFICANCE:g} "
+            "that are needed; give it in `sync`, or record more motion"
+        )
+    sd = _spread_of_parts(stretched, tracked, best)
     rate_sd = np.sqrt(12) * sd / length if rate != 1 else 0.0  # of a line through offsets spread over the video
     seconds = log_grid[0] + _vertex(lags, scores) * STEP_S - rate * grid[0]
     return ClockOffset(float(seconds), sd, INSTRUMENT_MOTION, rate, float(rate_sd))
@@ -194,6 +201,24 @@ def _peak(lags: np.ndarray, scores: np.ndarray, rate: float, log: PoseLog) -> in
             "of the recording"
         )
     return int(lags[best])
+
+
+def significance(short: np.ndarray, long: np.ndarray, lag: int, correlation: float) -> float:
+    """Return a correlation of two signals at a lag in standard deviations of chance (Fisher's z), by the number of
+    independent samples in their overlap (Bartlett 1946)."""
+    overlap = min(len(short) + min(lag, 0), len(long) - max(lag, 0), len(short), len(long))
+    count = min(len(short), len(long)) // 2
+    similar = _autocorrelation(short, count) * _autocorrelation(long, count)
+    inflation = 1 + 2 * float((similar * (1 - np.arange(1, count) / max(overlap, count))).sum())
+    samples = overlap / max(inflation, 1.0)
+    return float(np.arctanh(min(correlation, 0.9999)) * np.sqrt(max(samples - 3, 0.0)))
+
+
+def _autocorrelation(signal: np.ndarray, count: int) -> np.ndarray:
+    """Return the autocorrelation of a signal at lags 1 ... count - 1."""
+    centred = signal - signal.mean()
+    found = fftconvolve(centred, centred[::-1])[len(signal) - 1 :]
+    return np.asarray(found[1:count] / max(float(found[0]), 1e-18))
 
 
 def _vertex(lags: np.ndarray, scores: np.ndarray) -> float:

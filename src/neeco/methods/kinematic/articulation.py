@@ -161,8 +161,8 @@ class Articulation(nn.Module):
         of these link weights: at a reading of 0, and per unit of it)."""
         raise NotImplementedError
 
-    def joint_points(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
-        """Return named pivots and tips [3] mm, instrument frame."""
+    def joint_points(self, readings: Mapping[str, float], shaft: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
+        """Return named pivots and tips [3] mm, instrument frame; `shaft`: that of `shaft()`."""
         raise NotImplementedError
 
     def keypoints(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
@@ -171,7 +171,7 @@ class Articulation(nn.Module):
         rear, front = self.extent
         near = torch.maximum(self.wrist_start, rear) if self.jointed else front
         ends = {"shaft_far": origin + rear * direction, "shaft_near": origin + near * direction}
-        return ends | self.joint_points(readings)
+        return ends | self.joint_points(readings, (origin, direction))
 
     def measure_tips(self, points: Tensor, weights: Tensor) -> None:
         """Estimate the tips of moving links from solid Gaussians at points [M, 3] mm with link weights [M, link_count];

@@ -113,23 +113,23 @@ class Hinges(Articulation):
         from_closed = self.gains[joint] * (reading - self.closed[joint])
         return torch.where(self.closed[joint].isnan(), self.turns(joint, reading), from_closed)
 
-    def tips_at(self, joint: int, reading: float) -> Tensor:
+    def _tips(self, joint: int, reading: float, shaft: tuple[Tensor, Tensor], pivots: Tensor, axes: Tensor) -> Tensor:
         """Return the tips [2, 3] mm of a joint's left and right jaw, instrument frame. A tip that was not measured lies
         at the shaft's end when the joint is closed."""
-        origin, direction = shaft = self.shaft()
-        pivots, axes = self.axes(shaft)
+        origin, direction = shaft
         known = self.tips[joint].isfinite().all(1)  # [2]
         points = torch.where(known[:, None], self.tips[joint], origin + self.extent[1] * direction)  # [2, 3]
         angles = torch.where(known, self.turns(joint, reading), self.opening(joint, reading))
         order = self.left_right_order(joint, axes)
         return rotate_about(points, axes[joint], pivots[joint], angles).index_select(0, order)
 
-    def joint_points(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
+    def joint_points(self, readings: Mapping[str, float], shaft: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
         """Return the first joint's hinge and tips."""
         if not self.jointed:
             return {}
-        left, right = self.tips_at(0, readings[self.reading_names[0]])
-        return {"hinge": self.hinge(0)[0], "tip_left": left, "tip_right": right}
+        pivots, axes = self.axes(shaft)
+        left, right = self._tips(0, readings[self.reading_names[0]], shaft, pivots, axes)
+        return {"hinge": pivots[0], "tip_left": left, "tip_right": right}
 
     def parts(self, points: Tensor, weights: Tensor) -> Tensor:
         """A fixed jaw is learned as shaft, since it moves with it: beyond the hinge there are only jaws."""

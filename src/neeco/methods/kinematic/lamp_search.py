@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from neeco.raster import rasterize
+from neeco.raster import depth_maps, rasterize
 from neeco.raster.shadow import GAMMA, Casting, blocked
 from neeco.raster.types import Gaussians
 from neeco.scene.gaussian_scene import MAX_LAMPS
@@ -166,7 +166,7 @@ def _render_candidates(session: GaussianSession, index: int, offsets: Tensor) ->
     casting = ~instrument | (posed.opacities > FAINT_OPACITY)
     posed, instrument = posed.select(casting), instrument[casting]
     among = Casting.of(posed, instrument, camera)
-    missed = blocked(among, scene.shadow_width, offsets, rasterize)  # [C, N]
+    missed = blocked(among, scene.shadow_width, offsets, depth_maps)  # [C, N]
     channels = torch.stack([instrument.float(), *missed], 1)  # [N, 1 + C]
     rendering = rasterize(posed, camera, channels=channels)
     assert rendering.channels is not None

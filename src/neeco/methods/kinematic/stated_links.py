@@ -173,10 +173,14 @@ class StatedLinks(Articulation):
 
     def place(self, points: Tensor, link: int, readings: Mapping[str, float]) -> Tensor:
         """Return points [M, 3] mm of one link at rest moved to these readings, instrument frame."""
+        return points if link == 0 else self._placed(points, link, self.values(readings), self.axes())
+
+    def _placed(self, points: Tensor, link: int, values: Tensor, about: tuple[Tensor, Tensor]) -> Tensor:
+        """`place` for the joints' `values` and axes."""
         if link == 0:
             return points
-        pivots, axes = self.axes()
-        for joint, value in enumerate(self.values(readings)[:, link - 1]):
+        pivots, axes = about
+        for joint, value in enumerate(values[:, link - 1]):
             if self.slides[joint]:
                 points = points + value * axes[joint]
             else:
@@ -215,20 +219,21 @@ class StatedLinks(Articulation):
         towards = torch.linalg.cross(axes[joint], ahead)
         return pivots[joint], nn.functional.normalize(ahead, dim=0), nn.functional.normalize(towards, dim=0)
 
-    def joint_points(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
+    def joint_points(self, readings: Mapping[str, float], shaft: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
         """Return the pivot of every joint, `pivot_` + the link that it moves, and the tip of every end link, `tip_` +
         its name."""
         found = {}
-        pivots, _ = self.axes()
-        for name, group, pivot in zip(self._pivot_names[::-1], self.joint_groups[::-1], pivots.flip(0), strict=True):
+        about, values = self.axes(), self.values(readings)
+        pivots = about[0].flip(0)
+        for name, group, pivot in zip(self._pivot_names[::-1], self.joint_groups[::-1], pivots, strict=True):
             carrier = self.link_of(group[0].parent)
             if group[0].type == PRISMATIC:  # its offset across the axis is not observable: put on the shaft
-                origin, direction = self.shaft()
+                origin, direction = shaft
                 pivot = origin + ((pivot - origin) @ direction) * direction
-            found[f"pivot_{name}"] = self.place(pivot[None], carrier, readings)[0]
+            found[f"pivot_{name}"] = self._placed(pivot[None], carrier, values, about)[0]
         for link in self._ends:
             if bool(self.tips[link].isfinite().all()):
-                found[f"tip_{self.part_names[link]}"] = self.place(self.tips[link][None], link, readings)[0]
+                found[f"tip_{self.part_names[link]}"] = self._placed(self.tips[link][None], link, values, about)[0]
         return found
 
     def parts(self, points: Tensor, weights: Tensor) -> Tensor:
