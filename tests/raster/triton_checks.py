@@ -44,7 +44,7 @@ def deterministic() -> Iterator[None]:
     torch.use_deterministic_algorithms(False)
 
 
-@pytest.mark.parametrize(("sh_count", "channels"), [(1, 0), (1, 3), (4, 1), (4, 5), (9, 0), (9, 4), (16, 1)])
+@pytest.mark.parametrize(("sh_count", "channels"), [(1, 0), (4, 5), (9, 4), (16, 1)])
 def test_image_and_every_gradient_match_the_reference(sh_count: int, channels: int) -> None:
     same(scene_of(24, sh_count, channels, seed=sh_count + channels))
 
