@@ -31,7 +31,6 @@ class TinyScene:
     labelled: bool = True
     has_gaussians = True
     casts_shadow = False
-    label_threshold = None
     method: str = "tiny"
     diagnostics: dict[str, Any] = field(default_factory=dict)
 

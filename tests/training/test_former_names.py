@@ -1,4 +1,5 @@
-"""A method that was renamed is still trained, continued and loaded by its former name, with one line that says so."""
+"""A method that was renamed is still trained, continued and loaded by its former name, with one line that says so; so
+is a run that stored a setting which is none any more."""
 
 from __future__ import annotations
 
@@ -9,8 +10,10 @@ import yaml
 
 import neeco
 from neeco.cli import main
+from neeco.errors import NeecoError
 from neeco.scene.method_registry import current_name
-from neeco.training.config import training_config
+from neeco.training.config import config_to_dict, training_config
+from neeco.training.run import stored_config
 
 SAID = "method neeco is now called nps"
 SMALL = ["deformation.width=16", "deformation.depth=2"]
@@ -37,3 +40,12 @@ def test_a_run_of_a_former_name_is_continued_under_either(
         assert neeco.load(run).config["method"] == "nps"
     for name in ("neeco", "nps"):
         assert main([*flags, "--resume", "--method", name]) == 0
+
+
+def test_a_stored_setting_that_is_none_any_more_is_read_and_not_taken_anew(tmp_path: Path) -> None:
+    config = training_config("kinematic", {}, [])
+    stored = config_to_dict(config)
+    stored["deformation"] |= {"label_shares": True}
+    assert stored_config(tmp_path, stored) == config
+    with pytest.raises(NeecoError, match="label_shares"):
+        training_config("kinematic", {}, ["deformation.label_shares=false"])

@@ -14,13 +14,11 @@ from capture_files import PIVOT_MM, write_grasper
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
-from neeco.methods.kinematic import deformation
 from neeco.methods.space_carving import CarvingSettings, gather_evidence
 from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
-from neeco.training import initial
 from neeco.training.config import training_config
 from neeco.training.initial import initial_scene
 from neeco.training.run import load_run
@@ -70,18 +68,6 @@ def test_a_run_and_an_interrupted_one_give_the_same_bytes(capture: Path, tmp_pat
     evaluation = evaluate_run(run, run.capture(), ("test",), align=True)
     assert evaluation["given"]["test"]["frames"] == 4
     synthesize(run, tmp_path / "dataset", Settings(count=4, tissue_check=False, min_share=1e-4))
-
-
-def test_labels_are_weighed_in_images_of_the_size_learned(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In images of the searches' size thin Gaussians share their pixels with tissue: edges and dark rings were lost."""
-    looked_at = []
-    monkeypatch.setattr(deformation, "store_label_shares", lambda session: looked_at.append(session.scale))
-    monkeypatch.setattr(deformation, "conclude", lambda *_: None)
-    taken = read_capture(capture)
-    session = initial.begin_session(taken, TrainingViews.read(taken.split("train")), CONFIG, print)
-    assert session.resolution.search_scale < 1
-    session.scene.deformation.finish(session)
-    assert looked_at == [1.0]
 
 
 def test_with_two_instruments_each_has_its_own_parts_and_both_cast_a_shadow(capture: Path, tmp_path: Path) -> None:

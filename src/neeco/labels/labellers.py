@@ -25,7 +25,7 @@ from neeco.scene.deformation import otsu
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene, GaussianScene
 
-# Of scenes without a threshold of their own: the instrument's moving shadow is learned with labels of 0.3 to 0.5, so
+# The instrument's moving shadow is learned with labels of 0.3 to 0.5, so
 # that 0.5 is too low; 0.65 to 0.7 is best.
 LABEL_THRESHOLD = 0.65
 SHADOWED_THRESHOLD = 0.55  # where the scene models that shadow: 0.65 then loses as much of the silhouette's border
@@ -39,9 +39,7 @@ DELTAS = ("means", "quats", "scales")
 
 
 def threshold_of(scene: DrawableScene) -> float:
-    """Return the scene's own label threshold: the share of a pixel above which it is labelled instrument."""
-    if scene.label_threshold is not None:
-        return scene.label_threshold
+    """Return the share of a pixel above which it is labelled instrument in a scene."""
     return SHADOWED_THRESHOLD if scene.casts_shadow else LABEL_THRESHOLD
 
 

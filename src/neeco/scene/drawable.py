@@ -178,10 +178,6 @@ class DrawableScene(Protocol):
         """Whether the instruments' shadow is rendered as a shadow, so that none is learned as a faint part of them."""
 
     @property
-    def label_threshold(self) -> float | None:
-        """Share of a pixel from which its label is an instrument's; None: chosen by whether it casts a shadow."""
-
-    @property
     def label_names(self) -> Sequence[tuple[str, str]]:
         """(instrument, part) of each label column; empty where the scene learns no labels."""
 

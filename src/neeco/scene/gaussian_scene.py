@@ -52,8 +52,7 @@ class GaussianScene(nn.Module):
     `state_corrections` correct poses and readings by what depends on the state.
     `falloff` (tissue, instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`,
     `shadow_strengths` (0: no such lamp) and `shadow_width` the instruments' shadows on the tissue (see `Shadow`).
-    `background` in [0, 1] is the grey behind everything. `label_threshold` in (0, 1) is the share of a pixel from which
-    it is labelled an instrument; None: chosen by whether the scene renders shadows (see `neeco.labels.labellers`).
+    `background` in [0, 1] is the grey behind everything.
     """
 
     has_gaussians = True
@@ -78,7 +77,6 @@ class GaussianScene(nn.Module):
         self.recorded = recorded
         self.sh_degree = 0
         self.background = 0.0
-        self.label_threshold: float | None = None
         self.diagnostics: dict[str, Any] = {}
         device = canonical.means.device
         self.register_buffer("center", center.float().to(device))  # [3] mm, middle of the tissue; [T, 3] of several
@@ -113,7 +111,6 @@ class GaussianScene(nn.Module):
             "counts": list(canonical.counts),
             "sh_degree": self.sh_degree,
             "background": self.background,
-            "label_threshold": self.label_threshold,
         }
 
     @classmethod
@@ -137,10 +134,6 @@ class GaussianScene(nn.Module):
         scene.background = float(header.get("background", header.get("backdrop", 0.0)))
         if not 0 <= scene.background <= 1:
             raise ValueError(f"its background is {scene.background}, not a grey in [0, 1]")
-        if (threshold := header.get("label_threshold")) is not None:  # older scenes have none
-            scene.label_threshold = float(threshold)
-            if not 0 < scene.label_threshold < 1:
-                raise ValueError(f"its label_threshold is {threshold}, not a share between 0 and 1")
         return scene
 
     def at(self, state: State, perturbation: Perturbation = UNPERTURBED) -> Gaussians:

@@ -25,7 +25,7 @@ from neeco.scene.deformation import Deformation
 from neeco.scene.drawable import DrawableScene, Recorded
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.method import Stored
-from neeco.scene.method_registry import current_name, method_class, method_settings
+from neeco.scene.method_registry import current_name, method_class, method_settings, without_removed
 from neeco.settings import plain
 
 SCHEMA = "neeco-scene/2"
@@ -151,7 +151,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Drawable
         raise ValueError("its header holds an unpaired surrogate character")
     instruments, recorded = _recording(tensors, header)
     method = header["method"] = current_name(header["method"])
-    settings = method_settings(method, header["deformation"])
+    settings = method_settings(method, without_removed(header["deformation"]))
     kind = method_class(method)
     stored = Stored(settings, instruments, recorded, tensors, header)
     scene: DrawableScene = (

@@ -16,6 +16,7 @@ from neeco.settings import structure
 
 DEFAULT = "kinematic"
 PACKAGE = "neeco.methods"  # our package, and the entry point group of others
+REMOVED = ("label_shares",)  # settings of methods in scenes and runs before the release of version 0.3
 
 
 @cache
@@ -62,6 +63,11 @@ def method_settings(method: str, values: Mapping[str, Any]) -> Any:
     """Return the method's own settings with `values`. Raises NeecoError for an unknown field or one that does not
     fit."""
     return structure(method_class(method).Settings, values, "deformation", f"method {method}")
+
+
+def without_removed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a method's own settings as stored by any version, without those that are none any more."""
+    return {name: value for name, value in values.items() if name not in REMOVED}
 
 
 def make_deformation(method: str, instruments: tuple[Instrument, ...], settings: Any = None) -> Deformation:

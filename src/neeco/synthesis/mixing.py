@@ -223,9 +223,6 @@ def _merged(
             getattr(mixed, name).copy_(getattr(tissue, name))
     mixed.sh_degree = max(scene.sh_degree for scene in (tissue, *instrument_scenes))
     mixed.background = tissue.background
-    measured = [scene.label_threshold for scene in instrument_scenes if scene.label_threshold is not None]
-    if len(measured) == len(instrument_scenes):
-        mixed.label_threshold = sum(measured) / len(measured)
     return mixed.requires_grad_(False)
 
 

@@ -131,7 +131,6 @@ def over_tissue(instruments: GaussianScene, tissue: GaussianScene) -> GaussianSc
         made.vignette.copy_(tissue.vignette)
     made.sh_degree = max(instruments.sh_degree, tissue.sh_degree)
     made.background = tissue.background
-    made.label_threshold = instruments.label_threshold
     return made.to(own.means.device).requires_grad_(False)
 
 
@@ -147,7 +146,6 @@ def _copy(scene: GaussianScene, canonical: CanonicalGaussians) -> GaussianScene:
     )
     made.load_state_dict(scene.state_dict())
     made.sh_degree, made.background = scene.sh_degree, scene.background
-    made.label_threshold = scene.label_threshold
     return made.to(scene.center.device).requires_grad_(False)
 
 

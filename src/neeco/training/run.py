@@ -34,7 +34,7 @@ from neeco.files import (
 from neeco.scene.drawable import DrawableScene
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import DAMAGED, load_scene, pack_scene, save_tensors, unpack_scene
-from neeco.scene.method_registry import current_name
+from neeco.scene.method_registry import current_name, without_removed
 from neeco.scene.training_session import Session, StepResult, members
 from neeco.training.config import TrainConfig, check_ranges, config_from_dict, config_to_dict
 
@@ -158,6 +158,8 @@ def stored_config(path: Path, stored: Mapping[str, Any]) -> TrainConfig:
     """Return the settings in `stored`, which `read_config` read from run folder `path`. Raises NeecoError for a field
     that is unknown or does not fit, or a number out of range."""
     known = {key: value for key, value in stored.items() if key not in ("schema", "version", "capture", CAPTURE_DIGEST)}
+    if isinstance(own := known.get("deformation"), Mapping):
+        known["deformation"] = without_removed(own)
     try:
         config = config_from_dict(known)
         check_ranges(config)

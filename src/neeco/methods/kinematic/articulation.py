@@ -14,7 +14,6 @@ from neeco.raster.articulated import ArticulatedBody, link_weights
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import JointMotion, Skeleton
 
-LABEL_SHARE = "label_share"  # the per-Gaussian extra [N] in [0, 1]: weight in the labels of its instrument
 LINK_LOGITS = "part_logits"  # the per-Gaussian extra [N, logit_count] that link weights are the softmax of
 MODULES = "hinges"  # the articulations' name in files of scenes, since version 0.1
 GATE_RADII = 1.0  # shaft radii behind the first joint up to which a link that it moves may reach

@@ -22,7 +22,6 @@ from neeco.geometry.camera import Camera
 from neeco.methods.breathing import RATES as BREATHING_RATES
 from neeco.methods.breathing import BreathingTissue
 from neeco.methods.kinematic.articulation import (
-    LABEL_SHARE,
     LINK_LOGITS,
     ArticulatedInstruments,
     Articulation,
@@ -33,7 +32,6 @@ from neeco.methods.kinematic.finish import conclude
 from neeco.methods.kinematic.hinge_search import hinge_joints
 from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.interiors import fade_interior_tissue
-from neeco.methods.kinematic.label_shares import store_label_shares
 from neeco.methods.kinematic.lamp_search import find_shadow
 from neeco.methods.kinematic.silhouette_evidence import OBSERVED_AT, observe_silhouettes
 from neeco.methods.kinematic.state_passes import MARKS, fit_states
@@ -83,8 +81,6 @@ class KinematicSettings:
     shadow_at: tuple[int, ...] = (1000, 1500)
     # whether tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`)
     extrapolate_tissue: bool = True
-    # whether Gaussians that model shadow or blur next to an instrument count less in its labels, by the images' colours
-    label_shares: bool = True
     # whether a period is looked for with which the tissue moves, and its motion learned (see `neeco.methods.breathing`)
     breathing: bool = True
     # whether joints move as the capture's kinematics state, where they do; else as found from the images
@@ -183,8 +179,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             parts = articulation.parts(canonical.means[rows], self.link_weights(canonical, index))
             labels[rows, column : column + parts.shape[1]] = parts
             column += parts.shape[1]
-        share = canonical.extras.get(LABEL_SHARE)
-        return labels if share is None else labels * share[:, None]
+        return labels
 
     def deltas(self, canonical: CanonicalGaussians, state: State) -> Deltas:
         """Return the change from canonical to posed; 0 for tissue, so that the thresholds of the paper's labels
@@ -236,7 +231,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
     def fit_extras(self, extras: Mapping[str, Tensor]) -> dict[str, Tensor]:
         logits, columns = extras[LINK_LOGITS], self.logit_count
         logits = nn.functional.pad(logits, (0, max(0, columns - logits.shape[1])))[:, :columns]
-        return {LINK_LOGITS: logits, LABEL_SHARE: extras.get(LABEL_SHARE, logits.new_ones(len(logits)))}
+        return {LINK_LOGITS: logits}
 
     def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
         return {LINK_LOGITS: canonical.means.new_zeros(len(canonical), self.logit_count)}
@@ -329,8 +324,6 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         session = gaussian_session(training)
         scene = session.scene
         fade_interior_tissue(session, self)
-        if self.settings.label_shares and self.label_names:
-            store_label_shares(session)  # at full size: reduced pixels mix thin Gaussians with tissue
         conclude(session, self)
         report_contradictions(session)
         if self.breathing is not None:

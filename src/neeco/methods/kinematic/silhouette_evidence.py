@@ -13,10 +13,10 @@ import math
 import cv2
 import numpy as np
 import torch
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 
 from neeco.capture.model import evenly_spaced
-from neeco.methods.kinematic.label_shares import channels_and_tissue, color_density, shades_of, share_of_colors
+from neeco.raster import rasterize
 from neeco.training.session import GaussianSession
 from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
 
@@ -31,6 +31,9 @@ FAR, NEAR = (
     0.04,
     0.075,
 )  # of the images' width: no tissue within it of an instrument counts for noise; none farther shows
+N_BINS = 12  # of each colour in the histogram of the instruments' colours
+SMOOTHING = 0.7  # bins, standard deviation
+SHADES = 0.5, 1.05  # range of shades of the rendered tissue in contact shadows; a dark shaft is darker
 ALIKE = 0.05  # share of the instruments' colours that are a pixel's, from which it may show one like its tissue
 
 
@@ -49,7 +52,7 @@ def observe_silhouettes(session: GaussianSession) -> None:
         return
     lower, upper = (max(least, factor * noise) for least, factor in (TISSUE, NOT_TISSUE))
     shown = [view.image[view.usable & (view.residual > upper) & (view.label > LABEL)] for view in sample]
-    density = color_density(np.concatenate(shown))
+    density = _color_density(np.concatenate(shown))
     views = (sampled[index] if index in sampled else _View(session, index) for index in range(count))
     session.silhouettes = Silhouettes(tuple(view.silhouette(lower, upper, density) for view in views), noise)
 
@@ -58,13 +61,17 @@ class _View:
     """A training image beside the scene's tissue: residual [H, W] after the best shade, label [H, W] as rendered."""
 
     def __init__(self, session: GaussianSession, index: int) -> None:
-        columns = session.scene.canonical.of_instruments.float()[:, None]
-        channels, tissue = channels_and_tissue(session, index, columns)
+        scene = session.scene
+        state, camera = session.corrected(index)
+        posed, instruments = scene.at(state), scene.canonical.of_instruments
+        channels = rasterize(posed, camera, channels=instruments.float()[:, None]).channels
+        assert channels is not None
+        tissue = rasterize(posed.select(~instruments), camera).color.clamp(0, 1).cpu().numpy()
         self.label = channels[..., 0].cpu().numpy()
         self.image = session.views.target(index).cpu().numpy()
         mask = session.views.mask(index)
         self.usable = np.ones(self.label.shape, bool) if mask is None else mask.cpu().numpy()
-        off = np.abs(self.image - shades_of(self.image, tissue)[..., None] * tissue).mean(-1)
+        off = np.abs(self.image - _shades_of(self.image, tissue)[..., None] * tissue).mean(-1)
         self.residual = uniform_filter(off, WINDOW_PX)
 
     def within(self, share: float) -> np.ndarray:
@@ -77,7 +84,7 @@ class _View:
         `lower` tissue where instruments, whose colours have this density, rarely look like it."""
         off = np.clip((self.residual - lower) / (upper - lower), 0, 1)
         instrument = np.where(self.within(NEAR), 2 * off - 1, 0).clip(0, 1)
-        tissue = np.where(share_of_colors(self.image, density) < ALIKE, 1 - 2 * off, 0).clip(0, 1)
+        tissue = np.where(_share_of_colors(self.image, density) < ALIKE, 1 - 2 * off, 0).clip(0, 1)
         certain = np.where(self.usable, instrument - tissue, 0)
         return torch.from_numpy((UNKNOWN + certain * (INSTRUMENT - UNKNOWN)).round().clip(0, 255).astype(np.uint8))
 
@@ -87,3 +94,29 @@ def _noise(views: list[_View]) -> float:
     far = [view.residual[view.usable & ~view.within(FAR)] for view in views]
     residuals = np.concatenate(far)
     return float(np.quantile(residuals, NOISE_QUANTILE)) if len(residuals) else math.inf
+
+
+def _bins(colors: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the bins of colours [..., 3] in [0, 1], one array per channel."""
+    found = np.clip((colors * N_BINS).astype(int), 0, N_BINS - 1)
+    return found[..., 0], found[..., 1], found[..., 2]
+
+
+def _share_of_colors(images: np.ndarray, density: np.ndarray) -> np.ndarray:
+    """Return the share [...] of the colours with this density that are like each pixel of the images [..., 3]."""
+    shares: np.ndarray = density[_bins(images)] / N_BINS**3
+    return shares
+
+
+def _color_density(colors: np.ndarray) -> np.ndarray:
+    """[N_BINS, N_BINS, N_BINS] density of colours [M, 3] in [0, 1], per unit of the colour cube."""
+    counts = np.zeros((N_BINS,) * 3)
+    np.add.at(counts, _bins(colors), 1)
+    smooth = gaussian_filter(counts, SMOOTHING)
+    return smooth / max(smooth.sum(), 1e-9) * N_BINS**3
+
+
+def _shades_of(images: np.ndarray, tissue: np.ndarray) -> np.ndarray:
+    """Return the shade [...] of SHADES in which the rendered tissue [..., 3] is most like the images [..., 3]."""
+    squared = (tissue**2).sum(-1)
+    return np.clip((images * tissue).sum(-1) / np.maximum(squared, 1e-6), *SHADES)

@@ -341,7 +341,6 @@ class NerfScene(nn.Module):
     num_gaussians = None
     has_gaussians = False
     casts_shadow = False
-    label_threshold = None
 
     def __init__(
         self, method: str, settings: NerfiesSettings, instruments: tuple[Instrument, ...], recorded: Recorded
