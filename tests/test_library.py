@@ -145,7 +145,10 @@ def test_python_of_the_first_pages_runs_as_written(page: str, folder: Path, monk
         assert written in code or page == "README.md"
         code = code.replace(written, run)
     monkeypatch.chdir(folder)
-    search_less(monkeypatch)
+    if page == "README.md":  # the call is the other page's
+        monkeypatch.setattr(neeco, "train", lambda capture, output, **options: neeco.load("runs/sample"))
+    else:
+        search_less(monkeypatch)
     names: dict[str, object] = {}
     exec(compile(code, page, "exec"), names)
     images = names["images"]

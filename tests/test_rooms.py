@@ -5,11 +5,10 @@ from __future__ import annotations
 import ast
 import functools
 import itertools
-from pathlib import Path
 
 import pytest
+from source_trees import SOURCE, module_paths, module_trees
 
-SOURCE = Path(__file__).parents[1] / "src"
 ROOMS = (  # from the top down; rooms of one line do not know each other
     ("cli",),
     ("api",),
@@ -40,10 +39,10 @@ OUTSIDE = ("__init__", "__main__", "_native")  # the package's version, its star
 Graph = dict[str, set[str]]  # module -> modules it imports anywhere: at its top, in functions, for types alone
 
 
-def imports_of(source: str, package: str, known: set[str]) -> set[str]:
+def imports_of(source: str | ast.Module, package: str, known: set[str]) -> set[str]:
     """Modules of `known` that a module in `package` imports; of `from neeco.a import b`, neeco.a.b if it is one."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(ast.parse(source) if isinstance(source, str) else source):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -58,19 +57,10 @@ def imports_of(source: str, package: str, known: set[str]) -> set[str]:
 
 
 @functools.cache
-def modules() -> dict[str, Path]:
-    names = {}
-    for path in sorted((SOURCE / "neeco").rglob("*.py")):
-        parts = path.relative_to(SOURCE).with_suffix("").parts
-        names[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    return names
-
-
-@functools.cache
 def graph() -> Graph:
-    paths = modules()
+    paths, trees = module_paths(), module_trees()
     return {
-        name: imports_of(path.read_text(), name if path.name == "__init__.py" else name.rpartition(".")[0], set(paths))
+        name: imports_of(trees[name], name if path.name == "__init__.py" else name.rpartition(".")[0], set(paths))
         for name, path in paths.items()
     }
 
@@ -81,7 +71,7 @@ def room(module: str) -> str:
 
 def folders(imports: Graph) -> Graph:
     """The imports between folders. A package's own names count as its folder's; what it re-exports does not."""
-    packages = {name for name, path in modules().items() if path.name == "__init__.py"}
+    packages = {name for name, path in module_paths().items() if path.name == "__init__.py"}
 
     def folder(module: str) -> str:
         return module if module in packages else module.rpartition(".")[0]
@@ -135,7 +125,7 @@ def circles(imports: Graph) -> list[str]:
 
 
 def test_every_room_has_its_place() -> None:
-    assert {room(module) for module in modules()} <= {*LEVELS, *OUTSIDE}
+    assert {room(module) for module in module_paths()} <= {*LEVELS, *OUTSIDE}
 
 
 def test_a_room_imports_only_from_rooms_below() -> None:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import ast
-import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from source_trees import module_paths, module_trees
 
 ROOT = Path(__file__).parents[1]
-SOURCE = ROOT / "src"
 MAX_POSITIONAL = 6  # arguments of a call, fields of a dataclass
 # Callables that take arguments by position alone: the C++ kernels, torch's autograd, struct
 POSITIONAL_ONLY = ("native().", "_Pose.apply", "struct.pack")
@@ -29,16 +28,6 @@ PRIVATE_IN_TESTS = {  # at most ten
     "_search",
     "_verb",
 }
-
-
-@functools.cache
-def modules() -> dict[str, ast.Module]:
-    """Syntax trees of the package's modules by name; a package's own is named by its folder."""
-    trees = {}
-    for path in sorted((SOURCE / "neeco").rglob("*.py")):
-        parts = path.relative_to(SOURCE).with_suffix("").parts
-        trees[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = ast.parse(path.read_text(), str(path))
-    return trees
 
 
 def long_calls(tree: ast.Module) -> Iterator[str]:
@@ -91,23 +80,23 @@ def private_imports(tree: ast.Module, importer: str, known: set[str]) -> Iterato
 
 
 def known_modules() -> set[str]:
-    return {*modules(), "neeco._native"}
+    return {*module_paths(), "neeco._native"}
 
 
 def test_no_call_has_more_than_six_positional_arguments() -> None:
-    ours = {name: tree for name, tree in modules().items() if not name.startswith(TRITON)}
+    ours = {name: tree for name, tree in module_trees().items() if not name.startswith(TRITON)}
     assert [f"{name}:{item}" for name, tree in ours.items() for item in long_calls(tree)] == []
 
 
 def test_a_dataclass_of_more_than_six_fields_is_keyword_only() -> None:
-    found = [(name, item) for name, tree in modules().items() for item in long_dataclasses(tree)]
+    found = [(name, item) for name, tree in module_trees().items() for item in long_dataclasses(tree)]
     assert [f"{name}:{item}" for name, item in found if f"{name}.{item.split(': ')[1]}" not in PUBLIC_LONG] == []
 
 
 def test_what_is_private_is_not_imported_from_outside() -> None:
-    assert [
-        f"{name}:{item}" for name, tree in modules().items() for item in private_imports(tree, name, known_modules())
-    ] == []
+    known = known_modules()
+    found = [(name, item) for name, tree in module_trees().items() for item in private_imports(tree, name, known)]
+    assert [f"{name}:{item}" for name, item in found] == []
 
 
 def private_names_in(tree: ast.Module) -> Iterator[str]:
@@ -166,7 +155,7 @@ def fragments(tree: ast.Module) -> Iterator[str]:
 
 
 def test_a_docstring_begins_with_a_verb_or_names_its_result() -> None:
-    assert [f"{name}:{item}" for name, tree in modules().items() for item in fragments(tree)] == []
+    assert [f"{name}:{item}" for name, tree in module_trees().items() for item in fragments(tree)] == []
 
 
 def test_a_fragment_is_found() -> None:

@@ -211,11 +211,11 @@ def test_a_sensor_mounted_behind_the_tip_is_nothing_where_the_images_fit_its_pos
     behind = np.eye(4)
     behind[:3, 3] = [0, 0, -100.0]
     sample.edit_poses(lambda pose: pose @ behind)
-    assert problems(sample) == []
-    assert problems(sample, "warning") == []
+    assert [str(problem) for problem in check_capture(sample.root)] == []
     sample.edit(lambda document: document.pop("ply_file_path"))  # now the images tell nothing
-    assert problems(sample) == []
-    assert_found(sample, "frames[*].instruments[*].pose", "outside every image", "warning")
+    found = check_capture(sample.root)
+    assert errors_only(found) == []
+    assert any("outside every image" in problem.message for problem in found)
 
 
 def test_a_sensor_mounted_tilted_is_fine(folder):

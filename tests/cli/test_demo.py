@@ -7,15 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from neeco.capture import check_capture, errors_only
 from neeco.cli.demo import Arguments, run, sample_capture
 from neeco.errors import NeecoError
 
 
-def test_the_bundled_sample_is_found_and_sound() -> None:
-    sample = sample_capture()
-    assert errors_only(check_capture(sample)) == []
-    assert len(list((sample / "truth" / "masks").glob("*.png"))) > 0  # without them no mask score
+def test_the_bundled_sample_is_found_with_its_masks() -> None:
+    """That it is sound is a test of check's."""
+    assert len(list((sample_capture() / "truth" / "masks").glob("*.png"))) > 0  # without them no mask score
 
 
 def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path: Path) -> None:

