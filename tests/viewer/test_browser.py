@@ -267,6 +267,8 @@ def test_kept_states_and_images_are_what_was_shown(serve: Serve, context: Any, m
         assert torch.allclose(kept.state.instruments["grasper"].pose, state.instruments["grasper"].pose)
         taken_by = loaded.recorded.cameras[int(asked_for.frame)]
         assert kept.world_from_camera == pytest.approx(to_numpy(taken_by.world_from_camera), abs=1e-4)
+    page.press("forget the last kept")
+    page.wait_for("kept: 1 in")
     page.press("save labelled image")
     page.wait_for("written:")
     record = json.loads((run / "kept" / "samples" / ".records" / "000000.json").read_text())

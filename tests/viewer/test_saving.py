@@ -56,6 +56,18 @@ def test_kept_states_come_back_from_the_sampler_as_they_were(saved: SavedStates,
         assert (camera.width, camera.fx) == (WIDTH, 60.0)
 
 
+def test_the_last_kept_is_forgotten_first(saved: SavedStates, loaded: LoadedRun) -> None:
+    for roll in (0.1, 0.2):
+        saved.add(loaded, some_state(loaded, roll=roll), VIEW)
+    assert saved.remove_last(loaded) == 1
+    (line,) = saved.read(loaded)
+    expected = some_state(loaded, roll=0.1).instruments["grasper"].pose
+    assert torch.allclose(line.state.instruments["grasper"].pose, expected)
+    assert saved.remove_last(loaded) == 0
+    assert not saved.states_path.exists()
+    assert saved.remove_last(loaded) == 0
+
+
 def test_what_was_kept_before_stays(saved: SavedStates, loaded: LoadedRun, tmp_path: Path) -> None:
     saved.add(loaded, some_state(loaded), VIEW)
     before = saved.states_path.read_text()

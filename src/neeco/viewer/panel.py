@@ -41,7 +41,9 @@ class Actions:
     go_to: Callable[[int], None]  # the camera of a frame
     toggle_gizmo: Callable[[str, int, bool], None]  # an instrument's name and number, and whether its gizmo appears
     save_state: Callable[[], None]
+    remove_state: Callable[[], None]
     save_image: Callable[[], None]
+    dark: Callable[[bool], None]
 
 
 class Panel:
@@ -170,12 +172,16 @@ class Panel:
         labelled = bool(self._runs[0].scene.label_names)
         with gui.add_folder("Keep"):
             keep = gui.add_button("keep this state", hint="And this camera, for neeco synthesize --states.")
+            forget = gui.add_button("forget the last kept")
             save = gui.add_button(
                 "save labelled image", disabled=not labelled, hint="As neeco synthesize writes one, from here."
             )
             self.saved = gui.add_html("")
+        dark = gui.add_checkbox("dark", True)
         keep.on_click(lambda _: self._actions.save_state())
+        forget.on_click(lambda _: self._actions.remove_state())
         save.on_click(lambda _: self._actions.save_image())
+        dark.on_update(lambda _: self._actions.dark(bool(dark.value)))
 
     def _draw_plot(self, data: tuple[np.ndarray, ...]) -> None:
         if self._plot is not None:

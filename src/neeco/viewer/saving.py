@@ -48,9 +48,12 @@ class SavedStates:
         NeecoError where the file cannot be written, or holds states of another scene."""
         line = json.dumps(state_to_json(state) | {"camera": camera_to_json(world_from_camera)}, allow_nan=False)
         with self._lock:
-            lines = [*self._lines(loaded), line]
-            write_text(self.states_path, "".join(f"{line}\n" for line in lines))
-            return len(lines)
+            return self._write([*self._lines(loaded), line])
+
+    def remove_last(self, loaded: LoadedRun) -> int:
+        """Take the last one out again; returns how many are left. Raises NeecoError."""
+        with self._lock:
+            return self._write(self._lines(loaded)[:-1])
 
     def read(self, loaded: LoadedRun) -> list[StateLine]:
         """Read the saved states, checked against the scene. Raises NeecoError."""
@@ -84,3 +87,10 @@ class SavedStates:
                 entry["camera"] = camera_to_json(to_numpy(torch.from_numpy(line.world_from_camera)))
             lines.append(json.dumps(entry, allow_nan=False))
         return lines
+
+    def _write(self, lines: list[str]) -> int:
+        if lines:
+            write_text(self.states_path, "".join(f"{line}\n" for line in lines))
+        else:
+            self.states_path.unlink(missing_ok=True)
+        return len(lines)

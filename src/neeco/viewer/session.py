@@ -203,7 +203,7 @@ class ClientSession:
         self._shape = 0.0  # of a run's part of the window, width by height
         self._camera_frame = 0  # whose camera the window was sent to last
         self._followed: int | None = 0  # the frame that the camera went along to
-        client.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self._set_dark(True)
         self._loaded, self.overlays, self._panel = self._build(runs.loaded)
         self._go_to(0)
         client.camera.on_update(lambda _: self._request())
@@ -266,7 +266,9 @@ class ClientSession:
             go_to=self._go_to,
             toggle_gizmo=self._toggle_gizmo,
             save_state=self._save_state,
+            remove_state=self._remove_state,
             save_image=self._save_image,
+            dark=self._set_dark,
         )
         overlays = Overlays(self._client, runs[0], self._runs.unit, self._go_to, self._request)
         return runs, overlays, Panel(self._client, runs, actions)
@@ -335,6 +337,10 @@ class ClientSession:
         saved, loaded = self._saved, self._loaded[0]
         self._report(lambda: f"kept: {saved.add(loaded, self._state(), self._pose())} in {saved.states_path}")
 
+    def _remove_state(self) -> None:
+        saved, loaded = self._saved, self._loaded[0]
+        self._report(lambda: f"kept: {saved.remove_last(loaded)} in {saved.states_path}")
+
     def _save_image(self) -> None:
         if self._saving:  # or a page that asks a thousand times would be served long after it has gone
             return
@@ -357,6 +363,9 @@ class ClientSession:
             self._panel.saved.content = message_html(task())
         except NeecoError as error:
             self._panel.saved.content = message_html(f"error: {error}")
+
+    def _set_dark(self, on: bool) -> None:
+        self._client.gui.configure_theme(dark_mode=on, show_logo=False, show_share_button=False)
 
     def _send(self, whole: Picture, sharp: bool) -> None:
         depth = None
