@@ -49,7 +49,7 @@ from neeco.capture import (
 from neeco.capture.points import read_ply
 from neeco.errors import NeecoError
 from neeco.files import read_json, write_json
-from neeco.geometry.lines import ShaftLine, line_through_trocar
+from neeco.geometry.trocar import ShaftLine, line_through_trocar
 
 USUAL = (2.0, 6.0, 0.3, 1.5, 4.0)  # tilt, roll (degrees), across, depth (mm), joints (degrees)
 

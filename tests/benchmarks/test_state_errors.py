@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from neeco.capture import Capture, Frame, Instrument, InstrumentState, KinematicTree, Link, PointCloud, State
 from neeco.capture.kinematics import REVOLUTE
 from neeco.geometry.camera import Camera
-from neeco.geometry.lines import ShaftLine
+from neeco.geometry.trocar import ShaftLine
 
 NAME = "needle_driver"
 BESIDE = np.array([3.0, -2.0, 0.0])  # mm from the frame's origin to the shaft

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
-from neeco.geometry.lines import line_through_trocar
+from neeco.geometry.trocar import line_through_trocar
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs

@@ -112,13 +112,16 @@ class KinematicTree:
             chain.append(self.links[self._index[parent]])
         return {reading for link in chain for reading in link.value}
 
+    def root_from_recorded(self, readings: Mapping[str, float]) -> Array:
+        """[4, 4] mm of the link `pose_of`, whose pose is recorded. Raises KeyError without a reading that moves it."""
+        if self.pose_of is None:
+            return np.eye(4)
+        own = {name: readings[name] for name in self.readings_of(self.pose_of)}
+        return self.poses(dict.fromkeys(self.readings, 0.0) | own)[self.pose_of]
+
     def world_from_root(self, pose: Array, readings: Mapping[str, float]) -> Array:
         """[4, 4] mm from the recorded pose of the link `pose_of`. Raises KeyError without a reading that moves it."""
-        if self.pose_of is None:
-            return pose
-        own = {name: readings[name] for name in self.readings_of(self.pose_of)}
-        root_from_link = self.poses(dict.fromkeys(self.readings, 0.0) | own)[self.pose_of]
-        back: Array = pose @ np.linalg.inv(root_from_link)
+        back: Array = pose if self.pose_of is None else pose @ np.linalg.inv(self.root_from_recorded(readings))
         return back
 
     @cached_property

@@ -13,8 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.kinematics import FIXED, PRISMATIC, KinematicTree
-from neeco.geometry.lines import frame_about, line_through_trocar, unit
+from neeco.geometry.lines import frame_about, unit
 from neeco.geometry.projection import project
+from neeco.geometry.trocar import line_through_trocar
 
 TUBE_MM = 150.0  # of the root link that is modelled
 NEAREST_MM = 8.0  # depth at which cones are cut off

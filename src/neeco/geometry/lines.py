@@ -1,11 +1,8 @@
-"""Unit vectors, points and places nearest to lines in space, and the line of a shaft that moves about a trocar."""
+"""Unit vectors, and points and places nearest to lines in space."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.optimize import least_squares
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -65,40 +62,3 @@ def places_nearest_to_rays(point: np.ndarray, direction: np.ndarray, rays: np.nd
     [N, 3] from the origin."""
     slant = rays @ direction
     return np.asarray((rays @ point * slant - direction @ point) / np.maximum(1 - slant**2, 1e-6))
-
-
-MIN_LEVER_MM = 40.0  # from the instrument to its trocar
-MAX_BEND_MM = 0.3  # root mean square distance of a trocar from the line: beyond, a wrist bends the tracked frame
-MIN_TRAVEL_MM = 2.0  # in and out, from which a line has a direction
-
-
-@dataclass(frozen=True, eq=False)
-class ShaftLine:
-    """The line of a shaft in the frame that is logged: a point on it nearest to that frame's origin, and its direction
-    away from the trocar."""
-
-    point: np.ndarray  # [3] mm
-    axis: np.ndarray  # [3] unit
-
-
-def line_through_trocar(poses: np.ndarray, max_bend_mm: float = MAX_BEND_MM) -> ShaftLine | None:
-    """The line, fixed to poses [F, 4, 4], that goes through one fixed point in all of them, within max_bend_mm (rms);
-    None where there is none, or none is determined."""
-    back, places = poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3]
-
-    def off(trocar: np.ndarray) -> np.ndarray:
-        local = np.einsum("fij,fj->fi", back, trocar - places)
-        local = local - local.mean(0)
-        axis = np.linalg.svd(local, full_matrices=False)[2][0]
-        return np.asarray((local - np.outer(local @ axis, axis)).ravel())
-
-    found = least_squares(off, np.zeros(3))  # where arms with a remote centre of motion have it
-    local = np.einsum("fij,fj->fi", back, found.x - places)
-    middle = local.mean(0)
-    axis = np.linalg.svd(local - middle, full_matrices=False)[2][0]
-    travel = float(np.ptp(local @ axis))
-    rms = float(np.sqrt(np.square(found.fun).sum() / len(poses)))
-    if np.linalg.norm(local, axis=1).min() < MIN_LEVER_MM or rms > max_bend_mm or travel < MIN_TRAVEL_MM:
-        return None
-    axis = -axis if axis @ middle > 0 else axis
-    return ShaftLine(middle - (middle @ axis) * axis, axis)

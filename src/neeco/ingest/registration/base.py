@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import BaseUncertainty, evenly_spaced
 from neeco.errors import NeecoError
-from neeco.geometry.lines import ShaftLine
+from neeco.geometry.trocar import ShaftLine
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
 from neeco.ingest.registration.axial_texture import with_marks
 from neeco.ingest.registration.layers import EXCHANGED_SHARES, LayerFit

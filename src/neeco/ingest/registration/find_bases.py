@@ -8,9 +8,10 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
-from neeco.geometry.lines import line_through_trocar
+from neeco.geometry.trocar import line_through_trocar
 from neeco.ingest.frames.views import StageProgress, Views, reduced
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.interpolate import poses_at, readings_at
@@ -204,23 +205,19 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
     readings = {
         joint: values for joint, values in readings_later(0.0).items() if np.isfinite(values).mean() > MIN_READ_SHARE
     }
-    tree = item.kinematics
-    end = None if tree is None else tree.pose_of
+    tree = None if item.kinematics is None or item.kinematics.pose_of is None else item.kinematics
 
-    def root_from_logged(shift: float) -> np.ndarray:
+    def root_from_logged(tree: KinematicTree, shift: float) -> np.ndarray:
         """[F, 4, 4] of the link whose pose is logged, with readings of the same moments; NaN where one is missing."""
-        assert tree is not None
-        assert end is not None
-        values, needed = readings_later(shift), tree.readings_of(end)
-        states = [{name: float(values[name][row]) for name in needed} for row in range(len(times))]
-        rest = dict.fromkeys(tree.readings, 0.0)  # of links beyond
-        return np.stack([tree.poses(rest | state)[end] for state in states])
+        values = readings_later(shift)
+        states = ({name: float(read[row]) for name, read in values.items()} for row in range(len(times)))
+        return np.stack([tree.root_from_recorded(state) for state in states])
 
     def base_from_shaft(shift: float) -> np.ndarray:
         poses, _ = poses_at(log, clock.at(times) + shift)
-        return poses if end is None else poses @ np.linalg.inv(root_from_logged(shift))
+        return poses if tree is None else poses @ np.linalg.inv(root_from_logged(tree, shift))
 
-    wrists = None if end is None else root_from_logged(0.0)[:, :3, 3]
+    wrists = None if tree is None else root_from_logged(tree, 0.0)[:, :3, 3]
     if wrists is not None and not np.nanmin(np.linalg.norm(wrists, axis=1), initial=np.inf) > MIN_BEND_MM:
         wrists = None
     prior = None

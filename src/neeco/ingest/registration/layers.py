@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from neeco.capture.model import evenly_spaced
-from neeco.geometry.lines import ShaftLine
+from neeco.geometry.trocar import ShaftLine
 from neeco.ingest.foreground.background import exposure, find_background
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, NEAREST_MM, moved_base, poses_at_clock
 
