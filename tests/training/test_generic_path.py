@@ -62,9 +62,8 @@ def test_sixty_steps_agree(method: str, tmp_path: Path) -> None:
     assert sizes["native"] == sizes["torch"]
     if methods()[method].has_gaussians:
         apart = (plain - native).abs()
-        # a loss of order 1 is a sum and product of some hundred float32 numbers, each rounded to 2**-24; in few images
-        # rounding decides whether a pixel skips a Gaussian (alpha below 1/255), which is more
-        assert float(apart[:40].quantile(0.9)) < 256 * 2**-24
+        # a loss of order 1 is a sum and product of some hundred float32 numbers, each rounded to 2**-24
+        assert float(apart[:40].max()) < 256 * 2**-24
         # steps amplify differences: 27 times, where the most was measured
         assert float(apart.max()) < 256 * 2**-24 * 100
     assert float(plain[-20:].mean()) == pytest.approx(float(native[-20:].mean()), rel=5e-3)
