@@ -183,14 +183,11 @@ def _dispatch(words: list[str]) -> int:
         )
 
     try:
-        try:
-            parsed = parse(shown=arguments is None or _asks_for_help(words))
-        except SystemExit as end:
-            if not end.code or arguments is None:
-                raise
-            _misspelt_options(words, arguments)
-            parsed = parse(shown=True)
+        parsed = parse(shown=arguments is None or _asks_for_help(words))
     except SystemExit as end:
+        if end.code and arguments is not None:
+            _misspelt_options(words, arguments)
+            parse(shown=True)
         if not end.code and words[:1] == ["train"]:
             importlib.import_module(f"{__name__}.train").explain(words)
         raise

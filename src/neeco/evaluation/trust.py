@@ -16,6 +16,8 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
+from neeco.labels.drawing import distances_to
+
 NEIGHBOURHOOD = 0.03  # of the image's diagonal: how far from the label pixels may be missed
 TYPICAL_QUANTILE = 0.99  # of the errors in training frames
 MAX_SHARE = 0.5  # of the tissue's error: an instrument with a smaller one is there, if blurred
@@ -113,9 +115,7 @@ def _errors(
 ) -> _Errors:
     votes = np.ones(drawing.parts.shape, dtype=bool) if mask is None else mask.numpy()
     label = drawing.parts.numpy() > 0
-    # px, to the label; without any label, thousands
-    distance = cv2.distanceTransform((~label).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    near = ~label & (distance <= neighbourhood * float(np.hypot(*label.shape)))
+    near = ~label & (distances_to(label) <= neighbourhood * float(np.hypot(*label.shape)))
     assert drawing.tissue_image is not None
     whole, tissue = (
         uniform_filter((rendered - image).abs().mean(2).numpy(), WINDOW_PX)

@@ -260,6 +260,6 @@ def shows_any(parts: np.ndarray, ids: Sequence[int]) -> np.ndarray:
 
 
 def distances_to(pixels: np.ndarray) -> np.ndarray:
-    """Return distances [H, W] px, between centres, to the nearest of the pixels (bool [H, W], at least one); exact
-    (Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012)."""
+    """Return distances [H, W] px, between centres, to the nearest of the pixels (bool [H, W]), huge without any;
+    exact (Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012)."""
     return cv2.distanceTransform((~pixels).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

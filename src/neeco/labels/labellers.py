@@ -25,8 +25,7 @@ from neeco.scene.deformation import otsu
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene, GaussianScene
 
-# The instrument's moving shadow is learned with labels of 0.3 to 0.5, so
-# that 0.5 is too low; 0.65 to 0.7 is best.
+# The instrument's moving shadow is learned with labels of 0.3 to 0.5, so that 0.5 is too low; 0.65 to 0.7 is best.
 LABEL_THRESHOLD = 0.65
 SHADOWED_THRESHOLD = 0.55  # where the scene models that shadow: 0.65 then loses as much of the silhouette's border
 # A share below the first is clearly tissue, one above the second clearly instrument. Measured by what a U-Net learns

@@ -42,9 +42,7 @@ class Registration:
     clock: ClockOffset
     scale_sd: float  # relative, one standard deviation
     origin: np.ndarray  # [3] mm, world: about which the scale and the rotation may be off
-    covariances: (
-        np.ndarray
-    )  # [3, 7, 7] of ln scale, turn (rad) and shift (mm) of SfM's world, as `_covariances` has them
+    covariances: np.ndarray  # [3, 7, 7], as `_covariances`, of SfM's world: ln scale, turn (rad), shift (mm)
     position_residual: np.ndarray  # [N] mm, per frame used
     rotation_residual: np.ndarray  # [N] rad
     used: np.ndarray  # [N] indices of the frames used

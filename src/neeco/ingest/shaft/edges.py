@@ -292,6 +292,8 @@ def _profile_bases(radius_px: float, blur: float) -> tuple[np.ndarray, np.ndarra
     return np.stack(bases), used
 
 
+# Where a shaft ends and the wrist begins their colours differ, and neither is known. But what enters at the image's
+# border is shaft in most images that show much of the instrument, and what lies near the tip is not.
 SHAFT_SHARE, HEAD_SHARE = 0.3, 0.3  # of a long mask's length from the border, and from the tip, at first
 LONG_SHARE = 0.5  # of the images, those with the longest masks, from which the colours are learned first
 EDGE_PX = 2.0  # from the mask's or the image's ends, within which a tip or an end does not count

@@ -27,10 +27,8 @@ NOISE_QUANTILE = 0.98
 TISSUE, NOT_TISSUE = (0.02, 1.5), (0.05, 3.0)  # residuals (images in [0, 1]), and times the noise: the larger counts
 WINDOW_PX = 3  # over which residuals and probabilities are averaged
 LEAST_LABEL, LABEL = 0.1, 0.7  # rendered shares of a pixel from which an instrument may be near, and is there
-FAR, NEAR = (
-    0.04,
-    0.075,
-)  # of the images' width: no tissue within it of an instrument counts for noise; none farther shows
+FAR = 0.04  # of the images' width: tissue within it of an instrument does not count for noise
+NEAR = 0.075  # of the images' width: no instrument shows farther from a rendered one
 N_BINS = 12  # of each colour in the histogram of the instruments' colours
 SMOOTHING = 0.7  # bins, standard deviation
 SHADES = 0.5, 1.05  # range of shades of the rendered tissue in contact shadows; a dark shaft is darker
@@ -52,9 +50,9 @@ def observe_silhouettes(session: GaussianSession) -> None:
         return
     lower, upper = (max(least, factor * noise) for least, factor in (TISSUE, NOT_TISSUE))
     shown = [view.image[view.usable & (view.residual > upper) & (view.label > LABEL)] for view in sample]
-    density = _color_density(np.concatenate(shown))
+    colors = _color_shares(np.concatenate(shown))
     views = (sampled[index] if index in sampled else _View(session, index) for index in range(count))
-    session.silhouettes = Silhouettes(tuple(view.silhouette(lower, upper, density) for view in views), noise)
+    session.silhouettes = Silhouettes(tuple(view.silhouette(lower, upper, colors) for view in views), noise)
 
 
 class _View:
@@ -79,12 +77,12 @@ class _View:
         reach = 2 * math.ceil(share * self.label.shape[1]) + 1
         return cv2.dilate((self.label > LEAST_LABEL).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
 
-    def silhouette(self, lower: float, upper: float, density: np.ndarray) -> torch.Tensor:
+    def silhouette(self, lower: float, upper: float, colors: np.ndarray) -> torch.Tensor:
         """Return the frame's values [H, W] uint8 of `Silhouettes`: residuals above `upper` are instrument, those below
-        `lower` tissue where instruments, whose colours have this density, rarely look like it."""
+        `lower` tissue where instruments, with these shares of `colors`, rarely look like it."""
         off = np.clip((self.residual - lower) / (upper - lower), 0, 1)
         instrument = np.where(self.within(NEAR), 2 * off - 1, 0).clip(0, 1)
-        tissue = np.where(_share_of_colors(self.image, density) < ALIKE, 1 - 2 * off, 0).clip(0, 1)
+        tissue = np.where(colors[_bins(self.image)] < ALIKE, 1 - 2 * off, 0).clip(0, 1)
         certain = np.where(self.usable, instrument - tissue, 0)
         return torch.from_numpy((UNKNOWN + certain * (INSTRUMENT - UNKNOWN)).round().clip(0, 255).astype(np.uint8))
 
@@ -102,18 +100,12 @@ def _bins(colors: np.ndarray) -> tuple[np.ndarray, ...]:
     return found[..., 0], found[..., 1], found[..., 2]
 
 
-def _share_of_colors(images: np.ndarray, density: np.ndarray) -> np.ndarray:
-    """Return the share [...] of the colours with this density that are like each pixel of the images [..., 3]."""
-    shares: np.ndarray = density[_bins(images)] / N_BINS**3
-    return shares
-
-
-def _color_density(colors: np.ndarray) -> np.ndarray:
-    """[N_BINS, N_BINS, N_BINS] density of colours [M, 3] in [0, 1], per unit of the colour cube."""
+def _color_shares(colors: np.ndarray) -> np.ndarray:
+    """Return the share [N_BINS, N_BINS, N_BINS] of colours [M, 3] in [0, 1] that lie in each bin, smoothed."""
     counts = np.zeros((N_BINS,) * 3)
     np.add.at(counts, _bins(colors), 1)
-    smooth = gaussian_filter(counts, SMOOTHING)
-    return smooth / max(smooth.sum(), 1e-9) * N_BINS**3
+    smooth: np.ndarray = gaussian_filter(counts, SMOOTHING)
+    return smooth / max(smooth.sum(), 1e-9)
 
 
 def _shades_of(images: np.ndarray, tissue: np.ndarray) -> np.ndarray:
