@@ -134,10 +134,16 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 def encoded_image(image: Tensor, quality: int | None = None) -> bytes:
     """The content of the file that `write_image` writes."""
-    pixels = cv2.cvtColor(to_bytes(image.detach().cpu()).contiguous().numpy(), cv2.COLOR_RGB2BGR)  # as OpenCV has them
+    pixels = to_bytes(image.detach().cpu()).contiguous().numpy()
     if quality is None:
-        return encoded_png(pixels)
-    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+        return encoded_rgb(pixels)
+    turned = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)  # as OpenCV has them
+    return cv2.imencode(".jpg", turned, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+def encoded_rgb(pixels: np.ndarray) -> bytes:
+    """The content of a PNG of uint8 [H, W, 3] (RGB)."""
+    return encoded_png(cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
 
 
 def encoded_png(pixels: np.ndarray) -> bytes:
