@@ -39,11 +39,14 @@ def draw_through(camera: Camera, draw: Draw) -> Rendering:
     rendering = draw(source)
     if camera.is_pinhole and _size(fine) == _size(camera):
         return rendering
-    single = [(layer.alpha, layer.depth * layer.alpha) for layer in (rendering, *rendering.alone)]
-    planes = [rendering.color, *(plane[..., None] for pair in single for plane in pair)]
+    layers = Layer(rendering.alpha, rendering.depth), *rendering.alone
+    planes = [
+        rendering.color,
+        *(plane[..., None] for each in layers for plane in (each.alpha, each.depth * each.alpha)),
+    ]
     planes += [] if rendering.channels is None else [rendering.channels]
     found = resampled(torch.cat(planes, -1), source, fine, camera)
-    end = 3 + 2 * len(single)
+    end = 3 + 2 * len(layers)
     (alpha, weighted), *alone = found[..., 3:end].unflatten(-1, (-1, 2)).permute(2, 3, 0, 1)
     return replace(
         rendering,
