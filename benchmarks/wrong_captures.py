@@ -26,9 +26,10 @@ from PIL import Image, ImageOps
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.checks import inspect_capture
-from neeco.capture.checks.colors import _Colors, check_images
+from neeco.capture.checks.colors import _Colors, check_colors
 from neeco.capture.checks.motion import check_motion, evidence_by_chance, root_poses
 from neeco.capture.checks.motion_evidence import MotionEvidence
+from neeco.capture.checks.pictures import Pictures
 from neeco.capture.documents import ProblemReport
 from neeco.capture.readers import parse_capture
 from neeco.capture.readers.parsed import Parsed
@@ -211,7 +212,8 @@ def margins(name: str, parsed: Parsed) -> None:
         chosen = replace(parsed, frames=parsed.frames[rows], places=parsed.places[rows])
         report = parsed.places[0].report
         report.problems.clear()
-        motion, evidence = MotionEvidence.of(chosen), []
+        pictures = Pictures()
+        motion, evidence = MotionEvidence.of(chosen, pictures), []
         for instrument in chosen.instruments if motion is not None else ():
             assert motion is not None
             states = [frame.state.instruments[instrument.name] for frame in chosen.frames]
@@ -220,10 +222,10 @@ def margins(name: str, parsed: Parsed) -> None:
             evidence.append(f"{motion.mean(given):.2f} ({evidence_by_chance(motion, given):.2f})")
         colors = "-"
         if chosen.points is not None and chosen.points.measured:
-            agree = _Colors(chosen)
+            agree = _Colors(chosen, pictures)
             colors = " ".join(f"{agree.agreement(coarse=coarse).mean():.2f}" for coarse in (False, True))
-            check_images(chosen)
-        check_motion(chosen, {})
+            check_colors(chosen, pictures)
+        check_motion(chosen, {}, pictures)
         said = "; ".join(problem.message for problem in report.problems) or "silent"
         print(f"| {name}, {part} | {colors} | {', '.join(evidence) or '-'} | {said} |", flush=True)
 

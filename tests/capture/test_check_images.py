@@ -12,6 +12,7 @@ from PIL import Image
 
 from neeco.capture.checks import colors as checked
 from neeco.capture.checks.colors import agreements, check_colors
+from neeco.capture.checks.pictures import Pictures
 from neeco.capture.documents import Node, ProblemReport
 from neeco.capture.model import Frame, State
 from neeco.capture.points import PointCloud
@@ -63,7 +64,7 @@ def capture(tmp_path_factory) -> Parsed:
 def found(capture: Parsed) -> list[str]:
     report = ProblemReport()
     places = [replace(place, report=report) for place in capture.places]
-    check_colors(replace(capture, places=places))
+    check_colors(replace(capture, places=places), Pictures())
     assert all(problem.severity == "warning" for problem in report.problems)
     return [problem.message for problem in report.problems]
 
@@ -140,7 +141,7 @@ def test_nothing_is_said_where_the_points_have_no_colors_of_their_own(capture, t
     assert capture.points is not None
     grey = replace(capture, points=PointCloud(capture.points.positions))
     assert found(with_pixels(grey, tmp_path, lambda image: image[:, ::-1])) == []
-    assert agreements(grey, []) is None
+    assert agreements(grey, [], Pictures()) is None
 
 
 def test_an_orientation_in_exif_is_named(capture, tmp_path):

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from neeco.capture import check_capture
 from neeco.capture.checks import read_checked
 from neeco.capture.checks.motion import check_motion
+from neeco.capture.checks.pictures import Pictures
 from neeco.capture.documents import ProblemReport
 from neeco.capture.kinematics import KinematicTree, Link
 from neeco.capture.readers import parse_capture
@@ -38,7 +39,7 @@ def told(sample: Path, change: Callable[[Document], object]) -> list[str]:
     report = ProblemReport()
     parsed = parse_capture(sample, report)
     assert report.problems == []
-    check_motion(parsed, {})
+    check_motion(parsed, {}, Pictures())
     assert all(problem.severity == "warning" for problem in report.problems)
     return [f"{problem.field}: {problem.message}" for problem in report.problems]
 

@@ -49,16 +49,32 @@ def read_image(path: Path, size: tuple[int, int] | None = None, background: floa
 def read_image_bytes(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> Tensor:
     """`read_image` as uint8 [H, W, 3]. Files of 8 bits are read without a float image, which would fragment the memory
     of a process that reads many."""
+    return torch.from_numpy(byte_pixels(read_pixels(path, size, background)))
+
+
+def read_pixels(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> np.ndarray:
+    """`read_image` as an array: uint8 [H, W, 3] where that is exact, else float32 in [0, 1]."""
     image = open_image(path, size)
     if image.mode in ("RGB", "L", "P") and not _is_transparent(image):
-        return torch.from_numpy(np.array(image.convert("RGB")))
-    return to_bytes(torch.from_numpy(_to_rgb(image, background)))
+        return np.array(image.convert("RGB"))
+    pixels = _to_rgb(image, background)
+    rounded = byte_pixels(pixels)
+    return rounded if np.array_equal(rounded / np.float32(255), pixels) else pixels
+
+
+def byte_pixels(pixels: np.ndarray) -> np.ndarray:
+    """Pixels as `read_pixels` gives them, rounded to uint8."""
+    return pixels if pixels.dtype == np.uint8 else np.rint(pixels.clip(0, 1) * 255).astype(np.uint8)
 
 
 def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     """A loss mask as bool [H, W]: False where the stored image is black (darker than half). Raises NeecoError."""
-    grey = _to_rgb(open_image(path, size), background=0.0).mean(axis=2)
-    return torch.from_numpy(grey >= 0.5)
+    return torch.from_numpy(read_mask_pixels(path, size))
+
+
+def read_mask_pixels(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """`read_mask` as an array."""
+    return np.asarray(_to_rgb(open_image(path, size), background=0.0).mean(axis=2) >= 0.5)
 
 
 def read_labels(path: Path, size: tuple[int, int] | None = None) -> Tensor:
@@ -118,10 +134,16 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 def encoded_image(image: Tensor, quality: int | None = None) -> bytes:
     """The content of the file that `write_image` writes."""
-    pixels = cv2.cvtColor(to_bytes(image.detach().cpu()).contiguous().numpy(), cv2.COLOR_RGB2BGR)  # as OpenCV has them
+    pixels = to_bytes(image.detach().cpu()).contiguous().numpy()
     if quality is None:
-        return encoded_png(pixels)
-    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+        return encoded_rgb(pixels)
+    turned = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)  # as OpenCV has them
+    return cv2.imencode(".jpg", turned, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+def encoded_rgb(pixels: np.ndarray) -> bytes:
+    """The content of a PNG of uint8 [H, W, 3] (RGB)."""
+    return encoded_png(cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
 
 
 def encoded_png(pixels: np.ndarray) -> bytes:
@@ -214,18 +236,18 @@ class Hidden:
     points_in_view: int
 
 
-def measure_hidden(image: Tensor, mask: Tensor, camera: Camera | None, points: np.ndarray) -> Hidden:
-    """Count what a loss mask bool [H, W], False where ignored, hides of an image [H, W, 3] in [0, 1], and of points
-    [P, 3] mm in its camera (None: not known)."""
-    lit, ignored = (image.amax(-1) > LIT).numpy(), ~mask.numpy()
-    pixels = float(ignored[lit].mean()) if lit.mean() > MIN_LIT else None
+def measure_hidden(pixels: np.ndarray, mask: np.ndarray, camera: Camera | None, points: np.ndarray) -> Hidden:
+    """Count what a loss mask bool [H, W], False where ignored, hides of an image [H, W, 3], uint8 or in [0, 1], and of
+    points [P, 3] mm in its camera (None: not known)."""
+    lit, ignored = pixels.max(-1) > LIT * (255 if pixels.dtype == np.uint8 else 1), ~mask
+    share = float(ignored[lit].mean()) if lit.mean() > MIN_LIT else None
     if camera is None or not len(points):
-        return Hidden(pixels, 0, 0)
+        return Hidden(share, 0, 0)
     with np.errstate(all="ignore"):  # points on the camera's plane
         places, depths = project_world(points, camera)
     inside = (depths > camera.near) & (places >= 0).all(-1) & (places < [camera.width, camera.height]).all(-1)
     column, row = places[inside].astype(int).T
-    return Hidden(pixels, int(ignored[row, column].sum()), int(inside.sum()))
+    return Hidden(share, int(ignored[row, column].sum()), int(inside.sum()))
 
 
 def masks_fault(found: Sequence[Hidden]) -> Fault | None:

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from neeco.capture.images import read_image, read_image_bytes, read_mask
+from neeco.capture.images import read_image, read_image_bytes, read_mask_pixels, read_pixels
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
@@ -230,11 +230,20 @@ class Frame:
         """`load_image` in uint8 [H, W, 3]."""
         return read_image_bytes(self.image_path, (self.camera.width, self.camera.height), self.background)
 
+    def load_pixels(self) -> np.ndarray:
+        """`load_image` as an array: uint8 where that is exact, else float32."""
+        return read_pixels(self.image_path, (self.camera.width, self.camera.height), self.background)
+
     def load_mask(self) -> Tensor | None:
         """bool [H, W], True where the loss counts, or None when the frame has no mask. Raises NeecoError."""
+        mask = self.load_mask_pixels()
+        return None if mask is None else torch.from_numpy(mask)
+
+    def load_mask_pixels(self) -> np.ndarray | None:
+        """`load_mask` as an array."""
         if self.mask_path is None:
             return None
-        return read_mask(self.mask_path, (self.camera.width, self.camera.height))
+        return read_mask_pixels(self.mask_path, (self.camera.width, self.camera.height))
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -16,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.capture.images import has_alpha, write_image
+from neeco.capture.images import encoded_image, has_alpha
 from neeco.capture.model import SCHEMA, Capture, Frame, FromVideo, Instrument, State, Uncertainty
 from neeco.capture.points import write_ply
 from neeco.errors import NeecoError
-from neeco.files import read_bytes, write_atomically, write_json
+from neeco.files import read_bytes, sync_disk, write_json, write_unsynced
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.rotations import rigid_fault
 
@@ -78,6 +77,7 @@ def write_capture(
             entry["ply_file_path"] = f"sparse_{number}.ply"
             write_ply(path / entry["ply_file_path"], tissue.points)
         header.setdefault("tissues", []).append(entry)
+    sync_disk()  # the files above were left to the system
     write_json(path / "transforms.json", header)
 
 
@@ -249,13 +249,11 @@ def _write_image(frame: Frame, name: str, path: Path, image: Tensor | np.ndarray
     if tuple(pixels.shape) != wanted:
         raise NeecoError(f"{frame.image_path}: image has shape {tuple(pixels.shape)}, its camera says {wanted}")
     target = f"images/{name}.png"
-    write_image(path / target, pixels / 255 if pixels.dtype == torch.uint8 else pixels)
+    write_unsynced(path / target, encoded_image(pixels / 255 if pixels.dtype == torch.uint8 else pixels))
     return target
 
 
 def _copy(source: Path, target: Path) -> None:
     if os.path.exists(target) and os.path.samefile(source, target):
         return
-    if not source.is_file():
-        raise NeecoError(f"{source}: no such file")
-    write_atomically(target, lambda temporary: shutil.copyfile(source, temporary))
+    write_unsynced(target, read_bytes(source, "an image"))

@@ -76,10 +76,10 @@ def _inverted_masks(capture: Capture) -> list[str]:
     masked = [frame for frame in capture.frames if frame.mask_path is not None]
     found = []
     for index in evenly_spaced(len(masked), MAX_BORDER_FRAMES, floor=True):
-        frame, mask = masked[index], masked[index].load_mask()
+        frame, mask = masked[index], masked[index].load_mask_pixels()
         points = {tissue.name: tissue.points for tissue in capture.tissues}.get(str(frame.state.tissue), capture.points)
         assert mask is not None
-        found.append(measure_hidden(frame.load_image(), mask, frame.camera, measured_sample(points)))
+        found.append(measure_hidden(frame.load_pixels(), mask, frame.camera, measured_sample(points)))
     fault = masks_fault(found)
     return [] if fault is None else [f"Warning: {fault[0]} {fault[1]}."]
 
@@ -112,7 +112,7 @@ def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path)
     white = []
     for index in evenly_spaced(len(frames), MAX_BORDER_FRAMES, floor=True):
         tool = read_mask(masks[index], sizes[index])
-        white.append(measure_hidden(frames[index].load_image(), ~tool, None, np.zeros((0, 3))))
+        white.append(measure_hidden(frames[index].load_pixels(), ~tool.numpy(), None, np.zeros((0, 3))))
     fault = masks_fault(white)
     masked = []
     for frame, mask, size in zip(frames, masks, sizes, strict=True):

@@ -19,8 +19,9 @@ from scipy.spatial import cKDTree
 from neeco.capture.checks.cameras import CameraArrays
 from neeco.capture.checks.mistakes import camera_mistakes
 from neeco.capture.checks.motion_evidence import gain_certainty
+from neeco.capture.checks.pictures import Pictures, Size
 from neeco.capture.images import exif_orientation
-from neeco.capture.model import evenly_spaced
+from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.readers.parsed import Parsed
 
 MAX_IMAGES = 48  # compared with the points, evenly spaced over the capture
@@ -71,7 +72,7 @@ AS_GIVEN = _CameraHypothesis()
 class _Colors:
     """Sampled points of a capture, evenly spaced images, and how well they agree."""
 
-    def __init__(self, parsed: Parsed) -> None:
+    def __init__(self, parsed: Parsed, pictures: Pictures) -> None:
         assert parsed.points is not None
         positions, colors = parsed.points.positions.astype(np.float64), parsed.points.colors * 255
         if len(positions) > MAX_POINTS:
@@ -80,15 +81,11 @@ class _Colors:
         self.points, self.colors, self.brightness = positions, colors, (colors @ LUMA).astype(np.float32)
         count = min(FAR_NEIGHBOURS, len(positions) - 1)
         self.neighbours = cKDTree(positions).query(positions, k=count + 1)[1][:, 1:]
-        self.rows = np.array(evenly_spaced(len(parsed.frames), MAX_IMAGES))
+        self.rows = _compared_rows(parsed)
         cameras = CameraArrays.of([frame.camera for frame in parsed.frames])
-        self.cameras = cameras.resized(np.rint(cameras.sizes * np.minimum(1.0, WIDTH / cameras.sizes[:, :1])))
-        self.images = [self._reduced(parsed.frames[row].load_image_bytes().numpy(), row) for row in self.rows]
+        self.cameras = cameras.resized(np.array([_reduced_size(frame) for frame in parsed.frames], np.float64))
+        self.images = [pictures.image(parsed.frames[row], _reduced_size(parsed.frames[row])) for row in self.rows]
         self.grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in self.images]
-
-    def _reduced(self, image: np.ndarray, row: int) -> np.ndarray:
-        width, height = self.cameras.sizes[row].astype(int).tolist()
-        return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
 
     def project(self, hypothesis: _CameraHypothesis, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Columns and rows [F, P] px of the points in the images of cameras `rows`, and where they are inside."""
@@ -166,12 +163,26 @@ class _Colors:
         return np.asarray(across), np.asarray(down)
 
 
+def compared_pictures(parsed: Parsed) -> list[tuple[Frame, Size]]:
+    """Frames whose images `check_colors` compares with the points, and the sizes to which it reduces them."""
+    return [(parsed.frames[row], _reduced_size(parsed.frames[row])) for row in _compared_rows(parsed)]
+
+
+def _compared_rows(parsed: Parsed) -> np.ndarray:
+    return np.array(evenly_spaced(len(parsed.frames), MAX_IMAGES))
+
+
+def _reduced_size(frame: Frame) -> Size:
+    factor = min(1.0, WIDTH / frame.camera.width)
+    return round(frame.camera.width * factor), round(frame.camera.height * factor)
+
+
 def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Values [F, P] of a float32 image [h, w] at columns and rows [F, P] px."""
     return np.asarray(cv2.remap(image, u - 0.5, v - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def check_colors(parsed: Parsed) -> bool:
+def check_colors(parsed: Parsed, pictures: Pictures) -> bool:
     """Report images that contradict the cameras, or whose red and blue are swapped, by the sparse points.
 
     Says nothing without measured points that have colours. Returns False where images and cameras contradict each
@@ -179,7 +190,7 @@ def check_colors(parsed: Parsed) -> bool:
     """
     if not _has_colors(parsed):
         return True
-    colors, frames = _Colors(parsed), parsed.header("frames")
+    colors, frames = _Colors(parsed, pictures), parsed.header("frames")
     given = colors.agreement()
     fits = given.mean() >= GOOD_CORRELATION
     found = _best_hypothesis(colors, given, list(_offsets() if fits else _hypotheses(parsed, colors)))
@@ -207,10 +218,10 @@ def check_colors(parsed: Parsed) -> bool:
     return True
 
 
-def agreements(parsed: Parsed, poses: Sequence[np.ndarray]) -> list[float] | None:
+def agreements(parsed: Parsed, poses: Sequence[np.ndarray], pictures: Pictures) -> list[float] | None:
     """Mean correlation of the points' colours with the images' at each of other camera poses [N, 4, 4] of all frames;
     None where colours cannot be compared."""
-    colors = _Colors(parsed) if _has_colors(parsed) else None
+    colors = _Colors(parsed, pictures) if _has_colors(parsed) else None
     if colors is None:
         return None
     return [_quick(colors, _CameraHypothesis(cameras=replace(colors.cameras, poses=one))) for one in poses]

@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from neeco.capture.checks.pictures import Pictures, Size
 from neeco.capture.documents import Node, printable
 from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, Hidden, is_repeated, masks_fault, measure_hidden
 from neeco.capture.model import Frame
@@ -108,14 +110,18 @@ class _Decoded:
     hidden: Hidden | None  # by the mask; None: there is no usable one
 
 
-def check_image_files(parsed: Parsed) -> None:
-    """Decode every image and mask and report those damaged, of the wrong size, empty, or with the same pixels."""
+def check_image_files(parsed: Parsed, pictures: Pictures, compared: Mapping[Path, Collection[Size]]) -> None:
+    """Decode every image and mask and report those damaged, of the wrong size, empty, or with the same pixels.
+
+    pictures: receives what other checks compare; compared: the sizes of these, by the image.
+    """
     clouds = {tissue.name: measured_sample(tissue.points) for tissue in parsed.tissues}
     shared = measured_sample(parsed.points)
     points = [clouds.get(str(frame.state.tissue), shared) for frame in parsed.frames]
     cameras = [None if row in parsed.without_camera else frame.camera for row, frame in enumerate(parsed.frames)]
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        decoded = list(pool.map(_decode, parsed.frames, cameras, points))
+        sizes = [compared.get(frame.image_path, ()) for frame in parsed.frames]
+        decoded = list(pool.map(partial(_decode, pictures), parsed.frames, cameras, points, sizes))
     # the reader may have reported an image whose size it wanted to know
     reported = [place.child("file_path").reported for place in parsed.places]
     first: dict[bytes, int] = {}
@@ -137,26 +143,33 @@ def check_image_files(parsed: Parsed) -> None:
         parsed.header("frames[*].mask_path").warning(*fault)
 
 
-def _decode(frame: Frame, camera: Camera | None, points: np.ndarray) -> _Decoded:
-    """Decode a frame's image and mask, and measure what the mask hides. Errors name files without their folders."""
+def _decode(
+    pictures: Pictures, frame: Frame, camera: Camera | None, points: np.ndarray, sizes: Collection[Size]
+) -> _Decoded:
+    """Decode a frame's image and mask, keep them reduced to some sizes, and measure what the mask hides. Errors name
+    files without their folders."""
     digest, grey, uniform, image_error, mask_error = None, None, False, "", ""
-    image, hidden = None, None
+    pixels, mask, hidden = None, None, None
     try:
-        image = frame.load_image()
-        digest = hashlib.blake2b(image.numpy().tobytes(), digest_size=16).digest()
-        uniform = bool((image == image[0, 0]).all())
-        step = max(1, image.shape[1] // COMPARED_WIDTH)
-        grey = np.rint(255 * image.numpy()[::step, ::step].mean(-1)).astype(np.uint8)
+        pixels = frame.load_pixels()
+        digest = hashlib.blake2b(pixels.tobytes(), digest_size=16).digest()
+        uniform = bool((pixels[0] == pixels[0, 0]).all() and (pixels == pixels[0, 0]).all())
+        step = max(1, pixels.shape[1] // COMPARED_WIDTH)
+        few = pixels[::step, ::step]
+        few = few / np.float32(255) if few.dtype == np.uint8 else few
+        grey = np.rint(255 * few.mean(-1)).astype(np.uint8)
     except NeecoError as error:
         image_error = str(error).replace(str(frame.image_path), frame.image_path.name)
     try:
-        mask = frame.load_mask()
-        if mask is not None and not torch.any(mask):
+        mask = frame.load_mask_pixels()
+        if mask is not None and not mask.any():
             mask_error = "ignores every pixel (black is ignored); invert it, write 255 instead of 1, or drop the frame"
-        elif mask is not None and image is not None:
-            hidden = measure_hidden(image, mask, camera, points)
+        elif mask is not None and pixels is not None:
+            hidden = measure_hidden(pixels, mask, camera, points)
     except NeecoError as error:
         mask_error = str(error).replace(str(frame.mask_path), frame.mask_path.name if frame.mask_path else "")
+    if pixels is not None:
+        pictures.keep(frame, pixels, mask, sizes)
     return _Decoded(digest, grey, uniform, image_error, mask_error, hidden)
 
 

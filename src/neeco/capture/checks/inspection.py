@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from neeco.capture.checks import colors, motion_evidence
 from neeco.capture.checks.colors import check_colors
 from neeco.capture.checks.frames import check_frames, check_image_files
 from neeco.capture.checks.motion import check_motion
+from neeco.capture.checks.pictures import Pictures, Size
 from neeco.capture.checks.placement import check_placement
 from neeco.capture.checks.states import check_states
 from neeco.capture.documents import Problem, ProblemReport, condensed, errors_only, key_name
@@ -80,16 +82,25 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
         report.error(transforms, "frames", "holds no usable frame", "list images and their cameras there")
     capture = None if errors_only(report.problems) else capture_of(parsed)
     if parsed.frames:
+        parts, pictures = parsed.by_tissue(), Pictures()
         check_frames(parsed)
-        check_image_files(parsed)
+        check_image_files(parsed, pictures, _compared(parts) if motion else {})
         check_states(parsed)
-        parts = parsed.by_tissue()
-        verdicts = [check_placement(part) for part in parts]
+        verdicts = [check_placement(part, pictures) for part in parts]
         if motion and not errors_only(report.problems):
             for part, known in zip(parts, verdicts, strict=True):
-                if check_colors(part):  # else motion in them proves nothing
-                    check_motion(part, known)
+                if check_colors(part, pictures):  # else motion in them proves nothing
+                    check_motion(part, known, pictures)
     return Checked(condensed(report.problems), _summary(parsed), capture)
+
+
+def _compared(parts: list[Parsed]) -> dict[Path, set[Size]]:
+    """Sizes of the images that colours and motion are compared in, by the file."""
+    sizes: dict[Path, set[Size]] = {}
+    for part in parts:
+        for frame, size in (*colors.compared_pictures(part), *motion_evidence.compared_pictures(part)):
+            sizes.setdefault(frame.image_path, set()).add(size)
+    return sizes
 
 
 def _summary(parsed: Parsed) -> CaptureSummary:

@@ -7,7 +7,9 @@ explains it, only the contradiction is reported.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -16,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.checks.mistakes import placement_mistakes, rotation_mistakes
 from neeco.capture.checks.motion_evidence import MotionEvidence, TimeSteps
+from neeco.capture.checks.pictures import Pictures
 from neeco.capture.documents import printable
 from neeco.capture.model import Instrument, InstrumentState
 from neeco.capture.readers.parsed import Parsed
@@ -93,14 +96,14 @@ class MotionVerdict:
     supported: bool
 
 
-def check_motion(parsed: Parsed, known: Mapping[str, MotionVerdict]) -> None:
+def check_motion(parsed: Parsed, known: Mapping[str, MotionVerdict], pictures: Pictures) -> None:
     """Report instruments whose states the images contradict, with the mistake that explains it if one does.
 
     known: verdicts by instrument that were reached before. Says nothing of a capture without registered poses or
     without measured points, or where too little moves. `parsed` must be free of errors.
     """
     unknown = [instrument for instrument in parsed.instruments if instrument.name not in known]
-    motion = MotionEvidence.of(parsed) if unknown else None
+    motion = MotionEvidence.of(parsed, pictures) if unknown else None
     verdicts = dict(known)
     if motion is not None:
         verdicts |= {instrument.name: judge_motion(parsed, instrument, motion) for instrument in unknown}
@@ -243,7 +246,11 @@ def _same(one: _PoseHypothesis, other: _PoseHypothesis) -> bool:
 
 
 def _likeliest_few(tried: Iterable[_PoseHypothesis], few: MotionEvidence) -> list[_PoseHypothesis]:
-    return sorted(tried, key=lambda one: few.mean(one.poses, one.available), reverse=True)[:MAX_HYPOTHESES]
+    listed = list(tried)
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        means = list(pool.map(lambda one: few.mean(one.poses, one.available), listed))
+    order = sorted(range(len(listed)), key=means.__getitem__, reverse=True)  # of equal ones the first
+    return [listed[index] for index in order[:MAX_HYPOTHESES]]
 
 
 def _turned(judged: _Judged) -> Iterator[_PoseHypothesis]:

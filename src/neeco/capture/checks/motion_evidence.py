@@ -9,6 +9,9 @@ depth and carried along by the poses, lies on moving pixels.
 from __future__ import annotations
 
 import copy
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import cv2
 import numpy as np
@@ -16,6 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from neeco.capture.checks.cameras import MIN_DEPTH, CameraArrays
+from neeco.capture.checks.pictures import Pictures, Size
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.projection import project
@@ -90,31 +94,37 @@ class TimeSteps:
 class _Views:
     """Frames `rows` [F] of a capture reduced to [h, w] px, and what moves in them."""
 
-    def __init__(self, frames: list[Frame], rows: np.ndarray, points: np.ndarray) -> None:
-        first = frames[0].camera
-        self.width, self.height = WIDTH, max(8, round(WIDTH * first.height / first.width))
+    def __init__(self, frames: list[Frame], rows: np.ndarray, points: np.ndarray, pictures: Pictures) -> None:
+        self.width, self.height = _reduced_size(frames)
         cameras = CameraArrays.of([frames[row].camera for row in rows])
         self.cameras = cameras.resized(np.full((len(rows), 2), (self.width, self.height), np.float64))
-        depths = [self._tissue_depth(points, index) for index in range(len(rows))]
+        with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+            depths = list(pool.map(partial(self._tissue_depth, points), range(len(rows))))
         known = np.array([index for index, depth in enumerate(depths) if depth is not None], int)
         self.rows, self.cameras = rows[known], self.cameras[known]
         self.depths = np.array([depth for depth in depths if depth is not None])  # [F, h, w] mm
+        self.camera_from_world = np.linalg.inv(self.cameras.poses)
+        # [F, 3, 3] of points in a camera's frame to its image with a border of one pixel
+        self.projections = np.zeros((len(known), 3, 3))
+        fx, fy, cx, cy = self.cameras.intrinsics.T
+        self.projections[:, 0, 0], self.projections[:, 0, 2] = fx, cx + 1
+        self.projections[:, 1, 1], self.projections[:, 1, 2] = fy, cy + 1
+        self.projections[:, 2, 2] = 1
         if len(known) >= MIN_FRAMES:
-            self._find_motion([frames[row] for row in self.rows])
+            self._find_motion([frames[row] for row in self.rows], pictures)
 
-    def _find_motion(self, frames: list[Frame]) -> None:
-        pictures = np.stack([self._reduced(frame.load_image_bytes().numpy()) for frame in frames])
-        masks = [frame.load_mask() for frame in frames]
+    def _find_motion(self, frames: list[Frame], pictures: Pictures) -> None:
+        size = self.width, self.height
+        images = np.stack([pictures.image(frame, size) for frame in frames]).astype(np.float32)
+        masks = [pictures.mask(frame, size) for frame in frames]
         full = np.ones((self.height, self.width), np.float32)
-        shown = np.stack([full if mask is None else self._reduced(mask.numpy().astype(np.float32)) for mask in masks])
+        shown = np.stack([full if mask is None else mask for mask in masks])
         low, high = DIFFERENCE
-        moving = [(self._difference(pictures, shown, index) - low) / (high - low) for index in range(len(frames))]
+        with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+            differences = list(pool.map(partial(self._difference, images, shown), range(len(frames))))
+        moving = [((pixels - low) / (high - low)).clip(0, 1) for pixels in differences]
         # [F, h, w] confidence in [0, 1] that a pixel moves
-        self.moving = np.stack([cv2.blur(pixels.clip(0, 1), (3, 3)) for pixels in moving])
-
-    def _reduced(self, image: np.ndarray) -> np.ndarray:
-        size = (self.width, self.height)
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+        self.moving = np.stack([cv2.blur(pixels, (3, 3)) for pixels in moving])
 
     def _tissue_depth(self, points: np.ndarray, index: int) -> np.ndarray | None:
         """Depth [h, w] mm interpolated between the points [P, 3] in a camera's view; None where these are too few."""
@@ -150,7 +160,7 @@ class _Views:
             visible = cv2.remap(shown[other], x, y, cv2.INTER_LINEAR, borderValue=0) > 0.9
             predictions.append(np.where(visible[..., None], warped, picture))
             observed += visible
-        predicted = np.median(predictions, axis=0)
+        predicted = _median(predictions)
         known = (observed >= 3) & (shown[index] > 0.9)
         if known.any():  # the camera's exposure and white balance may have changed
             predicted = predicted * np.median(picture[known] / predicted[known].clip(1), axis=0)
@@ -169,16 +179,31 @@ class _Views:
         return near[evenly_spaced(len(near), NEIGHBOURS)].tolist()
 
 
+def compared_pictures(parsed: Parsed) -> list[tuple[Frame, Size]]:
+    """Frames whose images are compared, and the size to which they are reduced."""
+    size = _reduced_size(parsed.frames)
+    return [(parsed.frames[row], size) for row in _compared_rows(parsed)]
+
+
+def _compared_rows(parsed: Parsed) -> np.ndarray:
+    return np.array(evenly_spaced(len(parsed.frames), MAX_FRAMES))
+
+
+def _reduced_size(frames: list[Frame]) -> Size:
+    first = frames[0].camera
+    return WIDTH, max(8, round(WIDTH * first.height / first.width))
+
+
 class MotionEvidence:
     """Moving pixels of all frames as rays, each with points at several depths, and how well poses explain them."""
 
     @classmethod
-    def of(cls, parsed: Parsed) -> MotionEvidence | None:
+    def of(cls, parsed: Parsed, pictures: Pictures) -> MotionEvidence | None:
         """The evidence of a capture; None without registered poses or measured points, or where too little moves."""
-        points, rows = parsed.points, np.array(evenly_spaced(len(parsed.frames), MAX_FRAMES))
+        points, rows = parsed.points, _compared_rows(parsed)
         if not parsed.registered or points is None or not points.measured or len(rows) < MIN_FRAMES:
             return None
-        views = _Views(parsed.frames, rows, points.positions.astype(np.float64))
+        views = _Views(parsed.frames, rows, points.positions.astype(np.float64), pictures)
         rays = cls(views) if len(views.rows) >= MIN_FRAMES else None
         return rays if rays is not None and len(np.unique(rays.ray_views)) >= MIN_FRAMES else None
 
@@ -199,8 +224,10 @@ class MotionEvidence:
         depths = views.depths[self.ray_views, row, column][:, None] * DEPTHS
         self.points = slopes[:, None] * depths[..., None]  # [R, D, 3] mm, in the camera's frame
         # what moves everywhere or always is no evidence
-        self._evidence = (views.moving - views.moving.mean(0)).astype(np.float32).ravel()
-        self._others = self.ray_views[:, None] != np.arange(len(views.rows))  # [R, F]
+        evidence = (views.moving - views.moving.mean(0)).astype(np.float32)
+        self._evidence = np.pad(evidence, ((0, 0), (1, 1), (1, 1))).ravel()
+        size = (views.width + 2) * (views.height + 2)
+        self._first_places = np.arange(len(views.rows), dtype=np.int32) * np.int32(size)  # [F]
 
     def thinned(self) -> MotionEvidence:
         """Fewer of the rays, at fewer depths, for a first comparison of many poses."""
@@ -219,35 +246,42 @@ class MotionEvidence:
 
     def _subset(self, rays: np.ndarray | slice, depths: slice = slice(None)) -> MotionEvidence:
         few = copy.copy(self)
-        few.ray_views, few._others = self.ray_views[rays], self._others[rays]
+        few.ray_views = self.ray_views[rays]
         few.points = self.points[rays][:, depths]
         return few
 
     def evidence(self, poses: np.ndarray) -> np.ndarray:
         """float32 [R, D, F] at the rays' points, carried to every frame by poses [F, 4, 4], world_from_instrument; 0
         where they are out of view."""
-        views, count = self.views, len(self.views.rows)
-        camera_from_instrument = np.linalg.inv(views.cameras.poses) @ poses
+        views = self.views
+        camera_from_instrument = views.camera_from_world @ poses
         back = np.linalg.inv(camera_from_instrument)[self.ray_views]
-        points = np.einsum("rij,rdj->rdi", back[:, :3, :3], self.points) + back[:, None, :3, 3]
-        fixed = points.reshape(-1, 3).astype(np.float32)
-        turns, moves = (
-            part.astype(np.float32) for part in (camera_from_instrument[:, :3, :3], camera_from_instrument[:, :3, 3])
-        )
-        x, y, z = (fixed @ turns[:, axis].T + moves[:, axis] for axis in range(3))  # each [R D, F] mm
-        fx, fy, cx, cy = views.cameras.intrinsics.astype(np.float32).T
-        depth = z.clip(MIN_DEPTH)
-        u, v = x / depth * fx + cx, y / depth * fy + cy
-        inside = (z > MIN_DEPTH) & (u >= 0) & (u < views.width) & (v >= 0) & (v < views.height)
-        row, column = v.clip(0, views.height - 1).astype(np.int32), u.clip(0, views.width - 1).astype(np.int32)
-        place = (np.arange(count, dtype=np.int32) * views.height + row) * views.width + column
-        return (self._evidence[place] * inside).reshape(*self.points.shape[:2], count)
+        points = self.points @ back[:, :3, :3].transpose(0, 2, 1) + back[:, None, :3, 3]
+        fixed = np.ones((points.shape[0] * points.shape[1], 4), np.float32)
+        fixed[:, :3] = points.reshape(-1, 3)
+        # columns and rows count from the border around each image, where a point behind the camera falls, too
+        projections = (views.projections @ camera_from_instrument[:, :3]).astype(np.float32)  # [F, 3, 4]
+        u, v, z = fixed @ projections.transpose(1, 2, 0)  # each [R D, F]
+        nearness = (z > MIN_DEPTH) / np.maximum(z, np.float32(MIN_DEPTH))
+        place = self._place(v, nearness, views.height)
+        place *= views.width + 2
+        place += self._place(u, nearness, views.width)
+        place += self._first_places
+        return self._evidence.take(place).reshape(*self.points.shape[:2], -1)
+
+    @staticmethod
+    def _place(position: np.ndarray, nearness: np.ndarray, size: int) -> np.ndarray:
+        """Column or row, int32, of what is projected, in an image of `size` px with a border of one; overwrites
+        `position`."""
+        position *= nearness
+        return position.clip(0, np.float32(size + 1), out=position).astype(np.int32)
 
     def explained(self, evidence: np.ndarray, counts: np.ndarray) -> np.ndarray:
         """[R] mean evidence at each ray's best depth, over the other frames that count [F]."""
-        weights = (self._others & counts).astype(np.float32)
-        means = np.einsum("rdf,rf->rd", evidence, weights) / weights.sum(-1).clip(1)[:, None]
-        return np.asarray(means.max(1))
+        weights = counts.astype(np.float32)
+        own = weights[self.ray_views][:, None]  # a ray is no evidence in its own frame
+        sums = evidence @ weights - own * evidence[np.arange(len(evidence)), :, self.ray_views]
+        return np.asarray((sums / (weights.sum() - own).clip(1)).max(1))
 
     def mean(self, poses: np.ndarray, available: np.ndarray | None = None) -> float:
         """Mean evidence of poses [F, 4, 4], over the rays that they explain best and the frames they are of [F]."""
@@ -291,6 +325,16 @@ class MotionEvidence:
         other, own, frames = other[compared], own[compared], self.ray_views[counts][compared]
         gains = np.array([(other - own)[frames == frame].mean() for frame in np.unique(frames)])
         return float(other.mean() / max(own.mean(), 1e-9)), gain_certainty(gains), float(other.mean())
+
+
+def _median(images: list[np.ndarray]) -> np.ndarray:
+    """Median of an even number of images, as `np.median` has it, by a sorting network: in a tenth of its time."""
+    ranked, middle = list(images), len(images) // 2
+    for last in range(len(ranked) - 1, middle - 2, -1):
+        for index in range(last):
+            one, other = ranked[index : index + 2]
+            ranked[index : index + 2] = np.minimum(one, other), np.maximum(one, other)
+    return np.asarray((ranked[middle - 1] + ranked[middle]) / 2)
 
 
 def gain_certainty(gains: np.ndarray) -> float:

@@ -16,8 +16,9 @@ from neeco.capture.checks.colors import agreements
 from neeco.capture.checks.mistakes import camera_axes_mistakes, frame_mistakes, unit_mistakes
 from neeco.capture.checks.motion import POSES, MotionVerdict, judge_motion
 from neeco.capture.checks.motion_evidence import MotionEvidence
+from neeco.capture.checks.pictures import Pictures
 from neeco.capture.documents import Node, errors_only, printable
-from neeco.capture.model import Instrument
+from neeco.capture.model import Instrument, InstrumentState
 from neeco.capture.points import sampled
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.lines import across_projectors
@@ -56,7 +57,7 @@ class _Extent:
         return max(self.radius, self.distance)
 
 
-def check_placement(parsed: Parsed) -> dict[str, MotionVerdict]:
+def check_placement(parsed: Parsed, pictures: Pictures) -> dict[str, MotionVerdict]:
     """Check points, cameras against points, then instruments against both (not against cameras that are wrong).
 
     Returns what the images say of instruments that are out of view, by name.
@@ -67,9 +68,9 @@ def check_placement(parsed: Parsed) -> dict[str, MotionVerdict]:
     placed = parsed.with_cameras()
     extent = None if points is None or not placed.frames else _Extent.of(placed, points)
     if extent is not None:
-        _check_cameras(placed, extent)
+        _check_cameras(placed, extent, pictures)
     if placed.frames and len(errors_only(report.problems)) == before:
-        return _check_instruments(placed, extent)
+        return _check_instruments(placed, extent, pictures)
     return {}
 
 
@@ -99,7 +100,7 @@ def _radius(points: np.ndarray) -> float:
     return float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
 
 
-def _check_cameras(parsed: Parsed, extent: _Extent) -> None:
+def _check_cameras(parsed: Parsed, extent: _Extent, pictures: Pictures) -> None:
     """Report cameras far from the points, and mistakes in camera poses."""
     matrices = parsed.header("frames[*].transform_matrix")
     if parsed.instruments and extent.distance < MIN_DISTANCE_MM:
@@ -107,7 +108,7 @@ def _check_cameras(parsed: Parsed, extent: _Extent) -> None:
         parsed.header("frames").error(message, "give cameras, points and poses in mm")
         return
     visible = extent.cameras.sees(extent.points[None]).mean(axis=1)  # [F] share of the points in each image
-    fault = _camera_fault(parsed, extent, float(visible.mean())) if visible.mean() < MIN_VISIBLE else None
+    fault = _camera_fault(parsed, extent, float(visible.mean()), pictures) if visible.mean() < MIN_VISIBLE else None
     if fault is not None:
         matrices.error(f"points are outside the images: {fault[0]}", fault[1])
         return
@@ -129,7 +130,7 @@ def _check_cameras(parsed: Parsed, extent: _Extent) -> None:
             place.child("transform_matrix").warning("the camera has no point in its image", remedy)
 
 
-def _camera_fault(parsed: Parsed, extent: _Extent, given: float) -> Fault | None:
+def _camera_fault(parsed: Parsed, extent: _Extent, given: float, pictures: Pictures) -> Fault | None:
     """Name the mistake that best explains points out of view. Where the points' colours can confirm it, they must."""
     cameras, points = extent.cameras, extent.points[None]
     if np.linalg.norm(cameras.centers, axis=1).max() < MIN_DISTANCE_MM < 0.1 * extent.radius:
@@ -137,7 +138,7 @@ def _camera_fault(parsed: Parsed, extent: _Extent, given: float) -> Fault | None
     mistakes = [*camera_axes_mistakes(cameras.poses), *unit_mistakes(cameras.poses, {"metres": 1000.0})]
     faults = [(mistake.what.format(of="of the cameras"), mistake.remedy) for mistake in mistakes]
     clean = not errors_only(parsed.places[0].report.problems)
-    if clean and (colors := agreements(parsed, [mistake.poses for mistake in mistakes])) is not None:
+    if clean and (colors := agreements(parsed, [mistake.poses for mistake in mistakes], pictures)) is not None:
         best = int(np.argmax(colors))
         return faults[best] if colors[best] > MIN_COLOR_CORRELATION else None
     views = [CameraArrays(mistake.poses, cameras.intrinsics, cameras.sizes).sees(points) for mistake in mistakes]
@@ -151,7 +152,7 @@ def _most_visible(faults: Sequence[Fault], visible: Sequence[np.ndarray], given:
     return faults[best] if shares[best] > max(MIN_EXPLAINED, 3 * given) else None
 
 
-def _check_instruments(parsed: Parsed, extent: _Extent | None) -> dict[str, MotionVerdict]:
+def _check_instruments(parsed: Parsed, extent: _Extent | None, pictures: Pictures) -> dict[str, MotionVerdict]:
     """Report instruments far from the scene or outside every image, and the mistakes behind it.
 
     Returns what the images say of them, where they were compared.
@@ -169,16 +170,14 @@ def _check_instruments(parsed: Parsed, extent: _Extent | None) -> dict[str, Moti
         if not found:
             continue
         name = printable(instrument.name)
-        poses = np.stack([state.pose.numpy() for _, state in found])  # [I, 4, 4]
-        origins = poses[:, :3, 3]
+        origins = np.stack([state.pose[:3, 3].numpy() for _, state in found])
         farthest = float(np.linalg.norm(origins, axis=1).max())
         if np.ptp(origins, axis=0).max() > 0 and farthest < MIN_DISTANCE_MM:
             message = f"positions of {name} stay within {farthest:.2g} mm of the frame's origin: metres?"
             parsed.header(POSES).error(message, "give them in mm")
         elif parsed.registered:
             has = np.array([instrument.name in frame.state.instruments for frame in parsed.frames])
-            places = [place for place, _ in found]
-            verdict = _check_instrument(parsed, instrument, cameras[has], extent, poses, places)
+            verdict = _check_instrument(parsed, instrument, found, cameras[has], extent, pictures)
             if verdict is not None:
                 verdicts[instrument.name] = verdict
     return verdicts
@@ -187,28 +186,30 @@ def _check_instruments(parsed: Parsed, extent: _Extent | None) -> dict[str, Moti
 def _check_instrument(
     parsed: Parsed,
     instrument: Instrument,
+    found: list[tuple[Node, InstrumentState]],
     cameras: CameraArrays,
     extent: _Extent | None,
-    poses: np.ndarray,
-    places: list[Node],
+    pictures: Pictures,
 ) -> MotionVerdict | None:
-    """Check one registered instrument, given cameras, poses [I, 4, 4] and places of the frames that have it.
+    """Check one registered instrument, given its states, their places and the cameras of the frames that have it.
 
     Returns what the images say of it, where they were compared.
     """
-    name, all_poses, origins = printable(instrument.name), parsed.header(POSES), poses[:, :3, 3]
+    name, all_poses, places = printable(instrument.name), parsed.header(POSES), [place for place, _ in found]
+    poses = np.stack([state.pose.numpy() for _, state in found])  # [I, 4, 4]
+    origins = poses[:, :3, 3]
     visible = cameras.sees(origins[:, None])[:, 0]  # [I]
     outside = "every image" if not visible.any() else f"{len(visible) - int(visible.sum())} of {len(visible)} images"
     fault, verdict = None, None
     if visible.mean() < MIN_VISIBLE:
-        evidence = _motion_evidence(parsed, instrument)
+        evidence = _motion_evidence(parsed, instrument, pictures)
         if evidence is None:
             fault = _instrument_fault(cameras, poses, float(visible.mean()))
         else:  # the images decide where they can
             verdict = judge_motion(parsed, instrument, evidence)
-            found = verdict.fault
-            if found is not None and found.named and found.field == POSES:
-                fault = found.message, found.remedy
+            named = verdict.fault
+            if named is not None and named.named and named.field == POSES:
+                fault = named.message, named.remedy
     if fault is not None:
         all_poses.error(f"instrument {name} is outside {outside}: {fault[0]}", fault[1])
         return None
@@ -248,11 +249,11 @@ def _check_instrument(
     return verdict
 
 
-def _motion_evidence(parsed: Parsed, instrument: Instrument) -> MotionEvidence | None:
+def _motion_evidence(parsed: Parsed, instrument: Instrument, pictures: Pictures) -> MotionEvidence | None:
     """The motion in the images, where they can be read and every frame has the instrument."""
     everywhere = all(instrument.name in frame.state.instruments for frame in parsed.frames)
     clean = not errors_only(parsed.places[0].report.problems)
-    return MotionEvidence.of(parsed) if everywhere and clean else None
+    return MotionEvidence.of(parsed, pictures) if everywhere and clean else None
 
 
 def _visible_body_point(cameras: CameraArrays, poses: np.ndarray) -> tuple[np.ndarray, float]:

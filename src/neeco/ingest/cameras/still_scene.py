@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 import torch
 
-from neeco.capture.images import open_image, write_image, write_labels
+from neeco.capture.images import encoded_rgb, open_image, write_labels
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
+from neeco.files import write_unsynced
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.cameras.tissue_surface import TissueSurface, epipolar_error, surface_behind, surface_from_stereo
@@ -168,7 +169,7 @@ def read_right_camera(
         progress("writing the right camera's frames", done, len(rows))
         row = rows[frame]
         names[row] = f"{stems[row]}_right.png"
-        write_image(folder / names[row], torch.from_numpy(lens.undistort(image).astype(np.float32) / 255))
+        write_unsynced(folder / names[row], encoded_rgb(lens.undistort(image)))
     delays = {
         row: float(video.times[right] - times[selected[row]]) if one_clock else 0.0 for row, right in pairs.items()
     }

@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 import torch
 
-from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, is_repeated, open_image, write_image, write_labels
+from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, encoded_rgb, is_repeated, open_image, write_labels
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
+from neeco.files import write_unsynced
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.frames.views import StageProgress, Views
@@ -236,7 +237,7 @@ def _write(images: ChosenImages, video: VideoSource, progress: StageProgress) ->
     for done, (name, (_, image)) in enumerate(zip(names, video.read(images.selected.tolist()), strict=True)):
         progress("writing frames", done, len(names))
         straight = images.lens.undistort(image) if images.lens else image
-        write_image(folder / name, torch.from_numpy(straight.astype(np.float32) / 255))
+        write_unsynced(folder / name, encoded_rgb(straight))
 
 
 def _write_masks(images: ChosenImages) -> None:
