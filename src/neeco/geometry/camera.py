@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -105,6 +107,11 @@ class Camera:
         """The same camera, its pose and that of its lamps on `device`."""
         lamps = None if self.world_from_lamps is None else self.world_from_lamps.to(device)
         return replace(self, world_from_camera=self.world_from_camera.to(device), world_from_lamps=lamps)
+
+    @cached_property
+    def camera_from_world(self) -> np.ndarray:
+        """Inverse of the pose, [4, 4] float64 without gradient."""
+        return np.linalg.inv(self.world_from_camera.detach().cpu().double().numpy())
 
     @property
     def is_pinhole(self) -> bool:

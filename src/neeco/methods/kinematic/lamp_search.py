@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -54,6 +53,8 @@ class _NormalEquations:
 
     def fit(self, chosen: tuple[int, ...]) -> _Fit:
         """Return the non-negative least-squares strengths of these lamps."""
+        from scipy.optimize import nnls  # slow to import
+
         gram, moment = self.gram.sum(0)[np.ix_(chosen, chosen)], self.moment.sum(0)[list(chosen)]
         root = np.linalg.cholesky(gram + 1e-6 * np.eye(len(chosen)))
         strengths, _ = nnls(root.T, np.linalg.solve(root, moment))
