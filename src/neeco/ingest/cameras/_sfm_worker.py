@@ -24,6 +24,7 @@ SWEEPS = 4  # over frames that have no camera yet
 MISFIT_PX = 3.0
 STEPS = (15, 30)  # of the adjustment, before and after misfits are dropped
 LENS_STEPS = (30, 100)
+DIRECT_IMAGES = 100  # up to which the cameras' equations are factorised; beyond, conjugate gradients take half the time
 PARALLAX_POINTS = 500  # points looked at
 
 
@@ -232,6 +233,7 @@ def adjust(model: pycolmap.Reconstruction, job: dict[str, Any], steps: Sequence[
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.solver_options.num_threads = job["threads"]
     options.ceres.solver_options.function_tolerance = 1e-5
+    options.ceres.max_num_images_direct_sparse_cpu_solver = DIRECT_IMAGES
     for iterations in steps:
         options.ceres.solver_options.max_num_iterations = iterations
         pycolmap.bundle_adjustment(model, options)
