@@ -71,7 +71,6 @@ def test_a_check_waits_for_no_pytorch() -> None:
     assert done.stdout.endswith("\n0 False\n"), done.stderr
 
 
-
 @pytest.mark.parametrize("verb", cli.VERBS)
 def test_every_verb_has_help_with_hyphenated_options(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
