@@ -68,5 +68,5 @@ def test_images_without_features_match_nothing(images, tmp_path):
 
 
 def test_an_image_that_vanished_is_named(tmp_path):
-    with pytest.raises(NeecoError, match=r"gone\.png: cannot be read"):
+    with pytest.raises(NeecoError, match=r"gone\.png: no such file"):
         list(in_threads(lambda path: find_features(path, None, 10, 0.004, False), [tmp_path / "gone.png"], 2))

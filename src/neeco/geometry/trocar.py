@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 MIN_LEVER_MM = 40.0  # from the instrument to its trocar
 MAX_BEND_MM = 0.3  # root mean square distance of a trocar from the line: beyond, a wrist bends the tracked frame
@@ -24,6 +23,8 @@ class ShaftLine:
 def line_through_trocar(poses: np.ndarray, max_bend_mm: float = MAX_BEND_MM) -> ShaftLine | None:
     """The line, fixed to poses [F, 4, 4], that goes through one fixed point in all of them, within max_bend_mm (rms);
     None where there is none, or none is determined."""
+    from scipy.optimize import least_squares  # here: synthesis and tracking start without it
+
     back, places = poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3]
 
     def off(trocar: np.ndarray) -> np.ndarray:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
@@ -53,6 +52,8 @@ class Breathing(nn.Module):
     def of(cls, tissue: Tensor, period: float, swing: Tensor, origin: float) -> Breathing:
         """Return a breathing that moves all of the tissue, points [P, 3] mm, by `swing` [2 N_HARMONICS, 3] mm (a_1,
         b_1, …)."""
+        from scipy.cluster.vq import kmeans2  # here: only training needs it
+
         places, _ = kmeans2(
             tissue.detach().cpu().double().numpy(), min(N_CONTROL_POINTS, len(tissue)), minit="++", seed=0
         )

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 import cv2
 import numpy as np
 
-from neeco.errors import NeecoError
+from neeco.capture.images import open_image
 
 OCTAVE_LAYERS, EDGE_RATIO, SIGMA = 3, 10, 1.6  # of the scale space, as Lowe 2004 has them
 MAX_ANGLE, MAX_RATIO = 0.7, 0.8  # rad between matching descriptors; of the angle to the next similar one
@@ -32,7 +32,8 @@ class Features(NamedTuple):
 def find_features(image: Path, mask: Path | None, count: int, min_contrast: float, reduced: bool) -> Features:
     """At most about `count` features of an image file, where a mask is not black. reduced: detected in the image at
     half its size, of which SIFT's finest scale has the double. Raises NeecoError when a file cannot be read."""
-    grey, shown = _read(image), None if mask is None else _read(mask)
+    grey, shown = (None if path is None else np.asarray(open_image(path).convert("L")) for path in (image, mask))
+    assert grey is not None
     factor = 2 if reduced else 1
     if reduced:
         size = grey.shape[1] // 2, grey.shape[0] // 2
@@ -78,10 +79,3 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item], thread
         yield from pool.map(function, items)
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _read(path: Path) -> np.ndarray:
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if grey is None:
-        raise NeecoError(f"{path}: cannot be read any more; do not change files while they are ingested")
-    return grey

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -56,6 +55,8 @@ class _NormalEquations:
         """Return the non-negative least-squares strengths of these lamps."""
         gram, moment = self.gram.sum(0)[np.ix_(chosen, chosen)], self.moment.sum(0)[list(chosen)]
         root = np.linalg.cholesky(gram + 1e-6 * np.eye(len(chosen)))
+        from scipy.optimize import nnls  # here: only training needs it
+
         strengths, _ = nnls(root.T, np.linalg.solve(root, moment))
         return _Fit(chosen, strengths, float(2 * strengths @ moment - strengths @ gram @ strengths))
 
