@@ -14,11 +14,11 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 
 from neeco.capture import read_capture
-from neeco.capture.images import area_averaged
 from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.labels.drawing import draw
@@ -56,7 +56,8 @@ def main() -> None:
             areas: dict[str, list[float]] = {}
             for frame in frames:
                 camera = frame.camera.resized(round(learned.width * scale), round(learned.height * scale))
-                truth = area_averaged(frame.load_image(), camera.width, camera.height)
+                size = camera.width, camera.height
+                truth = torch.from_numpy(cv2.resize(frame.load_image().numpy(), size, interpolation=cv2.INTER_AREA))
                 gaussians = scene.at(frame.state)
                 plain = draw(scene, frame.state, replace(camera, learned_fx=camera.fx))
                 drawing = draw(scene, frame.state, camera)

@@ -430,14 +430,13 @@ def ingest(
         return ingest_and_report(read_recordings(sources, frames), output, report)
     if video is None:
         raise NeecoError("--video: give the video (or a folder of images), or a recording.yaml")
-    if intrinsics is not None and calibration is not None:
-        raise NeecoError("--calibration: given with --intrinsics; give one of them")
     recording = recording_from_flags(
         Path(video),
         instrument=_path(instrument),
         laparoscope=_path(laparoscope),
         joints=[(name, Path(log), _path(table)) for name, (log, table) in (joints or {}).items()],
-        intrinsics=intrinsics or _path(calibration),
+        intrinsics=intrinsics,
+        calibration=_path(calibration),
         sync=_path(sync),
         frames=frames,
         fps=fps,

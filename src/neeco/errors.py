@@ -51,6 +51,11 @@ def naming_arguments() -> Iterator[None]:
         raise
 
 
+def counted(count: int, noun: str) -> str:
+    """Return `1 frame`, `2 frames`."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """Return the name in `known` that is most similar to `name`; None where none is similar."""
     from difflib import get_close_matches  # slow to import

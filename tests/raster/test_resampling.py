@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -43,6 +44,19 @@ def test_an_image_smaller_than_learned_is_the_learned_one_averaged() -> None:
     assert torch.allclose(small.channels[..., 0], small.alpha, atol=1e-5)
     assert ((small.depth == 0) == (small.alpha == 0)).all()
     assert float((small.depth - 100).abs()[small.alpha > 0].max()) < 30
+
+
+@pytest.mark.parametrize("size", [(48, 36), (60, 45), (28, 21)])
+def test_a_pixel_of_any_smaller_size_is_the_mean_over_its_area(size: tuple[int, int]) -> None:
+    gaussians = thin_needles()
+    camera = replace(LEARNED.resized(*size), learned_fx=60.0)
+    small = rasterize(gaussians, camera, alone=[torch.ones(60, dtype=torch.bool)])
+    learned = rasterize(gaussians, LEARNED)
+    for found, given in ((small.color, learned.color), (small.alpha, learned.alpha)):
+        mean = cv2.resize(given.numpy(), size, interpolation=cv2.INTER_AREA)
+        assert np.allclose(found, mean, atol=1e-5)
+    assert torch.equal(small.alone[0].alpha, small.alpha)
+    assert torch.equal(small.alone[0].depth, small.depth)
 
 
 def test_an_image_larger_than_learned_shows_the_learned_one() -> None:

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.text import Text
 
 from neeco.cli._output import JsonTarget, ready_for_json, write_numbers
+from neeco.errors import counted
 
 if TYPE_CHECKING:
     from neeco.capture.checks import CaptureSummary
@@ -52,7 +53,7 @@ def _print(problems: list[Problem], errors: int, summary: CaptureSummary) -> Non
         console.print(Text.assemble((f"{label:<8}", style), str(problem)))
     warnings = len(problems) - errors
     if problems:
-        console.print(f"{_count(errors, 'error')}, {_count(warnings, 'warning')}")
+        console.print(f"{counted(errors, 'error')}, {counted(warnings, 'warning')}")
     else:
         console.print(Text("no problems found", "bold green"))
     for line in _summary_lines(summary):
@@ -81,7 +82,3 @@ def _summary_lines(summary: CaptureSummary) -> list[str]:
         ]
         lines.append(f"instrument {name!r}: " + ", ".join([f"moves {travel:.1f} mm", *joints]))
     return lines
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"

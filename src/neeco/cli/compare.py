@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from neeco.cli._output import print_outcome
+from neeco.errors import NeecoError
 from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
@@ -79,7 +80,6 @@ def run(args: Compare) -> int:
 
 def _spec(args: Compare) -> ComparisonSpec:
     """Return the comparison that the arguments ask for. Raises NeecoError for an unreadable budget or masks."""
-    from neeco.errors import NeecoError
     from neeco.studies.comparison import ComparisonSpec
 
     masks: dict[str, Path] = {}
@@ -95,7 +95,6 @@ def _spec(args: Compare) -> ComparisonSpec:
 
 
 def _budget(args: Compare) -> Budget:
-    from neeco.errors import NeecoError
     from neeco.studies.training_job import Budget
 
     options = {

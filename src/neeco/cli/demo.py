@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neeco.errors import NeecoError
 from neeco.settings import Device
 
 if TYPE_CHECKING:
@@ -32,7 +33,6 @@ class Arguments:
 
 def run(args: Arguments) -> int:
     """Do it all and say where everything lies."""
-    from neeco.errors import NeecoError
     from neeco.evaluation.image_metrics import find_lpips
     from neeco.raster.devices import device_of
     from neeco.training.run import open_run
@@ -71,8 +71,6 @@ def sample_capture() -> Path:
 
     Raises NeecoError when neither is there.
     """
-    from neeco.errors import NeecoError
-
     package = Path(__file__).resolve().parents[1]
     places = (package / "samples" / SAMPLE, package.parents[1] / "samples" / SAMPLE)
     for place in places:
@@ -83,7 +81,6 @@ def sample_capture() -> Path:
 
 def _check(path: Path) -> None:
     from neeco.capture import check_capture, errors_only
-    from neeco.errors import NeecoError
 
     print(f"1/4 check {path}")
     problems = check_capture(path)

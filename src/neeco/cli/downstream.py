@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from neeco.cli._output import print_outcome
+from neeco.errors import NeecoError
 from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
@@ -127,7 +128,6 @@ def _test(word: str) -> OtherCapture:
 
 def _data_set(word: str) -> ImageSet:
     """`NAME=DATASET` or `NAME=DATASET:COUNT`; a folder whose name ends so is the folder."""
-    from neeco.errors import NeecoError
     from neeco.studies.downstream.samples import ImageSet
 
     name, place = name_and_value("--sets", word, "kinematic=dataset")

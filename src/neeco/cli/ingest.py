@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from neeco.cli._output import JsonTarget, whole_lines
+from neeco.errors import NeecoError
 
 if TYPE_CHECKING:
     from neeco.ingest.recording.model import Recording
@@ -61,7 +62,6 @@ def run(args: Ingest) -> int:
     """Ingest, convert, or write a template."""
     from neeco.cli._output import ready_for_json, require_ending, write_numbers
     from neeco.cli._progress import Bars
-    from neeco.errors import NeecoError
     from neeco.ingest.convert import convert_folder
     from neeco.ingest.sources import folder_to_convert
     from neeco.report.choice_picture import write_draft
@@ -101,8 +101,6 @@ def run(args: Ingest) -> int:
 
 def _refuse_others(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
     """Raise NeecoError when an option was given that `what` would ignore."""
-    from neeco.errors import NeecoError
-
     for option in fields(Ingest):
         if option.name not in ("source", "init", *keep) and getattr(args, option.name) != option.default:
             raise NeecoError(f"{what}, and --{option.name} would be ignored with it; leave one of them out")
@@ -122,7 +120,6 @@ def _list_formats() -> int:
 
 def recordings_of(args: Ingest) -> list[Recording]:
     """Return the recordings that the arguments name. Raises NeecoError naming the option."""
-    from neeco.errors import NeecoError
     from neeco.ingest.sources import read_recordings, recording_from_flags
 
     if args.source:
@@ -131,10 +128,8 @@ def recordings_of(args: Ingest) -> list[Recording]:
         return read_recordings(args.source, args.frames)
     if args.video is None:
         raise NeecoError("--video: give the video (or images' folder), or a recording.yaml (`neeco ingest --init`)")
-    if args.intrinsics is not None and args.calibration is not None:
-        raise NeecoError("--calibration: given together with --intrinsics; give one of them")
     recording = recording_from_flags(
-        args.video, args.instrument, args.laparoscope, args.joint, args.calibration or args.intrinsics,
+        args.video, args.instrument, args.laparoscope, args.joint, args.intrinsics, args.calibration,
         sync=args.sync, frames=args.frames, fps=args.fps, shaft_diameter=args.shaft_diameter,
     )  # fmt: skip
     return [recording]

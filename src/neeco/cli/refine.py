@@ -7,6 +7,7 @@ from pathlib import Path
 
 import tyro
 
+from neeco.errors import NeecoError
 from neeco.settings import Device
 
 
@@ -29,7 +30,6 @@ class Arguments:
 def run(arguments: Arguments) -> int:
     """Fit, merge and train; print where the run is."""
     from neeco.cli._progress import Bars, resumable
-    from neeco.errors import NeecoError
     from neeco.raster.devices import device_of
     from neeco.tracking.refine import refine_run
     from neeco.training.run import open_gaussian_run

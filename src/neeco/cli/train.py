@@ -53,25 +53,12 @@ def run(args: Arguments) -> int:
     """Train with a progress bar; print where the run lies."""
     from neeco.cli._progress import train_with_progress
     from neeco.raster.devices import device_of
-    from neeco.training.config import training_config
+    from neeco.training.config import FLAGS, training_config
     from neeco.training.run import begun_config
 
-    config = training_config(
-        args.method,
-        {
-            "iterations": args.iterations,
-            "batch_size": args.batch_size,
-            "minutes": args.minutes,
-            "seed": args.seed,
-            "transforms": args.transforms,
-            "scale": args.scale,
-            "joints": args.joints,
-            "max_tissue_gaussians": args.max_tissue_gaussians,
-            "max_instrument_gaussians": args.max_instrument_gaussians,
-        },
-        args.set,
-        begun_config(args.output) if args.resume else None,
-    )
+    flags = {name: getattr(args, name) for name in FLAGS if name != "method"}
+    begun = begun_config(args.output) if args.resume else None
+    config = training_config(args.method, flags, args.set, begun)
     path = train_with_progress(args.capture, args.output, config, device_of(args.device), resume=args.resume)
     print(f"finished: {path}  (next: neeco evaluate {path})")
     return 0

@@ -69,7 +69,7 @@ def rendered_shadow(scene: GaussianScene, state: State, camera: Camera) -> Tenso
     posed = scene.at(state)
     light = posed.headlight
     assert light is not None
-    pinhole = replace(field_pinhole(of_learned_size(camera)), learned_fx=None)
+    pinhole = field_pinhole(of_learned_size(camera))
     shares = []
     for lit in (light, replace(light, shadow=None)):
         found = shadowed(replace(posed, headlight=lit), pinhole, depth_maps).headlight

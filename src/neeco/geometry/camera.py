@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -117,6 +118,11 @@ class Camera:
     def pose_array(self) -> np.ndarray:
         """`world_from_camera` as float64, without gradients."""
         return pose_array(self, "world_from_camera")
+
+    @cached_property
+    def camera_from_world(self) -> np.ndarray:
+        """Inverse of the pose, [4, 4] float64 without gradient."""
+        return np.linalg.inv(self.pose_array)
 
     @property
     def is_pinhole(self) -> bool:

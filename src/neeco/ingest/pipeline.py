@@ -133,24 +133,13 @@ def _right_frames(data: Episodes, right: RightCamera, frames: Sequence[Frame], r
     states, known = data.states_at(times)
     camera, found = right.pinhole.camera(right.world_from_camera), []
     for index, (frame, row) in enumerate(taken):
-        state = frame.state if right.delays[row] == 0 else _moved(frame.state, states, index, float(times[index]))
         if known[index]:
-            path = right.folder / right.names[row]
+            path, state = right.folder / right.names[row], frame.state
+            if right.delays[row] != 0:
+                uncertainty = next((item.uncertainty for item in state.instruments.values()), None)
+                state = _state(states, index, float(times[index]), uncertainty)
             found.append(replace(frame, image_path=path, camera=camera, state=state, mask_path=right.mask))
     return tuple(found)
-
-
-def _moved(state: State, states: States, row: int, time: float) -> State:
-    """Return a state with the poses and readings of another time, a row of `states`."""
-    instruments = {
-        name: replace(
-            item,
-            pose=torch.from_numpy(states[name][0][row].copy()),
-            joints={joint: float(values[row]) for joint, values in states[name][1].items()},
-        )
-        for name, item in state.instruments.items()
-    }
-    return State(instruments, time)
 
 
 def _result(

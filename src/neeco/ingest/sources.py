@@ -46,7 +46,8 @@ def recording_from_flags(
     instrument: Path | None = None,
     laparoscope: Path | None = None,
     joints: Sequence[tuple[str, Path, Path | None]] = (),
-    intrinsics: Path | Sequence[float] | None = None,
+    intrinsics: Sequence[float] | None = None,
+    calibration: Path | None = None,
     sync: Path | None = None,
     frames: int | None = None,
     fps: float | None = None,
@@ -55,6 +56,8 @@ def recording_from_flags(
     """Return a recording from the command line's options: columns are recognised from the headers. `video`: a file or a
     folder of images; joints: (name, log, calibration or None); shaft_diameter: mm, of an instrument that was not
     tracked. Raises NeecoError naming the option."""
+    if intrinsics is not None and calibration is not None:
+        raise NeecoError("--calibration: given together with --intrinsics; give one of them")
     given = [("--video", video), ("--instrument", instrument), ("--laparoscope", laparoscope), ("--sync", sync)]
     given += [(f"--joint {joint}", file) for joint, *files in joints for file in files]
     for option, file in given:
@@ -75,7 +78,7 @@ def recording_from_flags(
     check_frame_count(frames)
     if fps is not None and not 0 < fps < 1e6:  # NaN compares false
         raise NeecoError(f"--fps: {fps:g} is no frame rate; give frames per second")
-    if intrinsics is not None and not isinstance(intrinsics, str | Path) and len(intrinsics) != 4:
+    if intrinsics is not None and len(intrinsics) != 4:
         raise NeecoError(f"--intrinsics: takes FX FY CX CY, not {len(intrinsics)} numbers")
     video = Path(video)
     is_folder = video.is_dir() and format_of(video) is None
@@ -87,7 +90,7 @@ def recording_from_flags(
     }
     document = {
         "images" if is_folder else "video": {"folder" if is_folder else "file": _plain(video), "fps": fps},
-        "intrinsics": _plain(intrinsics),
+        "intrinsics": _plain(calibration or intrinsics),
         "instruments": [] if instrument is None and shaft_diameter is None else [tool],
         "laparoscope": _plain(laparoscope),
         "sync": _plain(sync),

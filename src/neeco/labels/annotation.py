@@ -98,14 +98,13 @@ def annotate(
     """Return the labels of every instrument of a rendering; names: (instrument, part) of its part ids."""
     drawn_at = scene.registered(drawing.state)  # the pose that agrees with the pixels
     parts = drawing.parts.numpy()
-    camera_from_world = np.linalg.inv(to_numpy(drawing.camera.world_from_camera))
     labels = []
     for instrument in instruments_of(names):
         if instrument not in drawing.state.instruments:
             continue
         ids = {part: k for k, (owner, part) in enumerate(names, 1) if owner == instrument}
         visible = shows_any(parts, tuple(ids.values()))
-        pose = camera_from_world @ to_numpy(drawn_at.instruments[instrument].pose)
+        pose = drawing.camera.camera_from_world @ to_numpy(drawn_at.instruments[instrument].pose)
         labels.append(
             InstrumentLabel(
                 name=instrument,
@@ -125,7 +124,7 @@ def shape_of(mask: np.ndarray) -> Shape | None:
     if rectangle is None:
         return None
     polygons = [_rounded(polygon, 2) for polygon in outer_polygons(mask)]
-    return Shape(int(mask.sum()), bounding_box(mask), _rounded(rectangle, 2), polygons)
+    return Shape(cv2.countNonZero(mask.view(np.uint8)), bounding_box(mask), _rounded(rectangle, 2), polygons)
 
 
 def visibility(visible: np.ndarray, unoccluded: np.ndarray) -> float:
@@ -136,7 +135,7 @@ def visibility(visible: np.ndarray, unoccluded: np.ndarray) -> float:
 
 def place_in_image(point: np.ndarray, camera: Camera) -> tuple[float, float, float] | None:
     """Return position (x, y) px and depth mm of a world point [3] mm; None where it is outside of the image."""
-    local = (np.linalg.inv(to_numpy(camera.world_from_camera)) @ np.append(point, 1.0))[:3]
+    local = (camera.camera_from_world @ np.append(point, 1.0))[:3]
     x, y = project_local(local, camera, nearest=camera.near)
     inside = local[2] > camera.near and 0 <= x < camera.width and 0 <= y < camera.height
     return (float(x), float(y), float(local[2])) if inside else None
@@ -211,12 +210,15 @@ def minimum_rectangle(mask: np.ndarray) -> np.ndarray | None:
     The direction is OpenCV's, the extent along it computed here: cv2.minAreaRect works in float32 and leaves corners of
     pixels outside.
     """
-    # the first and last pixel of every row carry the hull
-    rows = np.flatnonzero(mask.any(1))
-    if len(rows) == 0:
+    left, top, width, height = bounding_box(mask)
+    if not width:
         return None
-    first = mask[rows].argmax(1)
-    last = mask.shape[1] - mask[rows, ::-1].argmax(1)
+    inside = mask[top : top + height, left : left + width]
+    # the first and last pixel of every row carry the hull
+    rows = np.flatnonzero(inside.any(1))
+    first = left + inside[rows].argmax(1)
+    last = left + width - inside[rows, ::-1].argmax(1)
+    rows += top
     corners = np.concatenate([np.stack([x, rows + dy], 1) for x in (first, last) for dy in (0, 1)]).astype(float)
     found = []
     for turn in (0.0, np.radians(cv2.minAreaRect(corners.astype(np.float32))[2])):
@@ -229,14 +231,14 @@ def minimum_rectangle(mask: np.ndarray) -> np.ndarray | None:
 
 def outer_polygons(mask: np.ndarray) -> list[np.ndarray]:
     """Return the simplified outer contour [P, 2] (x, y) of every component of a mask, largest first."""
-    polygons = [_simplified(loop) for loop in _outer_loops(mask)] if mask.any() else []
+    polygons = [_simplified(loop) for loop in _outer_loops(mask)]
     return sorted(polygons, key=lambda polygon: -abs(signed_area(polygon)))
 
 
 def signed_area(polygon: np.ndarray) -> float:
     """Return the area of a polygon [P, 2], positive when it is clockwise in the image (y down)."""
-    x, y = polygon[:, 0], polygon[:, 1]
-    return float(0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+    x, y = np.concatenate([polygon, polygon[:1]]).T
+    return float(0.5 * np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]))
 
 
 def _outer_loops(mask: np.ndarray) -> list[np.ndarray]:
@@ -246,6 +248,8 @@ def _outer_loops(mask: np.ndarray) -> list[np.ndarray]:
     one nearest corner; where two pixels touch at a corner only, the touching ones are cut away.
     """
     x, y, width, height = bounding_box(mask)
+    if not width:
+        return []
     inside = mask[y : y + height, x : x + width].astype(np.uint8)
     fine = inside.repeat(MAGNIFICATION, 0).repeat(MAGNIFICATION, 1)
     upper_left, upper_right = inside[:-1, :-1], inside[:-1, 1:]

@@ -128,8 +128,7 @@ def _rasterize_resized(
     """`rasterize` for a pinhole of the learned size or a larger one; shadows are as soft as they were learned."""
     draw = partial(rasterize, backend=backend)
     pinhole = replace(camera, learned_fx=None)
-    at_learned_size = replace(of_learned_size(camera), learned_fx=None)
-    gaussians = shadowed(gaussians, at_learned_size, partial(depth_maps, backend=backend))
+    gaussians = shadowed(gaussians, of_learned_size(camera), partial(depth_maps, backend=backend))
     return draw(widened(gaussians, camera), pinhole, channels=channels, background=background, alone=alone)
 
 

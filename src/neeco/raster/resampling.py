@@ -14,15 +14,13 @@ from functools import lru_cache
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import embedding_bag, grid_sample
 
 from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import field_pinhole, lens_field
 from neeco.raster.reference import LOW_PASS
 from neeco.raster.types import Gaussians, Layer, Rendering
 
-# Scale from which the backends' own low-pass replaces supersampling. Measured at 0.9: 0.1 dB less than averaged.
-MIN_DIRECT_SCALE = 0.9
 ORIGIN = torch.eye(4)  # one tensor, so that cameras there are equal when their intrinsics are
 OUTSIDE = 2.0  # in the coordinates of `grid_sample`, beyond the image
 
@@ -33,29 +31,30 @@ def draw_through(camera: Camera, draw: Draw) -> Rendering:
     """Render for `camera`, which has a lens or a size other than the learned one; `draw` renders pinholes of the
     learned size or larger.
 
-    Sizes smaller than learned are supersampled by a whole number along each side, and averaged. A lens is rendered by
-    a pinhole whose field contains the lens's, and sampled bilinearly; beyond border and field the image is empty.
+    A size smaller than learned is the learned one, averaged over the area of each pixel. A lens is rendered by a
+    pinhole whose field contains the lens's, and sampled bilinearly; beyond border and field the image is empty.
     """
-    fine = supersampled(camera)
+    fine = of_rendered_size(camera)
     source = field_pinhole(fine)
     rendering = draw(source)
-    if fine is camera and camera.is_pinhole:
+    if camera.is_pinhole and _size(fine) == _size(camera):
         return rendering
-    alpha = rendering.alpha[..., None]
-    planes = [rendering.color, alpha, rendering.depth[..., None] * alpha]
+    layers = Layer(rendering.alpha, rendering.depth), *rendering.alone
+    planes = [
+        rendering.color,
+        *(plane[..., None] for each in layers for plane in (each.alpha, each.depth * each.alpha)),
+    ]
     planes += [] if rendering.channels is None else [rendering.channels]
     found = resampled(torch.cat(planes, -1), source, fine, camera)
-    layers = [
-        resampled(torch.stack([layer.alpha, layer.depth * layer.alpha], -1), source, fine, camera)
-        for layer in rendering.alone
-    ]
+    end = 3 + 2 * len(layers)
+    (alpha, weighted), *alone = found[..., 3:end].unflatten(-1, (-1, 2)).permute(2, 3, 0, 1)
     return replace(
         rendering,
         color=found[..., :3],
-        alpha=found[..., 3],
-        depth=_divided(found[..., 4], found[..., 3]),
-        channels=None if rendering.channels is None else found[..., 5:],
-        alone=tuple(Layer(layer[..., 0], _divided(layer[..., 1], layer[..., 0])) for layer in layers),
+        alpha=alpha,
+        depth=_divided(weighted, alpha),
+        channels=None if rendering.channels is None else found[..., end:],
+        alone=tuple(Layer(alpha, _divided(weighted, alpha)) for alpha, weighted in alone),
     )
 
 
@@ -69,11 +68,9 @@ def learned_scale(camera: Camera) -> float:
     return 1.0 if camera.learned_fx is None else camera.fx / camera.learned_fx
 
 
-def supersampled(camera: Camera) -> Camera:
-    """Return the camera of the rendered pixels, a whole number per pixel of the image along each side."""
-    scale = learned_scale(camera)
-    times = math.ceil(1 / scale - 1e-6) if scale < MIN_DIRECT_SCALE else 1
-    return camera if times == 1 else camera.resized(times * camera.width, times * camera.height)
+def of_rendered_size(camera: Camera) -> Camera:
+    """Return the camera of the pixels that are rendered: of the learned size where its own is smaller."""
+    return of_learned_size(camera) if learned_scale(camera) < 1 else camera
 
 
 def widened(gaussians: Gaussians, camera: Camera) -> Gaussians:
@@ -92,22 +89,50 @@ def widened(gaussians: Gaussians, camera: Camera) -> Gaussians:
 
 
 def of_learned_size(camera: Camera) -> Camera:
-    """Return the pinhole with approximately the learned number of pixels."""
+    """Return the camera with approximately the learned number of pixels, to be rendered as it is."""
     scale = learned_scale(camera)
-    return camera.resized(*(max(1, round(size / scale)) for size in (camera.width, camera.height)))
+    resized = camera.resized(*(max(1, round(size / scale)) for size in _size(camera)))
+    return replace(resized, learned_fx=None)
+
+
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.width, camera.height
 
 
 def resampled(image: Tensor, source: Camera, fine: Camera, camera: Camera) -> Tensor:
-    """Resample an image [H, W, C] of the pinhole `source` for `camera`, by the supersampled pixels of `fine`; 0 outside
-    the image."""
-    planes = image.permute(2, 0, 1)[None]
+    """Resample an image [H, W, C] of the pinhole `source` for `camera`, by the pixels of `fine`, which has the same
+    lens; 0 outside the image."""
     if not fine.is_pinhole:
         pinhole = (source.fx, source.fy), (source.cx, source.cy), (source.width, source.height)
         grid = _sampling_grid(replace(fine, world_from_camera=ORIGIN), pinhole)
-        planes = grid_sample(planes, grid.to(planes), align_corners=False)
-    if fine.width != camera.width:
-        planes = avg_pool2d(planes, fine.width // camera.width)
-    return planes[0].permute(1, 2, 0).contiguous()
+        planes = grid_sample(image.permute(2, 0, 1)[None], grid.to(image), align_corners=False)
+        image = planes[0].permute(1, 2, 0).contiguous()
+    if _size(fine) == _size(camera):
+        return image
+    pixels, shares = (given.to(image.device) for given in _covered_pixels(_size(fine), _size(camera)))
+    reduced = embedding_bag(pixels, image.flatten(0, 1), per_sample_weights=shares.to(image), mode="sum")
+    return reduced.view(camera.height, camera.width, -1)
+
+
+@lru_cache(maxsize=4)
+def _covered_pixels(size: tuple[int, int], reduced: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Return, for every pixel of an image reduced from one `size` (width, height) to another, the pixels [h w, K] of
+    the larger one that it covers, row by row, and the share [h w, K] of its area in each."""
+    (columns, across), (rows, down) = (_covered(*ends) for ends in zip(size, reduced, strict=True))
+    pixels = rows[:, None, :, None] * size[0] + columns[None, :, None, :]
+    shares = down[:, None, :, None] * across[None, :, None, :]
+    many = reduced[0] * reduced[1]
+    return pixels.reshape(many, -1), shares.reshape(many, -1)
+
+
+def _covered(many: int, few: int) -> tuple[Tensor, Tensor]:
+    """`_covered_pixels` along one side: [few, K] both."""
+    ratio = many / few
+    start = torch.arange(few, dtype=torch.float64)[:, None] * ratio
+    pixels = start.floor() + torch.arange(math.ceil(ratio) + 1)
+    shares = (torch.minimum(pixels + 1, start + ratio) - torch.maximum(pixels, start)).clamp_min(0) / ratio
+    used = (shares > 1e-9).any(0)  # the last column often is not
+    return pixels[:, used].clamp_max(many - 1).long(), shares[:, used].float()
 
 
 @lru_cache(maxsize=4)

@@ -13,6 +13,7 @@ from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 
 from neeco.capture.model import Capture
+from neeco.errors import counted
 from neeco.evaluation.mask_metrics import mean_of
 from neeco.files import write_text
 from neeco.report.charts import PALETTE, Level, Series, inline_svg, legend, line_chart, new_axes, page_style
@@ -140,7 +141,7 @@ def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
         text = Markup('<b class="{}">{}, synthetic images {} of {} comparisons{}.</b>')
         sentences.append(text.format(kind, start, ", ".join(parts), sum(counts.values()), place))
     if failed:
-        sentences.append(f"{len(failed)} training{'s' if len(failed) > 1 else ''} failed; they are listed below.")
+        sentences.append(f"{counted(len(failed), 'training')} failed; they are listed below.")
     return sentences
 
 

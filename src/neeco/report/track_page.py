@@ -16,7 +16,7 @@ from neeco.evaluation.image_metrics import overlay_parts
 from neeco.geometry.rotations import vector_from_rotation
 from neeco.labels.drawing import draw
 from neeco.report.charts import SMALL, Level, Series, line_chart
-from neeco.report.page import jpeg, write_page
+from neeco.report.page import jpeg, to_bytes, write_page
 from neeco.tracking.track import Tracked, state_of
 
 N_STRIP, N_LEAST_TRUSTED = 24, 12  # frames shown: spread over the footage, and the least trusted
@@ -106,7 +106,7 @@ def _banded(title: str, times: Sequence[float], values: np.ndarray, deviations: 
 def _figure(tracked: Tracked, frame: Frame, record: dict[str, Any]) -> dict[str, Any]:
     """One frame: its image, tinted by the label that the scene renders there."""
     image, trust = frame.load_image().numpy(), record["trust"]
-    picture = np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)
+    picture = to_bytes(image)
     if record["how"] != "lost":
         parts = draw(tracked.scene, state_of(record), frame.camera).parts
         assert parts is not None

@@ -13,7 +13,7 @@ from neeco.capture import Capture
 from neeco.capture.checks import read_checked
 from neeco.capture.model import RecordedStates
 from neeco.capture.writer import fingerprint
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, counted
 from neeco.evaluation.evaluate import EVALUATION_FILE, Progress, held_out_splits
 from neeco.evaluation.image_metrics import WEIGHTS_VARIABLE, find_lpips
 from neeco.files import own_folder, read_json, require_like, write_json
@@ -418,7 +418,7 @@ def absent_notes(comparison: ComparisonResult) -> list[str]:
 def budget_words(comparison: ComparisonResult) -> str:
     """Return the budget and the number of seeds, in words."""
     seeds = len(comparison.seeds)
-    return f"{Budget(**comparison.budget)} each, {seeds} seed{'s' if seeds > 1 else ''}"
+    return f"{Budget(**comparison.budget)} each, {counted(seeds, 'seed')}"
 
 
 def table_texts(comparison: ComparisonResult) -> dict[str, str]:

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from neeco.capture.model import Capture, Frame
+from neeco.errors import counted
 from neeco.raster.devices import cuda_backend
 from neeco.raster.native import simd, synchronise, threads
 from neeco.training.run import TrainedRun
@@ -59,7 +60,7 @@ def machine_words(machine: Mapping[str, Any], threads: str = "threads") -> str:
     """The machine that a study's numbers were taken on. threads: the field that counts them where it had one worker."""
     count = machine["threads_per_worker"] or machine[threads]
     workers = f", {machine['workers']} at once" if machine["workers"] > 1 else ""
-    return f"{hardware_words(machine)}, {count} thread{'s' if count > 1 else ''}{workers}, torch {machine['torch']}"
+    return f"{hardware_words(machine)}, {counted(count, 'thread')}{workers}, torch {machine['torch']}"
 
 
 def threads_per_worker(workers: int, cores: int | None = None) -> int:

@@ -24,7 +24,7 @@ from neeco.geometry.distortion import field_pinhole
 from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
-from neeco.raster.resampling import resampled, supersampled
+from neeco.raster.resampling import of_rendered_size, resampled
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings
@@ -176,7 +176,7 @@ class _Annotator:
             method = cv2.INTER_AREA if wanted.width < recorded.width else cv2.INTER_CUBIC
             pixels = cv2.resize(image.numpy(), (wanted.width, wanted.height), interpolation=method)
             return replace(drawing, image=torch.from_numpy(pixels).clamp(0, 1)), None
-        fine = supersampled(drawing.camera)
+        fine = of_rendered_size(drawing.camera)
         field = field_pinhole(fine)
         shown = resampled(torch.ones(field.height, field.width, 1), field, fine, wanted)[..., 0]
         known = torch.cat([image, torch.ones_like(image[..., :1])], -1)

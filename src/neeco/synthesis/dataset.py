@@ -10,7 +10,7 @@ import contextlib
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -145,7 +145,9 @@ def synthesize(
             on_progress(len(records))
         missing = [k for k in range(settings.count) if k not in records]
         scene_file, *others = (Path(given.path) / SCENE_FILE for given in runs)
-        spec = GeneratorSpec(scene_file, settings, str(scene.center.device), tuple(others))
+        # workers need not find the tolerance again
+        known = replace(settings, tissue_tolerance_mm=generator.acceptance.tolerance_mm)
+        spec = GeneratorSpec(scene_file, known, str(scene.center.device), tuple(others))
         made = 0
         for record in _draw_all(generator, spec, output, missing, min(workers, len(missing))):
             records[record["index"]] = record

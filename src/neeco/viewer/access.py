@@ -7,6 +7,7 @@ import hashlib
 import hmac
 import ipaddress
 import re
+import secrets
 import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from urllib.parse import parse_qs
 from neeco.errors import NeecoError
 
 HOST_HEADER = re.compile(r"([\w.-]+|\[[0-9a-f:.]+\])(:\d+)?", re.ASCII | re.IGNORECASE)
+HOST, PORT = "127.0.0.1", 8080
+TOKEN_BYTES = 24
 INLINE_SCRIPT = re.compile(rb"<script[^>]*>(.*?)</script>", re.DOTALL)
 
 
@@ -24,6 +27,11 @@ class AccessControl:
 
     token: str | None  # None: loopback, where none is needed
     cookie: str = "neeco"  # that holds it; browsers send one to all ports of a host, so it should name the port
+
+    @classmethod
+    def at(cls, host: str, port: int) -> AccessControl:
+        """Return that of a server on `host` and `port`: with a new token where other machines reach it."""
+        return cls(None if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES), f"neeco_{port}")
 
     def refusal(self, path: str, headers: Mapping[str, Sequence[str]]) -> str | None:
         """Why a request for `path` is refused, or None. headers: name in small letters -> all its values."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import logging
-import secrets
 import threading
 from collections.abc import Callable
 from functools import cache
@@ -20,11 +19,9 @@ from urllib.parse import parse_qs, urlsplit
 
 from neeco.errors import NeecoError
 from neeco.files import require_like
-from neeco.viewer.access import AccessControl, free_port, is_loopback, url_of
+from neeco.viewer.access import HOST, PORT, AccessControl, free_port, url_of
 from neeco.viewer.posing_session import PosingSession
 
-HOST, PORT = "127.0.0.1", 8080
-TOKEN_BYTES = 24
 MAX_BODY = 2**16  # bytes of a request's
 WAIT_S = 20.0  # for the rest of a request
 STATE = {"roll": float, "joints": {str: float}}  # degrees
@@ -40,11 +37,10 @@ class PosingServer:
         """folder: a capture, or a run of one. port: or the next that is free. Raises NeecoError."""
         self.session = PosingSession(folder)
         port = free_port(host, port)
-        self.token = None if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)
-        access = AccessControl(self.token, f"neeco_{port}")
+        access = AccessControl.at(host, port)
         handler = type("Handler", (_Handler,), {"session": self.session, "access": access})
         self._server = ThreadingHTTPServer((host, port), handler)
-        self.address = url_of(host, port, self.token)
+        self.address = url_of(host, port, access.token)
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
 

@@ -11,7 +11,6 @@ import gzip
 import http
 import io
 import logging
-import secrets
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,7 @@ import torch
 from neeco.errors import NeecoError, install_hint
 from neeco.labels.drawing import to_numpy
 from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
-from neeco.viewer.access import AccessControl, free_port, is_loopback, url_of
+from neeco.viewer.access import HOST, PORT, AccessControl, free_port, url_of
 from neeco.viewer.runs import ViewedRuns
 from neeco.viewer.saving import SavedStates
 from neeco.viewer.session import ClientSession, RenderThread
@@ -30,9 +29,7 @@ from neeco.viewer.viser_scene import field_of_view, upward
 if TYPE_CHECKING:
     import viser
 
-HOST, PORT = "127.0.0.1", 8080
 MAX_RUNS = 2
-TOKEN_BYTES = 24
 MISSING = f"view: needs viser; {install_hint('view')}"
 MAX_BROWSERS = 32  # at once
 # Keys on a focused slider are the slider's own. viser turns the camera by arrows that are pressed anywhere but in a
@@ -71,8 +68,9 @@ class ViewerServer:
         self.saved = SavedStates(runs[0], size)
         self.render_thread = RenderThread(self.runs.advance_timelines)
         port = free_port(host, port)
-        self.token = None if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)
-        self._server = _start_server(AccessControl(self.token, f"neeco_{port}"), host, port)
+        access = AccessControl.at(host, port)
+        self.token = access.token
+        self._server = _start_server(access, host, port)
         self.address = url_of(host, self._server.get_port(), self.token)
         self._prepare_scene()
         self._server.on_client_connect(self._connect)

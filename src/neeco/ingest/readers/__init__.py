@@ -314,6 +314,7 @@ def parse_number(text: str) -> float | None:
     return value if abs(value) < HUGE else np.nan
 
 
-def count_rows(count: int) -> str:
-    """`1 row`, `12 rows`."""
-    return f"{count} row{'' if count == 1 else 's'}"
+def rate_of(times: np.ndarray) -> float | None:
+    """Samples a second, of their times s; None where these do not say."""
+    span = float(np.ptp(times)) if len(times) > 1 else 0.0
+    return (len(times) - 1) / span if span > 0 else None

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, counted
 from neeco.ingest.calibration.camera_fields import cameras_in
 from neeco.ingest.calibration.stereo import RosCamera
 from neeco.ingest.readers import VideoSource
@@ -175,7 +175,7 @@ def open_topic(path: Path, topic: str, log: ImageLog, seconds: np.ndarray, notes
         raise NeecoError(f"{where}: changes from {first} to {second} pixels midway; cut the bag there")
     name = f"{path.name}: {topic}"
     for why, count in log.bad.items():
-        notes.append(f"{name}: {count} image{'' if count == 1 else 's'} left out: one {why}")
+        notes.append(f"{name}: {counted(count, 'image')} left out: one {why}")
     order = np.argsort(seconds, kind="stable")
     fresh = np.concatenate([[True], np.diff(seconds[order]) > 0])
     if not fresh.all():

@@ -7,6 +7,7 @@ passes through the trocar all the time: the lines along the right axis pass near
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError
 from neeco.geometry.lines import distances_to_lines, nearest_point
 from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import POSES, Stream, format_of, numbers, read_table
@@ -163,10 +163,10 @@ def _ways(values: np.ndarray, columns: Sequence[str], rotation: tuple[str, ...] 
     if rotation and form:
         return [(f"{form}, as named", rotation, form, None)]
     for names in ANGLES:
-        try:
-            found = tuple(columns[_ending(columns, name)] for name in names)
-        except NeecoError:
+        fitting = [[column for column in columns if re.split("[_.]", column.lower())[-1] == name] for name in names]
+        if any(len(named) != 1 for named in fitting):
             continue
+        found = tuple(column for (column,) in fitting)
         return [
             *((f"euler_convention: {way}", found, EULER, way) for way in CONVENTIONS),
             (ROTATION_VECTOR, found, ROTATION_VECTOR, None),
@@ -182,14 +182,6 @@ def _ways(values: np.ndarray, columns: Sequence[str], rotation: tuple[str, ...] 
         held = tuple(columns[place : place + 4])
         return [(way, held, way, None) for way in (QUATERNION_WXYZ, QUATERNION_XYZW)]
     return []
-
-
-def _ending(columns: Sequence[str], name: str) -> int:
-    """The only column of this name, or whose name ends in it."""
-    fitting = [index for index, column in enumerate(columns) if column.lower().split("_")[-1].split(".")[-1] == name]
-    if len(fitting) != 1:
-        raise NeecoError(f"{name}: no one column")
-    return fitting[0]
 
 
 def _are_rotations(matrices: np.ndarray) -> bool:

@@ -29,6 +29,7 @@ from neeco.ingest.readers import (
     choose_stream,
     compare_counts,
     numbers,
+    rate_of,
 )
 from neeco.ingest.readers.delimited import DelimitedText
 from neeco.ingest.readers.frame_names import meaning_of
@@ -81,8 +82,7 @@ class DvrkSession(RecordingFormat):
         # the left camera's are the frames; others are listed
         for number, name in enumerate(sorted(films, key=lambda name: ("right" in name, "left" not in name, name))):
             times = films[name].times
-            rate = (len(times) - 1) / float(np.ptp(times)) if len(times) > 1 and np.ptp(times) > 0 else None
-            found.append(Stream(name, IMAGES, "video", len(times), rate, offered=number == 0))
+            found.append(Stream(name, IMAGES, "video", len(times), rate_of(times), offered=number == 0))
         bag = _bag(path)
         if bag is not None:
             RosBag().require_package(bag)

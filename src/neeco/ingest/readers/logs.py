@@ -15,10 +15,10 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, counted
 from neeco.geometry.conventions import OPENCV
 from neeco.geometry.rotations import rotation_error
-from neeco.ingest.readers import Table, column_index, count_rows, numbers, parse_number, read_table
+from neeco.ingest.readers import Table, column_index, numbers, parse_number, read_table
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_in, meaning_of, of_dvrk
@@ -367,7 +367,7 @@ def _calibrated(
     note = ""
     if clamped.any():
         note = (
-            f"{table.title}: {count_rows(int(clamped.sum()))} with {name} just outside the table "
+            f"{table.title}: {counted(int(clamped.sum()), 'row')} with {name} just outside the table "
             f"{path.name} ({low:g} to {high:g}, by at most {excess[clamped].max():g}): "
             f"read as its end ({table.list_rows(table.lines[clamped])})"
         )

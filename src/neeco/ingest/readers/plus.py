@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, counted
 from neeco.files import require_content
 from neeco.ingest.readers import (
     IMAGES,
@@ -108,7 +108,7 @@ class PlusSequence(RecordingFormat):
             path, HEADER, values, numbers, stream=name, record="frame", stated_in=stated_in, meaning=_meaning(name)
         )
         notes = [
-            f"{table.title}: {len(left)} frame{'' if len(left) == 1 else 's'} dropped: {why} ({table.list_rows(left)})"
+            f"{table.title}: {counted(len(left), 'frame')} dropped: {why} ({table.list_rows(left)})"
             for why, left in dropped.items()
         ]
         if not rows:

@@ -28,6 +28,7 @@ from neeco.ingest.readers import (
     Table,
     VideoSource,
     choose_stream,
+    rate_of,
 )
 from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, meaning_of, of_dvrk
@@ -148,7 +149,7 @@ class RosBag(RecordingFormat):
     def _image_stream(self, survey: Survey, name: str) -> Stream:
         log = survey.images[name]
         received = [log.received[number] for number in log.numbers]
-        rate = _rate(survey.seconds(log.stamps, received))
+        rate = rate_of(survey.seconds(log.stamps, received))
         usable = len(log.numbers) > 0
         problem = None if usable or not log.bad else f"no image can be used: one {log.bad.most_common(1)[0][0]}"
         kind = f"{survey.image_types[name]}{f' ({log.description})' if usable else ''}"
@@ -173,7 +174,7 @@ class RosBag(RecordingFormat):
                 offered, title = False, f"{title}, the arms' in {', '.join(sorted(of_arms))}"
         elif name in dvrk:
             hints.append(DVRK_HINT)
-        rate = _rate(survey.seconds(log.stamps, log.received))
+        rate = rate_of(survey.seconds(log.stamps, log.received))
         return Stream(
             name, OTHER if log.static else POSES, title, len(log.stamps), rate, offered=offered, body=_body(name),
             hints=tuple(hints), asks=meaning.asks, problem=_all_damaged(log),
@@ -185,7 +186,7 @@ class RosBag(RecordingFormat):
             offered = bool(_DVRK_JOINTS.search(name))
             names = _joint_names(name, log)
             wrist = wrist_joints(names, "jaw" in name)
-        rate = _rate(survey.seconds(log.stamps, log.received))
+        rate = rate_of(survey.seconds(log.stamps, log.received))
         return Stream(
             name, READINGS, log.type, len(log.stamps), rate, offered=offered, body=_body(name), joints=wrist,
             problem=_all_damaged(log),
@@ -222,11 +223,6 @@ def _time_notes(title: str, stamps: Sequence[int], received: np.ndarray) -> list
                 "the streams do not share one, name its `clock` and give `sync`"
             )
     return notes
-
-
-def _rate(seconds: np.ndarray) -> float | None:
-    length = float(np.ptp(seconds)) if len(seconds) > 1 else 0.0
-    return (len(seconds) - 1) / length if length > 0 else None
 
 
 def _image_frames(survey: Survey) -> set[str]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from neeco.errors import NeecoError
-from neeco.ingest.readers import Table, column_index, count_rows, numbers
+from neeco.errors import NeecoError, counted
+from neeco.ingest.readers import Table, column_index, numbers
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.columns import JointColumns, PoseColumns, RecognisedColumns
 
@@ -37,7 +37,7 @@ class Rows:
         """Leave out a few rows that are wrong (bool [R]). Raises NeecoError when they are more than a few."""
         lines, count = self.table.lines[wrong & self.keep], int(self.keep.sum())
         if len(lines) > max(1, MAX_WRONG * count):
-            share = f"{self.table.list_rows(lines)} ({len(lines)} of {count_rows(count)})"
+            share = f"{self.table.list_rows(lines)} ({len(lines)} of {counted(count, 'row')})"
             raise NeecoError(f"{self.table.where}: {share}: {reason}")
         self.drop(wrong, reason.split(";")[0])
 
@@ -45,7 +45,7 @@ class Rows:
         """Return the changes to the rows, one sentence each."""
         name = self.table.title
         dropped = (
-            f"{name}: {count_rows(len(lines))} dropped: {reason} ({self.table.list_rows(lines)})"
+            f"{name}: {counted(len(lines), 'row')} dropped: {reason} ({self.table.list_rows(lines)})"
             for reason, lines in self.reasons.items()
         )
         return (*self.table.notes, *dropped, *(f"{name}: {repair}" for repair in self.repairs))
@@ -117,7 +117,7 @@ def read_cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
     rows.drop(missing, f"no value for {', '.join(names)}" if len(names) < 3 else "values are missing")
     bad = [(row, what) for row, what in bad if rows.keep[row]]
     if len(bad) > max(3, 0.5 * rows.keep.sum()):
-        similar = f"{len(bad)} of {count_rows(len(table.rows))} like it"
+        similar = f"{len(bad)} of {counted(len(table.rows), 'row')} like it"
         raise NeecoError(
             f"{table.where}: {table.record} {table.lines[bad[0][0]]}: {bad[0][1]} ({similar}); name other columns or "
             "repair the file"
@@ -160,20 +160,20 @@ def in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
     if doubled.sum() > max(MIN_SAMPLES, MAX_SAME_TIME * len(order)):
         raise NeecoError(
-            f"{table.where}: {count_rows(int(doubled.sum()))} of {len(order)} have the time of another; its times are "
-            "too coarse, or of several tools: name a finer column as columns.time"
+            f"{table.where}: {counted(int(doubled.sum()), 'row')} of {len(order)} have the time of another; its times "
+            "are too coarse, or of several tools: name a finer column as columns.time"
         )
     rows.drop(np.sort(order[doubled]), "a second row at one time")
     order = order[~doubled]
     if len(order) < MIN_SAMPLES:
         why = "; ".join(note.partition(": ")[2] for note in rows.notes()[:2])
         raise NeecoError(
-            f"{table.where}: {count_rows(len(order))} of {len(table.rows)} can be used{f' ({why})' if why else ''}; "
-            "record again or name the right columns"
+            f"{table.where}: {counted(len(order), 'row')} of {len(table.rows)} can be used{f' ({why})' if why else ''}"
+            "; record again or name the right columns"
         )
     if len(late):
         listed = table.list_rows(table.lines[late])
-        rows.repairs.append(f"{count_rows(len(late))} out of order in time; sorted ({listed})")
+        rows.repairs.append(f"{counted(len(late), 'row')} out of order in time; sorted ({listed})")
     return times[order], order
 
 
@@ -186,5 +186,4 @@ def find_gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float
         return (), ()
     total = sum(end - start for start, end in gaps)
     first = ", ".join(f"{start:.2f}-{end:.2f} s" for start, end in gaps[:3])
-    count = f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''}"
-    return gaps, (f"{table.title}: {count}, {total:.2f} s in all ({first}); not bridged",)
+    return gaps, (f"{table.title}: {counted(len(gaps), 'gap')}, {total:.2f} s in all ({first}); not bridged",)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from neeco.errors import counted
 from neeco.studies.downstream.conditions import BASELINES, PERMUTED, REAL
 from neeco.studies.downstream.intervals import Arm, Scores, arms_of
 from neeco.studies.downstream.scores import BOX_SCORES, MASK_SCORES
@@ -356,7 +357,7 @@ def budget_text(experiment: Document) -> str:
         for model in experiment["models"]
     ]
     folds = experiment["folds"]
-    return f"{'; '.join(models)}; {folds} fold{'s' if folds > 1 else ''}"
+    return f"{'; '.join(models)}; {counted(folds, 'fold')}"
 
 
 def data_files(experiment: Document) -> dict[str, str]:
