@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.cameras import sfm
-from neeco.ingest.cameras.features import Features
 from neeco.ingest.cameras.sfm import StructureFromMotion
 from neeco.ingest.cameras.sfm_strategies import Attempt, best_attempt, judge, motion_fault, strategies
 from neeco.ingest.recording.model import IngestSettings
@@ -80,8 +79,6 @@ def search(tmp_path, monkeypatch):
             return 30.0
 
         monkeypatch.setattr(sfm, "run_worker", run)
-        nothing = Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.float32))
-        monkeypatch.setattr(sfm, "find_features", lambda *_: nothing)
         settings = IngestSettings(sfm_minutes=minutes)
         names = [f"{index:06d}.png" for index in range(100)]
         made_sfm = StructureFromMotion(

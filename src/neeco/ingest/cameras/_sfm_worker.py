@@ -32,31 +32,47 @@ def say(stage: str, **facts: Any) -> None:
     print(json.dumps({"stage": stage, **facts}), flush=True)
 
 
-def store_matches(job: dict[str, Any], database: Path) -> None:
-    """The caller's features and matches as a database, the matches verified; one camera for all images, its intrinsics
-    given or to be estimated."""
-    say("verifying matches")
+def extract_and_match(job: dict[str, Any], database: Path) -> None:
+    """Features of every image, matched in the pairs listed by the caller; one camera for all, its intrinsics given or
+    to be estimated."""
+    say("features")
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = job["threads"]
+    options.sift.max_num_features = job["features"]
+    options.sift.peak_threshold = job["peak"]
+    options.sift.first_octave = job["first_octave"]
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = job["camera_model"]
     if job["camera_params"]:
         reader.camera_params = ",".join(str(value) for value in job["camera_params"])
-    pycolmap.Database.open(str(database)).close()
-    pycolmap.import_images(str(database), job["images"], pycolmap.CameraMode.SINGLE, job["names"], reader)
-    opened = pycolmap.Database.open(str(database))
-    number = {image.name: image.image_id for image in opened.read_all_images()}
-    with np.load(job["features"]) as saved:
-        keypoints = np.split(saved["keypoints"], np.cumsum(saved["counts"])[:-1])
-        for name, found in zip(job["names"], keypoints, strict=True):
-            opened.write_keypoints(number[name], found)
-        matches = np.split(saved["matches"], np.cumsum(saved["match_counts"])[:-1])
-        for (a, b), found in zip(job["pairs"], matches, strict=True):
-            opened.write_matches(number[a], number[b], found)
-    opened.close()
-    pairs = database.with_name("pairs.txt")
-    pairs.write_text("".join(f"{a} {b}\n" for a, b in job["pairs"]))
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.min_num_trials = MIN_TRIALS
-    pycolmap.verify_matches(str(database), str(pairs), options)
+    if job["masks"]:
+        reader.mask_path = job["masks"]
+    pycolmap.extract_features(
+        str(database),
+        job["images"],
+        image_names=job["names"],
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=options,
+        device=pycolmap.Device.cpu,
+    )
+    say("matching")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(database.with_name("pairs.txt"))
+    Path(pairing.match_list_path).write_text("".join(f"{a} {b}\n" for a, b in job["pairs"]))
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.num_threads = job["threads"]
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.min_num_trials = MIN_TRIALS
+    pycolmap.match_image_pairs(
+        str(database),
+        matching_options=matching,
+        pairing_options=pairing,
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
 
 
 def pipeline_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions:
@@ -277,7 +293,7 @@ def main(job_file: str) -> int:
     database = Path(job["database"])
     match job["task"]:
         case "match":
-            store_matches(job, database)
+            extract_and_match(job, database)
         case "map":
             map_keyframes(job, database)
         case "matches":

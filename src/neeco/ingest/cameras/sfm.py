@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from neeco.capture.images import open_image
 from neeco.errors import NeecoError
 from neeco.files import read_json
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.features import Features, find_features, in_threads, match_features
 from neeco.ingest.cameras.sfm_strategies import (
     Attempt,
     Strategy,
@@ -34,7 +32,7 @@ from neeco.ingest.recording.model import MIN_FRAMES, IngestSettings
 KEY_NEIGHBOURS = (1, 2, 3, 4, 6, 8, 12, 16)  # keyframes on, that a keyframe is matched with
 N_NEAR_KEYFRAMES = 3  # on each side, that another frame is matched with
 LOOP_STRIDE = 4  # keyframes between those that are all matched with each other: closes loops
-LARGE_PX = 1280  # of an image, whose features are detected at its own size, not at twice that: a quarter of the time
+LARGE_PX = 1280  # of an image, whose features are not detected at twice the size, which takes four times as long
 DENSE_FACTOR = 3  # on the number of features, in the attempt from more of them
 PEAK, DENSE_PEAK = 0.004, 0.002  # minimum contrast of a feature: tissue is smooth, COLMAP's 0.0067 leaves too few
 N_MOTION_PAIRS = 40  # of keyframes, that are tested for parallax
@@ -95,15 +93,15 @@ class StructureFromMotion:
         self.attempts: list[Attempt] = []  # in the order tried
         self.stopped = False  # the time was up before all strategies were tried
         self.seconds = 0.0  # of processor time used so far
-        self.folder = folder
-        self.threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self.job: dict[str, Any] = {
             "images": str(folder),
             "names": self.names,
+            "masks": str(masks) if masks else "",
             "work": str(work),
             "camera_model": "PINHOLE" if pinhole else "SIMPLE_RADIAL",
             "camera_params": [*pinhole.intrinsics] if pinhole else [],
-            "threads": self.threads,
+            "first_octave": -1 if max(size) < LARGE_PX else 0,
+            "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         }
         count = len(self.names)
         self.keys = range(0, count, max(1, count // settings.sfm_keyframes))
@@ -187,38 +185,12 @@ class StructureFromMotion:
 
     def _match(self, strategy: Strategy, progress: StageProgress) -> None:
         """Features and matches of all frames, into the database that strategies like this one share."""
-        before, saved = time.process_time(), self.work / "features.npz"
-        count, contrast = self.settings.sfm_features, PEAK
+        pairs = [(self.names[a], self.names[b]) for a, b in self.pairs]
+        features = self.settings.sfm_features
+        job = {"task": "match", "pairs": pairs, "features": features, "peak": PEAK} | self._parameters(strategy)
         if strategy.dense:
-            count, contrast = DENSE_FACTOR * count, DENSE_PEAK
-        reduced = max(self.size) >= LARGE_PX and not strategy.dense
-
-        def find(name: str) -> Features:
-            mask = None if self.masks is None else self.masks / f"{name}.png"
-            return find_features(self.folder / name, mask, count, contrast, reduced)
-
-        features: list[Features] = []
-        for found in in_threads(find, self.names, self.threads):
-            features.append(found)
-            progress("cameras: features", len(features), len(self.names))
-        matches: list[np.ndarray] = []
-        for pairs in in_threads(lambda pair: match_features(*(features[i] for i in pair)), self.pairs, self.threads):
-            matches.append(pairs)
-            progress("cameras: matching", len(matches), len(self.pairs))
-        np.savez(
-            saved,
-            keypoints=np.concatenate([found.keypoints for found in features]),
-            counts=[len(found.keypoints) for found in features],
-            matches=np.concatenate(matches),
-            match_counts=[len(pairs) for pairs in matches],
-        )
-        self.seconds += time.process_time() - before
-        job = {
-            "task": "match",
-            "pairs": [(self.names[a], self.names[b]) for a, b in self.pairs],
-            "features": str(saved),
-        }
-        self._work(self.job | job | self._parameters(strategy), progress)
+            job |= {"features": DENSE_FACTOR * features, "peak": DENSE_PEAK, "first_octave": -1}
+        self._work(self.job | job, progress)
 
     def _try(self, strategy: Strategy, parameters: dict[str, Any], progress: StageProgress) -> Attempt:
         try:
