@@ -23,7 +23,7 @@ class ShaftLine:
 def line_through_trocar(poses: np.ndarray, max_bend_mm: float = MAX_BEND_MM) -> ShaftLine | None:
     """The line, fixed to poses [F, 4, 4], that goes through one fixed point in all of them, within max_bend_mm (rms);
     None where there is none, or none is determined."""
-    from scipy.optimize import least_squares  # here: synthesis and tracking start without it
+    from scipy.optimize import least_squares  # slow to import
 
     back, places = poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3]
 

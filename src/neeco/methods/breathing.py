@@ -52,7 +52,7 @@ class Breathing(nn.Module):
     def of(cls, tissue: Tensor, period: float, swing: Tensor, origin: float) -> Breathing:
         """Return a breathing that moves all of the tissue, points [P, 3] mm, by `swing` [2 N_HARMONICS, 3] mm (a_1,
         b_1, …)."""
-        from scipy.cluster.vq import kmeans2  # here: only training needs it
+        from scipy.cluster.vq import kmeans2  # slow to import
 
         places, _ = kmeans2(
             tissue.detach().cpu().double().numpy(), min(N_CONTROL_POINTS, len(tissue)), minit="++", seed=0

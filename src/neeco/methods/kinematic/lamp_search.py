@@ -53,10 +53,10 @@ class _NormalEquations:
 
     def fit(self, chosen: tuple[int, ...]) -> _Fit:
         """Return the non-negative least-squares strengths of these lamps."""
+        from scipy.optimize import nnls  # slow to import
+
         gram, moment = self.gram.sum(0)[np.ix_(chosen, chosen)], self.moment.sum(0)[list(chosen)]
         root = np.linalg.cholesky(gram + 1e-6 * np.eye(len(chosen)))
-        from scipy.optimize import nnls  # here: only training needs it
-
         strengths, _ = nnls(root.T, np.linalg.solve(root, moment))
         return _Fit(chosen, strengths, float(2 * strengths @ moment - strengths @ gram @ strengths))
 
