@@ -30,7 +30,9 @@ from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs, JointColumns
 from neeco.ingest.registration import find_bases as module
 from neeco.ingest.registration.base import BaseRegistration
-from neeco.ingest.registration.find_bases import find_bases
+from neeco.ingest.registration.find_bases import correct_placement, find_bases
+from neeco.ingest.registration.hand_eye import Registration
+from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
 
 LENS = Lens(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (), (WIDTH, HEIGHT))
 STILL = np.tile(np.eye(4), (44, 1, 1))
@@ -96,6 +98,82 @@ def test_a_rough_base_is_found_before_a_scope_that_moves():
     cameras = np.linalg.inv(world.camera_from_world)
     placed, _ = find_bases(data, _black(world, cameras), lambda rows: world.masks[rows], silent)
     assert errors(placed.world_from_base["psm1"], world.poses_at(0.0))[0] < 1.2  # of 3.5 s in all
+
+
+def _placed(masks, beside, sd_mm, sd_deg):
+    """What `correct_placement` makes of an instrument that a hand-eye calibration places `beside` [4, 4] its own."""
+    world = make_world(44, moving_camera=True)
+    data = _data(world, None, {"ros": ClockOffset(0.03, 0.0, GIVEN)})
+    log = data.parts[0].poses["psm1"]
+    poses = np.tile(np.eye(4), (len(log.times), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(log.quats, scalar_first=True).as_matrix()
+    poses[:, :3, 3] = log.positions
+    poses = beside @ poses
+    quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
+    log = replace(log, positions=poses[:, :3, 3], quats=quats)
+    data = replace(data, parts=(replace(data.parts[0], poses={"psm1": log}),))
+    variances = np.square([0.005, *[np.radians(sd_deg) / 3**0.5] * 3, *[sd_mm / 3**0.5] * 3])
+    registration = Registration(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), camera_from_sensor=np.eye(4),
+        clock=ClockOffset(0.0, 0.0, GIVEN), scale_sd=0.005, origin=poses[:, :3, 3].mean(0),
+        covariances=np.stack([np.diag(variances)] * 3), position_residual=np.zeros(44),
+        rotation_residual=np.zeros(44), used=np.arange(44),
+    )  # fmt: skip
+    views = _black(world, np.linalg.inv(world.camera_from_world))
+    placed, found = correct_placement(data, views, registration, masks, silent)
+    corrected = placed.world_from_base.get("psm1", np.eye(4)) @ beside
+    return errors(corrected, world.poses_at(0.0)), errors(beside, world.poses_at(0.0)), found, data.notes.sentences
+
+
+@pytest.mark.slow
+def test_an_instrument_that_a_poor_hand_eye_calibration_places_beside_its_images_is_moved_there():
+    world = make_world(44, moving_camera=True)
+    after, before, found, notes = _placed(lambda rows: world.masks[rows], disturbed(4.0, 2.0, 4, world), 4.0, 2.0)
+    assert after[0] < 0.5 * before[0]
+    assert found["psm1"].sd_motion_mm < 1.5
+    assert "'psm1': its place was corrected by" in notes[0]
+
+
+@pytest.mark.slow
+def test_a_poor_hand_eye_calibration_that_happens_to_be_right_is_kept():
+    world = make_world(44, moving_camera=True)
+    after, before, found, _ = _placed(lambda rows: world.masks[rows], WORLD_FROM_BASE, 3.0, 1.5)
+    assert found == {}
+    assert after == before
+
+
+def test_a_usual_hand_eye_calibration_is_kept_without_looking():
+    world = make_world(44, moving_camera=True)
+    assert _placed(_no_masks, disturbed(0.5, 0.2, 1, world), 0.5, 0.2)[2] == {}
+
+
+def test_outlines_are_not_asked_for_a_place_of_which_nearly_nothing_is_known():
+    assert _placed(_no_masks, WORLD_FROM_BASE, 30.0, 10.0)[2] == {}
+
+
+def test_a_poor_hand_eye_calibration_is_kept_where_images_show_no_shaft():
+    world = make_world(44, moving_camera=True)
+    assert _placed(lambda rows: np.zeros_like(world.masks[rows]), WORLD_FROM_BASE, 3.0, 1.5)[2] == {}
+
+
+@pytest.mark.parametrize(("overlap", "doubts", "corrected"), [(0.9, (), True), (0.82, (), False), (0.9, ("?",), False)])
+def test_a_place_is_corrected_only_where_images_fit_clearly_better(monkeypatch, overlap, doubts, corrected):
+    world, moved = make_world(44, moving_camera=True), np.eye(4)
+    moved[:3, 3] = [1.0, 2.0, 3.0]
+
+    def find(name, masks, intrinsics, camera_from_world, poses_at, times, prior, **others):
+        assert np.array_equal(prior[0], np.eye(4))
+        assert prior[1:] == pytest.approx((3.0 / 3**0.5, 1.5 / 3**0.5), rel=0.01)  # along each axis
+        assert others["clock_known"]
+        return BaseRegistration(
+            world_from_base=moved, clock_s=0.0, clock_sd_s=0.0, covariance=np.eye(6), open_directions=(),
+            overlap=overlap, overlap_before=0.6, frames=44, from_masks=True, doubts=doubts,
+        )  # fmt: skip
+
+    monkeypatch.setattr(module, "find_base", find)
+    after, _, found, notes = _placed(lambda rows: world.masks[rows], WORLD_FROM_BASE, 3.0, 1.5)
+    assert ("psm1" in found) is (len(notes) == 1) is corrected
+    assert (after[1] > 1) is corrected
 
 
 def test_a_base_stated_to_the_world_is_not_taken_for_one_to_the_camera():

@@ -204,6 +204,9 @@ def test_a_trackers_slow_errors_count_in_where_the_cameras_stand() -> None:
         off = Rotation.from_matrix(found.rotation).as_rotvec(degrees=True)
         offs.append(np.linalg.norm(off))
         stated.append(found.placement_sd(cameras[:, :3, 3])[1])
+        assert found.scale_sd**2 == pytest.approx(found.covariances[:, 0, 0].max())
+        shared = np.array(found.uncertainty(cameras[:, :3, 3]).covariance)  # what a capture states
+        assert np.degrees(np.linalg.eigvalsh(shared[:3, :3])[-1] ** 0.5) == pytest.approx(stated[-1], rel=0.3)
     assert 0.4 < np.sqrt(np.mean(np.square(offs))) / np.mean(stated) < 1.6
 
 

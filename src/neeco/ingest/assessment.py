@@ -12,14 +12,13 @@ from neeco.capture.documents import Problem
 from neeco.capture.model import UNKNOWN_DEG, Capture
 from neeco.geometry.lines import frame_about
 from neeco.ingest.registration.base import BaseRegistration
-from neeco.ingest.registration.hand_eye import Registration
+from neeco.ingest.registration.hand_eye import PLACED_DEG, PLACED_MM, Registration
 from neeco.ingest.result import IngestResult
 from neeco.plausible import FEW_TRAIN_FRAMES
 
 # Limits above which there is a warning: conventions, not measurements.
 POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.015, 0.5
 BASE_MM, BASE_DEG = 2.0, 1.5  # standard deviations of a base
-PLACED_MM, PLACED_DEG = 1.0, 0.7  # standard deviations of the cameras' place in the tracker's frame
 SEVERE = 3.0  # times the limit
 MIN_POINTS = 100
 # Of a base's outline with what moves: right bases reach 0.92 to 0.97 (benchmarks/base_calibration.py)

@@ -18,7 +18,7 @@ from neeco.ingest.frames.views import SfmResult, StageProgress, Views
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.clocks import find_instrument_clocks, register
-from neeco.ingest.registration.find_bases import check_reference_frames, find_bases, require_no_base
+from neeco.ingest.registration.find_bases import check_reference_frames, correct_placement, find_bases, require_no_base
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.shaft.video_instruments import find_in_video, on_masks
 from neeco.ingest.timing.episodes import Episodes
@@ -70,7 +70,10 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     if registration is None:
         require_no_base(data)
     else:
-        data, bases = find_bases(data, _registered(views, registration), foreground, progress)
+        placed = _registered(views, registration)
+        data, bases = find_bases(data, placed, foreground, progress)
+        data, corrected = correct_placement(data, placed, registration, foreground, progress)
+        bases |= corrected
         data = data.with_assumed_clocks()
         progress("finding the instrument", 0, 0)
         on_instruments, shapes, evidence = _carve_instruments(data, sfm, views, flow, registration)

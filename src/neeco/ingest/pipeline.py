@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.capture.model import Capture, Frame, InstrumentState, State, Uncertainty
+from neeco.capture.model import BaseUncertainty, Capture, Frame, InstrumentState, State, Uncertainty
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.cameras.still_scene import RightCamera
@@ -111,14 +111,23 @@ def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
     registered = world.registration is not None or set(data.parts[0].poses) <= set(data.world_from_base)
     lens = replace(images.lens, size=images.size, border=images.border)
     instruments = tuple(
-        replace(one, base_uncertainty=base.uncertainty(views.world_from_camera[0], world.states[one.name][0][chosen]))
-        if (base := world.bases.get(one.name)) is not None
-        else one
+        replace(one, base_uncertainty=_shared_uncertainty(world, one.name, chosen))
         for one in instruments_of(data.recording, shaft)
     )
     return Capture(
         images.folder, frames, instruments, world.tissue, registered=registered, lens=lens, still=world.still
     )
+
+
+def _shared_uncertainty(world: World, name: str, chosen: np.ndarray) -> BaseUncertainty | None:
+    """Return the covariance of the error that the `chosen` poses of an instrument share: of its base as found in the
+    images, else of the scope's hand-eye calibration; None where poses come from the images, or nothing is known."""
+    poses = world.states[name][0][chosen]
+    if (base := world.bases.get(name)) is not None:
+        return base.uncertainty(world.views.world_from_camera[0], poses)
+    if world.registration is None or name not in world.data.parts[0].poses:
+        return None
+    return world.registration.uncertainty(poses[:, :3, 3])
 
 
 def _right_frames(data: Episodes, right: RightCamera, frames: Sequence[Frame], rows: list[int]) -> tuple[Frame, ...]:

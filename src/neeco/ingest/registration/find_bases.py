@@ -20,6 +20,7 @@ from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
 from neeco.ingest.registration.articulated import ArticulatedMotion, find_articulated_base
 from neeco.ingest.registration.base import MIN_FRAMES, BaseRegistration, base_from_layers, find_base
+from neeco.ingest.registration.hand_eye import PLACED_DEG, PLACED_MM, Registration
 from neeco.ingest.registration.layers import ArmImages, covered_by, evenly_lit, fit_layers
 from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
@@ -29,6 +30,8 @@ from neeco.ingest.timing.episodes import Episode, Episodes
 N_FRAMES = 140  # searched, evenly spaced
 MIN_BEND_MM = 2.0  # from the root to the logged link: nearer, nothing bends there
 MIN_READ_SHARE = 0.5  # of the frames, that a joint's log has to cover: those without a reading are left out
+MIN_OVERLAP, MIN_OVERLAP_GAIN = 0.85, 0.2  # of an instrument's outline with what moves, where its place is corrected
+MAX_PRIOR_MM, MAX_PRIOR_DEG = 8.0, 5.0  # standard deviations of a place, from which outlines find it
 MIN_TRAVEL_MM = 2.0  # root mean square, from which an arm counts as moving
 KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
 
@@ -118,6 +121,51 @@ def find_bases(
             data.notes.contradict(f"base of {name}, {place}", f"instrument {name!r}: {doubt}", severe=True)
         found[name] = registration
     return data, found
+
+
+def correct_placement(
+    data: Episodes,
+    views: Views,
+    registration: Registration,
+    moving: Callable[[np.ndarray], np.ndarray],
+    progress: StageProgress,
+) -> tuple[Episodes, dict[str, BaseRegistration]]:
+    """Correct the place of a single tracked instrument among the cameras, as far as the scope's hand-eye calibration
+    leaves it open, from what moves in the images: as the base of a robot that is known so well (see `find_bases`).
+
+    Nothing is corrected where the calibration is usual, nor where images do not show the instrument at its place
+    clearly better.
+    """
+    logs, items = data.parts[0].poses, data.recording.instruments
+    if len(items) != 1 or items[0].name not in logs or items[0].base is not None or logs[items[0].name].frame == CAMERA:
+        return data, {}
+    name = items[0].name
+    poses, known = data.instrument_poses(name, views.times)
+    if known.sum() < MIN_FRAMES:
+        return data, {}
+    sds = registration.placement_sd(poses[known, :3, 3])
+    if (sds[0] <= PLACED_MM and sds[1] <= PLACED_DEG) or sds[0] > MAX_PRIOR_MM or sds[1] > MAX_PRIOR_DEG:
+        return data, {}
+    progress("correcting the instrument's place", 0, 0)
+    covariance = np.array(registration.uncertainty(poses[known, :3, 3]).covariance)
+    sd_deg, sd_mm = np.degrees(np.sqrt(np.trace(covariance[:3, :3]) / 3)), np.sqrt(np.trace(covariance[3:, 3:]) / 3)
+    stated = StatedBase(np.eye(4), float(sd_mm), float(sd_deg), to_world=True)
+    observed = _Observed(views, np.array(evenly_spaced(len(views.times), N_FRAMES)), moving)
+    arm = _arm(data, replace(items[0], base=stated), observed)
+    try:
+        found, _ = _find(arm, observed, np.ones(observed.images.shape[:3], bool), alone=True)
+    except NeecoError:  # the images do not determine it
+        return data, {}
+    least = MIN_OVERLAP if found is None else max(MIN_OVERLAP, found.overlap_before + MIN_OVERLAP_GAIN)
+    if found is None or found.doubts or not found.overlap > least:
+        return data, {}
+    data.notes.add(
+        f"instrument {name!r}: its place was corrected by {found.moved_mm:.1f} mm and {found.turned_deg:.1f} deg from "
+        f"what moves in {found.frames} frames, as the hand-eye calibration is known to {sds[0]:.1f} mm and "
+        f"{sds[1]:.1f} deg only; its outline and what moves overlap by {found.overlap:.2f} "
+        f"({found.overlap_before:.2f} before)"
+    )
+    return data.with_base(name, found.world_from_base), {name: found}
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from neeco.capture.model import BaseUncertainty
 from neeco.errors import NeecoError
 from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.interpolate import poses_at
@@ -25,9 +26,11 @@ from neeco.ingest.timing.clock_search import RATE_SIGNIFICANCE, SCOPE_MOTION, Cl
 MIN_FRAMES = 12
 MIN_TURN_RAD = 0.05  # rad, spread of the scope's directions below which the hand-eye rotation is not determined
 MIN_TRAVEL_MM = 3.0  # mm, spread of the scope's positions below which the scale is not determined
+MIN_DEVIATION = 1e-6  # rad, mm: no covariance is smaller
 KNOT_SPACING_S = 2.5  # s between the knots of the tracker's drift
 CORRELATED_S = 1.0  # over which residuals of neighbouring frames are correlated: smoothing and drift of the tracker
 LAG, STRETCH = 13, 14  # the unknowns of the clock
+PLACED_MM, PLACED_DEG = 1.0, 0.7  # standard deviations of the cameras' place in the tracker's frame: usual, or less
 N_UNKNOWNS = 15  # in addition to the drift: scale, rotation, origin, hand-eye rotation, lever, clock
 
 
@@ -57,13 +60,28 @@ class Registration:
     def placement_sd(self, places: np.ndarray) -> tuple[float, float]:
         """Standard deviations, mm and degrees, by which cameras and tissue together may be off the tracker's frame at
         places [N, 3] mm of it, in the worst direction: by as much instruments are rendered beside their place."""
+        moves = self._moves(places)
+        shifts = np.einsum("nij,kjl,nml->kim", moves, self.covariances, moves) / max(len(places), 1)
+        sds = [np.sqrt(np.linalg.eigvalsh(part)[:, -1].max()) for part in (shifts, self.covariances[:, 1:4, 1:4])]
+        return float(sds[0]), float(np.degrees(sds[1]))
+
+    def uncertainty(self, places: np.ndarray) -> BaseUncertainty:
+        """Return the covariance of the error that all poses share with which instruments at places [N, 3] mm are placed
+        among cameras and tissue, for a capture: the largest of `covariances`."""
+        center = places.mean(0)
+        moves = np.concatenate([np.eye(7)[1:4], self._moves(center[None])[0]])
+        shared = max(moves @ self.covariances @ moves.T, key=lambda covariance: float(np.trace(covariance[3:, 3:])))
+        # the reader asks for a positive definite one
+        covariance = (shared + shared.T) / 2 + MIN_DEVIATION**2 * np.eye(6)
+        return BaseUncertainty(tuple(center.tolist()), tuple(map(tuple, covariance.tolist())))
+
+    def _moves(self, places: np.ndarray) -> np.ndarray:
+        """Derivatives [N, 3, 7] of the shift of places [N, 3] mm by ln scale, turn (rad) and shift (mm)."""
         arms = places - self.origin
         moves = np.zeros((len(places), 3, 7))
         moves[:, :, 0], moves[:, :, 4:] = arms, np.eye(3)
         moves[:, :, 1:4] = np.cross(np.eye(3), arms[:, None]).transpose(0, 2, 1)
-        shifts = np.einsum("nij,kjl,nml->kim", moves, self.covariances, moves) / max(len(places), 1)
-        sds = [np.sqrt(np.linalg.eigvalsh(part)[:, -1].max()) for part in (shifts, self.covariances[:, 1:4, 1:4])]
-        return float(sds[0]), float(np.degrees(sds[1]))
+        return moves
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Transform points [P, 3] from the SfM gauge to the world, mm."""
@@ -108,7 +126,7 @@ def register_with_laparoscope(
         translation=origin - scale * rotation.apply(problem.centre),
         camera_from_sensor=rigid(hand.as_matrix(), lever),
         clock=clock,
-        scale_sd=float(np.sqrt(max(covariances[0, 0, 0], 0.0))),
+        scale_sd=float(np.sqrt(covariances[:, 0, 0].max())),
         origin=origin,
         covariances=covariances[:, :7, :7],
         position_residual=np.linalg.norm(position[used], axis=1),
