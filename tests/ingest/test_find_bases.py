@@ -147,12 +147,16 @@ def test_a_usual_hand_eye_calibration_is_kept_without_looking():
     assert _placed(_no_masks, disturbed(0.5, 0.2, 1, world), 0.5, 0.2)[2] == {}
 
 
+def test_outlines_are_not_asked_for_a_place_of_which_nearly_nothing_is_known():
+    assert _placed(_no_masks, WORLD_FROM_BASE, 30.0, 10.0)[2] == {}
+
+
 def test_a_poor_hand_eye_calibration_is_kept_where_images_show_no_shaft():
     world = make_world(44, moving_camera=True)
     assert _placed(lambda rows: np.zeros_like(world.masks[rows]), WORLD_FROM_BASE, 3.0, 1.5)[2] == {}
 
 
-@pytest.mark.parametrize(("overlap", "doubts", "corrected"), [(0.9, (), True), (0.62, (), False), (0.9, ("?",), False)])
+@pytest.mark.parametrize(("overlap", "doubts", "corrected"), [(0.9, (), True), (0.82, (), False), (0.9, ("?",), False)])
 def test_a_place_is_corrected_only_where_images_fit_clearly_better(monkeypatch, overlap, doubts, corrected):
     world, moved = make_world(44, moving_camera=True), np.eye(4)
     moved[:3, 3] = [1.0, 2.0, 3.0]

@@ -6,12 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Capture
 from neeco.report.charts import PALETTE, inline_svg, new_axes, page_style, round_ticks
 
 BINS = 24
+RECTANGLE = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
 SLACK = 0.02  # of the trained range: a state outside by less is not called outside
 CONSTANT = 1e-6  # mm or deg
 SPLIT_COLORS = {"train": "accent", "test": "good", "unseen": "phase"}
@@ -148,11 +151,15 @@ def histogram(degree: Degree) -> str:
         if end - start > 0.0125 * (right - left):  # a thinner one would be a stroke
             axes.axvspan(start, end, color=PALETTE["phase"], alpha=0.13, linewidth=0, gid="beyond")
     edges, floor = np.linspace(low, high, BINS + 1), np.zeros(BINS)
-    middles, width = (edges[:-1] + edges[1:]) / 2, edges[1] - edges[0]
+    gap = 0.04 * (edges[1] - edges[0])
     for name in sorted(set(degree.splits), key=lambda name: [*SPLIT_COLORS, name].index(name)):
         count, color = np.histogram(degree.of(name), edges)[0], PALETTE[SPLIT_COLORS.get(name, "soft")]
         filled = count > 0
-        axes.bar(middles[filled], count[filled], 0.92 * width, floor[filled], color=color)
+        x, y = (edges[:-1] + gap, edges[1:] - gap), (floor, floor + count)
+        corners = [(x[across][filled], y[up][filled]) for across, up in ((0, 0), (1, 0), (1, 1), (0, 1), (0, 0))]
+        # all bars as one path: matplotlib takes a third of a second to add and to draw a patch for each
+        path = Path(np.array(corners).transpose(2, 0, 1).reshape(-1, 2), RECTANGLE * int(filled.sum()))
+        axes.add_patch(PathPatch(path, color=color, linewidth=0))
         floor += count
     axes.set_ylim(0, max(1.0, floor.max()))
     axes.axhline(0, color=PALETTE["edge"], linewidth=1)

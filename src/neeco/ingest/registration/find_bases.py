@@ -30,7 +30,8 @@ from neeco.ingest.timing.episodes import Episode, Episodes
 N_FRAMES = 140  # searched, evenly spaced
 MIN_BEND_MM = 2.0  # from the root to the logged link: nearer, nothing bends there
 MIN_READ_SHARE = 0.5  # of the frames, that a joint's log has to cover: those without a reading are left out
-MIN_OVERLAP_GAIN = 0.05  # of an instrument's outline with what moves, from which its place is corrected
+MIN_OVERLAP, MIN_OVERLAP_GAIN = 0.85, 0.2  # of an instrument's outline with what moves, where its place is corrected
+MAX_PRIOR_MM, MAX_PRIOR_DEG = 8.0, 5.0  # standard deviations of a place, from which outlines find it
 MIN_TRAVEL_MM = 2.0  # root mean square, from which an arm counts as moving
 KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
 
@@ -143,7 +144,7 @@ def correct_placement(
     if known.sum() < MIN_FRAMES:
         return data, {}
     sds = registration.placement_sd(poses[known, :3, 3])
-    if sds[0] <= PLACED_MM and sds[1] <= PLACED_DEG:
+    if (sds[0] <= PLACED_MM and sds[1] <= PLACED_DEG) or sds[0] > MAX_PRIOR_MM or sds[1] > MAX_PRIOR_DEG:
         return data, {}
     progress("correcting the instrument's place", 0, 0)
     covariance = np.array(registration.uncertainty(poses[known, :3, 3]).covariance)
@@ -155,7 +156,8 @@ def correct_placement(
         found, _ = _find(arm, observed, np.ones(observed.images.shape[:3], bool), alone=True)
     except NeecoError:  # the images do not determine it
         return data, {}
-    if found is None or found.doubts or not found.overlap > found.overlap_before + MIN_OVERLAP_GAIN:
+    least = MIN_OVERLAP if found is None else max(MIN_OVERLAP, found.overlap_before + MIN_OVERLAP_GAIN)
+    if found is None or found.doubts or not found.overlap > least:
         return data, {}
     data.notes.add(
         f"instrument {name!r}: its place was corrected by {found.moved_mm:.1f} mm and {found.turned_deg:.1f} deg from "
