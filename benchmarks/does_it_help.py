@@ -99,7 +99,7 @@ def points(
 
 
 def panel(axes: Axes, rows: list[dict[str, str]], test: str) -> None:
-    pairs = list(dict.fromkeys(row["pair"] for row in rows))
+    pairs = sorted(dict.fromkeys(row["pair"] for row in rows), key=APART.__eq__)  # that one last
     for k, (key, (colour, marker, _)) in enumerate(SHOWN.items()):
         for g, pair in enumerate(pairs):
             if (found := points(rows, pair, test, *key)) is None:
