@@ -62,15 +62,6 @@ def test_help_waits_for_no_numerical_library() -> None:
     assert shown.stdout.splitlines()[-1].strip() == "imported:"
 
 
-def test_a_check_waits_for_no_pytorch() -> None:
-    code = (
-        "import sys; from neeco.cli import main; status = main(['check', 'samples/liver-mini']); "
-        "print(status, 'torch' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2])
-    assert done.stdout.endswith("\n0 False\n"), done.stderr
-
-
 @pytest.mark.parametrize("verb", cli.VERBS)
 def test_every_verb_has_help_with_hyphenated_options(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:

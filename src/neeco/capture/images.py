@@ -7,20 +7,19 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import torch
 from PIL import ExifTags, Image
+from torch import Tensor
+from torch.nn.functional import interpolate
 
 from neeco.errors import NeecoError
 from neeco.files import require_file, write_atomically
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_world
 from neeco.plausible import Fault, mask_fault
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 # Pillow warns of images beyond 90 million pixels, and refuses them beyond twice that: both are refused here
 warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -44,16 +43,12 @@ def read_image(path: Path, size: tuple[int, int] | None = None, background: floa
     Grey, 16-bit and palette images become RGB; transparent pixels show `background` (0 black, 1 white).
     `size`: (width, height) the image must have. Raises NeecoError when unreadable, damaged or of another size.
     """
-    import torch
-
     return torch.from_numpy(_to_rgb(open_image(path, size), background))
 
 
 def read_image_bytes(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> Tensor:
     """`read_image` as uint8 [H, W, 3]. Files of 8 bits are read without a float image, which would fragment the memory
     of a process that reads many."""
-    import torch
-
     return torch.from_numpy(byte_pixels(read_pixels(path, size, background)))
 
 
@@ -74,8 +69,6 @@ def byte_pixels(pixels: np.ndarray) -> np.ndarray:
 
 def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     """A loss mask as bool [H, W]: False where the stored image is black (darker than half). Raises NeecoError."""
-    import torch
-
     return torch.from_numpy(read_mask_pixels(path, size))
 
 
@@ -89,8 +82,6 @@ def read_labels(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     image = open_image(path, size)
     if image.mode not in ("L", "P"):
         raise NeecoError(f"{path}: expected an 8-bit image of part ids, found mode {image.mode}; save it as grey PNG")
-    import torch
-
     return torch.from_numpy(np.array(image, dtype=np.uint8))
 
 
@@ -131,8 +122,6 @@ def write_image(path: Path, image: Tensor, quality: int | None = None) -> None:
 
 def write_labels(path: Path, labels: Tensor) -> None:
     """Write part ids (or a 0/255 mask), uint8 [H, W], as grey PNG, atomically. Raises NeecoError."""
-    import torch
-
     if labels.dtype != torch.uint8 or labels.ndim != 2:
         raise ValueError(f"labels must be uint8 [H, W], got {labels.dtype} {tuple(labels.shape)}")
     write_png(path, labels.detach().cpu().numpy())
@@ -174,15 +163,11 @@ def encoded_png(pixels: np.ndarray) -> bytes:
 
 def to_bytes(image: Tensor) -> Tensor:
     """An image of numbers in [0, 1] (clipped) rounded to 8 bits."""
-    import torch
-
     return image.clamp(0, 1).mul_(255).round_().to(torch.uint8)
 
 
 def area_averaged(image: Tensor, width: int, height: int) -> Tensor:
     """An image [H, W, C] reduced to another size, each pixel the mean of those that it covers."""
-    from torch.nn.functional import interpolate
-
     planes = image.permute(2, 0, 1)[None]
     return interpolate(planes, size=(height, width), mode="area")[0].permute(1, 2, 0)
 

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from neeco.errors import NeecoError
@@ -51,8 +52,6 @@ class Link:
         motion = self.joint_value(readings) * self.axis
         if self.type == PRISMATIC:
             return rigid(np.eye(3), motion) @ self.origin
-        import torch
-
         turn = rotation_from_vector(torch.from_numpy(motion)).numpy()
         return rigid(turn, self.origin[:3, 3] - turn @ self.origin[:3, 3]) @ self.origin
 

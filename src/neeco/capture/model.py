@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
 
 from neeco.capture.images import read_image, read_image_bytes, read_mask_pixels, read_pixels
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
@@ -20,13 +23,8 @@ from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
-from neeco.geometry.rotations import PoseField, as_pose, is_tensor, number_text, pose_array, position_text, rigid_fault
+from neeco.geometry.rotations import as_pose, number_text, position_text, rigid_fault
 from neeco.plausible import Fault, joint_fault
-
-if TYPE_CHECKING:
-    import torch
-    from numpy.typing import ArrayLike
-    from torch import Tensor
 
 SCHEMA = "neeco-capture/1"  # of the folder that holds a capture
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
@@ -77,22 +75,14 @@ class InstrumentState:
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "pose", as_pose(vars(self)["pose"], "InstrumentState.pose", np.float64))
+        object.__setattr__(self, "pose", as_pose(self.pose, "InstrumentState.pose", torch.float64))
         for joint, value in self.joints.items():
-            if not is_tensor(value) and not _is_finite(value):
+            if not isinstance(value, Tensor) and not _is_finite(value):
                 raise NeecoError(f"InstrumentState.joints: {joint!r} is {value!r}, not a finite number; correct it")
-
-    @property
-    def pose_array(self) -> np.ndarray:
-        """`pose` as float64, without gradients."""
-        return pose_array(self, "pose")
 
     def __repr__(self) -> str:
         joints = "".join(f", {name}={number_text(value)}" for name, value in self.joints.items())
         return f"InstrumentState(at {position_text(self.pose)}{joints})"
-
-
-setattr(InstrumentState, "pose", PoseField("pose"))  # noqa: B010 (it is a tensor to its readers)
 
 
 @dataclass(frozen=True)
@@ -118,7 +108,7 @@ class State:
             for name, state in self.instruments.items()
         }
         object.__setattr__(self, "instruments", given)
-        if not is_tensor(self.time) and not _is_finite(self.time):
+        if not isinstance(self.time, Tensor) and not _is_finite(self.time):
             raise NeecoError(f"State.time: is {self.time!r}, not a finite number of seconds; correct it")
 
     def __repr__(self) -> str:
@@ -247,11 +237,7 @@ class Frame:
     def load_mask(self) -> Tensor | None:
         """bool [H, W], True where the loss counts, or None when the frame has no mask. Raises NeecoError."""
         mask = self.load_mask_pixels()
-        if mask is None:
-            return None
-        import torch
-
-        return torch.from_numpy(mask)
+        return None if mask is None else torch.from_numpy(mask)
 
     def load_mask_pixels(self) -> np.ndarray | None:
         """`load_mask` as an array."""
@@ -317,7 +303,7 @@ def _is_finite(value: object) -> bool:
 
 def _is_readable(value: object, only_cheaply: bool) -> bool:
     """Return True if a number or tensor may be read; `only_cheaply`: without waiting for a GPU, nor gradients."""
-    if not is_tensor(value):
+    if not isinstance(value, Tensor):
         return True
     return not value.is_meta and not (only_cheaply and (value.requires_grad or value.device.type != "cpu"))
 
@@ -325,8 +311,6 @@ def _is_readable(value: object, only_cheaply: bool) -> bool:
 def share_lamps(cameras: Sequence[Camera], states: Sequence[State]) -> tuple[Camera, ...]:
     """Give the cameras of a still scope the lamps of the first one over each tissue: the second camera of a stereo
     scope has none of its own."""
-    import torch
-
     shared = []
     firsts: dict[str | None, Tensor] = {}
     for camera, state in zip(cameras, states, strict=True):

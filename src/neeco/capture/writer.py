@@ -9,9 +9,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from neeco.capture.images import encoded_image, has_alpha
 from neeco.capture.model import SCHEMA, Capture, Frame, FromVideo, Instrument, State, Uncertainty
@@ -19,10 +21,7 @@ from neeco.capture.points import write_ply
 from neeco.errors import NeecoError
 from neeco.files import read_bytes, sync_disk, write_json, write_unsynced
 from neeco.geometry.conventions import swap_camera_axes
-from neeco.geometry.rotations import is_tensor, rigid_fault
-
-if TYPE_CHECKING:
-    from torch import Tensor
+from neeco.geometry.rotations import rigid_fault
 
 
 def write_capture(
@@ -229,11 +228,11 @@ def _write_frame(
 
 def _number(value: Any) -> Any:
     """A number as JSON takes it: those of arrays become Python's."""
-    return value.item() if isinstance(value, np.generic | np.ndarray) or is_tensor(value) else value
+    return value.item() if isinstance(value, np.generic | np.ndarray | Tensor) else value
 
 
 def _rigid(pose: Tensor, field: str) -> np.ndarray:
-    matrix = pose.detach().cpu().double().numpy()
+    matrix = pose.detach().cpu().to(torch.float64).numpy()
     if (fault := rigid_fault(matrix)) is not None:
         raise NeecoError(f"{field}: {fault[0]}; {fault[1]}")
     return matrix
@@ -245,8 +244,6 @@ def _write_image(frame: Frame, name: str, path: Path, image: Tensor | np.ndarray
         target = f"images/{name}{frame.image_path.suffix}"
         _copy(frame.image_path, path / target)
         return target
-    import torch
-
     pixels = frame.load_image() if image is None else torch.as_tensor(image)
     wanted = (frame.camera.height, frame.camera.width, 3)
     if tuple(pixels.shape) != wanted:

@@ -50,7 +50,6 @@ neeco --tyro-print-completion bash|zsh|tcsh: completion for a shell, to be sourc
 folder of fpath (zsh)."""
 COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 
-WITHOUT_TORCH = ("check",)  # verbs that neither render nor learn: they need not wait a second for PyTorch
 USAGE = 2
 INTERRUPTED = 130  # 128 + SIGINT, what a shell reports
 PIPE_CLOSED = 141  # 128 + SIGPIPE
@@ -196,8 +195,6 @@ def _dispatch(words: list[str]) -> int:
     with contextlib.suppress(FileNotFoundError):  # the current folder was removed: absolute paths may do
         for word in (os.getcwd(), *words):
             require_utf8(word)
-    if words[0] in WITHOUT_TORCH:
-        return run(parsed)
     from neeco.raster.devices import readable_failures
     from neeco.raster.native import keep_freed_memory
 

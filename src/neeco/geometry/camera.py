@@ -8,15 +8,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
 
 from neeco.errors import NeecoError
-from neeco.geometry.rotations import PoseField, as_pose, number_text, pose_array, position_text
+from neeco.geometry.rotations import as_pose, number_text, position_text
 from neeco.plausible import camera_fault
-
-if TYPE_CHECKING:
-    import torch
-    from numpy.typing import ArrayLike
-    from torch import Tensor
 
 COEFFICIENT_COUNTS = (0, 4, 5, 8, 12, 14)  # of OpenCV's distortion models
 
@@ -82,7 +80,7 @@ class Camera:
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        pose = as_pose(vars(self)["world_from_camera"], "Camera.world_from_camera", np.float32)
+        pose = as_pose(self.world_from_camera, "Camera.world_from_camera", torch.float32)
         object.__setattr__(self, "world_from_camera", pose)
         try:
             fault = camera_fault(self.fx, self.fy, self.cx, self.cy, self.width, self.height, near=self.near)
@@ -110,19 +108,10 @@ class Camera:
         lamps = None if self.world_from_lamps is None else self.world_from_lamps.to(device)
         return replace(self, world_from_camera=self.world_from_camera.to(device), world_from_lamps=lamps)
 
-    def at(self, world_from_camera: np.ndarray) -> Camera:
-        """The same camera at another pose [4, 4]."""
-        return replace(self, world_from_camera=world_from_camera)  # type: ignore[arg-type]  # as `__init__` takes it
-
-    @property
-    def pose_array(self) -> np.ndarray:
-        """`world_from_camera` as float64, without gradients."""
-        return pose_array(self, "world_from_camera")
-
     @cached_property
     def camera_from_world(self) -> np.ndarray:
         """Inverse of the pose, [4, 4] float64 without gradient."""
-        return np.linalg.inv(self.pose_array)
+        return np.linalg.inv(self.world_from_camera.detach().cpu().double().numpy())
 
     @property
     def is_pinhole(self) -> bool:
@@ -157,6 +146,3 @@ class Camera:
         """The same view with at most about so many pixels."""
         factor = (pixels / (self.width * self.height)) ** 0.5
         return self if factor >= 1 else self.scaled(factor)
-
-
-setattr(Camera, "world_from_camera", PoseField("world_from_camera"))  # noqa: B010 (it is a tensor to its readers)

@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
 from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
@@ -45,8 +46,6 @@ class Lens:
         """Camera of a lens without distortion at a pose [4, 4], OpenCV axes."""
         assert self.size is not None
         assert not self.distorted
-        import torch
-
         return Camera(torch.from_numpy(world_from_camera.copy()), *self.intrinsics, *self.size)
 
     def distorted_camera(self, pinhole: Camera) -> Camera:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import pixels_of_rays, rays_of_pixels
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-Array = TypeVar("Array", "Tensor", np.ndarray)
+Array = TypeVar("Array", Tensor, np.ndarray)
 
 FIELD_MARGIN = 0.3  # share of half the field of view by which the linearisation point may lie outside
 
@@ -36,11 +35,9 @@ def project_world(points: Array, camera: Camera, nearest: float | None = None) -
     Tensors give tensors of their own type and device, arrays float64. A depth of 0 or less lies behind the camera.
     """
     if isinstance(points, np.ndarray):
-        pose = camera.pose_array
+        pose = camera.world_from_camera.detach().cpu().double().numpy()
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         return np.stack(project_local(local, camera, nearest), axis=-1), local[..., 2]
-    import torch
-
     view = camera.world_from_camera.to(points)
     local = (points - view[:3, 3]) @ view[:3, :3]
     return torch.stack(project_local(local, camera, nearest), dim=-1), local[..., 2]
@@ -48,8 +45,6 @@ def project_world(points: Array, camera: Camera, nearest: float | None = None) -
 
 def unproject_world(pixels: Tensor, depths: Tensor, camera: Camera) -> Tensor:
     """Points [..., 3] mm of the world at pixels [..., 2] and depths [...] mm: the inverse of `project_world`."""
-    import torch
-
     pose = camera.world_from_camera.to(depths)
     u, v = pixels.unbind(-1)
     if camera.is_pinhole:
@@ -63,8 +58,6 @@ def unproject_world(pixels: Tensor, depths: Tensor, camera: Camera) -> Tensor:
 
 def pixel_centers(rows: int, columns: int) -> Tensor:
     """Centres [rows, columns, 2] of an image's pixels, column before row."""
-    import torch
-
     down, across = torch.meshgrid(torch.arange(rows) + 0.5, torch.arange(columns) + 0.5, indexing="ij")
     return torch.stack([across, down], -1)
 
@@ -81,9 +74,7 @@ def project_local(points: Array, camera: Camera, nearest: float | None = None) -
     view. No gradients through a lens."""
     if camera.is_pinhole:
         return project(points, camera.fx, camera.fy, camera.cx, camera.cy, nearest)
-    if not isinstance(points, np.ndarray):
-        import torch
-
+    if isinstance(points, Tensor):
         u, v = project_local(points.detach().cpu().double().numpy(), camera, nearest)
         return torch.from_numpy(u).to(points), torch.from_numpy(v).to(points)
     slopes = np.stack(project(points, 1.0, 1.0, 0.0, 0.0, nearest), -1)
@@ -96,8 +87,6 @@ def field_slopes(camera: Camera, camera_means: Tensor) -> Tensor:
 
     A Gaussian at the side of the camera has enormous slopes and may still reach into the image.
     """
-    import torch
-
     margin_x = FIELD_MARGIN * 0.5 * camera.width / camera.fx
     margin_y = FIELD_MARGIN * 0.5 * camera.height / camera.fy
     x, y, z = camera_means.unbind(-1)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import sys
-from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from neeco.errors import NeecoError
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-Array = TypeVar("Array", "Tensor", np.ndarray)
+Array = TypeVar("Array", Tensor, np.ndarray)
 
 RIGID_TOLERANCE = 2e-3  # of R^T R - I; JSON with three decimals passes, a scale of 1.001 passes, a shear does not
 MAX_ENTRY = 1e9  # of a pose
@@ -20,8 +18,6 @@ MAX_ENTRY = 1e9  # of a pose
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product of quaternions [..., 4]: rotate by `b`, then by `a`."""
-    import torch
-
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(
@@ -37,8 +33,6 @@ def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
     """Unit quaternions [..., 4] to rotation matrices [..., 3, 3]."""
-    import torch
-
     w, x, y, z = quats.unbind(-1)
     entries = [
         1 - 2 * (y * y + z * z),
@@ -59,8 +53,6 @@ def matrix_to_quat(rotation: Tensor) -> Tensor:
 
     Picks, per matrix, the best conditioned of the four classic formulas (Shepperd 1978).
     """
-    import torch
-
     m = rotation.flatten(-2)
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = m.unbind(-1)
     candidates = torch.stack(
@@ -80,8 +72,6 @@ def matrix_to_quat(rotation: Tensor) -> Tensor:
 
 def skew(vector: Tensor) -> Tensor:
     """[..., 3] to the matrix [..., 3, 3] with skew(v) @ x = v x x."""
-    import torch
-
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vector.shape[:-1], 3, 3)
@@ -89,15 +79,11 @@ def skew(vector: Tensor) -> Tensor:
 
 def rotation_from_vector(vector: Tensor) -> Tensor:
     """Rotation vectors [..., 3] (axis * angle, rad) to matrices [..., 3, 3]; differentiable at zero."""
-    import torch
-
     return torch.linalg.matrix_exp(skew(vector))
 
 
 def vector_from_rotation(rotation: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] to rotation vectors [..., 3], angle in [0, pi]."""
-    import torch
-
     quat = matrix_to_quat(rotation)
     axis = quat[..., 1:]
     sine = axis.norm(dim=-1, keepdim=True)
@@ -107,8 +93,6 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
 
 def rigid(rotation: Array, translation: Array) -> Array:
     """Assemble poses [..., 4, 4] from rotations [..., 3, 3] and translations [..., 3], tensors or float64 arrays."""
-    import torch
-
     if isinstance(rotation, np.ndarray):
         pose = np.zeros((*rotation.shape[:-2], 4, 4))
         pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, translation, 1
@@ -126,8 +110,6 @@ def rigid_from_vector(vector: Tensor) -> Tensor:
 
 def rotate_about(points: Tensor, axis: Tensor, pivot: Tensor, angle: Tensor) -> Tensor:
     """Rotate points [M, 3] by `angle` [M] rad about the line through `pivot` [3] along unit `axis` [3] (Rodrigues)."""
-    import torch
-
     arm = points - pivot
     cosine, sine = angle.cos()[:, None], angle.sin()[:, None]
     along = (arm @ axis)[:, None] * axis
@@ -137,16 +119,12 @@ def rotate_about(points: Tensor, axis: Tensor, pivot: Tensor, angle: Tensor) -> 
 
 def axis_angle_quat(axis: Tensor, angle: Tensor) -> Tensor:
     """Unit `axis` [3] and `angle` [M] rad to quaternions [M, 4]."""
-    import torch
-
     half = angle[:, None] / 2
     return torch.cat([half.cos(), half.sin() * axis], -1)
 
 
 def spread_directions(count: int) -> Tensor:
     """Unit directions [count, 3] float64, evenly spread (a spiral by the golden angle)."""
-    import torch
-
     k = torch.arange(count, dtype=torch.float64)
     z, turn = 1 - (2 * k + 1) / count, k * torch.pi * (3 - 5**0.5)
     ring = (1 - z * z).sqrt()
@@ -179,47 +157,14 @@ def rigid_fault(matrix: np.ndarray) -> tuple[str, str] | None:
     return None
 
 
-class PoseField:
-    """A dataclass's field of a pose [4, 4], read as a tensor. An array stays one until then: PyTorch takes a second to
-    import, without which a capture can be read and checked."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __get__(self, holder: object, kind: type) -> Tensor:
-        if holder is None:
-            raise AttributeError(self.name)
-        pose = vars(holder)[self.name]
-        if isinstance(pose, np.ndarray):
-            import torch
-
-            pose = vars(holder)[self.name] = torch.from_numpy(pose)
-        return pose
-
-    def __set__(self, holder: object, pose: Tensor | np.ndarray) -> None:
-        vars(holder)[self.name] = pose
-
-
-def pose_array(holder: object, name: str) -> np.ndarray:
-    """A pose field [4, 4] float64 as an array, without gradients. Do not modify."""
-    pose = vars(holder)[name]
-    return np.asarray(pose if isinstance(pose, np.ndarray) else pose.detach().cpu().numpy(), np.float64)
-
-
-def is_tensor(value: object) -> TypeGuard[Tensor]:
-    """Whether a value is a tensor, without importing PyTorch: nothing is one before."""
-    torch = sys.modules.get("torch")
-    return torch is not None and isinstance(value, torch.Tensor)
-
-
-def as_pose(value: Any, field: str, dtype: type[np.floating[Any]]) -> Tensor | np.ndarray:
-    """Return a rigid transform [4, 4], a tensor, an array or nested lists, as a tensor or an array.
+def as_pose(value: Any, field: str, dtype: torch.dtype) -> Tensor:
+    """Return a rigid transform [4, 4], a tensor, an array or nested lists, as a tensor.
 
     A tensor of floats is returned with its type, device and gradients; only its shape is checked. Anything else is
-    copied to an array of `dtype`. Raises NeecoError naming `field` for another shape, and for arrays and lists that
-    are not a rotation and translation.
+    copied to `dtype` on the CPU. Raises NeecoError naming `field` for another shape, and for arrays and lists that are
+    not a rotation and translation.
     """
-    if is_tensor(value) and value.is_floating_point():
+    if isinstance(value, Tensor) and value.is_floating_point():
         if value.shape != (4, 4):
             raise NeecoError(f"{field}: expected a 4x4 matrix, found shape {tuple(value.shape)}")
         return value
@@ -231,7 +176,7 @@ def as_pose(value: Any, field: str, dtype: type[np.floating[Any]]) -> Tensor | n
         raise NeecoError(f"{field}: expected a 4x4 matrix, found shape {matrix.shape}")
     if (fault := rigid_fault(matrix)) is not None:
         raise NeecoError(f"{field}: {fault[0]}; {fault[1]}")
-    return matrix.astype(dtype)
+    return torch.from_numpy(matrix).to(dtype)
 
 
 def position_text(pose: Tensor) -> str:
@@ -241,4 +186,4 @@ def position_text(pose: Tensor) -> str:
 
 def number_text(value: float | Tensor) -> str:
     """A number to four digits; "?" for a tensor without values."""
-    return "?" if is_tensor(value) and value.is_meta else f"{float(value):.4g}"
+    return "?" if isinstance(value, Tensor) and value.is_meta else f"{float(value):.4g}"

@@ -24,7 +24,7 @@ class CameraArrays:
     @classmethod
     def of(cls, cameras: Sequence[Camera]) -> CameraArrays:
         return cls(
-            np.stack([camera.pose_array for camera in cameras]),
+            np.stack([camera.world_from_camera.double().numpy() for camera in cameras]),
             np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras]),
             np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64),
         )

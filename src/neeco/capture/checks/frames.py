@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from neeco.capture.checks.pictures import Pictures, Size
 from neeco.capture.documents import Node, printable
@@ -62,7 +63,7 @@ def check_frames(parsed: Parsed) -> None:
 def _check_still(parsed: Parsed) -> None:
     """Report a scope stated to stand still that has more cameras than a stereo scope."""
     placed = parsed.with_cameras().frames
-    poses = {tuple(frame.camera.pose_array.round(6).ravel().tolist()) for frame in placed}
+    poses = {tuple(frame.camera.world_from_camera.double().numpy().round(6).ravel().tolist()) for frame in placed}
     if parsed.still and len(poses) > MAX_STILL_CAMERAS:
         message = f"is 'still', but the frames have {len(poses)} different cameras"
         parsed.header("camera_motion").error(message, "write 'moving', or correct transform_matrix")
@@ -74,7 +75,7 @@ def _check_times(parsed: Parsed) -> None:
     backwards = []
     instants: dict[tuple[object, ...], Camera] = {}
     for frame, place in zip(parsed.frames, parsed.places, strict=True):
-        time, poses = frame.state.time, [state.pose_array.tobytes() for state in frame.state.instruments.values()]
+        time, poses = frame.state.time, [state.pose.numpy().tobytes() for state in frame.state.instruments.values()]
         first = instants.setdefault((place.file, time, *poses), frame.camera)
         if first is not frame.camera and not _same_view(first, frame.camera):
             continue  # another camera at the same instant
@@ -94,7 +95,7 @@ def _check_times(parsed: Parsed) -> None:
 
 def _same_view(one: Camera, other: Camera) -> bool:
     intrinsics = [(camera.fx, camera.fy, camera.cx, camera.cy) for camera in (one, other)]
-    return intrinsics[0] == intrinsics[1] and np.array_equal(one.pose_array, other.pose_array)
+    return intrinsics[0] == intrinsics[1] and torch.equal(one.world_from_camera, other.world_from_camera)
 
 
 @dataclass(frozen=True)
@@ -197,12 +198,10 @@ def _moved(one: Frame, two: Frame) -> bool:
     readings = [(value, second.get(name, value)) for first, second in joints for name, value in first.items()]
     if any(abs(after - before) > VISIBLE_RAD for before, after in readings):
         return True
-    pairs = [(one.camera.pose_array, two.camera.pose_array)]
-    pairs += [(one.state.instruments[name].pose_array, two.state.instruments[name].pose_array) for name in shared]
-    changes = [np.abs(second - first) for first, second in pairs]
-    return any(
-        bool(np.linalg.norm(change[:3, 3]) > VISIBLE_MM or change[:3, :3].max() > VISIBLE_RAD) for change in changes
-    )
+    pairs = [(one.camera.world_from_camera, two.camera.world_from_camera)]
+    pairs += [(one.state.instruments[name].pose, two.state.instruments[name].pose) for name in shared]
+    changes = [(second - first).abs() for first, second in pairs]
+    return any(bool(change[:3, 3].norm() > VISIBLE_MM or change[:3, :3].max() > VISIBLE_RAD) for change in changes)
 
 
 def _report_duplicate(parsed: Parsed, first: int, second: int) -> None:
@@ -222,11 +221,10 @@ def _same_state(one: Frame, two: Frame) -> bool:
     """Return True if two frames have the same camera pose and instrument states; time does not count."""
     first, second = one.state.instruments, two.state.instruments
     return (
-        np.array_equal(one.camera.pose_array, two.camera.pose_array)
+        torch.equal(one.camera.world_from_camera, two.camera.world_from_camera)
         and first.keys() == second.keys()
         and all(
-            np.array_equal(first[name].pose_array, second[name].pose_array)
-            and dict(first[name].joints) == dict(second[name].joints)
+            torch.equal(first[name].pose, second[name].pose) and dict(first[name].joints) == dict(second[name].joints)
             for name in first
         )
     )

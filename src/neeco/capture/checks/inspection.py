@@ -131,7 +131,7 @@ def _summary(parsed: Parsed) -> CaptureSummary:
 
 def _travel(parsed: Parsed, instrument: str) -> float:
     """Diagonal, mm, of the box that an instrument's origin moves in."""
-    origins = [state.pose_array[:3, 3] for _, state in parsed.states_of(instrument)]
+    origins = [state.pose[:3, 3].numpy() for _, state in parsed.states_of(instrument)]
     return float(np.linalg.norm(np.ptp(np.stack(origins), axis=0))) if origins else 0.0
 
 

@@ -131,7 +131,7 @@ def judge_motion(parsed: Parsed, instrument: Instrument, motion: MotionEvidence)
 def _recorded(parsed: Parsed, instrument: Instrument) -> tuple[list[InstrumentState], np.ndarray]:
     """Return the states of an instrument, which every frame has, and the poses [N, 4, 4] of its root."""
     states = [frame.state.instruments[instrument.name] for frame in parsed.frames]
-    return states, root_poses(instrument, np.stack([state.pose_array for state in states]), states)
+    return states, root_poses(instrument, np.stack([state.pose.numpy() for state in states]), states)
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ def _turned(judged: _Judged) -> Iterator[_PoseHypothesis]:
     if turning < MIN_TURNING_DEG:
         return
     states = [judged.states[row] for row in judged.rows]
-    for mistake in rotation_mistakes(np.stack([state.pose_array for state in states])):
+    for mistake in rotation_mistakes(np.stack([state.pose.numpy() for state in states])):
         message = f"{mistake.what.format(of=judged.of)}: turned back, they fit what moves in the images better"
         poses = root_poses(judged.instrument, mistake.poses, states)
         yield _PoseHypothesis(message, mistake.remedy, poses, judged.everywhere, TURNED, mistake.kind)
@@ -276,7 +276,7 @@ def _clearly_turned(motion: MotionEvidence, given: np.ndarray, other: _PoseHypot
 def _placed(judged: _Judged) -> Iterator[_PoseHypothesis]:
     """Poses of other frames, axes and units."""
     frames = [judged.parsed.frames[row] for row in judged.rows]
-    cameras = np.stack([frame.camera.pose_array for frame in frames])
+    cameras = np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames])
     for mistake in placement_mistakes(judged.given, cameras):
         message = f"{mistake.what.format(of=judged.of)}: corrected, they lie on what moves in the images"
         yield _PoseHypothesis(message, mistake.remedy, mistake.poses, judged.everywhere, ELSEWHERE, mistake.kind)

@@ -170,7 +170,7 @@ def _check_instruments(parsed: Parsed, extent: _Extent | None, pictures: Picture
         if not found:
             continue
         name = printable(instrument.name)
-        origins = np.stack([state.pose_array[:3, 3] for _, state in found])
+        origins = np.stack([state.pose[:3, 3].numpy() for _, state in found])
         farthest = float(np.linalg.norm(origins, axis=1).max())
         if np.ptp(origins, axis=0).max() > 0 and farthest < MIN_DISTANCE_MM:
             message = f"positions of {name} stay within {farthest:.2g} mm of the frame's origin: metres?"
@@ -196,7 +196,7 @@ def _check_instrument(
     Returns what the images say of it, where they were compared.
     """
     name, all_poses, places = printable(instrument.name), parsed.header(POSES), [place for place, _ in found]
-    poses = np.stack([state.pose_array for _, state in found])  # [I, 4, 4]
+    poses = np.stack([state.pose.numpy() for _, state in found])  # [I, 4, 4]
     origins = poses[:, :3, 3]
     visible = cameras.sees(origins[:, None])[:, 0]  # [I]
     outside = "every image" if not visible.any() else f"{len(visible) - int(visible.sum())} of {len(visible)} images"

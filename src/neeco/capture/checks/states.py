@@ -129,7 +129,7 @@ def _check_changes(parsed: Parsed) -> None:
         if len(states) < 2:
             continue
         name = printable(instrument.name)
-        moves = float(np.ptp(np.stack([state.pose_array for state in states]), axis=0).max()) > MIN_DEVIATION
+        moves = float(np.ptp(np.stack([state.pose.numpy() for state in states]), axis=0).max()) > MIN_DEVIATION
         joints_move = False
         for joint in instrument.joints:
             values = [state.joints[joint] for state in states if joint in state.joints]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from neeco.capture.documents import Node, Problem, ProblemReport, printable
 from neeco.capture.model import TEST_EVERY, Frame, PointCloud, State
@@ -139,9 +140,8 @@ def _camera(image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> C
             f"its camera model is {given.model}: the images are distorted; undistort them: neeco ingest {parsed.root} "
             "--output CAPTURE (or `colmap image_undistorter`)"
         )
-    return Camera(
-        _world_from_camera(image), fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion
-    )
+    pose = torch.from_numpy(_world_from_camera(image)).float()
+    return Camera(pose, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion)
 
 
 def _world_from_camera(image: _Image) -> np.ndarray:
@@ -150,8 +150,6 @@ def _world_from_camera(image: _Image) -> np.ndarray:
     norm = np.linalg.norm(quaternion)
     if not (0.99 < norm < 1.01 and np.abs(translation).max() < 1e9):  # nor when NaN
         raise NeecoError("its pose is not a finite unit quaternion and translation; drop it")
-    import torch
-
     rotation = quat_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
     return COLMAP.camera_to_opencv(rigid(rotation.T, -rotation.T @ translation))
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from neeco.capture.documents import Node, ProblemReport, errors_only
 from neeco.capture.model import Capture, Frame, Instrument, State, Tissue, share_lamps
@@ -81,7 +82,7 @@ def _points(measured: PointCloud | None, frames: Sequence[Frame]) -> PointCloud:
     """The points of one world, random ones in view of its frames where none were measured."""
     if measured is not None or not frames:
         return measured or PointCloud(measured=False)
-    return points_in_view(np.stack([frame.camera.pose_array for frame in frames]))
+    return points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames]))
 
 
 def _with_unrecorded(state: State, instruments: Sequence[Instrument]) -> State:
@@ -96,8 +97,6 @@ def _with_unrecorded(state: State, instruments: Sequence[Instrument]) -> State:
 
 def _of_roots(state: State, instruments: Sequence[Instrument], parsed: Parsed) -> State:
     """The state with poses of any other link of an instrument made those of its root, by its kinematics as stated."""
-    import torch
-
     moved = dict(state.instruments)
     for item in instruments:
         tree, given = item.kinematics, state.instruments.get(item.name)
@@ -108,7 +107,7 @@ def _of_roots(state: State, instruments: Sequence[Instrument], parsed: Parsed) -
                 f"{parsed.root}: kinematics of {item.name}: reading {missing[0]!r} is missing in a frame; run `neeco "
                 "check` on the capture"
             )
-        root = tree.world_from_root(given.pose_array, given.joints)
+        root = tree.world_from_root(given.pose.double().numpy(), given.joints)
         moved[item.name] = replace(given, pose=torch.from_numpy(root))
     return replace(state, instruments=moved)
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.capture.model import BaseUncertainty, Frame, FromVideo, Instrument, InstrumentState, State, Uncertainty
@@ -74,7 +75,7 @@ def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
         if name is None or pose is None or nodes is None or len(known) < len(joints):
             good = False
             continue
-        states[name] = InstrumentState(pose, known, trust, uncertainty)
+        states[name] = InstrumentState(torch.from_numpy(pose), known, trust, uncertainty)
     return states if good else None
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from neeco.capture.documents import Node, ProblemReport, printable
 from neeco.capture.images import EXTENSIONS
@@ -176,7 +177,8 @@ def _parse_frames(
             parsed.without_camera.add(len(parsed.frames))
         camera = camera or placeholder_camera(image_path)
         if pose is not None:
-            camera = camera.at(swap_camera_axes(pose))
+            opencv = torch.from_numpy(swap_camera_axes(pose)).to(torch.float32)
+            camera = replace(camera, world_from_camera=opencv)
         parsed.frames.append(Frame(image_path, camera, State(instruments, time, tissue), name, mask_path, background))
         parsed.places.append(node)
     header.pass_on()

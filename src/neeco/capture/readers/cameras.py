@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from neeco.capture.documents import Node, as_float, printable
 from neeco.capture.images import image_size
@@ -214,7 +215,7 @@ def _border(node: Node) -> Border | None:
 def placeholder_camera(image_path: Path) -> Camera:
     """A camera for an image whose own is wrong, so that image and states can still be checked."""
     width, height = _size_or_largest(image_path)
-    return Camera(np.eye(4), fx=width, fy=width, cx=width / 2, cy=height / 2, width=width, height=height)
+    return Camera(torch.eye(4), fx=width, fy=width, cx=width / 2, cy=height / 2, width=width, height=height)
 
 
 def _size_or_largest(image_path: Path) -> tuple[int, int]:
@@ -248,7 +249,7 @@ class CameraFields:
         except NeecoError as error:
             (stated.place or self._node("camera_model")).error_from(error)
             return None
-        return Camera(np.eye(4), fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion)
+        return Camera(torch.eye(4), fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion)
 
     def _has(self, *keys: str) -> bool:
         return any(self.frame.has(key) or self.document.has(key) for key in keys)

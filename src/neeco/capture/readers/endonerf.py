@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from neeco.capture.documents import Node, ProblemReport, printable
 from neeco.capture.images import EXTENSIONS
@@ -72,10 +73,9 @@ def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
         if row is None:
             continue
         rows.append(row)
+        pose = torch.from_numpy(row.world_from_camera).float()
         width, height = row.width, row.height
-        camera = Camera(
-            row.world_from_camera, fx=row.focal, fy=row.focal, cx=width / 2, cy=height / 2, width=width, height=height
-        )
+        camera = Camera(pose, fx=row.focal, fy=row.focal, cx=width / 2, cy=height / 2, width=width, height=height)
         split = "test" if order % TEST_EVERY == FIRST_TEST else "train"
         parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
         parsed.places.append(place)
