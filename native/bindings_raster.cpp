@@ -1,22 +1,43 @@
 // neeco._native: drawing and its gradient. Python holds a Drawing between the two.
 #include <nanobind/stl/string.h>
-#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <cmath>
 #include <memory>
 #include <mutex>
-#include <tuple>
 #include <vector>
 
 #include "arrays.hpp"
-#include "columns.hpp"
-#include "frames.hpp"
 #include "kernels.hpp"
 #include "parallel.hpp"
 
 namespace neeco {
 namespace {
+
+// Frames are tens of megabytes that the system would have to clear again and again: keep a few.
+class FrameStore {
+public:
+    std::unique_ptr<Frame> take() {
+        std::lock_guard<std::mutex> lock(mutex_);
+        if (idle_.empty()) return std::make_unique<Frame>();
+        auto frame = std::move(idle_.back());
+        idle_.pop_back();
+        return frame;
+    }
+    void give(std::unique_ptr<Frame> frame) {
+        std::lock_guard<std::mutex> lock(mutex_);
+        if (idle_.size() < 2) idle_.push_back(std::move(frame));
+    }
+
+private:
+    std::mutex mutex_;
+    std::vector<std::unique_ptr<Frame>> idle_;
+};
+
+FrameStore& store() {
+    static auto* frames = new FrameStore;
+    return *frames;
+}
 
 Camera camera_from(const Array& world_from_camera, float fx, float fy, float cx, float cy, int width, int height, float nearest) {
     const float* m = sized(world_from_camera, 16, "world_from_camera");
@@ -156,45 +177,6 @@ private:
     const Kernels* kernels_ = nullptr;
 };
 
-// A posed layer of a Jacobian's column: means, quats, scales and SH frames, the camera's pose, and the parameter's change.
-using Layer = std::tuple<Array, Array, Array, MaybeArray, Array, float>;
-
-// Columns [P, h, w, 3] of layers that share opacities, colours and light. lens: fx, fy, cx, cy, nearest.
-void layer_columns(const std::vector<Layer>& layers, Array opacities, Array sh, MaybeArray falloff, MaybeArray vignette, Array lens,
-                   Array under, Array image, Array weight, Array out) {
-    if (sh.ndim() != 3 || under.ndim() != 3 || image.ndim() != 3) throw std::invalid_argument("sh, under, image: must have three dimensions");
-    const size_t n = opacities.size(), k = sh.shape(1), height = under.shape(0), width = under.shape(1);
-    if (k != 1 && k != 4 && k != 9 && k != 16) throw std::invalid_argument("sh: K must be 1, 4, 9 or 16");
-    const size_t reduction = image.shape(0) ? height / image.shape(0) : 0;
-    if (!reduction || image.shape(0) * reduction != height || image.shape(1) * reduction != width)
-        throw std::invalid_argument("image: must be a whole number of times as small as what lies under the layers");
-    const size_t small = image.shape(0) * image.shape(1);
-    const Comparison comparison{static_cast<int>(height), static_cast<int>(width), static_cast<int>(reduction),
-                                sized(under, 3 * height * width, "under"), sized(image, 3 * small, "image"), sized(weight, small, "weight")};
-    GaussianInputs in{};
-    in.count = static_cast<int>(n);
-    in.sh_count = static_cast<int>(k);
-    in.opacities = opacities.data();
-    in.sh = sized(sh, 3 * k * n, "sh");
-    in.falloff = sized(falloff, n, "falloff");
-    in.vignette = sized(vignette, 2, "vignette");
-    const float* numbers = sized(lens, 5, "lens");
-    float* to = sized(out, 3 * small * layers.size(), "out");
-    std::vector<ColumnInputs> given;
-    for (const auto& [means, quats, scales, frames, pose, change] : layers) {
-        in.means = sized(means, 3 * n, "means");
-        in.quats = sized(quats, 4 * n, "quats");
-        in.scales = sized(scales, 3 * n, "scales");
-        in.sh_frames = sized(frames, 4 * n, "sh_frames");
-        const Camera camera = camera_from(pose, numbers[0], numbers[1], numbers[2], numbers[3], comparison.width, comparison.height, numbers[4]);
-        given.push_back({camera, in, change, to});
-        to += 3 * small;
-    }
-    const Kernels& chosen = kernels();
-    nb::gil_scoped_release release;
-    columns(chosen, given, comparison);
-}
-
 }  // namespace
 
 void bind_raster(nb::module_& m) {
@@ -207,8 +189,6 @@ void bind_raster(nb::module_& m) {
         .def("alone", &Drawing::alone)
         .def("backward", &Drawing::backward, nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg(),
              nb::arg());
-    m.def("layer_columns", &layer_columns, nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg(), nb::arg(),
-          nb::arg(), nb::arg());
     m.def("last_statistics", &last_statistics);
     m.def("keep_freed_memory", &keep_freed_memory);
     m.def("thread_count", &thread_count);

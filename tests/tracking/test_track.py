@@ -20,7 +20,7 @@ from neeco.capture.model import Capture, State
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import TypicalErrors
-from neeco.fitting.crop_rendering import InstrumentRenderer, TissueRenderer, color_matched, view_of
+from neeco.fitting.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer, color_matched, view_of
 from neeco.fitting.parameters import DEG
 from neeco.fitting.state_fitter import loose_prior
 from neeco.report.track_page import write_track_page
@@ -122,10 +122,11 @@ def test_a_fit_ends_at_the_state_that_was_drawn_at_any_size(tracked_run: Recorde
 
 def test_an_instrument_that_only_changes_its_place_need_not_be_posed_again(tracked_run: RecordedRun) -> None:
     drawer, one, other = InstrumentRenderer(tracked_run.scene), grasper_state(), grasper_state(2, -1, 68, 0.2, 0.4)
-    wall = torch.full((64, 96, 3), 0.4)
-    moved = drawer.composed(drawer.pose(one), drawer.moved_camera(one, other, CAMERA), wall)
-    assert (moved - drawer.composed(drawer.pose(other), CAMERA, wall)).abs().max() < 1e-3  # float32, of 1
-    assert (moved - drawer.composed(drawer.pose(one), CAMERA, wall)).abs().max() > 0.1
+    black, wall = torch.zeros(64, 96, 3), torch.full((64, 96, 3), 0.4)
+    view = FrameView(camera=CAMERA, image=black, weight=torch.ones(64, 96), tissue=wall, shadow_of=None, diagonal=115.0)
+    moved = drawer.moved(drawer.pose(one), one, other, view)
+    assert (moved - drawer.composed(drawer.pose(other), view)).abs().max() < 1e-3  # float32, of 1
+    assert (moved - drawer.composed(drawer.pose(one), view)).abs().max() > 0.1
 
 
 def test_instruments_are_posed_after_others_as_they_are_by_themselves(tracked_run: RecordedRun) -> None:

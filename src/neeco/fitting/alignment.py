@@ -12,14 +12,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from neeco.capture.images import area_averaged
 from neeco.capture.model import Frame, Instrument, State
 from neeco.fitting.crop_rendering import MAX_PIXELS
-from neeco.fitting.minimise import ImageResidual, difference_columns, minimise
+from neeco.fitting.minimise import ImageResidual, minimise
 from neeco.fitting.parameters import InstrumentParameters, StateParameters, moved_camera, precision_of
 from neeco.geometry.camera import Camera
 from neeco.raster import depth_maps, rasterize
@@ -88,10 +87,7 @@ class _AlignmentProblem:
         gaussians = self.gaussians(at)
         return gaussians, self.image(gaussians, at)
 
-    def columns(self, at: Tensor, posed: Gaussians, image: Tensor) -> np.ndarray:
-        return difference_columns(self._differences(at, posed), image, self.residual.weight)
-
-    def _differences(self, at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
+    def differences(self, at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
         # shadows, which move as little as what casts them, are rendered once for all differences
         still = shadowed(posed, _camera_at(self.camera, at), depth_maps)
         for index, step in enumerate(self.steps.tolist()):

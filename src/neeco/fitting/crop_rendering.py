@@ -176,18 +176,19 @@ class InstrumentRenderer:
         """Return (colour [h, w, 3] over black, alpha [h, w]) of the instruments in `state`."""
         return self._rendered(self.pose(state), camera)
 
-    def composed(self, posed: Gaussians, camera: Camera, tissue: Tensor) -> Tensor:
-        """Return posed instruments over an image of the tissue, [h, w, 3] both."""
-        return composite(*self._rendered(posed, camera), tissue)
+    def composed(self, posed: Gaussians, view: FrameView) -> Tensor:
+        """Return posed instruments over a view's tissue, [h, w, 3]."""
+        return composite(*self._rendered(posed, view.camera), view.tissue)
 
-    def moved_camera(self, state: State, other: State, camera: Camera) -> Camera:
-        """Return the camera from which `state` looks as `other`, which differs by the pose of the only instrument, does
-        from `camera`."""
+    def moved(self, posed: Gaussians, state: State, other: State, view: FrameView) -> Tensor:
+        """Return `composed` of `other`, which differs from the `state` of `posed` by the pose of the only instrument:
+        the camera is moved instead, and nothing need be posed again."""
         (name,) = other.instruments
         registered = self._posed(state)[0], self.alone.registered(other)
         was, now = (each.instruments[name].pose.cpu().double().numpy() for each in registered)
-        pose = was @ np.linalg.inv(now) @ camera.world_from_camera.cpu().double().numpy()
-        return replace(camera, world_from_camera=torch.from_numpy(pose.astype(np.float32)))
+        camera_pose = was @ np.linalg.inv(now) @ view.camera.world_from_camera.cpu().double().numpy()
+        camera = replace(view.camera, world_from_camera=torch.from_numpy(camera_pose.astype(np.float32)))
+        return self.composed(posed, replace(view, camera=camera))
 
     @torch.no_grad()
     def _rendered(self, posed: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:

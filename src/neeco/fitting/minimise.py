@@ -59,9 +59,8 @@ class FitProblem(Protocol[Posed]):
     def render(self, parameters: Tensor) -> tuple[Posed, Tensor]:
         """Return what is posed by the parameters, and its image [h, w, 3]."""
 
-    def columns(self, parameters: Tensor, posed: Posed, image: Tensor) -> np.ndarray:
-        """Return the derivatives [P, h, w, 3] of the residual, weighted and blurred, by every parameter, about those
-        that posed what `image` shows (see `difference_columns`)."""
+    def differences(self, parameters: Tensor, posed: Posed) -> Iterable[tuple[Tensor, float]]:
+        """Return for every parameter the image with that one changed, and by how much."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +99,9 @@ def minimise(
     for step in range(max_steps):
         off = residual.of(image)
         if step % linearised_for == 0:
-            columns = problem.columns(parameters, posed, image)
+            columns = np.empty((len(parameters), *image.shape), np.float32)
+            for row, (moved, change) in enumerate(problem.differences(parameters, posed)):
+                columns[row] = weighted_blur((moved - image).div_(change), residual.weight)
             touched = np.flatnonzero(columns.any(0))  # values that no parameter changes have no derivative
             jacobian = torch.from_numpy(columns.reshape(len(parameters), -1).take(touched, 1))  # [P, values]
         off = torch.from_numpy(off.numpy().take(touched))
@@ -124,11 +125,6 @@ def minimise(
             settled = True
             break
     return Minimum(parameters=parameters, cost=cost, posed=posed, image=image, information=information, settled=settled)
-
-
-def difference_columns(differences: Iterable[tuple[Tensor, float]], image: Tensor, weight: Tensor) -> np.ndarray:
-    """Return the columns [P, h, w, 3] of images [h, w, 3], each with one parameter changed, and by how much."""
-    return np.stack([weighted_blur((moved - image).div_(change), weight) for moved, change in differences])
 
 
 def weighted_blur(difference: Tensor, weight: Tensor) -> Tensor:

@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Generic, TypeVar
 
 import cv2
@@ -26,10 +25,8 @@ from neeco.fitting.crop_rendering import (
     view_of,
     working_size,
 )
-from neeco.fitting.minimise import ImageResidual, difference_columns, minimise
+from neeco.fitting.minimise import ImageResidual, minimise
 from neeco.fitting.parameters import StateParameters, precision_of
-from neeco.geometry.camera import Camera
-from neeco.raster.columns import MovedLayer, layer_columns, runs_columns
 from neeco.raster.types import Gaussians
 
 HUBER = 0.05  # colour residual beyond which the cost of a pixel is linear
@@ -82,29 +79,24 @@ class _CropProblem:
     precision: Tensor
 
     def render(self, at: Tensor) -> tuple[Gaussians, Tensor]:
-        posed = self.fitter.instruments.pose(self.moved.at(at))
-        return posed, self._composed(posed, self.view.camera)
+        return self._rendered(self.moved.at(at))
 
-    def _composed(self, posed: Gaussians, camera: Camera) -> Tensor:
-        return downsampled(self.fitter.instruments.composed(posed, camera, self.view.tissue), self.size)
+    def _rendered(self, state: State) -> tuple[Gaussians, Tensor]:
+        posed = self.fitter.instruments.pose(state)
+        return posed, downsampled(self.fitter.instruments.composed(posed, self.view), self.size)
 
-    def columns(self, at: Tensor, posed: Gaussians, image: Tensor) -> np.ndarray:
-        parameters, state, renderer = self.fitter.parameters, self.moved.at(at), self.fitter.instruments
-        camera, weight, layers = self.view.camera, self.residual.weight, []
-        # the pose of a single instrument moves all Gaussians as one: the camera is moved instead
+    def differences(self, at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
+        parameters, state = self.fitter.parameters, self.moved.at(at)
+        # the pose of a single instrument moves all Gaussians as one
         n_rigid = 6 if len(parameters.instruments) == 1 else 0
         for index, step in enumerate((parameters.vector_from_degrees(*STEPS) / self.size).tolist()):
             increments, change = at.clone(), step * parameters.step_sign(state, index, step)
             increments[index] += change
             other = parameters.moved(self.moved.expected, increments)
             if index < n_rigid:
-                layers.append(MovedLayer(posed, renderer.moved_camera(state, other, camera), change))
+                yield downsampled(self.fitter.instruments.moved(posed, state, other, self.view), self.size), change
             else:
-                layers.append(MovedLayer(renderer.pose(other), camera, change))
-        if runs_columns(posed, camera):
-            return layer_columns(layers, self.view.tissue, image, weight)
-        differences = ((self._composed(each.posed, each.camera), each.change) for each in layers)
-        return difference_columns(differences, image, weight)
+                yield self._rendered(other)[1], change
 
 
 class MovedStates:
@@ -191,9 +183,8 @@ class Fitter(Generic[P]):
     def ranked(self, view: FrameView, states: Iterable[State], size: float) -> list[State]:
         """Return states, the best first, by how well they explain a view reduced to `size`."""
         residual, renderer = residual_of(view, size), self.instruments
-        composed = partial(renderer.composed, camera=view.camera, tissue=view.tissue)
         scored = [
-            (float(residual.errors(downsampled(composed(renderer.pose(state)), size)).sum()), k, state)
+            (float(residual.errors(downsampled(renderer.composed(renderer.pose(state), view), size)).sum()), k, state)
             for k, state in enumerate(states)
         ]
         return [state for _, _, state in sorted(scored, key=lambda item: item[:2])]
