@@ -133,13 +133,15 @@ def correct_placement(
     """Correct the place of a single tracked instrument among the cameras, as far as the scope's hand-eye calibration
     leaves it open, from what moves in the images: as the base of a robot that is known so well (see `find_bases`).
 
-    Nothing is corrected where the calibration is usual, nor where images do not show the instrument at its place
-    clearly better.
+    Nothing is corrected where the calibration is usual or the log's clock is not known, nor where images do not show
+    the instrument at its place clearly better.
     """
     logs, items = data.parts[0].poses, data.recording.instruments
     if len(items) != 1 or items[0].name not in logs or items[0].base is not None or logs[items[0].name].frame == CAMERA:
         return data, {}
     name = items[0].name
+    if data.clock(logs[name].clock) is None:
+        return data, {}
     poses, known = data.instrument_poses(name, views.times)
     if known.sum() < MIN_FRAMES:
         return data, {}
