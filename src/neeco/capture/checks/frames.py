@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.capture.checks.pictures import Pictures, Size
+from neeco.capture.checks.pictures import Pictures, Size, in_threads
 from neeco.capture.documents import Node, printable
 from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, Hidden, is_repeated, masks_fault, measure_hidden
 from neeco.capture.model import Frame
@@ -119,9 +117,8 @@ def check_image_files(parsed: Parsed, pictures: Pictures, compared: Mapping[Path
     shared = measured_sample(parsed.points)
     points = [clouds.get(str(frame.state.tissue), shared) for frame in parsed.frames]
     cameras = [None if row in parsed.without_camera else frame.camera for row, frame in enumerate(parsed.frames)]
-    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        sizes = [compared.get(frame.image_path, ()) for frame in parsed.frames]
-        decoded = list(pool.map(partial(_decode, pictures), parsed.frames, cameras, points, sizes))
+    sizes = [compared.get(frame.image_path, ()) for frame in parsed.frames]
+    decoded = in_threads(partial(_decode, pictures), parsed.frames, cameras, points, sizes)
     # the reader may have reported an image whose size it wanted to know
     reported = [place.child("file_path").reported for place in parsed.places]
     first: dict[bytes, int] = {}

@@ -7,9 +7,7 @@ explains it, only the contradiction is reported.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -18,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.checks.mistakes import placement_mistakes, rotation_mistakes
 from neeco.capture.checks.motion_evidence import MotionEvidence, TimeSteps
-from neeco.capture.checks.pictures import Pictures
+from neeco.capture.checks.pictures import Pictures, in_threads
 from neeco.capture.documents import printable
 from neeco.capture.model import Instrument, InstrumentState
 from neeco.capture.readers.parsed import Parsed
@@ -247,8 +245,7 @@ def _same(one: _PoseHypothesis, other: _PoseHypothesis) -> bool:
 
 def _likeliest_few(tried: Iterable[_PoseHypothesis], few: MotionEvidence) -> list[_PoseHypothesis]:
     listed = list(tried)
-    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        means = list(pool.map(lambda one: few.mean(one.poses, one.available), listed))
+    means = in_threads(lambda one: few.mean(one.poses, one.available), listed)
     order = sorted(range(len(listed)), key=means.__getitem__, reverse=True)  # of equal ones the first
     return [listed[index] for index in order[:MAX_HYPOTHESES]]
 

@@ -9,8 +9,6 @@ depth and carried along by the poses, lies on moving pixels.
 from __future__ import annotations
 
 import copy
-import os
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import cv2
@@ -19,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from neeco.capture.checks.cameras import MIN_DEPTH, CameraArrays
-from neeco.capture.checks.pictures import Pictures, Size
+from neeco.capture.checks.pictures import Pictures, Size, in_threads
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.projection import project
@@ -98,8 +96,7 @@ class _Views:
         self.width, self.height = _reduced_size(frames)
         cameras = CameraArrays.of([frames[row].camera for row in rows])
         self.cameras = cameras.resized(np.full((len(rows), 2), (self.width, self.height), np.float64))
-        with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-            depths = list(pool.map(partial(self._tissue_depth, points), range(len(rows))))
+        depths = in_threads(partial(self._tissue_depth, points), range(len(rows)))
         known = np.array([index for index, depth in enumerate(depths) if depth is not None], int)
         self.rows, self.cameras = rows[known], self.cameras[known]
         self.depths = np.array([depth for depth in depths if depth is not None])  # [F, h, w] mm
@@ -120,8 +117,7 @@ class _Views:
         full = np.ones((self.height, self.width), np.float32)
         shown = np.stack([full if mask is None else mask for mask in masks])
         low, high = DIFFERENCE
-        with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-            differences = list(pool.map(partial(self._difference, images, shown), range(len(frames))))
+        differences = in_threads(partial(self._difference, images, shown), range(len(frames)))
         moving = [((pixels - low) / (high - low)).clip(0, 1) for pixels in differences]
         # [F, h, w] confidence in [0, 1] that a pixel moves
         self.moving = np.stack([cv2.blur(pixels, (3, 3)) for pixels in moving])

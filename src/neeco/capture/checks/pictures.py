@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -12,6 +15,13 @@ from neeco.capture.images import byte_pixels
 from neeco.capture.model import Frame
 
 Size = tuple[int, int]  # width and height, px
+Result = TypeVar("Result")
+
+
+def in_threads(function: Callable[..., Result], *arguments: Iterable[Any]) -> list[Result]:
+    """Return `list(map(function, *arguments))`, computed in threads: Pillow, OpenCV and NumPy let others run."""
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        return list(pool.map(function, *arguments))
 
 
 class Pictures:

@@ -91,9 +91,8 @@ def find_bases(
     if not unknown:
         return data, {}
     progress("finding the robot's base", 0, 0)
-    observed = _Observed(views, np.array(evenly_spaced(len(views.times), N_FRAMES)), moving)
-    shape, hidden = observed.images.shape[:3], observed.hidden
-    usable = np.ones(shape, bool) if hidden is None else np.tile(~hidden, (shape[0], 1, 1))
+    observed = _Observed(views, moving)
+    usable = observed.visible
     arms = [_arm(data, item, observed) for item in unknown]
     found = {}
     # what moves most is found most easily, and then out of the way
@@ -152,10 +151,10 @@ def correct_placement(
     covariance = np.array(registration.uncertainty(poses[known, :3, 3]).covariance)
     sd_deg, sd_mm = np.degrees(np.sqrt(np.trace(covariance[:3, :3]) / 3)), np.sqrt(np.trace(covariance[3:, 3:]) / 3)
     stated = StatedBase(np.eye(4), float(sd_mm), float(sd_deg), to_world=True)
-    observed = _Observed(views, np.array(evenly_spaced(len(views.times), N_FRAMES)), moving)
+    observed = _Observed(views, moving)
     arm = _arm(data, replace(items[0], base=stated), observed)
     try:
-        found, _ = _find(arm, observed, np.ones(observed.images.shape[:3], bool), alone=True)
+        found, _ = _find(arm, observed, observed.visible, alone=True)
     except NeecoError:  # the images do not determine it
         return data, {}
     least = MIN_OVERLAP if found is None else max(MIN_OVERLAP, found.overlap_before + MIN_OVERLAP_GAIN)
@@ -172,11 +171,14 @@ def correct_placement(
 
 @dataclass(frozen=True, eq=False)
 class _Observed:
-    """Some rows [F] of the views, and what is derived from them once."""
+    """N_FRAMES rows [F] of the views, or all, and what is derived from them once."""
 
     views: Views
-    rows: np.ndarray
     moving: Callable[[np.ndarray], np.ndarray]
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        return np.array(evenly_spaced(len(self.views.times), N_FRAMES))
 
     @cached_property
     def images(self) -> np.ndarray:
@@ -196,6 +198,12 @@ class _Observed:
     def hidden(self) -> np.ndarray | None:
         """Pixels beyond a round border, bool [h, w]."""
         return self.views.reduced_border
+
+    @property
+    def visible(self) -> np.ndarray:
+        """Pixels within the border, bool [F, h, w]."""
+        shape = self.images.shape[:3]
+        return np.ones(shape, bool) if self.hidden is None else np.tile(~self.hidden, (shape[0], 1, 1))
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:
