@@ -186,8 +186,8 @@ def find_base(
     if visible.sum() < MIN_FRAMES:
         raise NeecoError(
             f"what moves looks like a shaft in {int(visible.sum())} of {len(visible)} frames, at least {MIN_FRAMES} "
-            "are needed; give the transform, exactly or, before a still scope, of an arm with a trocar, roughly (sd_mm, "
-            "sd_deg), or a recording that shows more of it"
+            "are needed; give the transform, exactly or, before a still scope, of an arm with a trocar, roughly "
+            "(sd_mm, sd_deg), or a recording that shows more of it"
         )
     problem = problem.take(np.flatnonzero(visible))
     few = problem.take(np.array(evenly_spaced(len(problem.blocks), SEARCH_FRAMES)))
