@@ -178,6 +178,7 @@ def test_a_place_is_corrected_only_where_images_fit_clearly_better(monkeypatch, 
     after, _, found, notes = _placed(lambda rows: world.masks[rows], WORLD_FROM_BASE, 3.0, 1.5)
     assert ("psm1" in found) is (len(notes) == 1) is corrected
     assert (after[1] > 1) is corrected
+    assert all(item.tracked for item in found.values())
 
 
 def test_a_base_stated_to_the_world_is_not_taken_for_one_to_the_camera():

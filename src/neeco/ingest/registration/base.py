@@ -96,6 +96,7 @@ class BaseRegistration:
     explained: float = np.nan  # without masks: the share of the change in the images that the shaft explains
     shaft: np.ndarray | None = None  # [3] unit
     sd_motion_mm: float = np.nan
+    tracked: bool = False  # the place of an instrument that has no base, instead of its hand-eye calibration's
 
     def deviations(self, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations, mm [N] and degrees [N], of shifts along and turns about axes [N, 3] of the first

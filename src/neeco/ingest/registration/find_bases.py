@@ -166,7 +166,7 @@ def correct_placement(
         f"{sds[1]:.1f} deg only; its outline and what moves overlap by {found.overlap:.2f} "
         f"({found.overlap_before:.2f} before)"
     )
-    return data.with_base(name, found.world_from_base), {name: found}
+    return data.with_base(name, found.world_from_base), {name: replace(found, tracked=True)}
 
 
 @dataclass(frozen=True, eq=False)
