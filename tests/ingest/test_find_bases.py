@@ -83,11 +83,15 @@ def test_a_rough_base_is_found_with_its_clock_and_told_in_a_note():
     assert "mm and" in data.notes.sentences[0]
 
 
-def test_what_shows_no_shaft_names_the_recording():
-    world = make_world(44)
-    data = _data(world, StatedBase())
-    with pytest.raises(NeecoError, match=r"recording\.yaml: instrument 'psm1': camera_from_base"):
-        find_bases(data, _black(world), lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool), silent)
+@pytest.mark.parametrize(("moving", "key"), [(False, "camera_from_base"), (True, "world_from_base")])
+def test_what_shows_no_shaft_names_the_recording_and_the_key_that_states_the_base(moving, key):
+    world = make_world(44, moving_camera=moving)
+    data = _data(world, StatedBase(to_world=moving))
+    views = _black(world, np.linalg.inv(world.camera_from_world))
+    with pytest.raises(
+        NeecoError, match=rf"^recording\.yaml: instrument 'psm1': {key}: what moves looks like a shaft in"
+    ):
+        find_bases(data, views, lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool), silent)
     assert LENS.intrinsics == INTRINSICS
 
 
@@ -161,7 +165,7 @@ def test_a_place_is_corrected_only_where_images_fit_clearly_better(monkeypatch, 
     world, moved = make_world(44, moving_camera=True), np.eye(4)
     moved[:3, 3] = [1.0, 2.0, 3.0]
 
-    def find(name, masks, intrinsics, camera_from_world, poses_at, times, prior, **others):
+    def find(masks, intrinsics, camera_from_world, poses_at, times, prior, **others):
         assert np.array_equal(prior[0], np.eye(4))
         assert prior[1:] == pytest.approx((3.0 / 3**0.5, 1.5 / 3**0.5), rel=0.01)  # along each axis
         assert others["clock_known"]
@@ -208,7 +212,7 @@ def test_the_pose_of_a_tip_is_turned_into_the_shafts_with_readings_of_the_same_m
     )
     seen = {}
 
-    def find_base(name, masks, intrinsics, cameras, poses_at, times, **others):
+    def find_base(masks, intrinsics, cameras, poses_at, times, **others):
         seen.update(poses_at=poses_at, readings=others["readings"], times=times)
         return BaseRegistration(
             world_from_base=WORLD_FROM_BASE, clock_s=0.03, clock_sd_s=0.005, covariance=np.eye(6), open_directions=(),

@@ -305,12 +305,12 @@ def _find(
     try:
         if motion is not None and arm.prior is not None and alone and motion.bends:
             registration = find_articulated_base(
-                arm.item.name, observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), motion, arm.prior,
+                observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), motion, arm.prior,
                 hidden=observed.hidden, clock_known=clock_known,
             )  # fmt: skip
             return registration, np.zeros_like(usable)
         registration = find_base(
-            arm.item.name, observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), arm.poses_at,
+            observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), arm.poses_at,
             observed.times, prior=arm.prior, readings=readings, hidden=observed.hidden, images=observed.images,
             clock_known=clock_known,
         )  # fmt: skip
@@ -319,7 +319,8 @@ def _find(
             return found
         if not alone and arm.prior is not None and arm.travel < MIN_TRAVEL_MM:
             return None, np.zeros_like(usable)
-        raise NeecoError(f"{arm.where}: {error}") from error
+        assert arm.item.base is not None
+        raise NeecoError(f"{arm.where}: instrument {arm.item.name!r}: {arm.item.base.key}: {error}") from error
     return registration, np.zeros_like(usable)
 
 
