@@ -17,6 +17,7 @@ from ingest.base_world import (
     episodes,
     errors,
     make_world,
+    rigid,
     silent,
     views_of,
 )
@@ -29,7 +30,7 @@ from neeco.ingest.readers.logs import PoseLog, ReadingLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs, JointColumns
 from neeco.ingest.registration import find_bases as module
-from neeco.ingest.registration.base import BaseRegistration
+from neeco.ingest.registration.base import BaseRegistration, in_camera
 from neeco.ingest.registration.find_bases import correct_placement, find_bases
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
@@ -104,6 +105,17 @@ def test_a_rough_base_is_found_before_a_scope_that_moves():
     assert errors(placed.world_from_base["psm1"], world.poses_at(0.0))[0] < 1.2  # of 3.5 s in all
 
 
+def _hand_eye(origin, sd_mm, sd_deg):
+    """A hand-eye calibration that is known so well along and about each axis."""
+    variances = np.square([0.005, *[np.radians(sd_deg)] * 3, *[sd_mm] * 3])
+    return Registration(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), camera_from_sensor=np.eye(4),
+        clock=ClockOffset(0.0, 0.0, GIVEN), scale_sd=0.005, origin=origin,
+        covariances=np.stack([np.diag(variances)] * 3), position_residual=np.zeros(44),
+        rotation_residual=np.zeros(44), used=np.arange(44),
+    )  # fmt: skip
+
+
 def _placed(masks, beside, sd_mm, sd_deg):
     """What `correct_placement` makes of an instrument that a hand-eye calibration places `beside` [4, 4] its own."""
     world = make_world(44, moving_camera=True)
@@ -116,17 +128,59 @@ def _placed(masks, beside, sd_mm, sd_deg):
     quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
     log = replace(log, positions=poses[:, :3, 3], quats=quats)
     data = replace(data, parts=(replace(data.parts[0], poses={"psm1": log}),))
-    variances = np.square([0.005, *[np.radians(sd_deg) / 3**0.5] * 3, *[sd_mm / 3**0.5] * 3])
-    registration = Registration(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), camera_from_sensor=np.eye(4),
-        clock=ClockOffset(0.0, 0.0, GIVEN), scale_sd=0.005, origin=poses[:, :3, 3].mean(0),
-        covariances=np.stack([np.diag(variances)] * 3), position_residual=np.zeros(44),
-        rotation_residual=np.zeros(44), used=np.arange(44),
-    )  # fmt: skip
+    registration = _hand_eye(poses[:, :3, 3].mean(0), sd_mm / 3**0.5, sd_deg / 3**0.5)
     views = _black(world, np.linalg.inv(world.camera_from_world))
     placed, found = correct_placement(data, views, registration, masks, silent)
     corrected = placed.world_from_base.get("psm1", np.eye(4)) @ beside
     return errors(corrected, world.poses_at(0.0)), errors(beside, world.poses_at(0.0)), found, data.notes.sentences
+
+
+def test_a_base_is_as_far_off_among_misplaced_cameras_as_it_states(monkeypatch):
+    """The images show a base among the cameras, but not along its shaft nor about it: there it stays as stated to the
+    tracker, in whose frame a hand-eye calibration placed all cameras with one error."""
+    world, generator = make_world(14, moving_camera=True), np.random.default_rng(0)
+    poses = world.poses_at(0.0)
+    middle = poses[:, :3, 3].mean(0)  # in the base
+    at = (WORLD_FROM_BASE @ np.append(middle, 1.0))[:3]
+    shaft = (WORLD_FROM_BASE[:3, :3] @ poses[:, :3, 2].mean(0)) / np.linalg.norm(poses[:, :3, 2].mean(0))
+    across = np.eye(3) - np.outer(shaft, shaft)
+    seen = np.kron(np.diag([np.radians(0.3) ** -2, 0.3**-2]), across)  # information, of turns and shifts
+
+    def moved(base, step):
+        turn = rigid(tuple(step[:3]), (0.0, 0.0, 0.0))
+        turn[:3, 3] = at + step[3:] - turn[:3, :3] @ at
+        return turn @ base
+
+    def step(first, second):
+        turn = Rotation.from_matrix(second[:3, :3] @ first[:3, :3].T).as_rotvec()
+        return np.append(turn, (second - first)[:3] @ np.append(middle, 1.0))
+
+    def find(masks, intrinsics, camera_from_world, poses_at, times, prior, **others):
+        base = np.linalg.inv(camera_from_world[0]) @ world.camera_from_world[0] @ WORLD_FROM_BASE
+        shown = seen @ generator.multivariate_normal(np.zeros(6), np.linalg.pinv(seen))
+        known = np.diag(np.repeat([np.radians(prior[2]) ** -2, prior[1] ** -2], 3))
+        covariance = np.linalg.inv(seen + known)
+        return BaseRegistration(
+            world_from_base=moved(base, covariance @ (shown + known @ step(base, prior[0]))), clock_s=0.0,
+            clock_sd_s=0.0, covariance=in_camera(covariance, camera_from_world[0]), open_directions=(), frames=14,
+            from_masks=True,
+        )  # fmt: skip
+
+    monkeypatch.setattr(module, "find_base", find)
+    registration, off = _hand_eye(at, 3.0, 1.5), []
+    logged = _data(world, None, {"ros": ClockOffset(0.03, 0.0, GIVEN)})
+    (part,) = logged.parts
+    for _ in range(40):
+        error = generator.normal(size=6) * np.repeat([np.radians(1.5), 3.0], 3)
+        stated = generator.normal(size=6) * np.repeat([np.radians(1.0), 1.5], 3)
+        base, cameras = moved(WORLD_FROM_BASE, stated), moved(np.linalg.inv(world.camera_from_world), error)
+        items = (InstrumentLogs("psm1", base=StatedBase(base, 1.5, 1.0, to_world=True)),)
+        data = replace(logged, parts=(replace(part, recording=replace(part.recording, instruments=items)),))
+        _, found = find_bases(data, _black(world, cameras), lambda rows: world.masks[rows], silent, registration)
+        beside = step(moved(WORLD_FROM_BASE, error), found["psm1"].world_from_base)
+        covariance = np.array(found["psm1"].uncertainty(cameras[0], poses).covariance)
+        off.append(np.linalg.solve(np.linalg.cholesky(covariance), beside))
+    assert 0.85 < np.sqrt(np.square(off).mean()) < 1.15
 
 
 @pytest.mark.slow

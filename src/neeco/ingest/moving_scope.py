@@ -71,7 +71,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         require_no_base(data)
     else:
         placed = _registered(views, registration)
-        data, bases = find_bases(data, placed, foreground, progress)
+        data, bases = find_bases(data, placed, foreground, progress, registration)
         data, corrected = correct_placement(data, placed, registration, foreground, progress)
         bases |= corrected
         data = data.with_assumed_clocks()

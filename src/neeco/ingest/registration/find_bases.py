@@ -71,12 +71,18 @@ def require_no_base(data: Episodes) -> None:
 
 
 def find_bases(
-    data: Episodes, views: Views, moving: Callable[[np.ndarray], np.ndarray], progress: StageProgress
+    data: Episodes,
+    views: Views,
+    moving: Callable[[np.ndarray], np.ndarray],
+    progress: StageProgress,
+    registration: Registration | None = None,
 ) -> tuple[Episodes, dict[str, BaseRegistration]]:
     """Find the bases of all instruments of which the recording states something; take those stated exactly.
 
-    views: in mm; moving(rows): masks bool [R, h, w] of what moves in rows of them, reduced to REFERENCE_PIXELS. Lengths
-    of a robot are taken as they are. Return the episodes with these bases and the clocks that come with them, and what
+    views: in mm; moving(rows): masks bool [R, h, w] of what moves in rows of them, reduced to REFERENCE_PIXELS;
+    registration: what placed the cameras in the frame that bases are stated to, where the scope moves. Images show a
+    base among the cameras: what is stated of it is known there less well by the error of their place. Lengths of a
+    robot are taken as they are. Return the episodes with these bases and the clocks that come with them, and what
     was found by instrument. Notes state standard deviations and what stays undetermined. Raises NeecoError where
     nothing moves with an instrument.
     """
@@ -93,7 +99,7 @@ def find_bases(
     progress("finding the robot's base", 0, 0)
     observed = _Observed(views, moving)
     usable = observed.visible
-    arms = [_arm(data, item, observed) for item in unknown]
+    arms = [_among_cameras(_arm(data, item, observed), registration) for item in unknown]
     found = {}
     # what moves most is found most easily, and then out of the way
     for arm in sorted(arms, key=lambda arm: -arm.travel):
@@ -148,11 +154,9 @@ def correct_placement(
     if (sds[0] <= PLACED_MM and sds[1] <= PLACED_DEG) or sds[0] > MAX_PRIOR_MM or sds[1] > MAX_PRIOR_DEG:
         return data, {}
     progress("correcting the instrument's place", 0, 0)
-    covariance = np.array(registration.uncertainty(poses[known, :3, 3]).covariance)
-    sd_deg, sd_mm = np.degrees(np.sqrt(np.trace(covariance[:3, :3]) / 3)), np.sqrt(np.trace(covariance[3:, 3:]) / 3)
-    stated = StatedBase(np.eye(4), float(sd_mm), float(sd_deg), to_world=True)
+    stated = StatedBase(np.eye(4), 0.0, 0.0, to_world=True)
     observed = _Observed(views, moving)
-    arm = _arm(data, replace(items[0], base=stated), observed)
+    arm = _among_cameras(_arm(data, replace(items[0], base=stated), observed), registration)
     try:
         found, _ = _find(arm, observed, observed.visible, alone=True)
     except NeecoError:  # the images do not determine it
@@ -287,6 +291,20 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
         item=item, where=str(data.recording.path), clock=clock, readings=readings, prior=prior,
         readings_at=readings_later, poses_at=base_from_shaft, wrists=wrists,
     )  # fmt: skip
+
+
+def _among_cameras(arm: _Arm, registration: Registration | None) -> _Arm:
+    """Return the arm with the error of the cameras' place added to its prior, the same in all directions."""
+    if registration is None or arm.prior is None:
+        return arm
+    given, sd_mm, sd_deg = arm.prior
+    places = (given @ arm.poses_at(0.0))[:, :3, 3]
+    places = places[np.isfinite(places).all(1)]
+    if not len(places):
+        return arm
+    variances = np.diag(registration.uncertainty(places).covariance).reshape(2, 3).mean(1)  # rad^2, mm^2
+    placed_deg, placed_mm = np.degrees(np.sqrt(variances[0])), np.sqrt(variances[1])
+    return replace(arm, prior=(given, float(np.hypot(sd_mm, placed_mm)), float(np.hypot(sd_deg, placed_deg))))
 
 
 def _find(
