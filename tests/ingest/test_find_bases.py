@@ -31,7 +31,7 @@ from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs, JointColumns
 from neeco.ingest.registration import find_bases as module
 from neeco.ingest.registration.base import BaseRegistration, in_camera
-from neeco.ingest.registration.find_bases import correct_placement, find_bases
+from neeco.ingest.registration.find_bases import correct_placement, find_bases, follow_cameras
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
 
@@ -181,6 +181,25 @@ def test_a_base_is_as_far_off_among_misplaced_cameras_as_it_states(monkeypatch):
         covariance = np.array(found["psm1"].uncertainty(cameras[0], poses).covariance)
         off.append(np.linalg.solve(np.linalg.cholesky(covariance), beside))
     assert 0.85 < np.sqrt(np.square(off).mean()) < 1.15
+
+
+def test_a_base_found_among_cameras_stays_there_when_these_are_placed_again():
+    world = make_world(14, moving_camera=True)
+    data = _data(world, None, {"ros": ClockOffset(0.03, 0.0, GIVEN)}).with_base("psm1", WORLD_FROM_BASE)
+    base = BaseRegistration(
+        world_from_base=WORLD_FROM_BASE, clock_s=0.0, clock_sd_s=0.0, covariance=np.eye(6), open_directions=(),
+        frames=14, from_masks=True,
+    )  # fmt: skip
+    before = _black(world, np.linalg.inv(world.camera_from_world))
+    again = rigid((0.02, -0.01, 0.03), (2.0, -1.0, 3.0)) @ before.world_from_camera
+    after = replace(before, world_from_camera=again[2:], times=before.times[2:], frames=before.frames[2:])
+    placed, found = follow_cameras(data, {"psm1": base}, before, after)
+    beside = [
+        np.linalg.inv(views.world_from_camera) @ of.instrument_poses("psm1", views.times)[0]
+        for of, views in ((data, replace(after, world_from_camera=before.world_from_camera[2:])), (placed, after))
+    ]
+    np.testing.assert_allclose(*beside, atol=1e-6)
+    assert np.array_equal(found["psm1"].world_from_base, placed.world_from_base["psm1"])
 
 
 @pytest.mark.slow

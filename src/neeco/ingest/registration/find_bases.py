@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid
 from neeco.geometry.trocar import line_through_trocar
 from neeco.ingest.frames.views import StageProgress, Views, reduced
 from neeco.ingest.readers.columns import CAMERA
@@ -104,9 +106,9 @@ def find_bases(
     # what moves most is found most easily, and then out of the way
     for arm in sorted(arms, key=lambda arm: -arm.travel):
         name, clock = arm.item.name, arm.clock
-        registration, covered = _find(arm, observed, usable, alone=len(arms) == 1)
+        base, covered = _find(arm, observed, usable, alone=len(arms) == 1)
         usable = usable & ~covered
-        if registration is None:
+        if base is None:
             assert arm.prior is not None
             given, sd_mm, sd_deg = arm.prior
             data = data.with_base(name, given)
@@ -116,15 +118,15 @@ def find_bases(
             )
             continue
         if clock.source not in KNOWN:
-            clock = replace(clock.later(registration.clock_s), sd=registration.clock_sd_s, source=FOUND)
-        data = data.with_base(name, registration.world_from_base).with_moved_clock(logs[name].clock, clock)
+            clock = replace(clock.later(base.clock_s), sd=base.clock_sd_s, source=FOUND)
+        data = data.with_base(name, base.world_from_base).with_moved_clock(logs[name].clock, clock)
         if arm.item.kinematics is not None:  # found with readings of the same clock, where they have none of their own
             for own in {log.clock for log in data.parts[0].joints[name].values()}:
                 data = data if data.clock(own) is not None else data.with_moved_clock(own, clock)
-        data.notes.add(describe(name, registration))
-        for place, doubt in enumerate(registration.doubts):
+        data.notes.add(describe(name, base))
+        for place, doubt in enumerate(base.doubts):
             data.notes.contradict(f"base of {name}, {place}", f"instrument {name!r}: {doubt}", severe=True)
-        found[name] = registration
+        found[name] = base
     return data, found
 
 
@@ -171,6 +173,23 @@ def correct_placement(
         f"({found.overlap_before:.2f} before)"
     )
     return data.with_base(name, found.world_from_base), {name: replace(found, tracked=True)}
+
+
+def follow_cameras(
+    data: Episodes, bases: Mapping[str, BaseRegistration], before: Views, after: Views
+) -> tuple[Episodes, dict[str, BaseRegistration]]:
+    """Move bases found among cameras, `before`, with these to where a later calibration places them, `after`: there
+    the images show them. Both in mm, of the same frames or fewer afterwards."""
+    found = {}
+    _, old, new = np.intersect1d(before.frames, after.frames, return_indices=True)
+    motions = after.world_from_camera[new] @ np.linalg.inv(before.world_from_camera[old])
+    turn = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
+    for name, base in bases.items():
+        poses, known = data.instrument_poses(name, before.times[old])
+        middle = np.append(poses[known, :3, 3].mean(0), 1.0)
+        moved = rigid(turn, (motions @ middle).mean(0)[:3] - turn @ middle[:3]) @ base.world_from_base
+        data, found[name] = data.with_base(name, moved), replace(base, world_from_base=moved)
+    return data, found
 
 
 @dataclass(frozen=True, eq=False)
