@@ -86,15 +86,13 @@ def errors_in_deviations(
     prior = given, off[0] / SHARE, off[1] / SHARE
     if tree is None:
         found = find_base(
-            "instrument", recording.masks, recording.intrinsics, recording.camera_from_world, recording.poses_at,
+            recording.masks, recording.intrinsics, recording.camera_from_world, recording.poses_at,
             recording.times, prior, readings=recording.readings, images=recording.images, seed=seed,
         )  # fmt: skip
     else:
         _disturb_joints(recording, generator)
         motion = ArticulatedMotion(tree=tree, poses_at=recording.poses_at, readings_at=recording.readings_at)
-        found = find_articulated_base(
-            "instrument", recording.masks, recording.intrinsics, recording.camera_from_world, motion, prior
-        )
+        found = find_articulated_base(recording.masks, recording.intrinsics, recording.camera_from_world, motion, prior)
         print("; ".join(["", *found.doubts]), flush=True, end="")
     middle = np.append(recording.poses[:, :3, 3].mean(0), 1.0)
     shift = ((found.world_from_base - recording.truth) @ middle)[:3]

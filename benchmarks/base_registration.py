@@ -154,10 +154,10 @@ class BaseRecording:
         row: dict[str, Any] = {"capture": self.path.name, "mm": mm, "degrees": degrees, "seed": seed}
         try:
             found = find_articulated_base(
-                "instrument", self.masks, self.intrinsics, self.camera_from_world,
+                self.masks, self.intrinsics, self.camera_from_world,
                 ArticulatedMotion(tree=tree, poses_at=self.poses_at, readings_at=self.readings_at), prior,
             ) if tree is not None and prior is not None else find_base(
-                "instrument", self.masks, self.intrinsics, self.camera_from_world, self.poses_at, self.times, prior,
+                self.masks, self.intrinsics, self.camera_from_world, self.poses_at, self.times, prior,
                 readings=self.readings, images=self.images, seed=seed,
             )  # fmt: skip
         except NeecoError as error:

@@ -29,8 +29,8 @@ TESTS = {"across": ("across",), "within": ("test", "unseen")}  # of the page: of
 PASTED = "real+paste+strong"
 FEW, ALL = 10, 86  # labelled frames in the upper panels
 CUT, CUT_APART = 0.55, 0.25  # the axis of IoU begins here; that of the last panel
-EARLIER = "(two seeds)"  # ends the names of pairs in an earlier study, which the table holds and no panel shows
-APART = "back"  # the pair that no choice was made by; the last panel
+OTHER_STUDY = "("  # in the names of pairs in other studies than that of the upper panels: `back (96 px)`
+APART = "back (96 px)"  # of the last panel: the pair that no choice was made by
 CURVES = (  # of it, by labelled frames: conditions, colour, marker, name
     ("recipe+strong", "#009E73", "*", "synthetic alone (the recipe): no labelled frame"),
     (PASTED, "#CC79A7", "P", "labelled, pasted over the next operation's tissue"),
@@ -99,7 +99,7 @@ def points(
 
 
 def panel(axes: Axes, rows: list[dict[str, str]], test: str) -> None:
-    pairs = sorted(dict.fromkeys(row["pair"] for row in rows), key=APART.__eq__)  # that one last
+    pairs = list(dict.fromkeys(row["pair"] for row in rows if OTHER_STUDY not in row["pair"]))
     for k, (key, (colour, marker, _)) in enumerate(SHOWN.items()):
         for g, pair in enumerate(pairs):
             if (found := points(rows, pair, test, *key)) is None:
@@ -147,7 +147,7 @@ def curves(axes: Axes, rows: list[dict[str, str]]) -> None:
     axes.set_xticks(counts, [str(count) for count in counts])
     axes.set_xticks([], minor=True)
     axes.set_xlabel("labelled frames", fontsize=8, color=GREY)
-    axes.set_title("The next operation, pair kept apart", fontsize=10, color=GREY, loc="left", fontweight="bold")
+    axes.set_title("The next operation, pair kept apart, 96 px", fontsize=10, color=GREY, loc="left", fontweight="bold")
     axes.set_ylabel(f"IoU (axis from {CUT_APART})", fontsize=8, color=GREY)
     axes.tick_params(colors=GREY, labelsize=9)
     axes.grid(axis="y", color=GREY, alpha=0.25, linewidth=0.5)
@@ -161,7 +161,6 @@ def legend_below(axes: Axes, distance: float, **handles: Sequence[Line2D]) -> No
 
 def draw(rows: list[dict[str, str]]) -> None:
     """Write the figure: narrow, so that it is read on a phone without shrinking."""
-    rows = [row for row in rows if EARLIER not in row["pair"]]
     figure = Figure(figsize=(4.1, 9.2), layout="constrained")
     *panels, last = figure.subplots(3, 1)
     for axes, test in zip(panels, TESTS, strict=True):

@@ -8,7 +8,7 @@ them, `step` does, takes the photometric loss and its gradients and one step of 
 do the rasteriser's part alone, on the same posed tensors for all backends. Backends take turns, call by call; numbers
 are medians of the time from an idle device to an idle device, after three calls to warm up. Stages are timed by CUDA
 events in calls of their own, and held against peaks measured in the same run (`stages.MODEL`). FOLDER gets gpu.md and
-gpu.json.
+gpu.json, after every part.
 
 `--device cpu` measures the processor in the same way; without it and without a GPU this ends in one line.
 """
@@ -309,20 +309,24 @@ def markdown(result: dict[str, Any]) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def run(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Measure what was asked for. Raises NeecoError where there is no such device."""
+def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Measure what was asked for; yields all so far after every part. Raises NeecoError for what cannot be."""
     workloads = [Workload.of(word) for word in arguments.workload or WORKLOADS]
     if arguments.repeats < 1 or arguments.count < 2:
         raise NeecoError("--repeats must be at least 1, --count at least 2")
     device = device_of(arguments.device)
     peak = peaks(device)
     result: dict[str, Any] = {"hardware": hardware(device), "peak": peak, "repeats": arguments.repeats}
-    result["workloads"] = [measure(workload, device, arguments.repeats, peak) for workload in workloads]
-    if arguments.train is not None:
-        result["train"] = train_both(arguments.train, device, arguments.iterations, arguments.set)
+    result["workloads"] = []
+    for workload in workloads:
+        result["workloads"].append(measure(workload, device, arguments.repeats, peak))
+        yield result
     if arguments.synthesize is not None:
         result["synthesize"] = synthesize_some(arguments.synthesize, device, arguments.count)
-    return result
+        yield result
+    if arguments.train is not None:
+        result["train"] = train_both(arguments.train, device, arguments.iterations, arguments.set)
+        yield result
 
 
 def main(words: list[str] | None = None) -> int:
@@ -341,12 +345,12 @@ def main(words: list[str] | None = None) -> int:
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # else cuBLAS knows no fixed order
     try:
         with readable_failures():
-            result = run(arguments)
-        told = markdown(result)
-        if arguments.output is not None:
-            arguments.output.mkdir(parents=True, exist_ok=True)
-            write_json(arguments.output / "gpu.json", result)
-            write_text(arguments.output / "gpu.md", told)
+            for result in run(arguments):
+                told = markdown(result)
+                if arguments.output is not None:  # whatever ends the rest early
+                    arguments.output.mkdir(parents=True, exist_ok=True)
+                    write_json(arguments.output / "gpu.json", result)
+                    write_text(arguments.output / "gpu.md", told)
     except NeecoError as error:
         print(f"gpu.py: {' '.join(str(error).split())}", file=sys.stderr)
         return 1

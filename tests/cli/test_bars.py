@@ -1,12 +1,14 @@
 """What is told of work that goes on."""
 
 import time
+from types import SimpleNamespace
 
 import pytest
 
 from neeco.cli import _progress
 from neeco.cli._progress import Bars, counting
 from neeco.errors import NeecoError
+from neeco.studies.study import JobEvent
 from neeco.training.train import ProgressRow
 
 
@@ -46,3 +48,11 @@ def test_a_stage_that_reports_nothing_is_told_too_and_an_error_alone_ends_it(cap
     with pytest.raises(NeecoError):
         work()
     assert set(capsys.readouterr().err.splitlines()) == {"matching: 0:00:00 passed"}
+
+
+def test_jobs_that_all_ended_have_said_so_and_leave_no_last_line(capsys):
+    job = SimpleNamespace(title="kinematic, seed 0")
+    with Bars() as bars:
+        bars.job(JobEvent(index=0, total=1, job=job, stage="training", share=0.5))
+        bars.job(JobEvent(index=0, total=1, job=job, stage="done", result={"iterations": 3}))
+    assert capsys.readouterr().err == "1/1 kinematic, seed 0: done: 3 iterations (1 of 1 ended)\n"

@@ -123,7 +123,7 @@ def _off(base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find(masks: np.ndarray, tree: KinematicTree, given: np.ndarray, sd_mm: float = 5.0, sd_deg: float = 3.0):
-    return find_articulated_base("psm1", masks, INTRINSICS, STILL, _motion(tree), (given, sd_mm, sd_deg))
+    return find_articulated_base(masks, INTRINSICS, STILL, _motion(tree), (given, sd_mm, sd_deg))
 
 
 def test_the_bend_of_a_wrist_tells_the_place_along_the_shaft(masks):

@@ -17,6 +17,7 @@ from ingest.base_world import (
     episodes,
     errors,
     make_world,
+    rigid,
     silent,
     views_of,
 )
@@ -29,8 +30,8 @@ from neeco.ingest.readers.logs import PoseLog, ReadingLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs, JointColumns
 from neeco.ingest.registration import find_bases as module
-from neeco.ingest.registration.base import BaseRegistration
-from neeco.ingest.registration.find_bases import correct_placement, find_bases
+from neeco.ingest.registration.base import BaseRegistration, in_camera
+from neeco.ingest.registration.find_bases import correct_placement, find_bases, follow_cameras
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
 
@@ -83,11 +84,15 @@ def test_a_rough_base_is_found_with_its_clock_and_told_in_a_note():
     assert "mm and" in data.notes.sentences[0]
 
 
-def test_what_shows_no_shaft_names_the_recording():
-    world = make_world(44)
-    data = _data(world, StatedBase())
-    with pytest.raises(NeecoError, match=r"recording\.yaml: instrument 'psm1': camera_from_base"):
-        find_bases(data, _black(world), lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool), silent)
+@pytest.mark.parametrize(("moving", "key"), [(False, "camera_from_base"), (True, "world_from_base")])
+def test_what_shows_no_shaft_names_the_recording_and_the_key_that_states_the_base(moving, key):
+    world = make_world(44, moving_camera=moving)
+    data = _data(world, StatedBase(to_world=moving))
+    views = _black(world, np.linalg.inv(world.camera_from_world))
+    with pytest.raises(
+        NeecoError, match=rf"^recording\.yaml: instrument 'psm1': {key}: what moves looks like a shaft in"
+    ):
+        find_bases(data, views, lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool), silent)
     assert LENS.intrinsics == INTRINSICS
 
 
@@ -98,6 +103,17 @@ def test_a_rough_base_is_found_before_a_scope_that_moves():
     cameras = np.linalg.inv(world.camera_from_world)
     placed, _ = find_bases(data, _black(world, cameras), lambda rows: world.masks[rows], silent)
     assert errors(placed.world_from_base["psm1"], world.poses_at(0.0))[0] < 1.2  # of 3.5 s in all
+
+
+def _hand_eye(origin, sd_mm, sd_deg):
+    """A hand-eye calibration that is known so well along and about each axis."""
+    variances = np.square([0.005, *[np.radians(sd_deg)] * 3, *[sd_mm] * 3])
+    return Registration(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), camera_from_sensor=np.eye(4),
+        clock=ClockOffset(0.0, 0.0, GIVEN), scale_sd=0.005, origin=origin,
+        covariances=np.stack([np.diag(variances)] * 3), position_residual=np.zeros(44),
+        rotation_residual=np.zeros(44), used=np.arange(44),
+    )  # fmt: skip
 
 
 def _placed(masks, beside, sd_mm, sd_deg):
@@ -112,17 +128,78 @@ def _placed(masks, beside, sd_mm, sd_deg):
     quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
     log = replace(log, positions=poses[:, :3, 3], quats=quats)
     data = replace(data, parts=(replace(data.parts[0], poses={"psm1": log}),))
-    variances = np.square([0.005, *[np.radians(sd_deg) / 3**0.5] * 3, *[sd_mm / 3**0.5] * 3])
-    registration = Registration(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), camera_from_sensor=np.eye(4),
-        clock=ClockOffset(0.0, 0.0, GIVEN), scale_sd=0.005, origin=poses[:, :3, 3].mean(0),
-        covariances=np.stack([np.diag(variances)] * 3), position_residual=np.zeros(44),
-        rotation_residual=np.zeros(44), used=np.arange(44),
-    )  # fmt: skip
+    registration = _hand_eye(poses[:, :3, 3].mean(0), sd_mm / 3**0.5, sd_deg / 3**0.5)
     views = _black(world, np.linalg.inv(world.camera_from_world))
     placed, found = correct_placement(data, views, registration, masks, silent)
     corrected = placed.world_from_base.get("psm1", np.eye(4)) @ beside
     return errors(corrected, world.poses_at(0.0)), errors(beside, world.poses_at(0.0)), found, data.notes.sentences
+
+
+def test_a_base_is_as_far_off_among_misplaced_cameras_as_it_states(monkeypatch):
+    """The images show a base among the cameras, but not along its shaft nor about it: there it stays as stated to the
+    tracker, in whose frame a hand-eye calibration placed all cameras with one error."""
+    world, generator = make_world(14, moving_camera=True), np.random.default_rng(0)
+    poses = world.poses_at(0.0)
+    middle = poses[:, :3, 3].mean(0)  # in the base
+    at = (WORLD_FROM_BASE @ np.append(middle, 1.0))[:3]
+    shaft = (WORLD_FROM_BASE[:3, :3] @ poses[:, :3, 2].mean(0)) / np.linalg.norm(poses[:, :3, 2].mean(0))
+    across = np.eye(3) - np.outer(shaft, shaft)
+    seen = np.kron(np.diag([np.radians(0.3) ** -2, 0.3**-2]), across)  # information, of turns and shifts
+
+    def moved(base, step):
+        turn = rigid(tuple(step[:3]), (0.0, 0.0, 0.0))
+        turn[:3, 3] = at + step[3:] - turn[:3, :3] @ at
+        return turn @ base
+
+    def step(first, second):
+        turn = Rotation.from_matrix(second[:3, :3] @ first[:3, :3].T).as_rotvec()
+        return np.append(turn, (second - first)[:3] @ np.append(middle, 1.0))
+
+    def find(masks, intrinsics, camera_from_world, poses_at, times, prior, **others):
+        base = np.linalg.inv(camera_from_world[0]) @ world.camera_from_world[0] @ WORLD_FROM_BASE
+        shown = seen @ generator.multivariate_normal(np.zeros(6), np.linalg.pinv(seen))
+        known = np.diag(np.repeat([np.radians(prior[2]) ** -2, prior[1] ** -2], 3))
+        covariance = np.linalg.inv(seen + known)
+        return BaseRegistration(
+            world_from_base=moved(base, covariance @ (shown + known @ step(base, prior[0]))), clock_s=0.0,
+            clock_sd_s=0.0, covariance=in_camera(covariance, camera_from_world[0]), open_directions=(), frames=14,
+            from_masks=True,
+        )  # fmt: skip
+
+    monkeypatch.setattr(module, "find_base", find)
+    registration, off = _hand_eye(at, 3.0, 1.5), []
+    logged = _data(world, None, {"ros": ClockOffset(0.03, 0.0, GIVEN)})
+    (part,) = logged.parts
+    for _ in range(40):
+        error = generator.normal(size=6) * np.repeat([np.radians(1.5), 3.0], 3)
+        stated = generator.normal(size=6) * np.repeat([np.radians(1.0), 1.5], 3)
+        base, cameras = moved(WORLD_FROM_BASE, stated), moved(np.linalg.inv(world.camera_from_world), error)
+        items = (InstrumentLogs("psm1", base=StatedBase(base, 1.5, 1.0, to_world=True)),)
+        data = replace(logged, parts=(replace(part, recording=replace(part.recording, instruments=items)),))
+        _, found = find_bases(data, _black(world, cameras), lambda rows: world.masks[rows], silent, registration)
+        beside = step(moved(WORLD_FROM_BASE, error), found["psm1"].world_from_base)
+        covariance = np.array(found["psm1"].uncertainty(cameras[0], poses).covariance)
+        off.append(np.linalg.solve(np.linalg.cholesky(covariance), beside))
+    assert 0.85 < np.sqrt(np.square(off).mean()) < 1.15
+
+
+def test_a_base_found_among_cameras_stays_there_when_these_are_placed_again():
+    world = make_world(14, moving_camera=True)
+    data = _data(world, None, {"ros": ClockOffset(0.03, 0.0, GIVEN)}).with_base("psm1", WORLD_FROM_BASE)
+    base = BaseRegistration(
+        world_from_base=WORLD_FROM_BASE, clock_s=0.0, clock_sd_s=0.0, covariance=np.eye(6), open_directions=(),
+        frames=14, from_masks=True,
+    )  # fmt: skip
+    before = _black(world, np.linalg.inv(world.camera_from_world))
+    again = rigid((0.02, -0.01, 0.03), (2.0, -1.0, 3.0)) @ before.world_from_camera
+    after = replace(before, world_from_camera=again[2:], times=before.times[2:], frames=before.frames[2:])
+    placed, found = follow_cameras(data, {"psm1": base}, before, after)
+    beside = [
+        np.linalg.inv(views.world_from_camera) @ of.instrument_poses("psm1", views.times)[0]
+        for of, views in ((data, replace(after, world_from_camera=before.world_from_camera[2:])), (placed, after))
+    ]
+    np.testing.assert_allclose(*beside, atol=1e-6)
+    assert np.array_equal(found["psm1"].world_from_base, placed.world_from_base["psm1"])
 
 
 @pytest.mark.slow
@@ -161,7 +238,7 @@ def test_a_place_is_corrected_only_where_images_fit_clearly_better(monkeypatch, 
     world, moved = make_world(44, moving_camera=True), np.eye(4)
     moved[:3, 3] = [1.0, 2.0, 3.0]
 
-    def find(name, masks, intrinsics, camera_from_world, poses_at, times, prior, **others):
+    def find(masks, intrinsics, camera_from_world, poses_at, times, prior, **others):
         assert np.array_equal(prior[0], np.eye(4))
         assert prior[1:] == pytest.approx((3.0 / 3**0.5, 1.5 / 3**0.5), rel=0.01)  # along each axis
         assert others["clock_known"]
@@ -174,6 +251,7 @@ def test_a_place_is_corrected_only_where_images_fit_clearly_better(monkeypatch, 
     after, _, found, notes = _placed(lambda rows: world.masks[rows], WORLD_FROM_BASE, 3.0, 1.5)
     assert ("psm1" in found) is (len(notes) == 1) is corrected
     assert (after[1] > 1) is corrected
+    assert all(item.tracked for item in found.values())
 
 
 def test_a_base_stated_to_the_world_is_not_taken_for_one_to_the_camera():
@@ -208,7 +286,7 @@ def test_the_pose_of_a_tip_is_turned_into_the_shafts_with_readings_of_the_same_m
     )
     seen = {}
 
-    def find_base(name, masks, intrinsics, cameras, poses_at, times, **others):
+    def find_base(masks, intrinsics, cameras, poses_at, times, **others):
         seen.update(poses_at=poses_at, readings=others["readings"], times=times)
         return BaseRegistration(
             world_from_base=WORLD_FROM_BASE, clock_s=0.03, clock_sd_s=0.005, covariance=np.eye(6), open_directions=(),

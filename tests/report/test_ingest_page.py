@@ -278,6 +278,14 @@ def test_the_conclusion_names_the_two_facts_behind_it(tmp_path, overlap, conclus
     assert f"{sentence}</p>" in (tmp_path / "page.html").read_text()
 
 
+@pytest.mark.parametrize(("tracked", "level", "limit"), [(False, "good", "2"), (True, "careful", "1")])
+def test_a_tracked_instruments_corrected_place_is_judged_as_a_hand_eye_calibration(tracked, level, limit):
+    found = replace(based(0.95), shaft=np.array([0.0, 1.0, 0.0]), sd_motion_mm=1.3, tracked=tracked)
+    verdict = assess_ingest(made(SAMPLE, bases={"grasper": found}), read_capture(SAMPLE))
+    assert verdict.level == level
+    assert f"the motion of grasper is known to ±1.3 mm (usual: {limit} or less)" in verdict.facts
+
+
 def test_what_is_unknown_along_a_shaft_counts_where_links_are_stated_from_there():
     capture = read_capture(SAMPLE)
     (instrument,) = capture.instruments

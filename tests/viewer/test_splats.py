@@ -173,7 +173,7 @@ def test_a_joint_far_from_the_recorded_ones_is_refused_though_no_limits_are_stat
     scene.instruments = (replace(scene.instruments[0], joints={"jaw_angle": None}),)
     line = {"name": "grasper", "pose": np.eye(4).tolist(), "joints": {"jaw_angle": 3.0}}
     (tmp_path / "states.jsonl").write_text(json.dumps({"instruments": [line]}))
-    with pytest.raises(NeecoError, match="line 1: .*jaw_angle"):
+    with pytest.raises(NeecoError, match=r"line 1: .*jaw_angle"):
         exported_state(scene, 0, tmp_path / "states.jsonl")
 
 

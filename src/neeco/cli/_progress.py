@@ -59,8 +59,8 @@ class Bars:
             self.left.set()
             self.lines.join()
             if kind is None:
-                *before, last = [task for task in self.bar.tasks if task.visible]
-                for task in [task for task in before if (task.elapsed or 0) >= MIN_SHOWN_S] + [last]:
+                shown = [task for task in self.bar.tasks if task.visible]  # none where all were jobs that ended
+                for task in [task for task in shown[:-1] if (task.elapsed or 0) >= MIN_SHOWN_S] + shown[-1:]:
                     self._print(_line(task))
 
     def stage(self, what: str, done: int, total: int | None) -> None:

@@ -211,7 +211,8 @@ def _placed(registration: Registration, capture: Capture, found_in_images: Colle
 
 
 def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Evidence]:
-    """Return what the images say of a robot's base.
+    """Return what the images say of a robot's base, or of the place of a tracked instrument, which has to be known as
+    well as from a hand-eye calibration.
 
     linked: its links are stated in its frame, so that every error of the base counts; else a learned shape makes up for
     a constant offset.
@@ -222,16 +223,18 @@ def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Eviden
         says = f"the outline of {name} and what moves overlap by {overlap:.2f}"
         warning = f"{says[0].upper()}{says[1:]} only: is its clock right?"
         found.append(_Evidence(f"{says} (usual: {MIN_OVERLAP:g} or more)", level, warning))
-    known = [(f"the base of {name}", "mm", BASE_MM, base.sd_mm), (f"the base of {name}", "deg", BASE_DEG, base.sd_deg)]
+    limit_mm, limit_deg = (PLACED_MM, PLACED_DEG) if base.tracked else (BASE_MM, BASE_DEG)
+    what = f"the {'place' if base.tracked else 'base'} of {name}"
+    known = [(what, "mm", limit_mm, base.sd_mm), (what, "deg", limit_deg, base.sd_deg)]
     if base.shaft is not None and linked:
         sd_mm, sd_deg = base.deviations(frame_about(base.shaft).T)
         known = [
-            (f"the place of {name} along its shaft", "mm", BASE_MM, sd_mm[2:]),
-            (f"the place of {name} across its shaft", "mm", BASE_MM, sd_mm[:2]),
-            (f"the direction of {name}", "deg", BASE_DEG, sd_deg),
+            (f"the place of {name} along its shaft", "mm", limit_mm, sd_mm[2:]),
+            (f"the place of {name} across its shaft", "mm", limit_mm, sd_mm[:2]),
+            (f"the direction of {name}", "deg", limit_deg, sd_deg),
         ]
     elif np.isfinite(base.sd_motion_mm):
-        known = [(f"the motion of {name}", "mm", BASE_MM, np.array(base.sd_motion_mm))]
+        known = [(f"the motion of {name}", "mm", limit_mm, np.array(base.sd_motion_mm))]
     for what, unit, limit, sds in known:
         worst = float(np.max(sds))
         size = f"±{worst:.1f} {unit}" if np.isfinite(worst) else f"no {unit}"

@@ -18,7 +18,13 @@ from neeco.ingest.frames.views import SfmResult, StageProgress, Views
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.clocks import find_instrument_clocks, register
-from neeco.ingest.registration.find_bases import check_reference_frames, correct_placement, find_bases, require_no_base
+from neeco.ingest.registration.find_bases import (
+    check_reference_frames,
+    correct_placement,
+    find_bases,
+    follow_cameras,
+    require_no_base,
+)
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.shaft.video_instruments import find_in_video, on_masks
 from neeco.ingest.timing.episodes import Episodes
@@ -65,14 +71,15 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     bases: dict[str, BaseRegistration] = {}
     shapes: dict[str, RoughShape] = {}
     evidence: dict[int, np.ndarray] = {}
+    before: Views | None = None
     masks = None
     on_instruments = np.zeros(len(sfm.observations), dtype=bool)
     if registration is None:
         require_no_base(data)
     else:
-        placed = _registered(views, registration)
-        data, bases = find_bases(data, placed, foreground, progress)
-        data, corrected = correct_placement(data, placed, registration, foreground, progress)
+        before = _registered(views, registration)
+        data, bases = find_bases(data, before, foreground, progress, registration)
+        data, corrected = correct_placement(data, before, registration, foreground, progress)
         bases |= corrected
         data = data.with_assumed_clocks()
         progress("finding the instrument", 0, 0)
@@ -88,6 +95,8 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     data, registration = register(data, views)  # first: it may find clocks
     distance, shaft = settings.scene_distance_mm, None
     placed, points = _in_mm(sfm, views, registration, distance)
+    if before is not None and registration is not None:
+        data, bases = follow_cameras(data, bases, before, placed)
     if data.video_instrument is not None:
         assert masks is not None
         masks = masks[np.isin(first, sfm.indices)]

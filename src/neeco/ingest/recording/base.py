@@ -37,6 +37,11 @@ class StatedBase:
     to_world: bool = False
 
     @property
+    def key(self) -> str:
+        """The key of recording.yaml that states it."""
+        return WORLD_KEY if self.to_world else BASE_KEY
+
+    @property
     def exact(self) -> bool:
         return self.matrix is not None and self.sd_mm is None
 

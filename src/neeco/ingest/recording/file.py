@@ -244,8 +244,7 @@ class InstrumentSection(BasesSection):
         if self.from_video is not None and self.poses is not None:
             raise Fault("from_video", "poses are logged; leave out one of poses and from_video")
         if self.base is not None and self.poses is not None and self.poses.frame in CAMERA_FRAMES:
-            key = WORLD_KEY if self.base.to_world else BASE_KEY
-            raise Fault(key, "its poses are in the camera's frame already; leave out one of the two")
+            raise Fault(self.base.key, "its poses are in the camera's frame already; leave out one of the two")
         for reading in self.kinematics.readings if self.kinematics is not None else ():
             if reading not in self.joints:
                 known = ", ".join(self.joints) or "none"

@@ -79,7 +79,6 @@ class ArticulatedMotion:
 
 
 def find_articulated_base(
-    name: str,
     masks: np.ndarray,
     intrinsics: tuple[float, float, float, float],
     camera_from_world: np.ndarray,
@@ -89,24 +88,24 @@ def find_articulated_base(
     hidden: np.ndarray | None = None,
     clock_known: bool = False,
 ) -> BaseRegistration:
-    """Find the base of instrument `name`, whose links bend, near a stated one.
+    """Find the base of an instrument whose links bend, near a stated one.
 
     masks: foreground bool [F, h, w], through a pinhole of `intrinsics` (fx, fy, cx, cy px of the masks);
-    camera_from_world [F, 4, 4]; hidden: bool [h, w], beyond a round border. Raises NeecoError, naming the instrument,
-    where the foreground is not the instrument.
+    camera_from_world [F, 4, 4]; hidden: bool [h, w], beyond a round border. Raises NeecoError, which names neither
+    instrument nor key, where the foreground is not the instrument.
     """
     problem = _problem(
         masks, intrinsics, camera_from_world, motion, prior, hidden=hidden, sd_clock=0.0 if clock_known else CLOCK_SD_S
     )
     if problem is None:
         raise NeecoError(
-            f"instrument {name!r}: camera_from_base: poses, readings and what moves are there together in fewer than "
-            f"{MIN_FRAMES} frames; give the transform exactly, or a recording that shows more of it"
+            f"poses, readings and what moves are there together in fewer than {MIN_FRAMES} frames; give the transform "
+            "exactly, or a recording that shows more of it"
         )
     fits = _fits(problem)
     best = fits[0]
     if best.residual_px > MAX_RESIDUAL_PX or overlap(problem, best) < LEAST_OVERLAP or _exchangeable(problem, best):
-        raise NeecoError(unmoved(name, stated=True))
+        raise NeecoError(unmoved(stated=True))
     return _result(problem, fits, motion)
 
 
@@ -240,7 +239,7 @@ def _doubts(
     off = np.linalg.norm(step[3:]) / prior.sd_mm, np.linalg.norm(step[:3]) / prior.sd_rad
     if max(off) > MAX_SHIFT_SDS:
         found.append(
-            f"the base found is {max(off):.1f} standard deviations from the one stated: check camera_from_base, its "
+            f"the base found is {max(off):.1f} standard deviations from the one stated: check its transform, "
             "axes and unit, and which arm it is of"
         )
     sds = (fit.parameters - model.means) / model.sds

@@ -96,6 +96,7 @@ class BaseRegistration:
     explained: float = np.nan  # without masks: the share of the change in the images that the shaft explains
     shaft: np.ndarray | None = None  # [3] unit
     sd_motion_mm: float = np.nan
+    tracked: bool = False  # the place of an instrument that has no base, instead of its hand-eye calibration's
 
     def deviations(self, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations, mm [N] and degrees [N], of shifts along and turns about axes [N, 3] of the first
@@ -159,7 +160,6 @@ class BaseRegistration:
 
 
 def find_base(
-    name: str,
     masks: np.ndarray,
     intrinsics: tuple[float, float, float, float],
     camera_from_world: np.ndarray,
@@ -173,22 +173,22 @@ def find_base(
     images: np.ndarray | None = None,
     seed: int = 0,
 ) -> BaseRegistration:
-    """Find the base of instrument `name`.
+    """Find the base of an instrument.
 
     masks: foreground bool [F, h, w], through a pinhole of `intrinsics` (fx, fy, cx, cy px of the masks);
     camera_from_world [F, 4, 4]; poses_at(s): base_from_instrument [F, 4, 4] mm of the frames as the log has them s
     seconds later, NaN where it has none; times [F] s; readings [F, J] of its joints, NaN where a log has none; hidden:
     bool [h, w], beyond a round border; images: uint8 [F, h, w, 3], whose texture along the instrument shows how far in
-    it is. Raises NeecoError, naming the instrument, where the foreground is not the instrument.
+    it is. Raises NeecoError, which names neither instrument nor key, where the foreground is not the instrument.
     """
     generator = np.random.default_rng(seed)
     problem = _problem(masks, intrinsics, camera_from_world, poses_at, readings=readings, hidden=hidden, images=images)
     visible = np.isfinite(shaft_lines(problem.silhouettes.masks, hidden).points[:, 0])
     if visible.sum() < MIN_FRAMES:
         raise NeecoError(
-            f"instrument {name!r}: camera_from_base: what moves looks like a shaft in {int(visible.sum())} of "
-            f"{len(visible)} frames, at least {MIN_FRAMES} are needed; give the transform, exactly or, before a "
-            "still scope, of an arm with a trocar, roughly (sd_mm, sd_deg), or a recording that shows more of it"
+            f"what moves looks like a shaft in {int(visible.sum())} of {len(visible)} frames, at least {MIN_FRAMES} "
+            "are needed; give the transform, exactly or, before a still scope, of an arm with a trocar, roughly "
+            "(sd_mm, sd_deg), or a recording that shows more of it"
         )
     problem = problem.take(np.flatnonzero(visible))
     few = problem.take(np.array(evenly_spaced(len(problem.blocks), SEARCH_FRAMES)))
@@ -198,7 +198,7 @@ def find_base(
         known = BasePrior(prior[0], np.radians(prior[2]), prior[1], clock_sd)
     starts = _starts(few, known, _distance(problem, prior), generator)
     if not starts:
-        raise NeecoError(unmoved(name, stated=prior is not None))
+        raise NeecoError(unmoved(stated=prior is not None))
     best = max((fit_silhouettes(few, known, start) for start in starts), key=lambda fit: overlap(few, fit))
     radius = float(np.median(best.shape[len(best.shape) // 2 :, 0, 0]))
     if not RADIUS_RANGE_MM[0] < radius < RADIUS_RANGE_MM[1]:
@@ -209,7 +209,7 @@ def find_base(
     fit = _settle_size(problem, known, refine(problem, known, fit))
     problem, fit = with_marks(problem, fit)
     fit = refine(problem, known, fit)
-    _require_moved(name, problem, known, fit)
+    _require_moved(problem, known, fit)
     return _result(problem, known, fit)
 
 
@@ -350,28 +350,27 @@ def _filled(left: np.ndarray, right: np.ndarray, shape: tuple[int, ...]) -> np.n
     return filled.astype(bool)
 
 
-def _require_moved(name: str, problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> None:
+def _require_moved(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> None:
     """Raise NeecoError where poses of other moments, or none, explain the masks as well."""
     if not (fit.residual_px < MAX_RESIDUAL_PX * problem.px_scale and overlap(problem, fit) > MIN_OVERLAP):
-        raise NeecoError(unmoved(name, stated=known.sd_mm is not None))
+        raise NeecoError(unmoved(stated=known.sd_mm is not None))
     for share in EXCHANGED_SHARES:
         exchanged = replace(problem, poses=np.roll(problem.poses, round(share * len(problem.blocks)), axis=1))
         other = refine(exchanged, replace(known, sd_clock=0.0), fit, 12)
         if other.cost < MIN_EXCHANGED_COST * fit.cost:
-            raise NeecoError(unmoved(name, stated=known.sd_mm is not None))
+            raise NeecoError(unmoved(stated=known.sd_mm is not None))
 
 
-def unmoved(name: str, *, stated: bool) -> str:
+def unmoved(*, stated: bool) -> str:
     """Error where nothing in the images moves as an instrument's log says; stated: whether its base was, roughly."""
     if stated:
         return (
-            f"instrument {name!r}: camera_from_base: nothing in the images moves with its poses; check which arm and "
-            "which clock its log is of, or give the exact transform"
+            "nothing in the images moves with its poses; check which arm and which clock its log is of, or give the "
+            "exact transform"
         )
     return (
-        f"instrument {name!r}: camera_from_base: of all bases none was found from which its poses explain what moves; "
-        "state it as far as it is known (transform, sd_mm, sd_deg), which a wrist that bends needs, or check which arm "
-        "and which clock its log is of"
+        "of all bases none was found from which its poses explain what moves; state it as far as it is known "
+        "(transform, sd_mm, sd_deg), which a wrist that bends needs, or check which arm and which clock its log is of"
     )
 
 

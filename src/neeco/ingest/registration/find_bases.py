@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rigid
 from neeco.geometry.trocar import line_through_trocar
 from neeco.ingest.frames.views import StageProgress, Views, reduced
 from neeco.ingest.readers.columns import CAMERA
@@ -71,12 +73,18 @@ def require_no_base(data: Episodes) -> None:
 
 
 def find_bases(
-    data: Episodes, views: Views, moving: Callable[[np.ndarray], np.ndarray], progress: StageProgress
+    data: Episodes,
+    views: Views,
+    moving: Callable[[np.ndarray], np.ndarray],
+    progress: StageProgress,
+    registration: Registration | None = None,
 ) -> tuple[Episodes, dict[str, BaseRegistration]]:
     """Find the bases of all instruments of which the recording states something; take those stated exactly.
 
-    views: in mm; moving(rows): masks bool [R, h, w] of what moves in rows of them, reduced to REFERENCE_PIXELS. Lengths
-    of a robot are taken as they are. Return the episodes with these bases and the clocks that come with them, and what
+    views: in mm; moving(rows): masks bool [R, h, w] of what moves in rows of them, reduced to REFERENCE_PIXELS;
+    registration: what placed the cameras in the frame that bases are stated to, where the scope moves. Images show a
+    base among the cameras: what is stated of it is known there less well by the error of their place. Lengths of a
+    robot are taken as they are. Return the episodes with these bases and the clocks that come with them, and what
     was found by instrument. Notes state standard deviations and what stays undetermined. Raises NeecoError where
     nothing moves with an instrument.
     """
@@ -93,14 +101,14 @@ def find_bases(
     progress("finding the robot's base", 0, 0)
     observed = _Observed(views, moving)
     usable = observed.visible
-    arms = [_arm(data, item, observed) for item in unknown]
+    arms = [_among_cameras(_arm(data, item, observed), registration) for item in unknown]
     found = {}
     # what moves most is found most easily, and then out of the way
     for arm in sorted(arms, key=lambda arm: -arm.travel):
         name, clock = arm.item.name, arm.clock
-        registration, covered = _find(arm, observed, usable, alone=len(arms) == 1)
+        base, covered = _find(arm, observed, usable, alone=len(arms) == 1)
         usable = usable & ~covered
-        if registration is None:
+        if base is None:
             assert arm.prior is not None
             given, sd_mm, sd_deg = arm.prior
             data = data.with_base(name, given)
@@ -110,15 +118,15 @@ def find_bases(
             )
             continue
         if clock.source not in KNOWN:
-            clock = replace(clock.later(registration.clock_s), sd=registration.clock_sd_s, source=FOUND)
-        data = data.with_base(name, registration.world_from_base).with_moved_clock(logs[name].clock, clock)
+            clock = replace(clock.later(base.clock_s), sd=base.clock_sd_s, source=FOUND)
+        data = data.with_base(name, base.world_from_base).with_moved_clock(logs[name].clock, clock)
         if arm.item.kinematics is not None:  # found with readings of the same clock, where they have none of their own
             for own in {log.clock for log in data.parts[0].joints[name].values()}:
                 data = data if data.clock(own) is not None else data.with_moved_clock(own, clock)
-        data.notes.add(describe(name, registration))
-        for place, doubt in enumerate(registration.doubts):
+        data.notes.add(describe(name, base))
+        for place, doubt in enumerate(base.doubts):
             data.notes.contradict(f"base of {name}, {place}", f"instrument {name!r}: {doubt}", severe=True)
-        found[name] = registration
+        found[name] = base
     return data, found
 
 
@@ -148,11 +156,9 @@ def correct_placement(
     if (sds[0] <= PLACED_MM and sds[1] <= PLACED_DEG) or sds[0] > MAX_PRIOR_MM or sds[1] > MAX_PRIOR_DEG:
         return data, {}
     progress("correcting the instrument's place", 0, 0)
-    covariance = np.array(registration.uncertainty(poses[known, :3, 3]).covariance)
-    sd_deg, sd_mm = np.degrees(np.sqrt(np.trace(covariance[:3, :3]) / 3)), np.sqrt(np.trace(covariance[3:, 3:]) / 3)
-    stated = StatedBase(np.eye(4), float(sd_mm), float(sd_deg), to_world=True)
+    stated = StatedBase(np.eye(4), 0.0, 0.0, to_world=True)
     observed = _Observed(views, moving)
-    arm = _arm(data, replace(items[0], base=stated), observed)
+    arm = _among_cameras(_arm(data, replace(items[0], base=stated), observed), registration)
     try:
         found, _ = _find(arm, observed, observed.visible, alone=True)
     except NeecoError:  # the images do not determine it
@@ -166,7 +172,24 @@ def correct_placement(
         f"{sds[1]:.1f} deg only; its outline and what moves overlap by {found.overlap:.2f} "
         f"({found.overlap_before:.2f} before)"
     )
-    return data.with_base(name, found.world_from_base), {name: found}
+    return data.with_base(name, found.world_from_base), {name: replace(found, tracked=True)}
+
+
+def follow_cameras(
+    data: Episodes, bases: Mapping[str, BaseRegistration], before: Views, after: Views
+) -> tuple[Episodes, dict[str, BaseRegistration]]:
+    """Move bases found among cameras, `before`, with these to where a later calibration places them, `after`: there
+    the images show them. Both in mm, of the same frames or fewer afterwards."""
+    found = {}
+    _, old, new = np.intersect1d(before.frames, after.frames, return_indices=True)
+    motions = after.world_from_camera[new] @ np.linalg.inv(before.world_from_camera[old])
+    turn = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
+    for name, base in bases.items():
+        poses, known = data.instrument_poses(name, before.times[old])
+        middle = np.append(poses[known, :3, 3].mean(0), 1.0)
+        moved = rigid(turn, (motions @ middle).mean(0)[:3] - turn @ middle[:3]) @ base.world_from_base
+        data, found[name] = data.with_base(name, moved), replace(base, world_from_base=moved)
+    return data, found
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,6 +312,20 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
     )  # fmt: skip
 
 
+def _among_cameras(arm: _Arm, registration: Registration | None) -> _Arm:
+    """Return the arm with the error of the cameras' place added to its prior, the same in all directions."""
+    if registration is None or arm.prior is None:
+        return arm
+    given, sd_mm, sd_deg = arm.prior
+    places = (given @ arm.poses_at(0.0))[:, :3, 3]
+    places = places[np.isfinite(places).all(1)]
+    if not len(places):
+        return arm
+    variances = np.diag(registration.uncertainty(places).covariance).reshape(2, 3).mean(1)  # rad^2, mm^2
+    placed_deg, placed_mm = np.degrees(np.sqrt(variances[0])), np.sqrt(variances[1])
+    return replace(arm, prior=(given, float(np.hypot(sd_mm, placed_mm)), float(np.hypot(sd_deg, placed_deg))))
+
+
 def _find(
     arm: _Arm, observed: _Observed, usable: np.ndarray, *, alone: bool
 ) -> tuple[BaseRegistration | None, np.ndarray]:
@@ -305,12 +342,12 @@ def _find(
     try:
         if motion is not None and arm.prior is not None and alone and motion.bends:
             registration = find_articulated_base(
-                arm.item.name, observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), motion, arm.prior,
+                observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), motion, arm.prior,
                 hidden=observed.hidden, clock_known=clock_known,
             )  # fmt: skip
             return registration, np.zeros_like(usable)
         registration = find_base(
-            arm.item.name, observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), arm.poses_at,
+            observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), arm.poses_at,
             observed.times, prior=arm.prior, readings=readings, hidden=observed.hidden, images=observed.images,
             clock_known=clock_known,
         )  # fmt: skip
@@ -319,7 +356,8 @@ def _find(
             return found
         if not alone and arm.prior is not None and arm.travel < MIN_TRAVEL_MM:
             return None, np.zeros_like(usable)
-        raise NeecoError(f"{arm.where}: {error}") from error
+        assert arm.item.base is not None
+        raise NeecoError(f"{arm.where}: instrument {arm.item.name!r}: {arm.item.base.key}: {error}") from error
     return registration, np.zeros_like(usable)
 
 
