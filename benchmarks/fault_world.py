@@ -83,7 +83,7 @@ def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
         shelf.mkdir()
         return Verb(name, (*words, "--output", str(shelf / "out")), shelf, **more)  # type: ignore[arg-type]
 
-    draw = ("synthesize", str(run), "--no-tissue-check", "--min-share", "0", "--max-unseen", "1", "--count")
+    draw = ("synthesize", str(run), "--no-tissue-check", "--min-share", "0", "--max-unobserved", "1", "--count")
     made = {
         "train": lambda: verb("train", *train, touched=image, resume=("--resume",)),
         "synthesize": lambda: verb(

@@ -16,7 +16,7 @@ import yaml
 from forked import TESTS, Child, hasten_ingest, import_modules, module_at
 from PIL import Image
 
-DRAW = ["--no-tissue-check", "--min-share", "0", "--max-unseen", "1"]
+DRAW = ["--no-tissue-check", "--min-share", "0", "--max-unobserved", "1"]
 
 
 def prepare(verbs: Sequence[str]) -> None:

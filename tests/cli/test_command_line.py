@@ -122,6 +122,24 @@ def test_a_misspelt_option_is_answered_with_the_one_that_is_meant(
     assert "{None}" not in printed
 
 
+def test_options_next_to_a_misspelt_one_are_left_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (
+        ["ablate", "it", "--set", "seed=1", "--ouptut", "o"],
+        ["synthesize", "run", "--no-tissue-check", "-"],
+    ):
+        with pytest.raises(SystemExit):
+            cli.main(words)
+        printed = capsys.readouterr().err
+        assert "--set: no such option" not in printed
+        assert "--no-tissue-check: no such option" not in printed
+
+
+def test_a_command_that_is_printed_can_be_typed(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("neeco.cli._progress.train_with_progress", lambda capture, output, *_, **__: output)
+    assert cli.main(["train", "somewhere", "--output", "my run"]) == 0
+    assert "(next: neeco evaluate 'my run')" in capsys.readouterr().out
+
+
 def test_completion_knows_the_options_of_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
         cli.main(["--tyro-print-completion", "bash"])

@@ -36,7 +36,7 @@ OF_A_CAPTURE = {
     "train": ["--output", "out"],
     "compare": ["--output", "out", "--methods", "3dgs", "--iterations", "5"],
     "downstream": ["--output", "out"],
-    "ablate": ["--output", "out", "--tables", "joints", "--iterations", "5", "--kinematic-iterations", "5"],
+    "ablate": ["--output", "ablated", "--tables", "joints", "--iterations", "5", "--kinematic-iterations", "5"],
 }
 
 

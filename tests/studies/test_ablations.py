@@ -183,6 +183,25 @@ def test_a_damaged_capture_is_refused_before_anything_is_written(plan: AblationP
     assert not plan.output.exists()
 
 
+def test_a_folder_of_something_else_is_not_written_to(plan: AblationPlan) -> None:
+    before = sorted(plan.capture.iterdir())
+    with pytest.raises(NeecoError, match=r"not empty and no ablation.json in it; give another folder"):
+        run_ablations(replace(plan, output=plan.capture))
+    assert sorted(plan.capture.iterdir()) == before
+
+
+def test_an_interrupted_ablation_goes_on(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(jobs, *_):
+        jobs[0].run()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ablation_study, "run_jobs", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run_ablations(plan)
+    assert [run["name"] for run in run_ablations(replace(plan, tables=plan.tables[:1])).runs][1:] == ["nps"]
+
+
 def test_another_length_asks_for_another_output(plan: AblationPlan) -> None:
     run_ablations(plan)
     with pytest.raises(NeecoError, match="12 iterations, now 13 iterations; give another --output"):

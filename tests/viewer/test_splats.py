@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gzip
+import json
 import struct
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -166,6 +168,15 @@ def test_positions_that_spz_cannot_hold_are_refused() -> None:
         spz_bytes(splats_of(scene, *exported_state(scene, 0, None)))
 
 
+def test_a_joint_far_from_the_recorded_ones_is_refused_though_no_limits_are_stated(tmp_path: Path) -> None:
+    scene = make_scene("kinematic")
+    scene.instruments = (replace(scene.instruments[0], joints={"jaw_angle": None}),)
+    line = {"name": "grasper", "pose": np.eye(4).tolist(), "joints": {"jaw_angle": 3.0}}
+    (tmp_path / "states.jsonl").write_text(json.dumps({"instruments": [line]}))
+    with pytest.raises(NeecoError, match=r"line 1: .*jaw_angle"):
+        exported_state(scene, 0, tmp_path / "states.jsonl")
+
+
 def run_folder(path: Path, scene) -> Path:
     from neeco.scene.io import save_scene
 
@@ -189,6 +200,8 @@ def test_the_verb_writes_and_refuses(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(["export", str(run), "--states", str(states), "--output", str(tmp_path / "a.ply")]) == 1
     assert "states.jsonl: line 1" in capsys.readouterr().err
     assert not (tmp_path / "a.ply").exists()
+    assert main(["export", str(run), "--states", "interpolate", "--output", str(tmp_path / "a.ply")]) == 1
+    assert "interpolate: no such file; give a file of states" in capsys.readouterr().err
 
 
 def test_the_format_is_that_of_the_ending(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

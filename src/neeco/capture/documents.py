@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NoReturn
@@ -71,7 +72,7 @@ class ProblemReport:
         errors = condensed(errors_only(self.problems))
         if not errors:
             return
-        more = f" ({len(errors) - 1} more: run `neeco check {root}`)" if len(errors) > 1 else ""
+        more = f" ({len(errors) - 1} more: run `neeco check {shlex.quote(str(root))}`)" if len(errors) > 1 else ""
         place = "" if errors[0].file == str(root) else f"{root}: "
         raise NeecoError(f"{place}{errors[0]}{more}")
 

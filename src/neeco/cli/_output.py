@@ -192,9 +192,16 @@ def state_defaults(kind: Any) -> None:
 def option_names(kind: Any) -> list[str]:
     """Return the options of a dataclass of arguments, such as `--output`; nested ones add theirs."""
     names = []
-    for name, hint in typing.get_type_hints(kind, include_extras=True).items():
+    hints = typing.get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):
+        hint = hints[field.name]
         bare = typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint
-        names += option_names(bare) if dataclasses.is_dataclass(bare) else [f"--{name.replace('_', '-')}"]
+        markers = getattr(hint, "__metadata__", ())
+        if dataclasses.is_dataclass(bare):
+            names += option_names(bare)
+        elif tyro.conf.Positional not in markers:
+            name = next(filter(None, (getattr(marker, "name", None) for marker in markers)), field.name)
+            names.append(f"--{'no-' if field.default is True else ''}{name.replace('_', '-')}")
     return names
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -83,7 +84,7 @@ def run(args: Ingest) -> int:
         _refuse_others(args, f"{folder}: a folder in another format", keep=("output",))
         for sentence in convert_folder(folder, output):
             print(f"note: {sentence}")
-        print(f"capture: {output}  (next: neeco check {output})")
+        print(f"capture: {output}  (next: neeco check {shlex.quote(str(output))})")
         return 0
     recordings = recordings_of(args)
     if args.rrd is not None:
@@ -103,7 +104,9 @@ def _refuse_others(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
     """Raise NeecoError when an option was given that `what` would ignore."""
     for option in fields(Ingest):
         if option.name not in ("source", "init", *keep) and getattr(args, option.name) != option.default:
-            raise NeecoError(f"{what}, and --{option.name} would be ignored with it; leave one of them out")
+            raise NeecoError(
+                f"{what}, and --{option.name.replace('_', '-')} would be ignored with it; leave one of them out"
+            )
 
 
 def _list_formats() -> int:

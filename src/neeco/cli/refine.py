@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,5 +53,5 @@ def run(arguments: Arguments) -> int:
             on_row=bars.training,
         )
         bars.end("training")
-    print(f"finished: {path}  (next: neeco evaluate {path})")
+    print(f"finished: {path}  (next: neeco evaluate {shlex.quote(str(path))})")
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -60,7 +61,7 @@ def run(args: Arguments) -> int:
     begun = begun_config(args.output) if args.resume else None
     config = training_config(args.method, flags, args.set, begun)
     path = train_with_progress(args.capture, args.output, config, device_of(args.device), resume=args.resume)
-    print(f"finished: {path}  (next: neeco evaluate {path})")
+    print(f"finished: {path}  (next: neeco evaluate {shlex.quote(str(path))})")
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,7 +39,7 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
         if not parsed.frames and not report.problems:
             report.problems.extend(parsed.absent)
         if not parsed.frames and not report.problems:
-            report.error("frames", "", "no frame could be read", f"run `neeco check {folder}`")
+            report.error("frames", "", "no frame could be read", f"run `neeco check {shlex.quote(str(folder))}`")
         tool_masks = _tool_masks(parsed, report) if parsed.is_endonerf else []
         report.raise_first(folder)
         capture, notes = capture_of(parsed), _absent_images(parsed)

@@ -44,7 +44,7 @@ from neeco.studies.ablations import (
 )
 from neeco.studies.machine import machine
 from neeco.studies.masks import LabelScores, score_label_ways
-from neeco.studies.study import REMEDY, JobEvent, Result, check_workers, run_jobs
+from neeco.studies.study import REMEDY, JobEvent, Result, check_output, check_workers, run_jobs
 from neeco.studies.training_job import (
     CURVE_FILE,
     Budget,
@@ -58,6 +58,7 @@ from neeco.training.run import open_gaussian_run
 from neeco.training.schedule import MIN_RESET_INTERVAL
 
 SCHEMA = "neeco-ablation/1"
+FILE = "ablation.json"
 LABELS_FILE = "label_ways.json"
 MIN_WARM_UP_STEPS = 100  # with the network off: trained on a nearly empty image it moves Gaussians out of sight
 MAX_WARM_UP = 0.25  # share of the run
@@ -98,10 +99,13 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | Non
     variants = distinct_variants(chosen)
     capture = _open_capture(plan, variants)
     splits = held_out_splits(capture)
+    begun = check_output(plan.output, FILE, SCHEMA, plan.capture, "an ablation")
+    jobs = [_job(plan, variant) for variant in variants]
+    for job in jobs:
+        job.check()
     with own_folder(plan.output):
-        jobs = [_job(plan, variant) for variant in variants]
-        for job in jobs:
-            job.check()
+        if begun is None:
+            write_json(plan.output / FILE, {"schema": SCHEMA, "capture": str(plan.capture.absolute())})
         for job, variant in zip(jobs, variants, strict=True):
             if variant.derived is not None:
                 derive_capture(capture, plan.transforms, variant.derived, plan.seed, job.capture)
@@ -128,7 +132,7 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | Non
             note for method in methods for note in _shortcomings(method, _steps(plan, method), log_intervals[method])
         ],
     )
-    write_json(plan.output / "ablation.json", plain(result))
+    write_json(plan.output / FILE, plain(result))
     write_tables(plan.output, result.tables)
     return result
 

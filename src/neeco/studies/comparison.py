@@ -409,7 +409,7 @@ def absent_notes(comparison: ComparisonResult) -> list[str]:
     for key in SPLIT_METRICS:
         known = any(row[key]["n"] for row in comparison.summary)
         if not known and not any(note.startswith(key) for note in notes):
-            notes.append(f"{key}: nobody has it: {ABSENT.get(key, 'no run finished')}")
+            notes.append(f"{key}: no run has it: {ABSENT.get(key, 'no run finished')}")
     if not any(row["seconds"]["std"] is not None for row in comparison.summary):
         notes.append("no ± is given: one seed has no standard deviation; give --seeds 2 or more")
     return notes

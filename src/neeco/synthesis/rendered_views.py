@@ -21,7 +21,7 @@ from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import part_ids
-from neeco.synthesis.samplers import moved_camera, states_file
+from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.settings import AS_RECORDED, ImageSettings
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def state_views(scene: DrawableScene, path: Path) -> list[View]:
     first = scene.recorded.cameras[0]
     views = []
     instruments = scene.recorded.with_limits(scene.instruments)
-    for k, line in enumerate(read_states(states_file(str(path)), instruments, scene.recorded.tissues)):
+    for k, line in enumerate(read_states(path, instruments, scene.recorded.tissues)):
         camera = first if line.world_from_camera is None else moved_camera(first, line.world_from_camera)
         views.append(View(f"{k:06d}", line.state, camera))
     return views

@@ -115,7 +115,7 @@ def read_config(path: Path) -> dict[str, Any]:
     require_utf8(path)
     file = path / CONFIG_FILE
     if not path.is_dir():
-        raise NeecoError(f"{path}: no such run folder; make one with `neeco train CAPTURE --output {path}`")
+        raise NeecoError(f"{path}: no such run folder; make one with `neeco train`")
     for entry in path.glob("*"):
         if not entry.is_dir():  # folders that their owner has linked there are no part of the run
             require_inside(entry, path)

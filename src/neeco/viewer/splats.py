@@ -56,7 +56,8 @@ def exported_state(scene: GaussianScene, frame: int, states: Path | None) -> tup
     state, camera = scene.recorded.states[frame], scene.recorded.cameras[frame]
     if states is None:
         return state, camera
-    line = read_states(states, scene.instruments, scene.recorded.tissues)[0]
+    instruments = scene.recorded.with_limits(scene.instruments)
+    line = read_states(states, instruments, scene.recorded.tissues)[0]
     if line.world_from_camera is not None:
         camera = replace(camera, world_from_camera=torch.from_numpy(line.world_from_camera))
     return line.state, camera

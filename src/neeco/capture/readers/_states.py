@@ -39,7 +39,7 @@ def read_states(path: Path, instruments: Sequence[Instrument], tissues: Sequence
     Raises NeecoError naming file, line and field: unreadable, not JSON, an instrument, joint or tissue missing or
     unknown, a pose that is not rigid, a joint outside its limits.
     """
-    missing = "no such file; --states takes interpolate, extrapolate, grid or a file of states"
+    missing = "no such file; give a file of states"
     lines = read_text(Path(path), "one JSON object per line", missing).split("\n")
     states = [
         _parse_line(line, f"{path}: line {number}", instruments, tissues)
