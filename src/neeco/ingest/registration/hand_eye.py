@@ -244,7 +244,7 @@ def _covariances(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.nda
 def _clock_deviations(covariances: np.ndarray) -> np.ndarray:
     """Standard deviations [2] of LAG, s, and STRETCH."""
     clock = [LAG, STRETCH]
-    return np.asarray(np.sqrt(np.maximum(covariances[:2, clock, clock].max(0), 0.0)))
+    return np.asarray(np.sqrt(np.maximum(covariances[:, clock, clock].max(0), 0.0)))
 
 
 def _sensor_poses(times: np.ndarray, log: PoseLog, clock: ClockOffset) -> tuple[np.ndarray, np.ndarray]:
