@@ -58,8 +58,8 @@ def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, r
         ingest(recording, capture_folder, report, complete)
     except NeecoError as error:
         raise NeecoError(
-            f"{error} (with more known of it: neeco ingest --video {shlex.quote(str(path))} --calibration FILE --output CAPTURE, then "
-            "track CAPTURE with --tissue footage)"
+            f"{error} (with more known of it: neeco ingest --video {shlex.quote(str(path))} --calibration FILE "
+            "--output CAPTURE, then track CAPTURE with --tissue footage)"
         ) from None
     return read_capture(capture_folder)
 
