@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from neeco.errors import NeecoError
 from neeco.ingest.readers.columns import PoseColumns
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.readers.motive import MotiveExport
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 
@@ -114,3 +118,8 @@ def test_exports_of_something_else_end_in_one_line(world, old, new, message):
     with pytest.raises(NeecoError, match=rf"take\.csv: .*{message}") as caught:
         read_pose_log(PoseColumns(path))
     assert "\n" not in str(caught.value)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "poses.csv")
+    assert not MotiveExport().claims(tmp_path / "poses.csv")

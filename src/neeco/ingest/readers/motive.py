@@ -33,6 +33,8 @@ class MotiveExport(RecordingFormat):
     holds = "poses of rigid bodies by name: OptiTrack's CSV with its preamble (Format Version, ...)"
 
     def claims(self, path: Path) -> bool:
+        if not path.is_file():  # opening a pipe might never end
+            return False
         try:
             with path.open("rb") as file:
                 return file.read(64).lstrip(b'\xef\xbb\xbf"').startswith(FIRST)
