@@ -210,6 +210,19 @@ def test_a_trackers_slow_errors_count_in_where_the_cameras_stand() -> None:
     assert 0.4 < np.sqrt(np.mean(np.square(offs))) / np.mean(stated) < 1.6
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_no_rate_is_taken_for_what_a_trackers_slow_errors_explain(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    times, log = recorded(0.04, noise=0.0)
+    slow = gaussian_filter1d(rng.normal(size=(len(log.times), 6)), 10, axis=0)
+    slow *= np.repeat([0.003, 0.12], 3) / slow.std(0)
+    turns = Rotation.from_quat(log.quats, scalar_first=True) * Rotation.from_rotvec(slow[:, :3])
+    log = replace(log, quats=turns.as_quat(scalar_first=True), positions=log.positions + slow[:, 3:])
+    clock = register_with_laparoscope(scope_path(times[::8]), times[::8], log, None).clock
+    assert clock.rate == 1.0
+    assert abs(clock.seconds - 0.04) < 2 * clock.sd
+
+
 def test_motion_of_something_else_tells_no_clock() -> None:
     times = np.arange(0, 11, 0.04)
     other = np.random.default_rng(5).gamma(2.0, 1.0, len(times) - 1)

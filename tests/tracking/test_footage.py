@@ -232,6 +232,8 @@ def test_a_file_that_is_no_video_is_told_in_one_line(
     file.write_text("no video")
     with pytest.raises(NeecoError, match=r"notes\.mp4"):
         read_footage(file, tmp_path / "out", tracked_run.scene, False, lambda what, done, total: None)
+    with pytest.raises(NeecoError, match=r"gone\.mp4: no such file or folder; give a capture or a video"):
+        read_footage(tmp_path / "gone.mp4", tmp_path / "out", tracked_run.scene, False, lambda what, done, total: None)
     assert not (tmp_path / "out").exists()
     assert main(["track", "run", str(file), "--output", str(tmp_path / "out"), "--tissue", "run"]) == 1
     assert "leave it out" in capsys.readouterr().err

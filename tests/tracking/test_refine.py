@@ -75,6 +75,23 @@ def test_an_image_is_trained_on_once(tracked_run: RecordedRun) -> None:
     left, added = refine.without_twice(own, tracked)
     assert left.frames == (own.frames[0],)
     assert added == [tracked[1]]
+    assert refine.without_twice(own, [*tracked, *tracked])[1] == added
+
+
+def test_frames_of_which_none_is_new_are_refused_before_any_work(tracked_run: RecordedRun, tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    write_capture(tracked_run.capture(), own)
+    with pytest.raises(NeecoError, match="every frame is one that the run was trained on"):
+        refine.refine_run(tracked_run, [own], tmp_path / "out", device=CPU)
+    assert not (tmp_path / "out").exists()
+
+
+def test_fitting_ends_at_all_frames(tracked_run: RecordedRun) -> None:
+    capture = tracked_run.capture()
+    withheld = replace(capture, frames=tuple(replace(frame, split="test") for frame in capture.frames))
+    told: list[tuple[int, int]] = []
+    refine.fitted(tracked_run.scene, withheld, lambda done, total: told.append((done, total)))
+    assert told[-1] == (len(capture.frames), len(capture.frames))
 
 
 def test_recorded_states_are_fitted_to_their_images(tracked_run: RecordedRun) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,6 +32,8 @@ def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, r
     empty (without `resume`) or holds another video.
     """
     path = Path(path)
+    if not path.exists():
+        raise NeecoError(f"{path}: no such file or folder; give a capture or a video")
     if not path.is_file():
         return read_capture(path)
     require_content(path)
@@ -55,8 +58,8 @@ def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, r
         ingest(recording, capture_folder, report, complete)
     except NeecoError as error:
         raise NeecoError(
-            f"{error} (with more known of it: neeco ingest --video {path} --calibration FILE --output CAPTURE, then "
-            "track CAPTURE with --tissue footage)"
+            f"{error} (with more known of it: neeco ingest --video {shlex.quote(str(path))} --calibration FILE "
+            "--output CAPTURE, then track CAPTURE with --tissue footage)"
         ) from None
     return read_capture(capture_folder)
 

@@ -66,10 +66,11 @@ def refine_run(
     if not (folder / "transforms.json").exists():
         scene, own = run.scene, run.capture()
         one_tissue(scene, "refine")
-        frames = [frame for path in tracked for frame in _tracked_frames(path, scene)]
+        own, frames = without_twice(own, [frame for path in tracked for frame in _tracked_frames(path, scene)])
+        if not frames:
+            raise NeecoError(f"{tracked[0]}: every frame is one that the run was trained on; track other footage")
         with own_folder(output):
             write_json(output / BEGUN, info)
-            own, frames = without_twice(own, frames)
             recorded = fitted(scene, own, on_progress)
             merged = replace(own, frames=(*recorded, *_named_apart(frames, output / STAGING)))
             write_capture(merged, folder)
@@ -99,17 +100,19 @@ def _tracked_frames(path: Path, scene: GaussianScene) -> list[Frame]:
 
 
 def without_twice(own: Capture, tracked: Sequence[Frame]) -> tuple[Capture, list[Frame]]:
-    """Return both without images that both have.
+    """Return both without images that both have, and each image of the tracked ones once.
 
     Training frames stay as recorded. Withheld frames that were tracked are trained on as tracked, and are no longer
     test frames. Raises NeecoError when an image cannot be read.
     """
     images = {_digest(frame): frame for frame in own.frames}
-    again = {digest: frame for frame in tracked if (digest := _digest(frame)) in images}
-    withheld = {images[digest].image_path for digest in again if images[digest].split != "train"}
-    recorded = {frame.image_path for digest, frame in again.items() if images[digest].split == "train"}
-    frames = tuple(frame for frame in own.frames if frame.image_path not in withheld)
-    return replace(own, frames=frames), [frame for frame in tracked if frame.image_path not in recorded]
+    new: dict[bytes, Frame] = {}
+    for frame in tracked:
+        digest = _digest(frame)
+        if digest not in images or images[digest].split != "train":
+            new.setdefault(digest, frame)
+    withheld = {images[digest].image_path for digest in new.keys() & images.keys()}
+    return replace(own, frames=tuple(f for f in own.frames if f.image_path not in withheld)), list(new.values())
 
 
 def _digest(frame: Frame) -> bytes:
@@ -131,11 +134,11 @@ def fitted(scene: GaussianScene, capture: Capture, on_progress: Callable[[int, i
     """Return the frames of a capture, the states of training frames fitted to their images near the recorded ones."""
     fitter = fitter_of(scene)
     prior, frames = loose_prior(fitter.parameters, *RECORDED_PRIOR), []
-    for done, frame in enumerate(capture.frames):
-        on_progress(done, len(capture.frames))
+    for done, frame in enumerate(capture.frames, 1):
         if frame.split == "train":
             fit = fitter.fit(fitter.view(frame, frame.state), frame.state, prior)
             if fit is not None:
                 frame = replace(frame, state=fit.state)
         frames.append(frame)
+        on_progress(done, len(capture.frames))
     return frames

@@ -81,7 +81,8 @@ class Tracked:
         """One sentence on the trust in the states; the verdict DOUBTFUL is in capitals."""
         count, missing = len(self.records), sum(record["how"] == "lost" for record in self.records)
         typical = median(record["trust"]["value"] for record in self.records)
-        found = f"trust is {typical:.2f} in the median, and in {missing} of {count} frames nothing was found"
+        found = f"trust is {typical:.2f} in the median"
+        found += f", and in {missing} of {count} frames nothing was found" if missing else ""
         if self.written < MIN_TRUSTED_SHARE * count:
             return f"DOUBTFUL: {found}; is it the run's instrument, over its tissue?"
         return f"{'good' if self.written == count else 'usable'}: {found}"
