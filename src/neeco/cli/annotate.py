@@ -46,7 +46,7 @@ def run(arguments: Arguments) -> int:
         capture = None if arguments.capture is None else read_checked(arguments.capture)
         with (
             counting("annotate") as advance,
-            resumable("what was done is kept; run the same command again with --resume"),
+            resumable("what was done is kept; run the same command again with --resume", arguments.output),
         ):
             annotated = annotate_capture(
                 trained,

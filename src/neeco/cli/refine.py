@@ -41,7 +41,7 @@ def run(arguments: Arguments) -> int:
     with (
         open_gaussian_run(arguments.run, "refine", device) as opened,
         Bars() as bars,
-        resumable("run the same command again with --resume"),
+        resumable("run the same command again with --resume", arguments.output),
     ):
         path = refine_run(
             opened,

@@ -86,9 +86,13 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
         "jobs"
     ]:  # not just before its first result
         check_output(settings.output, FILE, SCHEMA, settings.capture, "a downstream experiment")
+    absent = [item for item in conditions if not any(bool(real) == item.real for real in counts)]
+    if absent and (settings.conditions is not None or len(absent) == len(conditions)):
+        more = "a number of labelled frames" if absent[0].real else "0, for sets alone"
+        raise NeecoError(f"--num-real: leaves nothing to train {absent[0].name} on; add {more}")
     jobs = _jobs(settings, conditions, counts)
     if not jobs:
-        raise NeecoError("--num-real: leaves nothing to train; add 0 for sets alone, or a number of labelled frames")
+        raise NeecoError("--conditions: boxes have no soft edges; use a model that predicts masks")
     for job in jobs:
         job.check()
     return DownstreamPlan(
