@@ -202,7 +202,7 @@ def test_a_trackers_slow_errors_count_in_where_the_cameras_stand(seconds: float)
         log = replace(log, quats=turns.as_quat(scalar_first=True), positions=log.positions + slow[:, 3:])
         cameras = scope_path(times)
         found = register_with_laparoscope(cameras, times, log, ClockOffset(0.0, 0.0, GIVEN))
-        place = cameras[:, :3, 3].mean(0, keepdims=True) + [0, 0, 100]
+        place = cameras[:, :3, 3].mean(0, keepdims=True) + np.array([0.0, 0.0, 100.0])
         shared = np.array(found.uncertainty(place).covariance)  # what a capture states
         turn, shift = Rotation.from_matrix(found.rotation).as_rotvec(), found.points(place)[0] - place[0]
         offs += [turn @ turn / np.trace(shared[:3, :3]), shift @ shift / np.trace(shared[3:, 3:])]
