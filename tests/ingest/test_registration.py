@@ -188,39 +188,28 @@ def test_a_correlation_counts_by_how_many_independent_samples_it_has() -> None:
     assert 1 < short < MIN_SIGNIFICANCE < 2 * short < significance(one, other, 0, 0.64)
 
 
-def test_a_trackers_slow_errors_count_in_where_the_cameras_stand() -> None:
-    """They last for half a second each: taken for independent ones, the turn would seem to be known far better."""
-    offs, stated = [], []
+@pytest.mark.parametrize("seconds", [0.25, 0.8])
+def test_a_trackers_slow_errors_count_in_where_the_cameras_stand(seconds: float) -> None:
+    """The registration absorbs most of them: by its residuals alone, all would seem to be known far better."""
+    offs = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
         times, log = recorded(0.0, noise=0.0)
-        slow = gaussian_filter1d(rng.normal(size=(len(log.times), 6)), 10, axis=0)
-        slow *= np.repeat([0.005, 0.2], 3) / slow.std(0)
+        times = times[::3]
+        slow = gaussian_filter1d(rng.normal(size=(len(log.times), 6)), 40 * seconds, axis=0)
+        slow *= np.repeat([0.002, 0.25], 3) / slow.std(0)
         turns = Rotation.from_quat(log.quats, scalar_first=True) * Rotation.from_rotvec(slow[:, :3])
         log = replace(log, quats=turns.as_quat(scalar_first=True), positions=log.positions + slow[:, 3:])
-        keep = times < 6
-        cameras = scope_path(times[keep])
-        found = register_with_laparoscope(cameras, times[keep], log, ClockOffset(0.0, 0.0, GIVEN))
-        off = Rotation.from_matrix(found.rotation).as_rotvec(degrees=True)
-        offs.append(np.linalg.norm(off))
-        stated.append(found.placement_sd(cameras[:, :3, 3])[1])
+        cameras = scope_path(times)
+        found = register_with_laparoscope(cameras, times, log, ClockOffset(0.0, 0.0, GIVEN))
+        place = cameras[:, :3, 3].mean(0, keepdims=True) + np.array([0.0, 0.0, 100.0])
+        shared = np.array(found.uncertainty(place).covariance)  # what a capture states
+        turn, shift = Rotation.from_matrix(found.rotation).as_rotvec(), found.points(place)[0] - place[0]
+        offs += [turn @ turn / np.trace(shared[:3, :3]), shift @ shift / np.trace(shared[3:, 3:])]
+        offs.append((np.log(found.scale) / found.scale_sd) ** 2)
         assert found.scale_sd**2 == pytest.approx(found.covariances[:, 0, 0].max())
-        shared = np.array(found.uncertainty(cameras[:, :3, 3]).covariance)  # what a capture states
-        assert np.degrees(np.linalg.eigvalsh(shared[:3, :3])[-1] ** 0.5) == pytest.approx(stated[-1], rel=0.3)
-    assert 0.4 < np.sqrt(np.mean(np.square(offs))) / np.mean(stated) < 1.6
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_no_rate_is_taken_for_what_a_trackers_slow_errors_explain(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    times, log = recorded(0.04, noise=0.0)
-    slow = gaussian_filter1d(rng.normal(size=(len(log.times), 6)), 10, axis=0)
-    slow *= np.repeat([0.003, 0.12], 3) / slow.std(0)
-    turns = Rotation.from_quat(log.quats, scalar_first=True) * Rotation.from_rotvec(slow[:, :3])
-    log = replace(log, quats=turns.as_quat(scalar_first=True), positions=log.positions + slow[:, 3:])
-    clock = register_with_laparoscope(scope_path(times[::8]), times[::8], log, None).clock
-    assert clock.rate == 1.0
-    assert abs(clock.seconds - 0.04) < 2 * clock.sd
+        assert found.placement_sd(place)[0] ** 2 == pytest.approx(np.linalg.eigvalsh(shared[3:, 3:])[-1], rel=0.01)
+    assert 0.4 < np.sqrt(np.mean(offs)) < 1.5
 
 
 def test_motion_of_something_else_tells_no_clock() -> None:

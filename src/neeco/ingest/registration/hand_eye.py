@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, nnls
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import BaseUncertainty
@@ -28,7 +29,8 @@ MIN_TURN_RAD = 0.05  # rad, spread of the scope's directions below which the han
 MIN_TRAVEL_MM = 3.0  # mm, spread of the scope's positions below which the scale is not determined
 MIN_DEVIATION = 1e-6  # rad, mm: no covariance is smaller
 KNOT_SPACING_S = 2.5  # s between the knots of the tracker's drift
-CORRELATED_S = 1.0  # over which residuals of neighbouring frames are correlated: smoothing and drift of the tracker
+CORRELATED_S = (0.3, 1.0, 3.0)  # over which a tracker's errors may be correlated: smoothing and drift
+LAGS_S = (0.0, 1e-6, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # bins of the autocovariance: a frame with itself, with later ones
 LAG, STRETCH = 13, 14  # the unknowns of the clock
 PLACED_MM, PLACED_DEG = 1.0, 0.7  # standard deviations of the cameras' place in the tracker's frame: usual, or less
 N_UNKNOWNS = 15  # in addition to the drift: scale, rotation, origin, hand-eye rotation, lever, clock
@@ -45,7 +47,7 @@ class Registration:
     clock: ClockOffset
     scale_sd: float  # relative, one standard deviation
     origin: np.ndarray  # [3] mm, world: about which the scale and the rotation may be off
-    covariances: np.ndarray  # [3, 7, 7], as `_covariances`, of SfM's world: ln scale, turn (rad), shift (mm)
+    covariances: np.ndarray  # [2, 7, 7], as `_covariances`, of SfM's world: ln scale, turn (rad), shift (mm)
     position_residual: np.ndarray  # [N] mm, per frame used
     rotation_residual: np.ndarray  # [N] rad
     used: np.ndarray  # [N] indices of the frames used
@@ -215,30 +217,44 @@ class _HandEye:
 
 
 def _covariances(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Covariances [3, U, U] of the unknowns, of which the largest holds: by the stated noise; by residuals that are
-    correlated over CORRELATED_S (Newey & West 1987); and by noise of the residuals' size and autocorrelation: a
-    tracker's slow errors, which a few unknowns absorb, leave few residuals.
+    """Covariances [2, U, U] of the unknowns, of which the larger holds: by the stated noise; and by the tracker's own
+    errors, white and correlated over CORRELATED_S, whose variances explain the residuals' autocovariance.
 
-    residuals [Q] and jacobian [Q, U] as `least_squares` returns them: the first are not yet weighted by the soft-L1
-    loss. times [N] s of the frames, whose positions and rotations come first.
+    The unknowns absorb much of slow errors: what is left in residuals looks smaller and less correlated than the errors
+    are. So the variances (Rao 1972, "Estimation of variance and covariance components") are those whose residuals,
+    after that absorption, have the autocovariances at LAGS_S that were found. residuals [Q] and jacobian [Q, U] as
+    `least_squares` returns them: the first are not yet weighted by the soft-L1 loss. times [N] s of the frames, whose
+    positions and rotations come first.
     """
-    weighted = residuals * (1 + residuals**2) ** 0.25
     count, unknowns = len(times), len(covariance)
-    gain = (covariance @ jacobian.T)[:, : 6 * count].reshape(unknowns, 2, count, 3)
-    errors = weighted[: 6 * count].reshape(2, count, 3)
-    frames = (gain * errors).sum((1, 3))  # [U, N]
+    weighted = (residuals * (1 + residuals**2) ** 0.25)[: 6 * count].reshape(2, count, 3).transpose(0, 2, 1)
+    gain = (covariance @ jacobian.T)[:, : 6 * count].reshape(unknowns, 2, count, 3).transpose(1, 3, 0, 2)
+    slopes = jacobian[: 6 * count].reshape(2, count, 3, unknowns).transpose(0, 2, 1, 3)
     apart = np.abs(times[:, None] - times)
-    near = np.clip(1 - apart / CORRELATED_S, 0, None)
-    modelled = np.zeros_like(covariance)
-    some = (apart > 0.1 * CORRELATED_S) & (apart < 0.4 * CORRELATED_S)
-    for kind in range(2):  # positions, rotations
-        products = errors[kind] @ errors[kind].T
-        size = float(np.trace(products))
-        slow = float(products[some].mean() / near[some].mean() * count / size) if some.any() and size > 0 else 0.0
-        slow = float(np.clip(slow, 0, 1))
-        alike = size / (3 * count) * (slow * near + (1 - slow) * np.eye(count))
-        modelled += np.einsum("unk,nm,vmk->uv", gain[:, kind], alike, gain[:, kind], optimize=True)
-    return np.stack([covariance, frames @ near @ frames.T, modelled])
+    spread = []  # [C][2, 3, U, N] gain times the errors' correlation, for each component
+    for seconds in (None, *CORRELATED_S):
+        spread.append(gain if seconds is None else gain @ _correlation(apart, seconds))
+    absorbed = np.stack([np.einsum("kaun,kavn->kuv", some, gain, optimize=True) for some in spread], 1)  # [2, C, U, U]
+    found, expected = list[float](), list[np.ndarray]()
+    for low, high in pairwise(LAGS_S):
+        pairs = ((apart >= low) & (apart < high)).astype(np.float64)
+        if not (total := pairs.sum()):
+            continue
+        own = [np.trace(pairs), *(_correlation(apart[pairs > 0], seconds).sum() for seconds in CORRELATED_S)]
+        for kind in range(2):  # positions, rotations
+            near = pairs @ slopes[kind] / total  # [3, N, U]
+            row = np.einsum("kcuv,anu,anv->kc", absorbed, slopes[kind], near, optimize=True)
+            for component, some in enumerate(spread):
+                row[kind, component] += 3 * own[component] / total - 2 * np.einsum("aun,anu->", some[kind], near)
+            found.append(float(np.sum(weighted[kind] * (weighted[kind] @ pairs))) / total)
+            expected.append(row.ravel())
+    variances, _ = nnls(np.stack(expected), np.array(found))
+    return np.stack([covariance, np.tensordot(variances, absorbed.reshape(-1, unknowns, unknowns), 1)])
+
+
+def _correlation(apart: np.ndarray, seconds: float) -> np.ndarray:
+    """Correlation of errors that are `apart` s, smooth as a tracker's filter leaves them."""
+    return np.exp(-((apart / seconds) ** 2) / 2)
 
 
 def _clock_deviations(covariances: np.ndarray) -> np.ndarray:
