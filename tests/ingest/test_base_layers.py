@@ -17,6 +17,7 @@ from neeco.geometry.trocar import line_through_trocar
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
+from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.find_bases import find_bases
 from neeco.ingest.registration.layers import (
     ArmImages,
@@ -162,14 +163,18 @@ def _data(arms: dict[str, Arm], bases: dict[str, StatedBase]) -> Episodes:
 
 
 def _place(data: Episodes, images: np.ndarray) -> Mapping[str, np.ndarray]:
+    return _found(data, images)[0]
+
+
+def _found(data: Episodes, images: np.ndarray) -> tuple[Mapping[str, np.ndarray], dict[str, BaseRegistration]]:
     lens = Lens(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (), (WIDTH, HEIGHT))
     cameras = np.tile(np.eye(4), (len(TIMES), 1, 1))
 
     def no_masks(rows: np.ndarray) -> np.ndarray:
         return np.zeros((len(rows), HEIGHT, WIDTH), bool)
 
-    placed, _ = find_bases(data, views_of(TIMES, cameras, lens, lambda row: images[row]), no_masks, silent)
-    return placed.world_from_base
+    placed, found = find_bases(data, views_of(TIMES, cameras, lens, lambda row: images[row]), no_masks, silent)
+    return placed.world_from_base, found
 
 
 @pytest.mark.slow
@@ -186,8 +191,11 @@ def test_of_several_arms_one_that_hardly_moves_keeps_what_is_given():
     resting = Arm(RIGHT.camera_from_base, 0.0)
     arms = {"psm1": resting, "psm2": resting}
     data = _data(arms, {name: StatedBase(RIGHT.wrong(6, 4), 5.0, 3.0) for name in arms})
-    placed = _place(data, _images(resting))
+    placed, found = _found(data, _images(resting))
     assert np.array_equal(placed["psm1"], RIGHT.wrong(6, 4))
+    assert found["psm1"].frames == 0
+    stated = found["psm1"].uncertainty(np.eye(4), np.eye(4)[None])  # for the capture, and the verdict
+    assert np.array(stated.covariance).diagonal() == pytest.approx([np.radians(3.0) ** 2] * 3 + [25.0] * 3)
     assert (
         "too little to find its base, which stays as given, with standard deviations 5.0 mm and 3.0 deg"
         in data.notes.sentences[0]

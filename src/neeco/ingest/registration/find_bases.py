@@ -84,9 +84,9 @@ def find_bases(
     views: in mm; moving(rows): masks bool [R, h, w] of what moves in rows of them, reduced to REFERENCE_PIXELS;
     registration: what placed the cameras in the frame that bases are stated to, where the scope moves. Images show a
     base among the cameras: what is stated of it is known there less well by the error of their place. Lengths of a
-    robot are taken as they are. Return the episodes with these bases and the clocks that come with them, and what
-    was found by instrument. Notes state standard deviations and what stays undetermined. Raises NeecoError where
-    nothing moves with an instrument.
+    robot are taken as they are. Return the episodes with these bases and the clocks that come with them, and what was
+    found by instrument, from no frame where a base stays as given. Notes state standard deviations and what stays
+    undetermined. Raises NeecoError where nothing moves with an instrument.
     """
     unknown, logs = [], data.parts[0].poses
     for item in data.recording.instruments:
@@ -115,6 +115,15 @@ def find_bases(
             data.notes.add(
                 f"instrument {name!r}: it moves by {arm.travel:.1f} mm only, too little to find its base, "
                 f"which stays as given, with standard deviations {sd_mm:.1f} mm and {sd_deg:.1f} deg"
+            )
+            found[name] = BaseRegistration(
+                world_from_base=given,
+                clock_s=0.0,
+                clock_sd_s=clock.sd,
+                covariance=np.diag(np.repeat([np.radians(sd_deg) ** 2, sd_mm**2], 3)),
+                open_directions=(),
+                frames=0,
+                from_masks=False,
             )
             continue
         if clock.source not in KNOWN:
@@ -179,12 +188,14 @@ def follow_cameras(
     data: Episodes, bases: Mapping[str, BaseRegistration], before: Views, after: Views
 ) -> tuple[Episodes, dict[str, BaseRegistration]]:
     """Move bases found among cameras, `before`, with these to where a later calibration places them, `after`: there
-    the images show them. Both in mm, of the same frames or fewer afterwards."""
-    found = {}
+    the images show them. Both in mm, of the same frames or fewer afterwards. Those that stay as given stay."""
+    found = dict(bases)
     _, old, new = np.intersect1d(before.frames, after.frames, return_indices=True)
     motions = after.world_from_camera[new] @ np.linalg.inv(before.world_from_camera[old])
     turn = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
     for name, base in bases.items():
+        if not base.frames:
+            continue
         poses, known = data.instrument_poses(name, before.times[old])
         middle = np.append(poses[known, :3, 3].mean(0), 1.0)
         moved = rigid(turn, (motions @ middle).mean(0)[:3] - turn @ middle[:3]) @ base.world_from_base
