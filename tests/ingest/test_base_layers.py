@@ -131,6 +131,7 @@ def test_a_wrist_that_bends_behind_what_is_logged_leaves_no_line():
     assert line_through_trocar(LEFT.poses_at(TIMES) @ bend @ tip) is None
 
 
+@pytest.mark.slow
 def test_a_dark_shaft_is_found_before_a_dark_clamp_without_masks_while_another_arm_moves():
     images, poses = evenly_lit(_images(LEFT, RIGHT)), np.tile(LEFT.poses_at(TIMES), (len(CLOCK_SHIFTS_S), 1, 1, 1))
     line, given = line_through_trocar(poses[0]), LEFT.wrong(6, 4)

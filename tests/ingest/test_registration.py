@@ -195,7 +195,7 @@ def test_a_trackers_slow_errors_count_in_where_the_cameras_stand(seconds: float)
     for seed in range(2):
         rng = np.random.default_rng(seed)
         times, log = recorded(0.0, noise=0.0)
-        times = times[::3]
+        times = times[::5]
         slow = gaussian_filter1d(rng.normal(size=(len(log.times), 6)), 40 * seconds, axis=0)
         slow *= np.repeat([0.002, 0.25], 3) / slow.std(0)
         turns = Rotation.from_quat(log.quats, scalar_first=True) * Rotation.from_rotvec(slow[:, :3])
