@@ -111,7 +111,7 @@ def _hand_eye(origin, sd_mm, sd_deg):
     return Registration(
         scale=1.0, rotation=np.eye(3), translation=np.zeros(3), camera_from_sensor=np.eye(4),
         clock=ClockOffset(0.0, 0.0, GIVEN), scale_sd=0.005, origin=origin,
-        covariances=np.stack([np.diag(variances)] * 3), position_residual=np.zeros(44),
+        covariances=np.stack([np.diag(variances)] * 2), position_residual=np.zeros(44),
         rotation_residual=np.zeros(44), used=np.arange(44),
     )  # fmt: skip
 

@@ -69,7 +69,7 @@ class Registration:
 
     def uncertainty(self, places: np.ndarray) -> BaseUncertainty:
         """Return the covariance of the error that all poses share with which instruments at places [N, 3] mm are placed
-        among cameras and tissue, for a capture: the largest of `covariances`."""
+        among cameras and tissue, for a capture: the larger of `covariances`."""
         center = places.mean(0)
         moves = np.concatenate([np.eye(7)[1:4], self._moves(center[None])[0]])
         shared = max(moves @ self.covariances @ moves.T, key=lambda covariance: float(np.trace(covariance[3:, 3:])))
@@ -231,9 +231,8 @@ def _covariances(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.nda
     gain = (covariance @ jacobian.T)[:, : 6 * count].reshape(unknowns, 2, count, 3).transpose(1, 3, 0, 2)
     slopes = jacobian[: 6 * count].reshape(2, count, 3, unknowns).transpose(0, 2, 1, 3)
     apart = np.abs(times[:, None] - times)
-    spread = []  # [C][2, 3, U, N] gain times the errors' correlation, for each component
-    for seconds in (None, *CORRELATED_S):
-        spread.append(gain if seconds is None else gain @ _correlation(apart, seconds))
+    # [C][2, 3, U, N] gain times the errors' correlation: white ones, and correlated ones
+    spread = [gain, *(gain @ _correlation(apart, seconds) for seconds in CORRELATED_S)]
     absorbed = np.stack([np.einsum("kaun,kavn->kuv", some, gain, optimize=True) for some in spread], 1)  # [2, C, U, U]
     found, expected = list[float](), list[np.ndarray]()
     for low, high in pairwise(LAGS_S):
