@@ -120,8 +120,12 @@ def test_whoever_is_not_logged_in_learns_it_before_anything_is_rendered(
     with pytest.raises(NeecoError, match=r"^--push-to-hub lab/rods: .+; log in with `hf auth login`") as caught:
         check_hub("lab/rods")
     assert "\n" not in str(caught.value)
-    with pytest.raises(NeecoError, match=r"^--push-to-hub no name: "):
-        check_hub("no name")
+
+
+@pytest.mark.parametrize("name", ["no name", "a/b/c", "-rods"])
+def test_a_wrong_name_is_said_to_be_wrong_not_logged_out(hub: Hub, name: str) -> None:
+    with pytest.raises(NeecoError, match=r"is not a repository's name; give NAME or OWNER/NAME"):
+        check_hub(name)
 
 
 def test_a_refused_upload_is_one_line(hub: Hub, dataset: Path) -> None:

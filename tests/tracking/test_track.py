@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
@@ -282,14 +283,46 @@ def test_what_was_broken_off_goes_on_to_the_same_bytes(
         track_footage(tracked_run, withheld(footage), output, start="first", on_progress=stop)
     with pytest.raises(NeecoError, match="not empty"):
         track_footage(tracked_run, withheld(footage), output, start="first")
-    with pytest.raises(NeecoError, match="min_trust: begun with"):
-        track_footage(tracked_run, withheld(footage), output, start="first", min_trust=0.4, resume=True)
+    with pytest.raises(NeecoError, match="start: begun with"):
+        track_footage(tracked_run, withheld(footage), output, start="none", resume=True)
     track_footage(tracked_run, withheld(footage), output, start="first", resume=True)
     whole, resumed = contents(tracked.output), contents(output)
     whole.pop("track.html", None)
     assert resumed == whole
     track_footage(tracked_run, withheld(footage), output, start="first", resume=True)  # complete: nothing to do
     assert contents(output) == whole
+
+
+def test_frames_are_chosen_by_another_trust_without_tracking_again(
+    tracked_run: RecordedRun, footage: Capture, tracked: Tracked, tmp_path: Path
+) -> None:
+    output = tmp_path / "capture"
+    shutil.copytree(tracked.output, output)
+    trusts = sorted(record["trust"]["value"] for record in tracked.records)
+    middle = trusts[len(trusts) // 2]
+
+    def never(done: int, total: int) -> None:
+        raise AssertionError("tracked again")
+
+    def chosen(min_trust: float) -> int:
+        again = track_footage(
+            tracked_run,
+            withheld(footage),
+            output,
+            start="first",
+            min_trust=min_trust,
+            resume=True,
+            on_progress=never,
+        )
+        return again.written
+
+    assert chosen(middle) == sum(trust >= middle for trust in trusts) == len(read_capture(output).frames)
+    stricter = contents(output)
+    assert chosen(1.0) == sum(trust >= 1 for trust in trusts)
+    if trusts[-1] < 1:
+        assert contents(output) == stricter, "a capture is not replaced by one of no frame"
+    chosen(tracked.min_trust)
+    assert contents(output).keys() - {"track.html"} == contents(tracked.output).keys() - {"track.html"}
 
 
 def test_what_cannot_be_tracked_is_refused_in_words(tracked_run: RecordedRun, footage: Capture, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ class Arguments:
     world; it is learned from the footage first, and OUTPUT/run becomes a run of the instruments over it. Default: run
     for a capture, footage for a video."""
     min_trust: float = 0.5
-    """Frames trusted less are left out of the capture: 0 to 1."""
+    """Frames trusted less are left out of the capture: 0 to 1. With --resume another value chooses anew."""
     resume: bool = False
     """Continue interrupted tracking."""
     device: Device = "auto"

@@ -160,13 +160,15 @@ def track_footage(
             records = [_record(frames[k], step, parameters) for k, step in enumerate(steps)]
             info |= {"complete": True, "reference": reference.to_json(), "frames": records}
         else:
-            info = stored
+            info = stored | {"min_trust": min_trust}  # of the same steps, other frames may be trusted
             if tissue == "footage":
                 scene = load_gaussians(output / RUN / SCENE_FILE, "track", scene.center.device)
         registered = trained_on.registered or tissue == "footage"
         trusted = replace(footage, frames=_with_trust(frames, info["frames"], min_trust), registered=registered)
         if trusted.frames:
             write_tracked(trusted, output, scene, trained_on)
+        elif stored.get("complete"):
+            info = stored  # its capture stays
         if tissue == "footage" and not stored.get("complete"):
             _write_run(output, run, scene)
         write_json(output / INFO, info)
@@ -359,5 +361,5 @@ def _check_output(output: Path, info: dict[str, Any], resume: bool) -> None:
     begun = read_begun(output, INFO, resume, "tracked footage")
     if begun is None:
         return
-    keys = ("schema", "version", "scene_sha256", "captures_sha256", "start", "tissue", "min_trust")
+    keys = ("schema", "version", "scene_sha256", "captures_sha256", "start", "tissue")
     require_same(str(output / INFO), ((key, begun.get(key), info[key]) for key in keys))

@@ -128,11 +128,15 @@ def push_to_hub(folder: Path, name: str) -> str:
 def _failures(name: str) -> Iterator[None]:
     """Put failures of the hub, of the network and of the name into one line."""
     try:
-        from huggingface_hub.errors import HTTPError
+        from huggingface_hub.errors import HFValidationError, HTTPError
     except ImportError:
         raise NeecoError(f"{OPTION}: needs huggingface_hub; {install_hint('hub')}") from None
     try:
         yield
-    except (HTTPError, OSError, ValueError) as error:  # no connection; refused, not logged in; not a name
+    except HFValidationError:
+        raise NeecoError(
+            f"{OPTION} {name}: is not a repository's name; give NAME or OWNER/NAME of letters, digits, '-', '_' and '.'"
+        ) from None
+    except (HTTPError, OSError, ValueError) as error:  # no connection; refused, not logged in
         reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".: ")
         raise NeecoError(f"{OPTION} {name}: {reason}; log in with `hf auth login`, or try again") from error
