@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,7 @@ from neeco.files import (
     require_like,
     visible_entries,
     write_atomically,
+    write_text,
     write_unsynced,
 )
 from neeco.ingest.calibration.lens import read_lens
@@ -316,3 +318,20 @@ def test_unsynced_files_are_whole_and_so_is_what_they_replace(tmp_path: Path, mo
         write_unsynced(path, b"second")
     assert [entry.name for entry in path.parent.iterdir()] == ["file.bin"]
     assert path.read_bytes() == b"first"
+
+
+@pytest.mark.parametrize("write", [lambda path: write_text(path, "x"), lambda path: write_unsynced(path, b"x")])
+def test_whoever_cannot_write_learns_what_to_do(tmp_path: Path, write: Callable[[Path], None]) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    for path, remedy in (
+        (tmp_path / ("x" * 300), "give a shorter name"),
+        (tmp_path / "file" / "a.png", "a file has "),  # errno depends on what is tried first
+        (tmp_path / "folder", "a folder has the file's name"),
+    ):
+        with pytest.raises(NeecoError) as refused:
+            write(path)
+        message = str(refused.value)
+        assert message.startswith(f"{path}: cannot write: "), message
+        assert f"; {remedy}" in message
+    assert {entry.name for entry in tmp_path.iterdir()} == {"file", "folder"}

@@ -45,6 +45,25 @@ _PLACEHOLDERS = (
 PLACEHOLDERS = [(re.compile(start, re.DOTALL | re.IGNORECASE), problem) for start, problem in _PLACEHOLDERS]
 
 
+_REMEDIES = {
+    errno.ENOSPC: "free space there, or write to another disk",
+    errno.EDQUOT: "free space of your quota, or write to another disk",
+    errno.ENAMETOOLONG: "give a shorter name",
+    errno.EACCES: "give a folder that you may write to",
+    errno.EPERM: "give a folder that you may write to",
+    errno.EROFS: "give a folder that you may write to",
+    errno.EISDIR: "a folder has the file's name; remove it",
+    errno.EEXIST: "a file has that name; give another path",
+    errno.ENOTDIR: "a file has the name of one of its folders; remove it, or give another path",
+}
+
+
+def cannot_write(path: Path, error: OSError) -> NeecoError:
+    """Return the error that names `path`, why the disk refused it, and what to do."""
+    remedy = _REMEDIES.get(error.errno or 0, "check that path and the disk")
+    return NeecoError(f"{path}: cannot write: {error.strerror or error}; {remedy}")
+
+
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write(temporary_path)` produce a file next to `path`, sync it to disk and rename it to `path`.
 
@@ -59,7 +78,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         # not by `tempfile`, whose files are their owner's alone
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
-        raise NeecoError(f"{path}: cannot write here: {error.strerror or error}") from error
+        raise cannot_write(path, error) from error
     try:
         write(temporary)
         with open(temporary, "rb") as stream:
@@ -67,7 +86,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         os.replace(temporary, path)
         _sync_folder(path.parent)
     except OSError as error:
-        raise NeecoError(f"{path}: cannot write: {error.strerror or error}") from error
+        raise cannot_write(path, error) from error
     finally:
         with contextlib.suppress(FileNotFoundError):
             temporary.unlink()
@@ -96,7 +115,7 @@ def write_unsynced(path: Path, content: bytes) -> None:
                 temporary.unlink()
             raise
     except OSError as error:
-        raise NeecoError(f"{path}: cannot write: {error.strerror or error}") from error
+        raise cannot_write(path, error) from error
 
 
 def sync_disk() -> None:
@@ -143,7 +162,7 @@ def new_folder(path: Path) -> Iterator[None]:
             pass
     except OSError as error:
         _remove_empty(made)
-        raise NeecoError(f"{path}: cannot write here: {error.strerror or error}; give another folder") from error
+        raise cannot_write(path, error) from error
     try:
         yield
     except BaseException:
@@ -196,7 +215,7 @@ def _locked(folder: Path, named: Path) -> Iterator[None]:
         try:
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
-            raise NeecoError(f"{lock}: cannot write: {error.strerror or error}") from error
+            raise cannot_write(lock, error) from error
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from neeco.errors import NeecoError
-from neeco.files import LOCK, TEMPORARY, new_folder, own_folder
+from neeco.files import LOCK, TEMPORARY, cannot_write, new_folder, own_folder
 
 
 @contextmanager
@@ -36,7 +36,7 @@ def staged(output: Path) -> Iterator[Path]:
                 place.rmdir()
             (folder / "capture").rename(place)
         except OSError as error:
-            raise NeecoError(f"{place}: cannot write: {error.strerror or error}") from error
+            raise cannot_write(place, error) from error
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from neeco.capture.checks import read_checked
 from neeco.capture.model import Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError, memory_failure
-from neeco.files import own_folder, read_begun, read_text, require_same, write_json, write_text
+from neeco.files import cannot_write, own_folder, read_begun, read_text, require_same, write_json, write_text
 from neeco.scene.io import pack_scene, save_scene
 from neeco.scene.method_registry import method_class, unmet_need
 from neeco.scene.training_session import Session, StepResult
@@ -295,7 +295,7 @@ class _Log:
             with self.path.open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(entry, allow_nan=False) + "\n")
         except OSError as error:
-            raise NeecoError(f"{self.path}: cannot write: {error.strerror or error}") from error
+            raise cannot_write(self.path, error) from error
         if self.progress:
             self.progress(self.last)
 
