@@ -59,7 +59,8 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
         if count < MIN_SOLID_GAUSSIANS:
             session.report(
                 f"warning: {instrument.name}: hardly anything was learned of it ({count} solid Gaussians), so its "
-                "labels will be empty; the images show it too little, or another that moves similarly has its place"
+                f"labels will be empty; {session.iteration} iterations are too few, the images show it too little, or "
+                "another that moves similarly has its place"
             )
         articulation.extent.copy_(solid_extent(scene.canonical, index, articulation))
         if articulation.jointed:
