@@ -74,6 +74,19 @@ def test_watching_a_run_neither_changes_it_nor_costs_it_time(capture: Path, tmp_
     assert 60 <= rows[-1]["seconds"] < 300
 
 
+@pytest.mark.parametrize(("iterations", "ends"), [(20, [8, 16, 20]), (16, [8, 16]), (7, [])])
+def test_the_last_row_is_of_the_runs_end_unless_it_is_shorter_than_a_row(
+    iterations: int, ends: list[int], capture: Path, tmp_path: Path
+) -> None:
+    shown: list[int] = []
+    config = training_config("3dgs", {"iterations": iterations}, ["log_interval=8"])
+    run = train(capture, tmp_path / "run", config, progress=lambda row: shown.append(row.iteration))
+    written = run / "metrics.jsonl"
+    rows = [json.loads(line) for line in written.read_text().splitlines()] if written.exists() else []
+    assert [row["iteration"] for row in rows] == ends
+    assert not rows or (rows[-1]["progress"], shown[-1]) == (1.0, iterations)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_a_network_rests_while_the_scene_takes_shape(share: float, capture: Path, tmp_path: Path) -> None:
     """What moves it: nothing before its share of the iterations, and from then on the network."""

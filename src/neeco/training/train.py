@@ -222,6 +222,8 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
                 save_checkpoint(session, output)
             if stop.is_set():
                 raise KeyboardInterrupt
+        if session.window and session.iteration > config.log_interval:  # of what came after the last row
+            log.row(session)
         save_checkpoint(session, output)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"at iteration {session.iteration}; {go_on}") from None
