@@ -250,10 +250,10 @@ def write_text(path: Path, text: str) -> None:
     write_atomically(path, write)
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write `value` as indented JSON, atomically. NaN and infinity are refused (ValueError): JSON has no such
-    numbers."""
-    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+def write_json(path: Path, value: Any, indent: int | None = 1) -> None:
+    """Write `value` as JSON, atomically; `indent` None: in one line, ten times as fast. NaN and infinity are refused
+    (ValueError): JSON has no such numbers."""
+    write_text(path, json.dumps(value, indent=indent, allow_nan=False) + "\n")
 
 
 def finite(value: Any) -> Any:

@@ -41,7 +41,7 @@ def write_preview(
     for k, tile in enumerate(tiles):
         row, column = divmod(k, columns)
         sheet.paste(tile, (GAP + column * (PAIR_WIDTH + GAP), header + GAP + row * (height + GAP)))
-    write_atomically(root / "preview.png", lambda temporary: sheet.save(temporary, format="PNG"))
+    write_atomically(root / "preview.png", lambda temporary: sheet.save(temporary, format="PNG", compress_level=1))
 
 
 def draw_tile(root: Path, record: Record, bones: Sequence[tuple[str, str]] = ()) -> Image.Image:

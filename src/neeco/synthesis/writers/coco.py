@@ -63,7 +63,7 @@ class Coco(Writer):
             )
             for kind, categories, made in (("instances", instruments, by_instrument), ("parts", parts, by_part)):
                 path = folder / (f"{kind}.json" if split is None else f"annotations/{kind}_{split}.json")
-                write_json(path, _document(chosen, categories, made))
+                write_json(path, _document(chosen, categories, made), indent=None)
 
 
 def _document(
