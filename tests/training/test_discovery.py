@@ -21,7 +21,7 @@ from neeco.methods.kinematic import discovery
 from neeco.methods.kinematic.hinge_search import find_hinges, search_hinge, unbend_seeds
 from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve, shape_around_frame
-from neeco.methods.tissue_fit import tissue_evidence
+from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
 from neeco.training.initial import begin_session, initial_scene
@@ -126,6 +126,18 @@ def test_what_lies_behind_transparent_images_is_no_evidence(tmp_path: Path) -> N
     scene.background = 1.0  # as of images cut out of their surroundings
     evidence = tissue_evidence(scene, TrainingViews(frames, white, (None,) * len(frames)), config)
     assert float(evidence.hits[:, :, :6].mean()) < 0.05  # beside the points
+
+
+def test_the_tissue_whose_errors_are_evidence_does_not_depend_on_the_rates_of_training(tmp_path: Path) -> None:
+    capture = read_capture(write_capture(tmp_path / "capture"))
+    views = TrainingViews.read(capture.split("train"))
+
+    def colors(*changes: str) -> torch.Tensor:
+        config = training_config("kinematic", {}, changes)
+        tissue = fit_tissue(initial_scene(capture, views.frames, config, print), views, config, steps=5)
+        return tissue.canonical.sh_dc
+
+    assert torch.equal(colors(), colors("optimizer.color_rate=1e-7"))
 
 
 def test_without_instruments_there_is_nothing_to_look_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

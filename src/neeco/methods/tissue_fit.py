@@ -14,7 +14,7 @@ from neeco.methods.static import Static
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
-from neeco.training.config import TrainConfig, method_defaults
+from neeco.training.config import OptimizerConfig, TrainConfig, method_defaults
 from neeco.training.session import GaussianSession, new_session
 
 DENSITY_START = 200  # steps of a longer fit of the tissue before it adds Gaussians
@@ -66,6 +66,7 @@ def fit_tissue(
         refine=RefineConfig(),
         density_start=density_start,
         density_stop=0.8,
+        optimizer=OptimizerConfig(),  # what counts as evidence was measured at these rates, whatever training has
     )
     session = new_session(tissue, views, short)
     session.start()
