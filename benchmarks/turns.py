@@ -8,7 +8,9 @@ OLD_RUN, NEW_RUN: what each trained of CAPTURE, which is a rendered capture with
 
 Every command runs in a process of its own, start included; the table has the medians, every turn, and the ratio of the
 medians, by wall and by processor time of the process and its workers. Of `images` and `track` the time is per image
-and per frame: a long command less a short one. Leave the machine alone meanwhile, or read the processor time only.
+and per frame: a long command less a short one. The wall time of `samples` is that of one sample, its processor time
+that of the whole benchmark, which also writes and reads a data set. Leave the machine alone meanwhile, or read the
+processor time only.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from neeco.studies.machine import hardware_words, machine
 
 START = "import sys; from neeco.cli import main; sys.exit(main())"
 IMAGES = 300
-FRAMES = (40, 160)  # of the two stretches that are tracked
+FRAMES = (40, 160)  # at most, of the two stretches that are tracked
 COMMANDS = ("help", "check", "one image", "images 320x256", "images 240x192", "samples", "track", "ingest")
 
 
@@ -79,7 +81,7 @@ class Side:
     run: Path
     capture: Path
     folder: Path  # for outputs
-    footage: dict[int, Path]
+    footage: tuple[Path, ...]  # a short stretch to track and a longer one
 
     def time(self, command: str) -> Took:
         """Run one of COMMANDS. Exits with what it said where it fails."""
@@ -99,10 +101,11 @@ class Side:
             return many.less(few, IMAGES)
         if command == "track":
             few, many = (
-                self._neeco("track", run, str(self.footage[count]), "--output", self._output(), "--start", "first")
-                for count in FRAMES
+                self._neeco("track", run, str(path), "--output", self._output(), "--start", "first")
+                for path in self.footage
             )
-            return many.less(few, FRAMES[1] - FRAMES[0])
+            short, long = (len(read_capture(path).frames) for path in self.footage)  # CAPTURE may have fewer than asked
+            return many.less(few, long - short)
         if command == "ingest":
             logs, camera = self.capture / "logs", read_capture(self.capture).frames[0].camera
             joint = ["--joint", "jaw_angle", str(logs / "jaw.csv"), str(logs / "jaw_calibration.csv")]
@@ -143,9 +146,9 @@ def main() -> None:
     arguments, hardware = tyro.cli(Turns, description=__doc__), machine(torch.device("cpu"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        footage = {count: folder / f"footage-{count}" for count in FRAMES}
+        footage = tuple(folder / f"footage-{count}" for count in FRAMES)
         if "track" in arguments.only:
-            for count, path in footage.items():
+            for count, path in zip(FRAMES, footage, strict=True):
                 script = str(Path(__file__).parent / "tracking.py")
                 words = [script, "footage", str(arguments.capture), str(path), "--splits", "train", "test"]
                 subprocess.run([sys.executable, *words, "--count", str(count), "--first-state"], check=True)
