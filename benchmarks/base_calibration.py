@@ -11,7 +11,8 @@ what is left after the best constant offset in the instrument's frame. Printed: 
 deviation, which are 1 if these hold.
 
 With `--kinematics` (as `base_registration.py` has it), the links are fitted, and readings have the errors of encoders:
-offsets of 1.5 degrees, play of 0.7 degrees and noise; then `clock` is printed, too, and what is doubted.
+offsets of 1.5 degrees, play of 0.7 degrees and noise; then `clock` is printed, too, and what is doubted. With
+`--errors 0x0` nothing is given.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ def errors_in_deviations(
     generator = np.random.default_rng(10 + seed)
     _disturb_log(recording, generator)
     given = wrong_base(recording.truth, recording.poses, *off, seed)
-    prior = given, off[0] / SHARE, off[1] / SHARE
+    prior = (given, off[0] / SHARE, off[1] / SHARE) if off[0] else None
     if tree is None:
         found = find_base(
             recording.masks, recording.intrinsics, recording.camera_from_world, recording.poses_at,

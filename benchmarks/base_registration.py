@@ -156,7 +156,8 @@ class BaseRecording:
             found = find_articulated_base(
                 self.masks, self.intrinsics, self.camera_from_world,
                 ArticulatedMotion(tree=tree, poses_at=self.poses_at, readings_at=self.readings_at), prior,
-            ) if tree is not None and prior is not None else find_base(
+                seed=seed,
+            ) if tree is not None else find_base(
                 self.masks, self.intrinsics, self.camera_from_world, self.poses_at, self.times, prior,
                 readings=self.readings, images=self.images, seed=seed,
             )  # fmt: skip

@@ -36,7 +36,7 @@ WITH_BAD_PATH = {
 
 def neeco(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """Run the program as a user does."""
-    command = [sys.executable, "-c", "import sys; from neeco.cli import main; sys.exit(main())", *words]
+    command = [sys.executable, "-m", "neeco", *words]
     return subprocess.run(
         command, capture_output=True, text=True, cwd=cwd, check=False, env=os.environ | {"COLUMNS": "120"}
     )

@@ -15,7 +15,12 @@ from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.errors import NeecoError
 from neeco.fitting.link_silhouette import ArticulatedModel, joint_values, with_motion
 from neeco.ingest.foreground.silhouettes import silhouettes_of
-from neeco.ingest.registration.articulated import ArticulatedMotion, find_articulated_base
+from neeco.ingest.registration.articulated import (
+    ArticulatedMotion,
+    find_articulated_base,
+    problem_of,
+    unknown_starts,
+)
 from neeco.ingest.registration.articulated_fit import (
     ArticulatedFit,
     ArticulatedProblem,
@@ -183,6 +188,29 @@ def test_a_rough_base_is_found_within_what_it_states(masks, seed):
     assert (np.abs(shift) < 3 * found.sd_mm).all()
     assert (np.abs(turn) < 3 * found.sd_deg).all()
     assert found.doubts == ()
+
+
+def test_lines_and_links_lead_near_a_base_of_which_nothing_is_known(masks):
+    problem = problem_of(masks, INTRINSICS, STILL, _motion(_tree()), None, hidden=None, sd_clock=0.08)
+    assert min(np.linalg.norm(_off(start)[0]) for start in unknown_starts(problem, seed=0)) < 8
+
+
+@pytest.mark.slow
+def test_a_base_of_which_nothing_is_known_is_found_within_what_it_states(masks):
+    found = find_articulated_base(masks, INTRINSICS, STILL, _motion(_tree()), None)
+    turn, shift = _off(found.world_from_base)
+    assert np.abs(shift).max() < 2.5
+    assert np.abs(turn).max() < 1.2
+    assert (np.abs(shift) < 3 * found.sd_mm).all()
+    assert (np.abs(turn) < 3 * found.sd_deg).all()
+    assert not np.isfinite(found.moved_mm)
+    assert found.doubts == ()
+
+
+@pytest.mark.slow
+def test_another_arms_log_is_refused_where_nothing_is_known_of_its_base(masks):
+    with pytest.raises(NeecoError, match="of all bases none was found"):
+        find_articulated_base(masks[::-1], INTRINSICS, STILL, _motion(_tree()), None)
 
 
 def _doubts(masks: np.ndarray, tree: KinematicTree, given: np.ndarray) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, WORLD_FROM_BASE, disturbed, errors, make_world
@@ -63,7 +64,7 @@ def test_a_base_of_which_nothing_is_known_and_none_fits_asks_for_a_rough_one(mon
     world = make_world(14)
     far = Candidates(np.array([1e9]), np.eye(4)[None], np.zeros((1, 3)), np.zeros((1, 3)))
     monkeypatch.setattr(base, "search", lambda *arguments: far)
-    with pytest.raises(NeecoError, match=r"of all bases none .* state it as far as it is known"):
+    with pytest.raises(NeecoError, match=r"of all bases none .* the base as far as it is known"):
         _find(world, None)
 
 
@@ -84,6 +85,28 @@ def test_lines_and_tips_alone_tell_the_rotation_of_a_base_of_which_nothing_is_kn
     generator = np.random.default_rng(3)
     found = search(views, uniform_rotations(2000, generator), generator, 0.2)
     assert min(errors(base, world.poses_at(TRUE_CLOCK_S))[2] for base in found.world_from_base) < 12
+
+
+def _bent(height: int, width: int) -> np.ndarray:
+    """A mask [1, h, w] of a shaft that enters from the left, level, and a wrist that bends by 60 degrees."""
+    mask = np.zeros((height, width), np.uint8)
+    cv2.line(mask, (0, 60), (80, 60), 1, 9)
+    cv2.line(mask, (80, 60), (105, 103), 1, 9)
+    return mask[None].astype(bool)
+
+
+def test_the_line_of_a_shaft_is_that_of_its_part_at_the_border_not_of_a_wrist_that_bends():
+    found = shaft_lines(_bent(120, 160))
+    assert abs(found.directions[0, 1]) < 0.02 < 0.9 < found.directions[0, 0]
+    assert abs(found.points[0, 1] - 60.5) < 0.5
+    assert np.linalg.norm(found.tips[0] - (105, 103)) < 8
+
+
+def test_a_shaft_that_enters_at_a_round_border_has_a_line():
+    hidden = np.hypot(*(np.mgrid[:120, :160] - np.array([60, 80])[:, None, None])) > 55
+    masks = _bent(120, 160) & ~hidden
+    assert not shaft_lines(masks).visible[0]
+    assert silhouettes_of(masks, INTRINSICS, hidden).shafts.visible[0]
 
 
 def test_distances_to_outlines_know_no_outline_beyond_the_border():

@@ -286,14 +286,15 @@ def test_the_pose_of_a_tip_is_turned_into_the_shafts_with_readings_of_the_same_m
     )
     seen = {}
 
-    def find_base(masks, intrinsics, cameras, poses_at, times, **others):
-        seen.update(poses_at=poses_at, readings=others["readings"], times=times)
+    def find_articulated_base(masks, intrinsics, cameras, motion, prior, **others):
+        assert prior is None
+        seen.update(poses_at=motion.poses_at, readings_at=motion.readings_at)
         return BaseRegistration(
             world_from_base=WORLD_FROM_BASE, clock_s=0.03, clock_sd_s=0.005, covariance=np.eye(6), open_directions=(),
             frames=44, from_masks=True,
         )  # fmt: skip
 
-    monkeypatch.setattr(module, "find_base", find_base)
+    monkeypatch.setattr(module, "find_articulated_base", find_articulated_base)
     placed, _ = find_bases(replace(data, parts=(part,)), _black(world), lambda rows: world.masks[rows], silent)
     assert placed.clock("encoder").seconds == placed.clock("ros").seconds == 0.03  # as the readings were moved
     for shift in (0.0, 0.04):
@@ -301,4 +302,6 @@ def test_the_pose_of_a_tip_is_turned_into_the_shafts_with_readings_of_the_same_m
         known = np.isfinite(found).all((1, 2))
         assert (known == (seen["times"] + shift >= joint.times[0])).all()
         assert np.abs(found[known] - expected[known]).max() < 0.05
-    assert seen["readings"].shape == (44, 1)  # frames without a reading are left out, not the joint
+    read = seen["readings_at"](0.0)["yaw"]  # frames without a reading are left out, not the joint
+    assert read.shape == (44,)
+    assert 20 < np.isfinite(read).sum() < 44

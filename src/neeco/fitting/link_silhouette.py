@@ -7,12 +7,13 @@ links and the errors of what is stated (pivots, axes, offsets of readings) are p
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.kinematics import FIXED, PRISMATIC, KinematicTree
+from neeco.capture.kinematics import FIXED, PRISMATIC, REVOLUTE, KinematicTree
 from neeco.geometry.lines import frame_about, unit
 from neeco.geometry.projection import project
 from neeco.geometry.trocar import line_through_trocar
@@ -326,6 +327,33 @@ def bends(tree: KinematicTree, values: np.ndarray) -> bool:
     kinds = [link.type for link in tree.links]
     least = np.array([np.inf if kind == FIXED else MIN_SLIDE_MM if kind == PRISMATIC else MIN_MOTION for kind in kinds])
     return bool((np.std(values, axis=0) > least).any())
+
+
+def mirrored(
+    tree: KinematicTree,
+    axis: np.ndarray,
+    camera_from_world: np.ndarray,
+    pose: np.ndarray,
+    readings: Mapping[str, float],
+) -> tuple[np.ndarray, dict[str, float]]:
+    """Return the state with nearly the same silhouette as (pose [4, 4] world_from_root, readings): mirrored in depth
+    about the first joint and, in its own frame, along that joint's axis; what bends across it then bends the other way.
+    axis [3]: the shaft's, unit, in the root's frame."""
+    bending = [link for link in tree.links if link.type in (REVOLUTE, PRISMATIC)]
+    first = unit(bending[0].axis - (bending[0].axis @ axis) * axis) if abs(bending[0].axis @ axis) < 0.9 else None
+    if first is None:
+        first = np.linalg.svd(axis[None])[2][1]
+    pivot = bending[0].origin[:3, 3]
+    here = camera_from_world @ pose
+    center = here[:3, :3] @ pivot + here[:3, 3]
+    here[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ here[:3, :3] @ (np.eye(3) - 2 * np.outer(first, first))
+    here[:3, 3] = center - here[:3, :3] @ pivot
+    values = dict(readings)
+    for reading in tree.readings:
+        gains = [link.value[reading] for link in bending if reading in link.value and abs(link.axis @ first) < 0.5]
+        if gains and abs(sum(gains)) > 0.5 * len(gains):
+            values[reading] = -values[reading]
+    return np.linalg.inv(camera_from_world) @ here, values
 
 
 def _tube_axis(tree: KinematicTree, pivot: np.ndarray, poses: np.ndarray) -> np.ndarray:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.kinematics import PRISMATIC, REVOLUTE
 from neeco.capture.model import evenly_spaced
+from neeco.fitting.link_silhouette import mirrored
 from neeco.fitting.link_states import (
     FIRST_SOFTNESS,
     POSE,
@@ -26,7 +26,6 @@ from neeco.fitting.link_states import (
     posterior,
 )
 from neeco.fitting.parameters import DEG
-from neeco.geometry.lines import unit
 
 # standard deviations of errors that are tried: tilts, roll (rad), across, depth (mm), revolute (rad), prismatic (mm)
 TRIED = (2 * DEG, 6 * DEG, 0.4, 1.5, 4 * DEG, 1.5)
@@ -205,7 +204,11 @@ def _from_starts(found: _Fitted, state: int, good: np.ndarray, slides: np.ndarra
     axis = problem.model.shaft_axis(found.fit.shared)
     starts = [(given, readings), (problem.corrected(found.fit)[0][state], problem.corrected(found.fit)[1][state])]
     starts += [(given @ _turn(axis, angle), readings) for angle in (np.pi / 2, np.pi, -np.pi / 2)]
-    starts.append(_mirrored(views, given, readings, axis, view))
+    names = views.tree.readings
+    there, bent = mirrored(
+        views.tree, axis, views.camera_from_world[view], given, dict(zip(names, readings.tolist(), strict=True))
+    )
+    starts.append((there, np.array([bent[name] for name in names])))
     own_poses, own_readings = problem.corrected(found.fit)
     others = _subproblem(found, view, own_poses[good], own_readings[good], sds_of(WRONG, slides))
     ratios = np.broadcast_to(found.ratios[view], (len(good), *found.ratios.shape[1:]))
@@ -242,29 +245,6 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
     return turn
-
-
-def _mirrored(
-    views: LinkViews, pose: np.ndarray, readings: np.ndarray, axis: np.ndarray, view: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """The state with nearly the same silhouette: mirrored in depth about the first joint and, in its own frame, along
-    that joint's axis; what bends across it then bends the other way."""
-    here = views.camera_from_world[view] @ pose
-    bending = [link for link in views.tree.links if link.type in (REVOLUTE, PRISMATIC)]
-    first = unit(bending[0].axis - (bending[0].axis @ axis) * axis) if abs(bending[0].axis @ axis) < 0.9 else None
-    if first is None:
-        first = np.linalg.svd(axis[None])[2][1]
-    pivot = bending[0].origin[:3, 3]
-    center = here[:3, :3] @ pivot + here[:3, 3]
-    here = here.copy()
-    here[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ here[:3, :3] @ (np.eye(3) - 2 * np.outer(first, first))
-    here[:3, 3] = center - here[:3, :3] @ pivot
-    values = readings.copy()
-    for index, reading in enumerate(views.tree.readings):
-        gains = [link.value[reading] for link in bending if reading in link.value and abs(link.axis @ first) < 0.5]
-        if gains and abs(sum(gains)) > 0.5 * len(gains):
-            values[index] = -values[index]
-    return np.linalg.inv(views.camera_from_world[view]) @ here, values
 
 
 def take(views: LinkViews, states: np.ndarray) -> LinkViews:

@@ -11,6 +11,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 MIN_ELONGATION = 2.0  # length over width of a shaft
 MIN_AREA = 0.002  # share of the image: smaller pieces of a mask are noise
 EDGE_PX = 2  # from the image's border, within which a piece continues beyond it
+ENTERING, MIN_SLICES, LINE_ROUNDS = 0.5, 6, 4  # share of a piece that its line is fitted to; px long at least
 SMOOTH_PX = 1.5  # of distances: the steps of a mask's outline would be taken for its shape
 
 
@@ -22,7 +23,7 @@ class Silhouettes:
     masks: np.ndarray  # bool [F, h, w]
     distances: np.ndarray  # float32 [F, h, w]
     intrinsics: tuple[float, float, float, float]
-    corners: np.ndarray  # [F, C, 2] px of the convex hull of each mask's shaft; NaN without a shaft or its tip
+    shafts: ShaftLines
 
     def look_up(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Signed distances [F, N] px at pixels [F, N, 2], bilinear between centres, and their gradients [F, N, 2].
@@ -41,7 +42,7 @@ class Silhouettes:
 
     def extent(self, directions: np.ndarray) -> np.ndarray:
         """Extent [F] px of the piece with the shaft along unit directions [F, 2]; NaN where its tip is not visible."""
-        return np.asarray(np.einsum("fcj,fj->fc", self.corners, directions).max(1))
+        return np.asarray(np.einsum("fcj,fj->fc", self.shafts.corners, directions).max(1))
 
     def inside(self, pixels: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Whether pixels [F, N, 2] are in the image, `margin` px from its border, bool [F, N]."""
@@ -50,7 +51,7 @@ class Silhouettes:
 
     def take(self, rows: np.ndarray) -> Silhouettes:
         """Return those of some of the frames."""
-        return Silhouettes(self.masks[rows], self.distances[rows], self.intrinsics, self.corners[rows])
+        return Silhouettes(self.masks[rows], self.distances[rows], self.intrinsics, self.shafts.take(rows))
 
 
 def silhouettes_of(
@@ -67,7 +68,7 @@ def silhouettes_of(
         signed = np.where(mask, inside - 0.5, 0.5 - outside)
         limit = float(np.hypot(*mask.shape))
         found[row] = gaussian_filter(np.clip(signed, -limit, limit), SMOOTH_PX, mode="nearest")
-    return Silhouettes(masks & ~unknown, found, intrinsics, shaft_lines(masks & ~unknown, hidden).corners)
+    return Silhouettes(masks & ~unknown, found, intrinsics, shaft_lines(masks & ~unknown, hidden))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,15 @@ class ShaftLines:
     directions: np.ndarray  # [F, 2] unit, towards the tip
     tips: np.ndarray  # [F, 2]
     corners: np.ndarray  # [F, C, 2] of the convex hull of the piece, where its tip is visible
+
+    @property
+    def visible(self) -> np.ndarray:
+        """Frames that show a shaft, bool [F]."""
+        return np.isfinite(self.points[:, 0])
+
+    def take(self, rows: np.ndarray) -> ShaftLines:
+        """Return those of some of the frames."""
+        return ShaftLines(self.points[rows], self.directions[rows], self.tips[rows], self.corners[rows])
 
 
 def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLines:
@@ -109,7 +119,7 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
         # the end farther from where it enters is the tip
         sign = -1.0 if np.median(along[touching]) > 0 else 1.0
         direction, along = sign * vectors[:, 1], sign * along
-        points[row], directions[row] = center, direction
+        points[row], directions[row] = _entering_line(places, touching, center, direction)
         end = along > along.max() - 2.0
         if not touching[end].any():
             tips[row] = places[end].mean(0)
@@ -118,3 +128,28 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
     padded = [hull[np.arange(most) % len(hull)] for hull in hulls]
     corners = np.array(padded, np.float64).reshape(count, most, 2)
     return ShaftLines(points, directions, tips, corners)
+
+
+def _entering_line(
+    places: np.ndarray, touching: np.ndarray, point: np.ndarray, direction: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a point [2] on the middle line of a piece's pixels [N, 2], and its unit direction, by the share of it
+    where it enters: what lies beyond may be a wrist that bends, or jaws. touching: bool [N], at the border; point and
+    direction: of the whole piece, from there."""
+    for _ in range(LINE_ROUNDS):
+        along = (places - point) @ direction
+        bins = (along - along.min()).astype(int)
+        count = np.bincount(bins)
+        inside = np.flatnonzero((count > 0) & (np.bincount(bins, touching) == 0))  # the border cuts slices off
+        inside = inside[inside <= inside[0] + ENTERING * (inside[-1] - inside[0])] if len(inside) else inside
+        if len(inside) < MIN_SLICES:
+            break
+        middles = np.stack([np.bincount(bins, places[:, k])[inside] for k in (0, 1)], -1) / count[inside, None]
+        weights = np.ones(len(middles))
+        for _ in range(LINE_ROUNDS):
+            point = np.average(middles, 0, weights)
+            off = middles - point
+            vector = np.linalg.eigh((off * weights[:, None]).T @ off)[1][:, 1]
+            direction = vector if vector @ direction >= 0 else -vector
+            weights = 1 / (1 + np.square(off @ (-direction[1], direction[0])))
+    return point, direction

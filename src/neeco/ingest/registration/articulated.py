@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -29,8 +30,11 @@ from neeco.ingest.registration.articulated_fit import (
     with_pose_errors,
 )
 from neeco.ingest.registration.base import (
+    MAX_START_COST,
     MIN_FRAMES,
     N_BLOCKS,
+    N_UNIFORM,
+    TYPICAL_RADIUS_MM,
     BaseRegistration,
     Prior,
     in_camera,
@@ -41,10 +45,12 @@ from neeco.ingest.registration.base import (
 from neeco.ingest.registration.layers import EXCHANGED_SHARES
 from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S, BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock
+from neeco.ingest.registration.silhouette_search import ShaftViews, search, uniform_rotations
 
 START_FRAMES, FIT_FRAMES = 16, 48  # on which starts are compared, and that the result is fitted to
 ALONG_MM = (-10.0, -5.0, 5.0, 10.0)  # starts along the shaft
 ROLLS_RAD = (-0.25, 0.25)  # starts turned about it
+UNIFORM_STEP_RAD = 0.2  # about that between uniform rotations
 N_REFINED = 3  # starts that are fitted to all frames
 APART_MM, APART_RAD = 3.0, 0.035  # between results that count as different
 # added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
@@ -83,18 +89,19 @@ def find_articulated_base(
     intrinsics: tuple[float, float, float, float],
     camera_from_world: np.ndarray,
     motion: ArticulatedMotion,
-    prior: Prior,
+    prior: Prior | None,
     *,
     hidden: np.ndarray | None = None,
     clock_known: bool = False,
+    seed: int = 0,
 ) -> BaseRegistration:
-    """Find the base of an instrument whose links bend, near a stated one.
+    """Find the base of an instrument whose links bend, near a stated one, or anywhere.
 
     masks: foreground bool [F, h, w], through a pinhole of `intrinsics` (fx, fy, cx, cy px of the masks);
     camera_from_world [F, 4, 4]; hidden: bool [h, w], beyond a round border. Raises NeecoError, which names neither
     instrument nor key, where the foreground is not the instrument.
     """
-    problem = _problem(
+    problem = problem_of(
         masks, intrinsics, camera_from_world, motion, prior, hidden=hidden, sd_clock=0.0 if clock_known else CLOCK_SD_S
     )
     if problem is None:
@@ -102,19 +109,21 @@ def find_articulated_base(
             f"poses, readings and what moves are there together in fewer than {MIN_FRAMES} frames; give the transform "
             "exactly, or a recording that shows more of it"
         )
-    fits = _fits(problem)
+    fits = _fits(problem, known_starts(problem) if prior is not None else unknown_starts(problem, seed))
+    if not fits:
+        raise NeecoError(unmoved(stated=prior is not None))
     best = fits[0]
     if best.residual_px > MAX_RESIDUAL_PX or overlap(problem, best) < LEAST_OVERLAP or _exchangeable(problem, best):
-        raise NeecoError(unmoved(stated=True))
+        raise NeecoError(unmoved(stated=prior is not None))
     return _result(problem, fits, motion)
 
 
-def _problem(
+def problem_of(
     masks: np.ndarray,
     intrinsics: tuple[float, float, float, float],
     camera_from_world: np.ndarray,
     motion: ArticulatedMotion,
-    prior: Prior,
+    prior: Prior | None,
     *,
     hidden: np.ndarray | None,
     sd_clock: float,
@@ -129,7 +138,9 @@ def _problem(
     if len(rows) < MIN_FRAMES:
         return None
     rows = rows[evenly_spaced(len(rows), FIT_FRAMES)]
-    given, sd_mm, sd_deg = prior
+    known_base = BasePrior(np.eye(4), None, None, sd_clock)
+    if prior is not None:
+        known_base = BasePrior(prior[0], np.radians(prior[2]), prior[1], sd_clock)
     return ArticulatedProblem(
         model=ArticulatedModel(motion.tree, poses[len(CLOCK_SHIFTS_S) // 2][known]),
         silhouettes=silhouettes_of(masks[rows], intrinsics, hidden),
@@ -139,24 +150,60 @@ def _problem(
         readings={key: part[:, rows] for key, part in readings.items()},
         values=with_motion(values[:, rows]),
         blocks=np.arange(len(rows)) * N_BLOCKS // len(rows),
-        prior=BasePrior(given, np.radians(sd_deg), sd_mm, sd_clock),
+        prior=known_base,
     )
 
 
-def _fits(problem: ArticulatedProblem) -> list[ArticulatedFit]:
-    """Fits from different starts, the best first; of similar ones the best."""
+def _fits(problem: ArticulatedProblem, starts: list[np.ndarray]) -> list[ArticulatedFit]:
+    """Fits from different starts world_from_base, the best first; of similar ones the best."""
     few = problem.take(np.array(evenly_spaced(len(problem.blocks), START_FRAMES)))
-    base, means = problem.prior.world_from_base, problem.model.means
+    first = [ArticulatedFit(start, 0.0, problem.model.means.copy()) for start in starts]
+    coarse = [fit_articulated(few, start, WIDTHS_PX[:2], 10, rough=True) for start in first]
+    chosen = _distinct(problem, coarse)[:N_REFINED]
+    fits = _distinct(problem, [fit_articulated(problem, fit, WIDTHS_PX[1:]) for fit in chosen])
+    return [minimise(problem, fits[0], WIDTHS_PX[-1], 20), *fits[1:]] if fits else []
+
+
+def known_starts(problem: ArticulatedProblem) -> list[np.ndarray]:
+    """The base as stated, and shifted along the shaft or turned about it: there it is the least certain."""
+    base = problem.prior.world_from_base
     shaft = (base[:3, :3] @ problem.poses[len(CLOCK_SHIFTS_S) // 2][:, :3, :3] @ problem.model.axis).mean(0)
     shaft /= np.linalg.norm(shaft)
     steps = [np.zeros(6)]
     steps += [np.append(np.zeros(3), along * shaft) for along in ALONG_MM]
     steps += [np.append(roll * shaft, np.zeros(3)) for roll in ROLLS_RAD]
-    starts = [ArticulatedFit(moved_base(base, problem.pivot(base), step), 0.0, means.copy()) for step in steps]
-    coarse = [fit_articulated(few, start, WIDTHS_PX[:2], 10, rough=True) for start in starts]
-    chosen = _distinct(problem, coarse)[:N_REFINED]
-    fits = _distinct(problem, [fit_articulated(problem, fit, WIDTHS_PX[1:]) for fit in chosen])
-    return [minimise(problem, fits[0], WIDTHS_PX[-1], 20), *fits[1:]]
+    return [moved_base(base, problem.pivot(base), step) for step in steps]
+
+
+def unknown_starts(problem: ArticulatedProblem, seed: int) -> list[np.ndarray]:
+    """The best bases of all, by lines and tips of the masks' shafts."""
+    lines, model, generator = problem.silhouettes.shafts, problem.model, np.random.default_rng(seed)
+    if lines.visible.sum() < MIN_FRAMES:
+        return []
+    half = float(np.median(problem.silhouettes.distances.max((1, 2))))
+    distance = TYPICAL_RADIUS_MM * problem.silhouettes.intrinsics[0] / max(half, 0.5)
+    cameras = np.linalg.inv(problem.camera_from_world)
+    middle = len(CLOCK_SHIFTS_S) // 2
+    ends = model.cones_at(model.means, problem.values[middle])[0]
+    outermost = [2 + index for index, cone in enumerate(model.cones) if cone.child is None]
+    views = ShaftViews(
+        lines=lines,
+        intrinsics=problem.silhouettes.intrinsics,
+        camera_from_world=problem.camera_from_world,
+        base_from_instrument=problem.poses[middle],
+        center=(cameras[:, :3, 3] + distance * cameras[:, :3, 2]).mean(0),  # where most of them look
+        sd_mm=distance,
+        distance=distance,
+        axis=model.axis,
+        tips=ends[:, outermost or [1], 1].mean(1),
+    )
+    found = search(views, uniform_rotations(N_UNIFORM, generator), generator, UNIFORM_STEP_RAD)
+    import os
+
+    if os.environ.get("DBG"):
+        print("costs", found.costs.round(3))
+        globals()["DBG"] = found
+    return list(found.world_from_base[found.costs < MAX_START_COST])
 
 
 def _distinct(problem: ArticulatedProblem, fits: list[ArticulatedFit]) -> list[ArticulatedFit]:
@@ -187,7 +234,7 @@ def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
 
 
 def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: ArticulatedMotion) -> BaseRegistration:
-    best, given = with_pose_errors(problem, fits[0]), problem.prior.world_from_base
+    best, prior = with_pose_errors(problem, fits[0]), problem.prior
     full = covariance(problem, best)
     spread = SCATTER**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
@@ -199,7 +246,10 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
     spread = in_view + np.diag(floor**2)
     poses = problem.camera_from_world[0] @ best.world_from_base @ poses_at_clock(problem.poses, best.clock)
     shaft = (poses[:, :3, :3] @ problem.model.axis).mean(0)
-    before = replace(best, world_from_base=given)
+    stated: dict[str, Any] = {}
+    if prior.sd_mm is not None:
+        stated = moved_from(prior.world_from_base, best.world_from_base, problem.middle)
+        stated["overlap_before"] = overlap(problem, replace(best, world_from_base=prior.world_from_base))
     return BaseRegistration(
         world_from_base=best.world_from_base,
         clock_s=best.clock,
@@ -207,14 +257,13 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
         covariance=spread,
         open_directions=(),
         overlap=overlap(problem, best),
-        overlap_before=overlap(problem, before),
         residual_px=best.residual_px * problem.px_scale,
         frames=len(problem.blocks),
         from_masks=True,
         shaft=shaft / np.linalg.norm(shaft),
         sd_motion_mm=sd_motion(spread, poses),
         doubts=tuple(_doubts(problem, fits[0], best, motion)),
-        **moved_from(given, best.world_from_base, problem.middle),
+        **stated,
     )
 
 
@@ -225,7 +274,8 @@ def _doubts(
     make up for reversed joints."""
     model, prior = problem.model, problem.prior
     starts = [rigid]
-    if overlap(problem, fit) < USUAL_OVERLAP:  # a reversed joint may have led it astray
+    known = prior.sd_mm is not None and prior.sd_rad is not None
+    if known and overlap(problem, fit) < USUAL_OVERLAP:  # a reversed joint may have led it astray
         starts.append(replace(rigid, world_from_base=prior.world_from_base, parameters=model.means.copy()))
     reversed_ = [
         reading
@@ -233,15 +283,14 @@ def _doubts(
         if any(_reversed(problem, rigid, start, motion, reading) for start in starts)
     ]
     found = [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
-    assert prior.sd_mm is not None
-    assert prior.sd_rad is not None
-    step = _step(problem, replace(fit, world_from_base=prior.world_from_base), fit)
-    off = np.linalg.norm(step[3:]) / prior.sd_mm, np.linalg.norm(step[:3]) / prior.sd_rad
-    if max(off) > MAX_SHIFT_SDS:
-        found.append(
-            f"the base found is {max(off):.1f} standard deviations from the one stated: check its transform, "
-            "axes and unit, and which arm it is of"
-        )
+    if prior.sd_mm is not None and prior.sd_rad is not None:
+        step = _step(problem, replace(fit, world_from_base=prior.world_from_base), fit)
+        off = np.linalg.norm(step[3:]) / prior.sd_mm, np.linalg.norm(step[:3]) / prior.sd_rad
+        if max(off) > MAX_SHIFT_SDS:
+            found.append(
+                f"the base found is {max(off):.1f} standard deviations from the one stated: check its transform, "
+                "axes and unit, and which arm it is of"
+            )
     sds = (fit.parameters - model.means) / model.sds
     for index in np.flatnonzero(np.abs(sds) > MAX_SDS) if not reversed_ else ():  # they follow from it
         part = model.names[index]

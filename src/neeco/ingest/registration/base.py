@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.model import BaseUncertainty, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.trocar import ShaftLine
-from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
+from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.axial_texture import with_marks
 from neeco.ingest.registration.layers import EXCHANGED_SHARES, LayerFit
 from neeco.ingest.registration.silhouette_fit import (
@@ -183,7 +183,7 @@ def find_base(
     """
     generator = np.random.default_rng(seed)
     problem = _problem(masks, intrinsics, camera_from_world, poses_at, readings=readings, hidden=hidden, images=images)
-    visible = np.isfinite(shaft_lines(problem.silhouettes.masks, hidden).points[:, 0])
+    visible = problem.silhouettes.shafts.visible
     if visible.sum() < MIN_FRAMES:
         raise NeecoError(
             f"what moves looks like a shaft in {int(visible.sum())} of {len(visible)} frames, at least {MIN_FRAMES} "
@@ -267,7 +267,7 @@ def _starts(
         rotations = rotations_about(given[:3, :3], known.sd_rad, N_ROTATIONS, generator)
         center, sd_mm, step = problem.pivot(given), known.sd_mm, 0.5 * known.sd_rad
     views = ShaftViews(
-        lines=shaft_lines(problem.silhouettes.masks),
+        lines=problem.silhouettes.shafts,
         intrinsics=problem.silhouettes.intrinsics,
         camera_from_world=problem.camera_from_world,
         base_from_instrument=problem.poses[len(CLOCK_SHIFTS_S) // 2],
@@ -369,8 +369,9 @@ def unmoved(*, stated: bool) -> str:
             "exact transform"
         )
     return (
-        "of all bases none was found from which its poses explain what moves; state it as far as it is known "
-        "(transform, sd_mm, sd_deg), which a wrist that bends needs, or check which arm and which clock its log is of"
+        "of all bases none was found from which its poses explain what moves; state the links of a wrist that bends "
+        "(kinematics), or the base as far as it is known (transform, sd_mm, sd_deg); check which arm and which clock "
+        "its log is of"
     )
 
 

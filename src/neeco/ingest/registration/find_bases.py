@@ -351,7 +351,7 @@ def _find(
     tree, clock_known = arm.item.kinematics, arm.clock.source in KNOWN
     motion = None if tree is None else ArticulatedMotion(tree=tree, poses_at=arm.poses_at, readings_at=arm.readings_at)
     try:
-        if motion is not None and arm.prior is not None and alone and motion.bends:
+        if motion is not None and alone and motion.bends:
             registration = find_articulated_base(
                 observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), motion, arm.prior,
                 hidden=observed.hidden, clock_known=clock_known,

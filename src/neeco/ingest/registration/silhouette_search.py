@@ -18,7 +18,7 @@ from neeco.ingest.foreground.silhouettes import ShaftLines
 
 LINE_SD_RAD = 0.03  # of a shaft's direction in a mask: jaws open, masks fray
 TIP_SD_PX, LINE_SD_PX = 5.0, 2.0  # of masks: the tip's place moves with the jaws
-TIP_SD_MM = 60.0  # prior distance of the tip from the tracked frame's origin
+TIP_SD_MM, STATED_TIP_SD_MM = 60.0, 5.0  # prior distance of the tip from the tracked frame's origin, or as stated
 SIDEWAYS_WEIGHT = 5e-4  # of a line's weight: where motion leaves it open, shafts are viewed from the side
 N_ROUNDS = 3  # of robust reweighting
 CHUNK = 500  # rotations tried at once
@@ -33,7 +33,8 @@ FAR_COST = 1e9  # of a base behind the cameras
 class ShaftViews:
     """Shafts [F] in masks, the poses they are of, and where the base may be: `center` [3] mm is the prior mean of the
     instrument's mean position in the world, sd_mm its standard deviation; distance mm: approximate depth of the
-    instrument."""
+    instrument; axis [3] and tips [F, 3] mm: the shaft's direction and the tip's places in the instrument's frame, as
+    stated links have them, None where they are to be found."""
 
     lines: ShaftLines
     intrinsics: tuple[float, float, float, float]
@@ -42,6 +43,8 @@ class ShaftViews:
     center: np.ndarray
     sd_mm: float
     distance: float
+    axis: np.ndarray | None = None
+    tips: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +53,7 @@ class Candidates:
 
     costs: np.ndarray  # [B] mean robust residual in [0, 1]
     world_from_base: np.ndarray  # [B, 4, 4]
-    tips: np.ndarray  # [B, 3] mm, instrument frame
+    tips: np.ndarray  # [B, 3] mm, instrument frame; relative to those stated
     axes: np.ndarray  # [B, 3] unit, instrument frame, towards the tip
 
     def distinct(self, count: int, apart_rad: float) -> Candidates:
@@ -105,6 +108,8 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     turned = np.einsum("bij,fjk->bfik", rotations, views.base_from_instrument[:, :3, :3])  # world_from_instrument
     middle = views.base_from_instrument[:, :3, 3].mean(0)
     moved = np.einsum("bij,fj->bfi", rotations, views.base_from_instrument[:, :3, 3] - middle)
+    if views.tips is not None:
+        moved = moved + np.einsum("bfij,fj->bfi", turned, views.tips)
 
     def rays(pixels: np.ndarray) -> np.ndarray:
         slopes = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], -1)
@@ -131,11 +136,12 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     # [B, F, 3, 6]: derivatives by the shift of the middle, and the tip
     linear = np.concatenate([np.broadcast_to(rows, on_tip.shape), on_tip], -1) * scale[:, None]
     wanted = np.einsum("fri,bfi->bfr", rows, places - moved) * scale
-    prior = np.diag([views.sd_mm**-2.0] * 3 + [TIP_SD_MM**-2.0] * 3)
+    tip_sd = TIP_SD_MM if views.tips is None else STATED_TIP_SD_MM
+    prior = np.diag([views.sd_mm**-2.0] * 3 + [tip_sd**-2.0] * 3)
     target = np.append(prior[:3, :3] @ views.center, np.zeros(3))
     for _ in range(N_ROUNDS):
         moments = np.einsum("bf,bfi,bfj->bij", weight, along, along) + sideways
-        axes = np.linalg.eigh(moments)[1][:, :, 0]
+        axes = np.linalg.eigh(moments)[1][:, :, 0] if views.axis is None else np.tile(views.axis, (count, 1))
         line_off = np.einsum("bfj,bj->bf", along, axes) / LINE_SD_RAD
         weight = has_line / (1 + line_off**2)
         matrix = np.einsum("bfr,bfri,bfrj->bij", weights, linear, linear) + prior
@@ -155,7 +161,10 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     ends = [np.einsum("fij,bfj->bfi", cameras[:, :3, :3].transpose(0, 2, 1), end - places) for end in (at, behind)]
     pixels = [end[..., :2] / np.maximum(end[..., 2:], 1e-3) for end in ends]
     agreement = np.sign(np.einsum("bfi,fi->bf", pixels[0] - pixels[1], ahead) * has_line).sum(1)
-    axes = axes * np.where(agreement >= 0, 1.0, -1.0)[:, None]
+    if views.axis is None:
+        axes = axes * np.where(agreement >= 0, 1.0, -1.0)[:, None]
+    else:
+        costs = np.where(agreement >= 0, costs, FAR_COST)
     bases = np.tile(np.eye(4), (count, 1, 1))
     bases[:, :3, :3] = rotations
     bases[:, :3, 3] = shift - rotations @ middle
