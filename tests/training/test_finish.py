@@ -102,6 +102,16 @@ def test_a_hinge_in_the_wrong_place_is_reported(wrong: str, session: GaussianSes
     assert "NOT found" in told["verdict"]
 
 
+def test_a_joint_that_no_log_has_is_not_sent_to_its_log(session: GaussianSession) -> None:
+    (grasper,) = session.scene.instruments
+    session.scene.instruments = (replace(grasper, unrecorded=("jaw_angle",)),)
+    with torch.no_grad():
+        hinges_of(session).scale.fill_(0.0)
+    told = verdict(session)["verdict"]
+    assert told.startswith("NOT found: no log has it")
+    assert "check the joint's log" not in told
+
+
 def test_an_instrument_of_which_nothing_was_learned_is_told_of(session: GaussianSession) -> None:
     told: list[str] = []
     session.report = told.append

@@ -118,6 +118,11 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
         verdict = f"NOT found: {warning}"
     elif explains:
         verdict = f"found: the reading explains {explained:.0%} of the moving parts' error"
+    elif name in instrument.unrecorded:
+        verdict = (
+            f"NOT found: no log has it, and its values as estimated from the images explain only {explained:.0%} of "
+            "the moving parts' error; other values will look wrong (log the joint in the next recording)"
+        )
     else:
         verdict = (
             f"NOT found: the reading explains only {explained:.0%} of the moving parts' error; "
