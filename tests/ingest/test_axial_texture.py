@@ -67,3 +67,13 @@ def test_an_instrument_of_one_colour_has_no_marks():
     images = np.where(problem.silhouettes.masks[..., None], np.uint8(120), np.uint8(0)) * np.ones(3, np.uint8)
     marked, _ = with_marks(replace(problem, images=images), fit)
     assert marked.marks is None
+
+
+def test_a_fit_behind_the_camera_has_no_marks():
+    problem, fit = _fitted()
+    images = np.full((*problem.silhouettes.masks.shape, 3), 90, np.uint8)
+    behind = fit.world_from_base.copy()
+    behind[2, 3] -= 400.0
+    marked, unchanged = with_marks(replace(problem, images=images), replace(fit, world_from_base=behind))
+    assert marked.marks is None
+    assert np.array_equal(unchanged.world_from_base, behind)

@@ -36,6 +36,8 @@ def with_marks(problem: SilhouetteProblem, fit: SilhouetteFit) -> tuple[Silhouet
     camera_from_base = problem.camera_from_world @ fit.world_from_base
     depth = np.median(camera_from_base[:, 2, :3] @ problem.middle + camera_from_base[:, 2, 3])
     step = STEP_PX * float(depth) / problem.silhouettes.intrinsics[0]  # mm
+    if step <= 0:  # a fit that went astray, behind the camera
+        return replace(problem, marks=None), fit
     behind = np.arange(FRONT_SHARE * fit.stations[-1], fit.stations[-1], step)
     colors = _profiles(problem, fit, problem.images, behind)
     shifts, deviations, weights = _align(colors, round(MAX_SHIFT_PX / STEP_PX))
