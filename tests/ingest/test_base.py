@@ -96,7 +96,7 @@ def _bent(height: int, width: int) -> np.ndarray:
 
 
 def test_the_line_of_a_shaft_is_that_of_its_part_at_the_border_not_of_a_wrist_that_bends():
-    found = shaft_lines(_bent(120, 160))
+    found = shaft_lines(_bent(120, 160)).entering
     assert abs(found.directions[0, 1]) < 0.02 < 0.9 < found.directions[0, 0]
     assert abs(found.points[0, 1] - 60.5) < 0.5
     assert np.linalg.norm(found.tips[0] - (105, 103)) < 8

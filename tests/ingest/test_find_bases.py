@@ -300,7 +300,7 @@ def test_the_pose_of_a_tip_is_turned_into_the_shafts_with_readings_of_the_same_m
     for shift in (0.0, 0.04):
         found, expected = seen["poses_at"](shift), world.poses_at(shift)
         known = np.isfinite(found).all((1, 2))
-        assert (known == (seen["times"] + shift >= joint.times[0])).all()
+        assert (known == (world.times + shift >= joint.times[0])).all()
         assert np.abs(found[known] - expected[known]).max() < 0.05
     read = seen["readings_at"](0.0)["yaw"]  # frames without a reading are left out, not the joint
     assert read.shape == (44,)

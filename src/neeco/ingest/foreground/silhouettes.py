@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -79,6 +79,8 @@ class ShaftLines:
     directions: np.ndarray  # [F, 2] unit, towards the tip
     tips: np.ndarray  # [F, 2]
     corners: np.ndarray  # [F, C, 2] of the convex hull of the piece, where its tip is visible
+    entering_points: np.ndarray  # [F, 2] and [F, 2], as the first two, of the part at the border alone
+    entering_directions: np.ndarray
 
     @property
     def visible(self) -> np.ndarray:
@@ -87,13 +89,18 @@ class ShaftLines:
 
     def take(self, rows: np.ndarray) -> ShaftLines:
         """Return those of some of the frames."""
-        return ShaftLines(self.points[rows], self.directions[rows], self.tips[rows], self.corners[rows])
+        return ShaftLines(*(values[rows] for values in vars(self).values()))
+
+    @property
+    def entering(self) -> ShaftLines:
+        """Lines of the parts at the border: of shafts, whatever bends beyond them."""
+        return replace(self, points=self.entering_points, directions=self.entering_directions)
 
 
 def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLines:
     """Return lines and tips of the largest elongated piece of each mask [F, h, w] that enters at the image's border."""
     count, height, width = masks.shape
-    points, directions, tips = (np.full((count, 2), np.nan) for _ in range(3))
+    points, directions, tips, entries, courses = (np.full((count, 2), np.nan) for _ in range(5))
     hulls: list[np.ndarray] = [np.full((1, 2), np.nan)] * count
     border = np.zeros((height, width), dtype=bool)
     border[:EDGE_PX], border[-EDGE_PX:], border[:, :EDGE_PX], border[:, -EDGE_PX:] = True, True, True, True
@@ -119,7 +126,8 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
         # the end farther from where it enters is the tip
         sign = -1.0 if np.median(along[touching]) > 0 else 1.0
         direction, along = sign * vectors[:, 1], sign * along
-        points[row], directions[row] = _entering_line(places, touching, center, direction)
+        points[row], directions[row] = center, direction
+        entries[row], courses[row] = _entering_line(places, touching, center, direction)
         end = along > along.max() - 2.0
         if not touching[end].any():
             tips[row] = places[end].mean(0)
@@ -127,7 +135,7 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
     most = max((len(hull) for hull in hulls), default=1)
     padded = [hull[np.arange(most) % len(hull)] for hull in hulls]
     corners = np.array(padded, np.float64).reshape(count, most, 2)
-    return ShaftLines(points, directions, tips, corners)
+    return ShaftLines(points, directions, tips, corners, entries, courses)
 
 
 def _entering_line(

@@ -187,7 +187,7 @@ def unknown_starts(problem: ArticulatedProblem, seed: int) -> list[np.ndarray]:
     ends = model.cones_at(model.means, problem.values[middle])[0]
     outermost = [2 + index for index, cone in enumerate(model.cones) if cone.child is None]
     views = ShaftViews(
-        lines=lines,
+        lines=lines.entering,
         intrinsics=problem.silhouettes.intrinsics,
         camera_from_world=problem.camera_from_world,
         base_from_instrument=problem.poses[middle],
@@ -195,6 +195,7 @@ def unknown_starts(problem: ArticulatedProblem, seed: int) -> list[np.ndarray]:
         sd_mm=distance,
         distance=distance,
         axis=model.axis,
+        end=model.rest[model.first][:3, 3],
         tips=ends[:, outermost or [1], 1].mean(1),
     )
     found = search(views, uniform_rotations(N_UNIFORM, generator), generator, UNIFORM_STEP_RAD)

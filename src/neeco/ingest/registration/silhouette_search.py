@@ -33,8 +33,9 @@ FAR_COST = 1e9  # of a base behind the cameras
 class ShaftViews:
     """Shafts [F] in masks, the poses they are of, and where the base may be: `center` [3] mm is the prior mean of the
     instrument's mean position in the world, sd_mm its standard deviation; distance mm: approximate depth of the
-    instrument; axis [3] and tips [F, 3] mm: the shaft's direction and the tip's places in the instrument's frame, as
-    stated links have them, None where they are to be found."""
+    instrument; axis [3], end [3] and tips [F, 3] mm: the shaft's direction, its end, and the tip's places in the
+    instrument's frame, as stated links have them; None where they are to be found, and the tip is on the shaft's
+    line."""
 
     lines: ShaftLines
     intrinsics: tuple[float, float, float, float]
@@ -44,6 +45,7 @@ class ShaftViews:
     sd_mm: float
     distance: float
     axis: np.ndarray | None = None
+    end: np.ndarray | None = None
     tips: np.ndarray | None = None
 
 
@@ -107,9 +109,11 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     places = cameras[:, :3, 3]
     turned = np.einsum("bij,fjk->bfik", rotations, views.base_from_instrument[:, :3, :3])  # world_from_instrument
     middle = views.base_from_instrument[:, :3, 3].mean(0)
-    moved = np.einsum("bij,fj->bfi", rotations, views.base_from_instrument[:, :3, 3] - middle)
+    ends = moved = np.einsum("bij,fj->bfi", rotations, views.base_from_instrument[:, :3, 3] - middle)
     if views.tips is not None:
         moved = moved + np.einsum("bfij,fj->bfi", turned, views.tips)
+    if views.end is not None:
+        ends = ends + np.einsum("bfij,j->bfi", turned, views.end)
 
     def rays(pixels: np.ndarray) -> np.ndarray:
         slopes = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], -1)
@@ -133,9 +137,14 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     weight = np.broadcast_to(has_line, (count, len(has_line))).astype(float)
     weights = np.broadcast_to(given, (count, *given.shape)).astype(float)
     on_tip = np.einsum("fri,bfij->bfrj", rows, turned)
+    if views.end is not None:
+        on_tip[:, :, 2] = 0.0
     # [B, F, 3, 6]: derivatives by the shift of the middle, and the tip
     linear = np.concatenate([np.broadcast_to(rows, on_tip.shape), on_tip], -1) * scale[:, None]
-    wanted = np.einsum("fri,bfi->bfr", rows, places - moved) * scale
+    wanted = np.einsum("fri,bfi->bfr", rows, places - moved)
+    if views.end is not None:
+        wanted[:, :, 2] = np.einsum("fi,bfi->bf", normals, places - ends)
+    wanted = wanted * scale
     tip_sd = TIP_SD_MM if views.tips is None else STATED_TIP_SD_MM
     prior = np.diag([views.sd_mm**-2.0] * 3 + [tip_sd**-2.0] * 3)
     target = np.append(prior[:3, :3] @ views.center, np.zeros(3))
