@@ -12,10 +12,18 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from wristed_world import make_driver
 
 from neeco.capture.model import InstrumentState, State, Uncertainty
 from neeco.fitting.state_fitter import StateFit
-from neeco.methods.kinematic.contradictions import CONTRADICTING, Misfits, refit_outliers
+from neeco.methods.kinematic.contradictions import (
+    CONTRADICTING,
+    HELD_BACK,
+    Misfits,
+    judge_held_back,
+    mirrored_state,
+    refit_outliers,
+)
 from neeco.methods.kinematic.state_passes import LARGE
 from neeco.methods.kinematic.state_search import JOINT, LARGEST, FittedState, StateSearch
 from neeco.scene import Recorded
@@ -120,7 +128,7 @@ def test_a_wrong_state_contradicts_the_others_and_is_found_from_one_of_theirs(tm
     states[3] = replace(TRUE[10], time=TRUE[3].time)
     session = session_of(tmp_path, states)
     search = search_of(session)
-    refit_outliers(search, LARGE, Misfits.of(search))
+    refit_outliers(search, LARGE, Misfits.of(search), large=False)
     assert session.scene.diagnostics[CONTRADICTING] == {"000003": "fitted anew"}
     found = session.refinement.state(3, states[3])
     assert session.refinement.layout.increments_between(TRUE[3], found)[3:6].norm() < 0.7
@@ -131,9 +139,38 @@ def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
     frame = session.full_views.frames[5]
     world.write_image(frame.image_path, torch.rand(64, 96, 3, generator=torch.Generator().manual_seed(0)))
     search = search_of(session)
-    refit_outliers(search, LARGE, Misfits.of(search))
+    refit_outliers(search, LARGE, Misfits.of(search), large=False)
     assert session.scene.diagnostics[CONTRADICTING] == {"000005": "left out"}
     assert session.refinement.weights.tolist() == [float(index != 5) for index in range(len(TRUE))]
+
+
+def test_a_mirrored_state_is_held_back_and_fitted_once_the_scene_went_on_without_it(tmp_path: Path) -> None:
+    """It looks so much like the right one that it is no outlier."""
+    scene = make_driver(12)
+    true = list(scene.recorded.states)
+    frames = world.record(scene, tmp_path, true, "train").frames
+    session = new_session(scene, TrainingViews.read(frames, 1.0), method_defaults("kinematic"))
+    wrong = mirrored_state(search_of(session), 4, true[4])
+    scene.recorded = Recorded.of((*frames[:4], replace(frames[4], state=wrong), *frames[5:]), scene.instruments)
+    views = TrainingViews.read(
+        tuple(replace(f, state=s) for f, s in zip(frames, scene.recorded.states, strict=True)), 1.0
+    )
+    session = new_session(scene, views, method_defaults("kinematic"))
+    search = search_of(session)
+    misfits = replace(Misfits.of(search), limit=1e3, rejection_limit=1e3)
+    refit_outliers(search, LARGE, misfits, large=True)
+    held = scene.diagnostics[HELD_BACK]
+    assert "000004" in held
+    assert len(held) <= 4
+    assert session.refinement.weights.tolist() == [float(name not in held) for name in scene.recorded.names]
+    judge_held_back(search)
+    assert scene.diagnostics[CONTRADICTING] == {"000004": "fitted anew"}
+    assert HELD_BACK not in scene.diagnostics
+    assert bool((session.refinement.weights == 1).all())
+    found = session.refinement.state(4, wrong)
+    off = session.refinement.layout.increments_between(true[4], found)
+    assert off[3:6].norm() < 1.0
+    assert off[:3].norm().rad2deg() < 5
 
 
 def test_stated_uncertainties_are_the_prior(tmp_path: Path) -> None:

@@ -31,8 +31,9 @@ def decided(
     )
     monkeypatch.setattr(module.StateSearch, "of", lambda session, articulated: search)
     monkeypatch.setattr(module, "size_of_errors", lambda search, outliers: size)
-    monkeypatch.setattr(module, "refit_outliers", lambda search, scale, misfits: None)
-    monkeypatch.setattr(module.Misfits, "of", lambda search: module.Misfits({}, 1.0, 1.0))
+    monkeypatch.setattr(module, "refit_outliers", lambda search, scale, misfits, large: None)
+    monkeypatch.setattr(module, "hold_back", lambda search, misfits: None)
+    monkeypatch.setattr(module.Misfits, "of", lambda search: module.Misfits({}, 1.0, 1.0, 1.0))
     monkeypatch.setattr(module, "CARVED_AT", ())
     module.fit_states(session, None, mark)  # type: ignore[arg-type]
     return module.STATE_ERRORS in session.scene.diagnostics

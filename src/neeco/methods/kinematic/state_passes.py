@@ -14,7 +14,13 @@ import torch
 from neeco.capture.model import evenly_spaced
 from neeco.fitting.alignment import STATE_ERRORS
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.methods.kinematic.contradictions import CONTRADICTING, Misfits, refit_outliers
+from neeco.methods.kinematic.contradictions import (
+    CONTRADICTING,
+    Misfits,
+    hold_back,
+    judge_held_back,
+    refit_outliers,
+)
 from neeco.methods.kinematic.discovery import carve_again
 from neeco.methods.kinematic.state_registration import LARGE_ERRORS
 from neeco.methods.kinematic.state_search import LARGEST, StateSearch
@@ -40,6 +46,8 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
     several = any(len(frames) > 1 for frames in refinement.frames_of_instant)
     if several or not (scene.instruments and session.config.refine.frame_poses):
         return  # gradients of several cameras' images determine an instant's state better than each image does
+    if mark in CARVED_AT:
+        judge_held_back(StateSearch.of(session, articulated))
     if mark in DECIDED_AT and STATE_ERRORS not in scene.diagnostics:
         search, first = StateSearch.of(session, articulated), mark == DECIDED_AT[0]
         misfits = Misfits.of(search) if first else None
@@ -49,8 +57,10 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
             session.report("the states' errors are larger than a tracker's: they are fitted to the images")
             for (index,) in refinement.frames_of_instant:
                 refinement.set_deviations(index, search.deviations(index, SCALE))
-        if misfits is not None:
-            refit_outliers(search, LARGE if scale is None else SCALE, misfits)
+        if misfits is None and scale is not None:
+            hold_back(search, Misfits.of(search))
+        elif misfits is not None:
+            refit_outliers(search, LARGE if scale is None else SCALE, misfits, large=scale is not None)
     if STATE_ERRORS not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, contradicting = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})

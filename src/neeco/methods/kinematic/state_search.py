@@ -74,11 +74,14 @@ class StateSearch:
         """Return frame `index` over tissue with the shadow of instruments in `state` (None: none)."""
         return self.fitter.view(self.session.full_views.frames[index], state)
 
-    def fitted(self, index: int, scale: float, about: State | None = None) -> FittedState | None:
-        """Return the state of frame `index` fitted from its present one, with a prior about that recorded (or `about`
-        another) of errors `scale` times as large as usual ones of a robot, or as stated; None where the fit leads out
-        of the image."""
-        start, given, precision = self.state(index), self.session.recorded.states[index], self.precision(index, scale)
+    def fitted(
+        self, index: int, scale: float, about: State | None = None, start: State | None = None
+    ) -> FittedState | None:
+        """Return the state of frame `index` fitted from its present one (or another `start`), with a prior about that
+        recorded (or `about` another) of errors `scale` times as large as usual ones of a robot, or as stated; None
+        where the fit leads out of the image."""
+        given, precision = self.session.recorded.states[index], self.precision(index, scale)
+        start = start or self.state(index)
         fit = self.fitter.fit(self.view(index, start), about or given, precision, start, levels=LEVELS, steps=STEPS)
         if fit is None:
             return None
