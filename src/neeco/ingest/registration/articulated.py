@@ -40,6 +40,7 @@ from neeco.ingest.registration.base import (
     in_camera,
     moved_from,
     sd_motion,
+    too_few_shafts,
     unmoved,
 )
 from neeco.ingest.registration.layers import EXCHANGED_SHARES
@@ -110,11 +111,14 @@ def find_articulated_base(
             "exactly, or a recording that shows more of it"
         )
     fits = _fits(problem, known_starts(problem) if prior is not None else unknown_starts(problem, seed))
-    if not fits:
-        raise NeecoError(unmoved(stated=prior is not None))
-    best = fits[0]
-    if best.residual_px > MAX_RESIDUAL_PX or overlap(problem, best) < LEAST_OVERLAP or _exchangeable(problem, best):
-        raise NeecoError(unmoved(stated=prior is not None))
+    best = fits[0] if fits else None
+    if (
+        best is None
+        or best.residual_px > MAX_RESIDUAL_PX
+        or overlap(problem, best) < LEAST_OVERLAP
+        or _exchangeable(problem, best)
+    ):
+        raise NeecoError(unmoved(stated=prior is not None, linked=True))
     return _result(problem, fits, motion)
 
 
@@ -176,10 +180,10 @@ def known_starts(problem: ArticulatedProblem) -> list[np.ndarray]:
 
 
 def unknown_starts(problem: ArticulatedProblem, seed: int) -> list[np.ndarray]:
-    """The best bases of all, by lines and tips of the masks' shafts."""
+    """The best bases of all, by lines and tips of the masks' shafts. Raises NeecoError where too few show one."""
     lines, model, generator = problem.silhouettes.shafts, problem.model, np.random.default_rng(seed)
     if lines.visible.sum() < MIN_FRAMES:
-        return []
+        raise NeecoError(too_few_shafts(lines))
     half = float(np.median(problem.silhouettes.distances.max((1, 2))))
     distance = TYPICAL_RADIUS_MM * problem.silhouettes.intrinsics[0] / max(half, 0.5)
     cameras = np.linalg.inv(problem.camera_from_world)
@@ -199,11 +203,6 @@ def unknown_starts(problem: ArticulatedProblem, seed: int) -> list[np.ndarray]:
         tips=ends[:, outermost or [1], 1].mean(1),
     )
     found = search(views, uniform_rotations(N_UNIFORM, generator), generator, UNIFORM_STEP_RAD)
-    import os
-
-    if os.environ.get("DBG"):
-        print("costs", found.costs.round(3))
-        globals()["DBG"] = found
     return list(found.world_from_base[found.costs < MAX_START_COST])
 
 

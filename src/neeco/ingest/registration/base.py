@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.model import BaseUncertainty, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.trocar import ShaftLine
-from neeco.ingest.foreground.silhouettes import silhouettes_of
+from neeco.ingest.foreground.silhouettes import ShaftLines, silhouettes_of
 from neeco.ingest.registration.axial_texture import with_marks
 from neeco.ingest.registration.layers import EXCHANGED_SHARES, LayerFit
 from neeco.ingest.registration.silhouette_fit import (
@@ -185,11 +185,7 @@ def find_base(
     problem = _problem(masks, intrinsics, camera_from_world, poses_at, readings=readings, hidden=hidden, images=images)
     visible = problem.silhouettes.shafts.visible
     if visible.sum() < MIN_FRAMES:
-        raise NeecoError(
-            f"what moves looks like a shaft in {int(visible.sum())} of {len(visible)} frames, at least {MIN_FRAMES} "
-            "are needed; give the transform, exactly or, before a still scope, of an arm with a trocar, roughly "
-            "(sd_mm, sd_deg), or a recording that shows more of it"
-        )
+        raise NeecoError(too_few_shafts(problem.silhouettes.shafts))
     problem = problem.take(np.flatnonzero(visible))
     few = problem.take(np.array(evenly_spaced(len(problem.blocks), SEARCH_FRAMES)))
     clock_sd = 0.0 if clock_known else CLOCK_SD_S
@@ -361,17 +357,27 @@ def _require_moved(problem: SilhouetteProblem, known: BasePrior, fit: Silhouette
             raise NeecoError(unmoved(stated=known.sd_mm is not None))
 
 
-def unmoved(*, stated: bool) -> str:
-    """Error where nothing in the images moves as an instrument's log says; stated: whether its base was, roughly."""
+def too_few_shafts(shafts: ShaftLines) -> str:
+    """Error where too few masks show a shaft."""
+    return (
+        f"what moves looks like a shaft in {int(shafts.visible.sum())} of {len(shafts.visible)} frames, at least "
+        f"{MIN_FRAMES} are needed; give the transform, exactly or, before a still scope, of an arm with a trocar, "
+        "roughly (sd_mm, sd_deg), or a recording that shows more of it"
+    )
+
+
+def unmoved(*, stated: bool, linked: bool = False) -> str:
+    """Error where nothing in the images moves as an instrument's log says; stated: whether its base was, roughly;
+    linked: whether its links were."""
     if stated:
         return (
             "nothing in the images moves with its poses; check which arm and which clock its log is of, or give the "
             "exact transform"
         )
+    links = "" if linked else "the links of a wrist that bends (kinematics), or "
     return (
-        "of all bases none was found from which its poses explain what moves; state the links of a wrist that bends "
-        "(kinematics), or the base as far as it is known (transform, sd_mm, sd_deg); check which arm and which clock "
-        "its log is of"
+        f"of all bases none was found from which its poses explain what moves; state {links}the base as far as it is "
+        "known (transform, sd_mm, sd_deg); check which arm and which clock its log is of"
     )
 
 
