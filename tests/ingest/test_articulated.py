@@ -208,6 +208,15 @@ def test_a_base_of_which_nothing_is_known_is_found_within_what_it_states(masks):
 
 
 @pytest.mark.slow
+def test_a_transform_in_other_axes_is_told_from_another_arms_log(masks):
+    turned = Rotation.from_rotvec([0.0, 0.0, np.pi]).as_matrix()
+    given = WORLD_FROM_BASE.copy()
+    given[:3] = turned @ given[:3]
+    with pytest.raises(NeecoError, match=r"from one turned by 1(79|80) deg.*check the axes"):
+        _find(masks, _tree(), given)
+
+
+@pytest.mark.slow
 def test_another_arms_log_is_refused_where_nothing_is_known_of_its_base(masks):
     with pytest.raises(NeecoError, match="of all bases none was found"):
         find_articulated_base(masks[::-1], INTRINSICS, STILL, _motion(_tree()), None)

@@ -57,7 +57,7 @@ APART_MM, APART_RAD = 3.0, 0.035  # between results that count as different
 # added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
 FLOOR_MM, FLOOR_DEPTH_MM, FLOOR_DEG = 0.25, 0.35, 0.25
 SCATTER = 1.3  # factor on standard deviations; assumed, as the floors are: few recordings were measured
-USUAL_OVERLAP = 0.85  # of the silhouette with the masks
+USUAL_OVERLAP, MIN_GAIN = 0.85, 0.1  # of the silhouette with the masks, and by which another base betters the stated
 LEAST_OVERLAP, MAX_RESIDUAL_PX = 0.4, 2.5  # beyond, nothing is found
 REVERSED_SHARE = 0.8  # of the cost, from which a joint counts as reversed
 MIN_EXCHANGED = 1.25  # times the cost, with poses of other moments
@@ -110,16 +110,42 @@ def find_articulated_base(
             f"poses, readings and what moves are there together in fewer than {MIN_FRAMES} frames; give the transform "
             "exactly, or a recording that shows more of it"
         )
-    fits = _fits(problem, known_starts(problem) if prior is not None else unknown_starts(problem, seed))
-    best = fits[0] if fits else None
-    if (
-        best is None
-        or best.residual_px > MAX_RESIDUAL_PX
-        or overlap(problem, best) < LEAST_OVERLAP
-        or _exchangeable(problem, best)
-    ):
+    if prior is None:
+        fits = _explaining(problem, unknown_starts(problem, seed))
+    else:
+        fits = _explaining(problem, known_starts(problem))
+    reached = overlap(problem, fits[0]) if fits else 0.0
+    if prior is not None and reached < USUAL_OVERLAP and (words := _elsewhere(problem, reached, seed)):
+        raise NeecoError(words)
+    if not fits:
         raise NeecoError(unmoved(stated=prior is not None, linked=True))
     return _result(problem, fits, motion)
+
+
+def _explaining(problem: ArticulatedProblem, starts: list[np.ndarray]) -> list[ArticulatedFit]:
+    """Fits from different starts, the best first; none where that does not explain the masks, or poses of other moments
+    do so about as well."""
+    fits = _fits(problem, starts)
+    if not fits or fits[0].residual_px > MAX_RESIDUAL_PX or overlap(problem, fits[0]) < LEAST_OVERLAP:
+        return []
+    return [] if _exchangeable(problem, fits[0]) else fits
+
+
+def _elsewhere(problem: ArticulatedProblem, reached: float, seed: int) -> str:
+    """Error for a stated base that explains the masks worse, by `reached` of their overlap, than one far from it; else
+    empty."""
+    if problem.silhouettes.shafts.visible.sum() < MIN_FRAMES:
+        return ""
+    free = replace(problem, prior=BasePrior(np.eye(4), None, None, problem.prior.sd_clock))
+    fits = _explaining(free, unknown_starts(free, seed))
+    if not fits or overlap(free, fits[0]) < max(USUAL_OVERLAP, reached + MIN_GAIN):
+        return ""
+    off = moved_from(problem.prior.world_from_base, fits[0].world_from_base, problem.middle)
+    return (
+        "what moves in the images is not explained from the base as stated, but from one turned by "
+        f"{off['turned_deg']:.0f} deg, with the instrument {off['moved_mm']:.0f} mm away: check the axes and the "
+        "direction of the transform, or write unknown"
+    )
 
 
 def problem_of(
