@@ -9,7 +9,7 @@ from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, WORLD_FROM_BASE, disturb
 
 from neeco.errors import NeecoError
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
-from neeco.ingest.registration import base
+from neeco.ingest.registration import silhouette_search
 from neeco.ingest.registration.base import find_base
 from neeco.ingest.registration.silhouette_search import Candidates, ShaftViews, search, uniform_rotations
 
@@ -63,7 +63,7 @@ def test_masks_in_which_nothing_moves_with_the_pose_end_in_one_line():
 def test_a_base_of_which_nothing_is_known_and_none_fits_asks_for_a_rough_one(monkeypatch):
     world = make_world(14)
     far = Candidates(np.array([1e9]), np.eye(4)[None], np.zeros((1, 3)), np.zeros((1, 3)))
-    monkeypatch.setattr(base, "search", lambda *arguments: far)
+    monkeypatch.setattr(silhouette_search, "search", lambda *arguments: far)
     with pytest.raises(NeecoError, match=r"of all bases none .* the base as far as it is known"):
         _find(world, None)
 

@@ -30,11 +30,8 @@ from neeco.ingest.registration.articulated_fit import (
     with_pose_errors,
 )
 from neeco.ingest.registration.base import (
-    MAX_START_COST,
     MIN_FRAMES,
     N_BLOCKS,
-    N_UNIFORM,
-    TYPICAL_RADIUS_MM,
     BaseRegistration,
     Prior,
     in_camera,
@@ -46,12 +43,11 @@ from neeco.ingest.registration.base import (
 from neeco.ingest.registration.layers import EXCHANGED_SHARES
 from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S, BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock
-from neeco.ingest.registration.silhouette_search import ShaftViews, search, uniform_rotations
+from neeco.ingest.registration.silhouette_search import distance_to, search_bases
 
 START_FRAMES, FIT_FRAMES = 16, 48  # on which starts are compared, and that the result is fitted to
 ALONG_MM = (-10.0, -5.0, 5.0, 10.0)  # starts along the shaft
 ROLLS_RAD = (-0.25, 0.25)  # starts turned about it
-UNIFORM_STEP_RAD = 0.2  # about that between uniform rotations
 N_REFINED = 3  # starts that are fitted to all frames
 APART_MM, APART_RAD = 3.0, 0.035  # between results that count as different
 # added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
@@ -136,7 +132,7 @@ def _elsewhere(problem: ArticulatedProblem, reached: float, seed: int) -> str:
     empty."""
     if problem.silhouettes.shafts.visible.sum() < MIN_FRAMES:
         return ""
-    free = replace(problem, prior=BasePrior(np.eye(4), None, None, problem.prior.sd_clock))
+    free = replace(problem, prior=BasePrior.of(None, problem.prior.sd_clock))
     fits = _explaining(free, unknown_starts(free, seed))
     if not fits or overlap(free, fits[0]) < max(USUAL_OVERLAP, reached + MIN_GAIN):
         return ""
@@ -168,9 +164,6 @@ def problem_of(
     if len(rows) < MIN_FRAMES:
         return None
     rows = rows[evenly_spaced(len(rows), FIT_FRAMES)]
-    known_base = BasePrior(np.eye(4), None, None, sd_clock)
-    if prior is not None:
-        known_base = BasePrior(prior[0], np.radians(prior[2]), prior[1], sd_clock)
     return ArticulatedProblem(
         model=ArticulatedModel(motion.tree, poses[len(CLOCK_SHIFTS_S) // 2][known]),
         silhouettes=silhouettes_of(masks[rows], intrinsics, hidden),
@@ -180,7 +173,7 @@ def problem_of(
         readings={key: part[:, rows] for key, part in readings.items()},
         values=with_motion(values[:, rows]),
         blocks=np.arange(len(rows)) * N_BLOCKS // len(rows),
-        prior=known_base,
+        prior=BasePrior.of(prior, sd_clock),
     )
 
 
@@ -207,29 +200,22 @@ def known_starts(problem: ArticulatedProblem) -> list[np.ndarray]:
 
 def unknown_starts(problem: ArticulatedProblem, seed: int) -> list[np.ndarray]:
     """The best bases of all, by lines and tips of the masks' shafts. Raises NeecoError where too few show one."""
-    lines, model, generator = problem.silhouettes.shafts, problem.model, np.random.default_rng(seed)
-    if lines.visible.sum() < MIN_FRAMES:
-        raise NeecoError(too_few_shafts(lines))
-    half = float(np.median(problem.silhouettes.distances.max((1, 2))))
-    distance = TYPICAL_RADIUS_MM * problem.silhouettes.intrinsics[0] / max(half, 0.5)
-    cameras = np.linalg.inv(problem.camera_from_world)
-    middle = len(CLOCK_SHIFTS_S) // 2
-    ends = model.cones_at(model.means, problem.values[middle])[0]
+    shafts, model = problem.silhouettes.shafts, problem.model
+    if shafts.visible.sum() < MIN_FRAMES:
+        raise NeecoError(too_few_shafts(shafts))
+    ends = model.cones_at(model.means, problem.values[len(CLOCK_SHIFTS_S) // 2])[0]
     outermost = [2 + index for index, cone in enumerate(model.cones) if cone.child is None]
-    views = ShaftViews(
-        lines=lines.entering,
-        intrinsics=problem.silhouettes.intrinsics,
-        camera_from_world=problem.camera_from_world,
-        base_from_instrument=problem.poses[middle],
-        center=(cameras[:, :3, 3] + distance * cameras[:, :3, 2]).mean(0),  # where most of them look
-        sd_mm=distance,
-        distance=distance,
+    found = search_bases(
+        problem,
+        problem.prior,
+        distance_to(problem, problem.prior),
+        np.random.default_rng(seed),
+        shafts.entering,
         axis=model.axis,
         end=model.rest[model.first][:3, 3],
         tips=ends[:, outermost or [1], 1].mean(1),
     )
-    found = search(views, uniform_rotations(N_UNIFORM, generator), generator, UNIFORM_STEP_RAD)
-    return list(found.world_from_base[found.costs < MAX_START_COST])
+    return list(found.world_from_base)
 
 
 def _distinct(problem: ArticulatedProblem, fits: list[ArticulatedFit]) -> list[ArticulatedFit]:

@@ -43,13 +43,11 @@ from neeco.ingest.registration.silhouette_model import (
     resized,
     sides,
 )
-from neeco.ingest.registration.silhouette_search import ShaftViews, rotations_about, search, uniform_rotations
+from neeco.ingest.registration.silhouette_search import TYPICAL_RADIUS_MM, distance_to, search_bases
 
 MIN_FRAMES = 12  # that show a shaft
 SEARCH_FRAMES, FIT_FRAMES = 40, 140  # on which starts are compared, and that the result is fitted to
 N_BLOCKS = 10  # stretches of a recording whose errors are taken to be independent
-N_ROTATIONS, N_UNIFORM = 500, 4000  # tried about a rough base, and without one
-MAX_START_COST = 2.0  # of robust losses below 1 each, and the prior's
 SIZE_FACTORS, MAX_SIZE_STEPS = (1.25, 1.1), 8  # by which the scale is varied, and how often at most
 LOG_SIZE_RANGE, SIZE_SAMPLES = 0.15, 9  # of the loss about its minimum
 MIN_OVERLAP_RATIO = 0.95  # to the overlap before: less of an instrument fits more easily
@@ -57,7 +55,7 @@ MIN_OVERLAP = 0.25  # of the instrument's silhouette with the masks
 # Standard deviations that more frames do not lower, as wrists and jaws blur the tip: of the logarithm of the size, and
 # of the place along the shaft, which a rigid shape hardly determines (benchmarks/base_calibration.py)
 SIZE_SD, ALONG_SD_MM = 0.03, 4.0
-RADIUS_RANGE_MM, TYPICAL_RADIUS_MM = (1.5, 5.5), 3.5  # of shafts; one outside is first taken to be typical
+RADIUS_RANGE_MM = (1.5, 5.5)  # of shafts; one outside is first taken to be typical
 LEVER_MM = 40.0  # from the instrument's middle, at which a turn counts as a shift
 OPEN_SD_MM = 3.0  # at that lever, from which a direction counts as undetermined
 OPEN_SHARE = 0.7  # of the prior's standard deviation: the images have hardly reduced it
@@ -183,16 +181,17 @@ def find_base(
     """
     generator = np.random.default_rng(seed)
     problem = _problem(masks, intrinsics, camera_from_world, poses_at, readings=readings, hidden=hidden, images=images)
-    visible = problem.silhouettes.shafts.visible
-    if visible.sum() < MIN_FRAMES:
-        raise NeecoError(too_few_shafts(problem.silhouettes.shafts))
-    problem = problem.take(np.flatnonzero(visible))
+    shafts = problem.silhouettes.shafts
+    if shafts.visible.sum() < MIN_FRAMES:
+        raise NeecoError(too_few_shafts(shafts))
+    problem = problem.take(np.flatnonzero(shafts.visible))
     few = problem.take(np.array(evenly_spaced(len(problem.blocks), SEARCH_FRAMES)))
-    clock_sd = 0.0 if clock_known else CLOCK_SD_S
-    known = BasePrior(np.eye(4), None, None, clock_sd)
-    if prior is not None:
-        known = BasePrior(prior[0], np.radians(prior[2]), prior[1], clock_sd)
-    starts = _starts(few, known, _distance(problem, prior), generator)
+    known = BasePrior.of(prior, 0.0 if clock_known else CLOCK_SD_S)
+    found = search_bases(few, known, distance_to(problem, known), generator)
+    starts = [
+        SilhouetteFit.of_line(base, 0.0, tip, axis, problem.readings.shape[1])
+        for base, tip, axis in zip(found.world_from_base, found.tips, found.axes, strict=True)
+    ]
     if not starts:
         raise NeecoError(unmoved(stated=prior is not None))
     best = max((fit_silhouettes(few, known, start) for start in starts), key=lambda fit: overlap(few, fit))
@@ -237,46 +236,6 @@ def _problem(
         blocks=np.minimum(np.arange(len(rows)) * N_BLOCKS // max(len(rows), 1), N_BLOCKS - 1),
         images=None if images is None else images[rows],
     )
-
-
-def _distance(problem: SilhouetteProblem, prior: Prior | None) -> float:
-    """Approximate mm from the cameras to the instrument: by the prior, else by a shaft of typical size."""
-    half = float(np.median([mask.max() for mask in problem.silhouettes.distances]))
-    guess = TYPICAL_RADIUS_MM * problem.silhouettes.intrinsics[0] / max(half, 0.5)
-    if prior is None:
-        return guess
-    place = problem.pivot(prior[0])
-    depth = float(np.median(problem.camera_from_world[:, 2, :3] @ place + problem.camera_from_world[:, 2, 3]))
-    return depth if depth > 0.2 * guess else guess
-
-
-def _starts(
-    problem: SilhouetteProblem, known: BasePrior, distance: float, generator: np.random.Generator
-) -> list[SilhouetteFit]:
-    """First fits, from lines and tips of the masks."""
-    if known.sd_rad is None or known.sd_mm is None:
-        rotations = uniform_rotations(N_UNIFORM, generator)
-        cameras = np.linalg.inv(problem.camera_from_world)  # the instrument is where most of them look
-        center, sd_mm, step = (cameras[:, :3, 3] + distance * cameras[:, :3, 2]).mean(0), distance, 0.2
-    else:
-        given = known.world_from_base
-        rotations = rotations_about(given[:3, :3], known.sd_rad, N_ROTATIONS, generator)
-        center, sd_mm, step = problem.pivot(given), known.sd_mm, 0.5 * known.sd_rad
-    views = ShaftViews(
-        lines=problem.silhouettes.shafts,
-        intrinsics=problem.silhouettes.intrinsics,
-        camera_from_world=problem.camera_from_world,
-        base_from_instrument=problem.poses[len(CLOCK_SHIFTS_S) // 2],
-        center=center,
-        sd_mm=sd_mm,
-        distance=distance,
-    )
-    found = search(views, rotations, generator, step)
-    return [
-        SilhouetteFit.of_line(base, 0.0, tip, axis, problem.readings.shape[1])
-        for cost, base, tip, axis in zip(found.costs, found.world_from_base, found.tips, found.axes, strict=True)
-        if cost < MAX_START_COST
-    ]
 
 
 def _best_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> SilhouetteFit:

@@ -55,6 +55,13 @@ class BasePrior:
     sd_mm: float | None
     sd_clock: float = CLOCK_SD_S
 
+    @classmethod
+    def of(cls, stated: tuple[np.ndarray, float, float] | None, sd_clock: float) -> BasePrior:
+        """Return that of a base [4, 4] with standard deviations mm and degrees; None: nothing is known of it."""
+        if stated is None:
+            return cls(np.eye(4), None, None, sd_clock)
+        return cls(stated[0], np.radians(stated[2]), stated[1], sd_clock)
+
 
 @dataclass(frozen=True, eq=False)
 class _Residuals:

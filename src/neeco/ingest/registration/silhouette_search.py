@@ -15,7 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from neeco.geometry.lines import unit
 from neeco.ingest.foreground.silhouettes import ShaftLines
+from neeco.ingest.registration.silhouette_fit import BasePrior
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSilhouettes
 
+N_ROTATIONS, N_UNIFORM = 500, 4000  # tried about a rough base, and without one
+MAX_START_COST = 2.0  # of robust losses below 1 each, and the prior's
+TYPICAL_RADIUS_MM = 3.5  # of shafts
 LINE_SD_RAD = 0.03  # of a shaft's direction in a mask: jaws open, masks fray
 TIP_SD_PX, LINE_SD_PX = 5.0, 2.0  # of masks: the tip's place moves with the jaws
 TIP_SD_MM, STATED_TIP_SD_MM = 60.0, 5.0  # prior distance of the tip from the tracked frame's origin, or as stated
@@ -68,6 +73,10 @@ class Candidates:
                 rows.append(row)
                 if len(rows) == count:
                     break
+        return self.take(np.array(rows, int))
+
+    def take(self, rows: np.ndarray) -> Candidates:
+        """Those of some rows."""
         return Candidates(*(values[rows] for values in vars(self).values()))
 
 
@@ -81,6 +90,49 @@ def rotations_about(center: np.ndarray, sd_rad: float, count: int, generator: np
     vectors = generator.normal(0, sd_rad, (count, 3))
     vectors[0] = 0
     return Rotation.from_rotvec(vectors).as_matrix() @ center
+
+
+def distance_to(problem: LoggedSilhouettes, known: BasePrior) -> float:
+    """Approximate mm from the cameras to the instrument: by the prior, else by a shaft of typical size."""
+    half = float(np.median([mask.max() for mask in problem.silhouettes.distances]))
+    guess = TYPICAL_RADIUS_MM * problem.silhouettes.intrinsics[0] / max(half, 0.5)
+    if known.sd_mm is None:
+        return guess
+    place = problem.pivot(known.world_from_base)
+    depth = float(np.median(problem.camera_from_world[:, 2, :3] @ place + problem.camera_from_world[:, 2, 3]))
+    return depth if depth > 0.2 * guess else guess
+
+
+def search_bases(
+    problem: LoggedSilhouettes,
+    known: BasePrior,
+    distance: float,
+    generator: np.random.Generator,
+    lines: ShaftLines | None = None,
+    **stated: np.ndarray,
+) -> Candidates:
+    """The best bases by lines (the masks' shafts where None) and tips of the masks. distance: as `distance_to` has it;
+    stated: what links say of the shaft (see `ShaftViews`)."""
+    if known.sd_rad is None or known.sd_mm is None:
+        rotations = uniform_rotations(N_UNIFORM, generator)
+        cameras = np.linalg.inv(problem.camera_from_world)  # the instrument is where most of them look
+        center, sd_mm, step = (cameras[:, :3, 3] + distance * cameras[:, :3, 2]).mean(0), distance, 0.2
+    else:
+        given = known.world_from_base
+        rotations = rotations_about(given[:3, :3], known.sd_rad, N_ROTATIONS, generator)
+        center, sd_mm, step = problem.pivot(given), known.sd_mm, 0.5 * known.sd_rad
+    views = ShaftViews(
+        lines=problem.silhouettes.shafts if lines is None else lines,
+        intrinsics=problem.silhouettes.intrinsics,
+        camera_from_world=problem.camera_from_world,
+        base_from_instrument=problem.poses[len(CLOCK_SHIFTS_S) // 2],
+        center=center,
+        sd_mm=sd_mm,
+        distance=distance,
+        **stated,
+    )
+    found = search(views, rotations, generator, step)
+    return found.take(np.flatnonzero(found.costs < MAX_START_COST))
 
 
 def search(views: ShaftViews, rotations: np.ndarray, generator: np.random.Generator, first_step: float) -> Candidates:

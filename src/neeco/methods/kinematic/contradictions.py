@@ -123,9 +123,7 @@ def judge_held_back(search: StateSearch) -> None:
     """Compare the states of frames that were held back, or left out, with others, by a scene that went on without them:
     wrong ones are fitted anew, right ones count again."""
     session, refinement, diagnostics = search.session, search.session.refinement, search.session.scene.diagnostics
-    held: list[str] | None = diagnostics.pop(HELD_BACK, None)
-    if held is None:
-        return
+    held: list[str] = diagnostics.pop(HELD_BACK)
     noted: dict[str, str] = dict(diagnostics.get(CONTRADICTING, {}))
     certain = [index for index in range(len(refinement.weights)) if refinement.weights[index] > 0]
     misfits = torch.tensor([search.misfit(index, search.state(index)) for index in certain])
@@ -137,7 +135,7 @@ def judge_held_back(search: StateSearch) -> None:
         given = session.recorded.states[index]
         own = search.fitted(index, 1.0, start=given)
         misfit = math.inf if own is None else own.fit.misfit
-        mirror = [mirrored_state(search, index, given)] if _linked(search) else []
+        mirror = [mirrored_state(search, index, given)] if search.linked else []
         for starts, refuted in ((mirror, REFUTED), (_other_starts(search, index, others), CLEARLY_REFUTED)):
             found = _fit_from(search, index, starts)
             if (
@@ -157,7 +155,7 @@ def _suspects(search: StateSearch, misfits: Misfits) -> list[int]:
     """Return frames of instruments with stated links whose states may be wrong though they are no outliers: explained
     worse than most, or not much better than the mirrored state, which is another one."""
     session, weights = search.session, search.session.refinement.weights
-    if not (math.isfinite(misfits.limit) and _linked(search)):
+    if not (math.isfinite(misfits.limit) and search.linked):
         return []
     noted = session.scene.diagnostics.get(CONTRADICTING, {})
     scores: dict[int, float] = {}
@@ -171,11 +169,6 @@ def _suspects(search: StateSearch, misfits: Misfits) -> list[int]:
         scores[index] = max(misfit / misfits.suspect_limit, alike)
     most = min(int(MAX_SHARE * len(misfits.of_frame)), MAX_SUSPECTS)
     return [index for index in sorted(scores, key=lambda index: -scores[index])[:most] if scores[index] > 1]
-
-
-def _linked(search: StateSearch) -> bool:
-    """Return whether the links of all instruments are stated."""
-    return all(item.kinematics is not None for item in search.session.scene.instruments)
 
 
 def _states_of(search: StateSearch, frames: Sequence[int]) -> list[State]:

@@ -16,6 +16,7 @@ from neeco.fitting.alignment import STATE_ERRORS
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.methods.kinematic.contradictions import (
     CONTRADICTING,
+    HELD_BACK,
     Misfits,
     hold_back,
     judge_held_back,
@@ -46,7 +47,7 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
     several = any(len(frames) > 1 for frames in refinement.frames_of_instant)
     if several or not (scene.instruments and session.config.refine.frame_poses):
         return  # gradients of several cameras' images determine an instant's state better than each image does
-    if mark in CARVED_AT:
+    if mark in CARVED_AT and HELD_BACK in scene.diagnostics:
         judge_held_back(StateSearch.of(session, articulated))
     if mark in DECIDED_AT and STATE_ERRORS not in scene.diagnostics:
         search, first = StateSearch.of(session, articulated), mark == DECIDED_AT[0]

@@ -66,6 +66,11 @@ class StateSearch:
         )
         return cls(session, Fitter(InstrumentRenderer(scene), bounded, TissueRenderer(scene), CORRELATION_PX), shafts)
 
+    @property
+    def linked(self) -> bool:
+        """Whether the links of all instruments are stated."""
+        return all(item.kinematics is not None for item in self.session.scene.instruments)
+
     def state(self, index: int) -> State:
         """Return the state of training frame `index` as corrected so far."""
         return self.session.refinement.state(index, self.session.recorded.states[index])
@@ -161,8 +166,7 @@ class StateSearch:
                 if len(each):
                     variances[number] = each[: math.ceil(KEPT_SHARE * len(each))].mean()
         # without stated links, roll, depth and joints follow the errors of a hinge that is still rough
-        linked = all(item.kinematics is not None for item in self.session.scene.instruments)
-        counted = COMPARED if linked else (0,)
+        counted = COMPARED if self.linked else (0,)
         return float(variances[[number for number in counted if number in kinds]].sqrt().median())
 
     def stated_scale(self) -> float:
