@@ -8,8 +8,9 @@ back, and judged by a scene that went on learning without them.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
@@ -24,7 +25,7 @@ CONTRADICTING = "contradicting_states"  # of a scene's diagnostics: what became 
 HELD_BACK = "held_back"  # of a scene's diagnostics: names of frames that the scene does not learn from, to judge them
 OUTLYING = 3.0  # robust standard deviations of a log misfit above which a state is an outlier
 REJECTED = 6.0  # above which a frame that no state explains is left out
-BETTER = 0.6  # of an outlier's misfit: that of another state which refutes it
+BETTER = 0.7  # of a state's misfit: that of another one which refutes it
 MIN_DISTANCE = 3.0  # standard deviations of the prior, root mean square, of a state that is another one
 EXPLAINED = 1.0  # misfit up to which a state explains its image
 MIN_SPREAD = 0.25  # standard deviation of log misfits, at least
@@ -34,8 +35,8 @@ MIN_FRAMES = 8  # with fewer, no state contradicts the others
 START_SCALE = 3.0  # of the prior about another start, times usual errors
 SUSPECT = 1.0  # robust standard deviations of a log misfit above which a state may be wrong
 ALIKE = 1.15  # times a state's misfit, below which the mirrored state may be right instead
-REFUTED, CLEARLY_REFUTED = 0.8, 0.5  # of a suspect's misfit: that of the mirrored state, or another, which refutes it
-USUAL = 1.2  # times the median misfit, up to which a suspect is explained
+UNDECIDED, MUCH_MORE = 0.9, 1.15  # of an own misfit, and gain: those of another state for which a frame stays held back
+N_OWN, N_NEAR = 12, 64  # states of the prior that are tried about a frame's own, and about another
 MAX_SHARE, MAX_SUSPECTS = 1 / 3, 24  # of all frames
 MAX_NAMED = 8  # frames in a line
 FITTED_ANEW, LEFT_OUT = "fitted anew", "left out"
@@ -60,11 +61,8 @@ class Misfits:
         shown = torch.tensor([misfit for misfit in misfits.values() if math.isfinite(misfit)])
         if len(shown) < MIN_FRAMES:
             return cls(misfits, math.inf, math.inf, math.inf)
-        logs = shown.clamp(1e-3, 1e3).log()
-        spread = max(1.4826 * float((logs - logs.median()).abs().median()), MIN_SPREAD)
-        median = float(logs.median())
-        limits = (max(median + many * spread, math.log(EXPLAINED)) for many in (OUTLYING, REJECTED, SUSPECT))
-        found = cls(misfits, *map(math.exp, limits))
+        limits = (max(_limit(shown, many), EXPLAINED) for many in (OUTLYING, REJECTED, SUSPECT))
+        found = cls(misfits, *limits)
         if len(found.outliers) > len(shown) // 2:
             return replace(found, limit=math.inf, rejection_limit=math.inf)
         return found
@@ -75,6 +73,21 @@ class Misfits:
         return [index for index, misfit in self.of_frame.items() if self.limit < misfit < math.inf]
 
 
+def _limit(misfits: Tensor, many: float) -> float:
+    """Return the misfit that is so many robust standard deviations of their logarithms above the median of [F]."""
+    logs = misfits.clamp(1e-3, 1e3).log()
+    spread = max(1.4826 * float((logs - logs.median()).abs().median()), MIN_SPREAD)
+    return math.exp(float(logs.median()) + many * spread)
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """A frame's best fit among several, and standard deviations [P] that cover all those that it does not refute."""
+
+    fit: StateFit
+    deviations: Tensor
+
+
 @torch.no_grad()
 def refit_outliers(search: StateSearch, scale: float, misfits: Misfits, *, large: bool) -> None:
     """Fit states that are outliers from other starts, or leave them out, and note them in the scene's diagnostics.
@@ -82,32 +95,15 @@ def refit_outliers(search: StateSearch, scale: float, misfits: Misfits, *, large
 
     scale: of the errors of all states (see `StateSearch.fitted`).
     """
-    session, refinement, diagnostics = search.session, search.session.refinement, search.session.scene.diagnostics
-    limit, names = misfits.limit, session.recorded.names
-    others = _states_of(search, [index for index, misfit in misfits.of_frame.items() if misfit <= limit])
-    noted: dict[str, str] = dict(diagnostics.get(CONTRADICTING, {}))
+    names, noted = search.session.recorded.names, _noted(search)
+    others = _states_of(search, [index for index, misfit in misfits.of_frame.items() if misfit <= misfits.limit])
     for index in misfits.outliers:
-        if names[index] in noted:
-            continue
-        own, given = search.fitted(index, scale), session.recorded.states[index]
-        misfit = misfits.of_frame[index] if own is None else own.fit.misfit
-        if misfit <= limit:
-            continue
-        found = _fit_from(search, index, _other_starts(search, index, others))
-        verdict = ""
-        if found is not None and found[0].misfit < BETTER * misfit:
-            if _distance(search, index, given, found[0].state, scale) > MIN_DISTANCE:
-                verdict = FITTED_ANEW if found[0].misfit < limit else LEFT_OUT
-                refinement.set_state(index, given, found[0].state, found[1])
-        elif misfit > misfits.rejection_limit:
-            verdict = LEFT_OUT
-        if verdict == LEFT_OUT:
-            refinement.weights[index] = 0
-        if verdict:
-            noted[names[index]] = verdict
-    if noted:
-        diagnostics[CONTRADICTING] = noted
-    if noted or large:
+        if names[index] not in noted:
+            own = _own_fit(search, index, scale)
+            if own is None or own.misfit > misfits.limit:
+                other = _fit_from(search, index, _other_starts(search, index, others))
+                _judge(search, index, scale, own, other, misfits)
+    if _noted(search) or large:
         hold_back(search, misfits)
 
 
@@ -115,40 +111,111 @@ def hold_back(search: StateSearch, misfits: Misfits) -> None:
     """Let the scene no longer learn from frames whose states may be wrong; note their names in its diagnostics."""
     session, suspects = search.session, _suspects(search, misfits)
     session.refinement.weights[suspects] = 0
-    session.scene.diagnostics[HELD_BACK] = [session.recorded.names[index] for index in suspects]
+    held = session.scene.diagnostics.setdefault(HELD_BACK, [])
+    held += [session.recorded.names[index] for index in suspects]
 
 
 @torch.no_grad()
-def judge_held_back(search: StateSearch) -> None:
+def judge_held_back(search: StateSearch, *, last: bool) -> None:
     """Compare the states of frames that were held back, or left out, with others, by a scene that went on without them:
-    wrong ones are fitted anew, right ones count again."""
-    session, refinement, diagnostics = search.session, search.session.refinement, search.session.scene.diagnostics
-    held: list[str] = diagnostics.pop(HELD_BACK)
-    noted: dict[str, str] = dict(diagnostics.get(CONTRADICTING, {}))
-    certain = [index for index in range(len(refinement.weights)) if refinement.weights[index] > 0]
-    misfits = torch.tensor([search.misfit(index, search.state(index)) for index in certain])
-    usual = max(USUAL * float(misfits.median()), EXPLAINED)
-    others = _states_of(search, certain)
-    for index, name in enumerate(session.recorded.names):
-        if name not in held and noted.get(name) != LEFT_OUT:
+    wrong ones are fitted anew, right ones count again, and undecided ones are held back until the `last` mark."""
+    session, refinement, names = search.session, search.session.refinement, search.session.recorded.names
+    held: list[str] = session.scene.diagnostics.pop(HELD_BACK)
+    misfits = Misfits.of(search)
+    others = _states_of(search, [index for index in range(len(names)) if refinement.weights[index] > 0])
+    undecided: list[str] = []
+    for index, name in enumerate(names):
+        if name not in held and _noted(search).get(name) != LEFT_OUT:
             continue
-        given = session.recorded.states[index]
-        own = search.fitted(index, 1.0, start=given)
-        misfit = math.inf if own is None else own.fit.misfit
-        mirror = [mirrored_state(search, index, given)] if search.linked else []
-        for starts, refuted in ((mirror, REFUTED), (_other_starts(search, index, others), CLEARLY_REFUTED)):
-            found = _fit_from(search, index, starts)
-            if (
-                found is not None
-                and found[0].misfit < min(refuted * misfit, usual)
-                and _distance(search, index, given, found[0].state, 1.0) > MIN_DISTANCE
-            ):
-                noted[name] = FITTED_ANEW
-                refinement.set_state(index, given, found[0].state, found[1])
-                break
-        refinement.weights[index] = float(noted.get(name) != LEFT_OUT)
-    if noted:
-        diagnostics[CONTRADICTING] = noted
+        starts, own = _other_starts(search, index, others), _own_fit(search, index, 1.0)
+        if search.linked:
+            starts.append(mirrored_state(search, index, session.recorded.states[index]))
+        other = _fit_from(search, index, starts)
+        _judge(search, index, 1.0, own, other, misfits)
+        if name in _noted(search):
+            continue
+        if not last and own is not None and _explains_better(other, own, UNDECIDED * own.misfit, MUCH_MORE):
+            undecided.append(name)
+        refinement.weights[index] = float(name not in undecided)
+    if undecided:
+        session.scene.diagnostics[HELD_BACK] = undecided
+
+
+@torch.no_grad()
+def fitted_anew(search: StateSearch, index: int) -> Refitted | None:
+    """Return the fit of a frame whose recorded state is wrong, about its present one; None if it leaves the image."""
+    return _fit_from(search, index, [search.state(index)])
+
+
+def leave_out_unexplained(search: StateSearch, misfits: Mapping[int, float]) -> None:
+    """Leave out frames that were fitted anew and are outliers in the end: their states remain unknown.
+
+    misfits: of all frames that count, by their number, after the last fits.
+    """
+    names, noted = search.session.recorded.names, _noted(search)
+    right = [misfit for index, misfit in misfits.items() if names[index] not in noted]
+    limit = _limit(torch.tensor(right), OUTLYING) if len(right) >= MIN_FRAMES else math.inf
+    for index, misfit in misfits.items():
+        if names[index] in noted and misfit > limit:
+            noted[names[index]] = LEFT_OUT
+            search.session.refinement.weights[index] = 0
+
+
+def _noted(search: StateSearch) -> dict[str, str]:
+    """Return what became of states that contradict the others, by the frame's name."""
+    noted: dict[str, str] = search.session.scene.diagnostics.get(CONTRADICTING, {})
+    return noted
+
+
+def _judge(
+    search: StateSearch,
+    index: int,
+    scale: float,
+    own: StateFit | None,
+    other: Refitted | None,
+    misfits: Misfits,
+) -> None:
+    """Replace the state of frame `index` where another explains its image much better, leave the frame out where none
+    does, and note either.
+
+    own: the best fit about the recorded state, None where it leaves the image. other: that of other states.
+    """
+    session, name = search.session, search.session.recorded.names[index]
+    misfit, given = misfits.of_frame[index] if own is None else own.misfit, session.recorded.states[index]
+    verdict = ""
+    if _explains_better(other, own, BETTER * misfit):
+        if _distance(search, index, given, other.fit.state, scale) > MIN_DISTANCE:
+            verdict = FITTED_ANEW if other.fit.misfit < misfits.limit else LEFT_OUT
+            session.refinement.set_state(index, given, other.fit.state, other.deviations)
+    elif misfit > misfits.rejection_limit:
+        verdict = LEFT_OUT
+    if verdict:
+        session.refinement.weights[index] = float(verdict != LEFT_OUT)
+        session.scene.diagnostics[CONTRADICTING] = {**_noted(search), name: verdict}
+
+
+def _explains_better(
+    other: Refitted | None, own: StateFit | None, misfit: float, more: float = 1.0
+) -> TypeGuard[Refitted]:
+    """Whether another fit leaves less than such a `misfit`, and explains more of the image, `more` times as much: a
+    state that hardly shows in the image leaves little unexplained there."""
+    return other is not None and other.fit.misfit < misfit and (own is None or other.fit.gain > more * own.gain)
+
+
+def _own_fit(search: StateSearch, index: int, scale: float) -> StateFit | None:
+    """Return the best fit of a frame about its recorded state, from the most promising of it, its present state and
+    some of the prior: one that stops in a minimum nearby must not make another state look better."""
+    given, precision = search.session.recorded.states[index], search.precision(index, scale)
+    starts = [given, search.state(index), *_sampled(search, index, given, precision, N_OWN)]
+    return max(_fits(search, index, starts, precision, given), key=lambda fit: fit.gain, default=None)
+
+
+def _sampled(search: StateSearch, index: int, state: State, precision: Tensor, count: int) -> list[State]:
+    """Return states of a prior with such precision [P, P] about `state`, the same for the same frame."""
+    spread = torch.linalg.cholesky(torch.linalg.inv(precision))
+    random = torch.Generator().manual_seed(index)
+    samples = torch.randn((count, len(spread)), generator=random, dtype=torch.float64)
+    return [search.fitter.parameters.moved(state, spread @ at) for at in samples]
 
 
 def _suspects(search: StateSearch, misfits: Misfits) -> list[int]:
@@ -221,14 +288,31 @@ def _other_starts(search: StateSearch, index: int, others: Sequence[State]) -> l
     ]
 
 
-def _fit_from(search: StateSearch, index: int, starts: Sequence[State]) -> tuple[StateFit, Tensor] | None:
-    """Return the best fit of a frame from the most promising starts, with its standard deviations [P]; None where none
-    stays in the image."""
+def _fit_from(search: StateSearch, index: int, starts: Sequence[State]) -> Refitted | None:
+    """Return the best fit of a frame from the most promising starts, and from states about the first found; None where
+    none stays in the image."""
+    precision = search.precision(index, START_SCALE)
+    fits = _fits(search, index, starts, precision)
+    if not fits:
+        return None
+    first = max(fits, key=lambda fit: fit.gain)
+    about = [first.state, *([mirrored_state(search, index, first.state)] if search.linked else [])]
+    near = [state for center in about for state in _sampled(search, index, center, precision, N_NEAR // len(about))]
+    fits += _fits(search, index, near, precision)
+    best = max(fits, key=lambda fit: fit.gain)
+    possible = [fit.state for fit in fits if BETTER * fit.misfit <= best.misfit]
+    apart = torch.stack([search.session.refinement.layout.increments_between(best.state, state) for state in possible])
+    return Refitted(best, (best.deviations(precision).square() + apart.square().mean(0)).sqrt())
+
+
+def _fits(
+    search: StateSearch, index: int, starts: Sequence[State], precision: Tensor, about: State | None = None
+) -> list[StateFit]:
+    """Return fits of a frame from the N_TRIED most promising starts, with a prior of such precision [P, P] about each
+    (or `about` one state)."""
     view = search.view(index, None)
-    best: tuple[StateFit, Tensor] | None = None
-    for start in search.fitter.ranked(view, starts, 0.25)[:N_TRIED]:
-        precision = search.precision(index, START_SCALE)
-        fit = search.fitter.fit(view, start, precision, levels=LEVELS, steps=STEPS)
-        if fit is not None and (best is None or fit.misfit < best[0].misfit):
-            best = fit, fit.deviations(precision)
-    return best
+    fits = (
+        search.fitter.fit(view, about or start, precision, start, levels=LEVELS, steps=STEPS)
+        for start in search.fitter.ranked(view, starts, LEVELS[0])[:N_TRIED]
+    )
+    return [fit for fit in fits if fit is not None]

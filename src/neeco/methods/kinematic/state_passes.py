@@ -18,8 +18,10 @@ from neeco.methods.kinematic.contradictions import (
     CONTRADICTING,
     HELD_BACK,
     Misfits,
+    fitted_anew,
     hold_back,
     judge_held_back,
+    leave_out_unexplained,
     refit_outliers,
 )
 from neeco.methods.kinematic.discovery import carve_again
@@ -48,7 +50,7 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
     if several or not (scene.instruments and session.config.refine.frame_poses):
         return  # gradients of several cameras' images determine an instant's state better than each image does
     if mark in CARVED_AT and HELD_BACK in scene.diagnostics:
-        judge_held_back(StateSearch.of(session, articulated))
+        judge_held_back(StateSearch.of(session, articulated), last=mark == CARVED_AT[-1])
     if mark in DECIDED_AT and STATE_ERRORS not in scene.diagnostics:
         search, first = StateSearch.of(session, articulated), mark == DECIDED_AT[0]
         misfits = Misfits.of(search) if first else None
@@ -64,15 +66,22 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
             refit_outliers(search, LARGE if scale is None else SCALE, misfits, large=scale is not None)
     if STATE_ERRORS not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
-    search, contradicting = StateSearch.of(session, articulated), scene.diagnostics.get(CONTRADICTING, {})
+    search, last = StateSearch.of(session, articulated), mark == FITTED_AT[-1]
+    contradicting = scene.diagnostics.get(CONTRADICTING, {})
+    explained: dict[int, float] = {}
     for (index,) in refinement.frames_of_instant:
-        known = search.state(index) if session.recorded.names[index] in contradicting else None
-        fit = search.fitted(index, SCALE, known) if refinement.weights[index] > 0 else None
+        if not refinement.weights[index] > 0:
+            continue
+        wrong = session.recorded.names[index] in contradicting
+        about = search.state(index) if wrong else None
+        fit = fitted_anew(search, index) if wrong and last else search.fitted(index, SCALE, about)
         if fit is not None:
             # until the last fit, gradients go on with the uncertainty of recorded states
-            last = mark == FITTED_AT[-1]
             deviations = fit.deviations if last else search.deviations(index, SCALE)
             refinement.set_state(index, session.recorded.states[index], fit.fit.state, deviations)
+            explained[index] = fit.fit.misfit
+    if last:
+        leave_out_unexplained(search, explained)
     if mark in CARVED_AT and _is_shown(session):
         with session.searching():
             carve_again(session, articulated)
