@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 from wristed_world import make_driver
 
 from neeco.capture.model import InstrumentState, State, Uncertainty
@@ -149,26 +150,76 @@ def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
     assert session.refinement.weights.tolist() == [float(index != 5) for index in range(len(TRUE))]
 
 
-@pytest.mark.parametrize(("gained", "verdict"), [(-10.0, None), (10.0, "fitted anew")])
+def judged_by(search: StateSearch, explained: Callable[[State, State, StateFit], StateFit]) -> str | None:
+    """What becomes of frame 5, held back, if its fits with a prior about a state, from a start, are as `explained`."""
+
+    class Answering(Fitter[StateParameters]):
+        def fit(
+            self, view: FrameView, expected: State, precision: Tensor, start: State | None = None, **named: Any
+        ) -> StateFit | None:
+            found = super().fit(view, expected, precision, start, **named)
+            return None if found is None else explained(expected, start or expected, found)
+
+    fitter = Answering(search.fitter.instruments, search.fitter.parameters, search.fitter.tissue)
+    diagnostics = search.session.scene.diagnostics
+    diagnostics[HELD_BACK] = ["000005"]
+    judge_held_back(replace(search, fitter=fitter), last=True)
+    verdict: str | None = diagnostics.get(CONTRADICTING, {}).get("000005")
+    return verdict
+
+
+@pytest.mark.parametrize(("gain", "verdict"), [(20.0, None), (40.0, "fitted anew")])
 def test_a_state_refutes_another_only_if_more_of_the_image_is_explained(
-    gained: float, verdict: str | None, tmp_path: Path
+    gain: float, verdict: str | None, tmp_path: Path
 ) -> None:
     """One that hardly shows in the image leaves little unexplained there."""
-    session = session_of(tmp_path, TRUE)
-    given = session.recorded.states[5]
+    search = search_of(session_of(tmp_path, TRUE))
+    given = search.session.recorded.states[5]
 
-    class Edges(Fitter[StateParameters]):
-        def fit(self, view: FrameView, expected: State, *rest: Any, **named: Any) -> StateFit | None:
-            found = super().fit(view, expected, *rest, **named)
-            if found is None or expected is given:
-                return None if found is None else replace(found, misfit=0.9, gain=30.0)
-            return replace(found, state=TRUE[11], misfit=0.2, gain=30.0 + gained)
+    def explained(expected: State, start: State, found: StateFit) -> StateFit:
+        if expected is given:
+            return replace(found, misfit=0.9, gain=30.0)
+        return replace(found, state=TRUE[11], misfit=0.2, gain=gain)
 
-    search = search_of(session)
-    fitter = Edges(search.fitter.instruments, search.fitter.parameters, search.fitter.tissue)
-    session.scene.diagnostics[HELD_BACK] = ["000005"]
-    judge_held_back(replace(search, fitter=fitter), last=True)
-    assert session.scene.diagnostics.get(CONTRADICTING, {}).get("000005") == verdict
+    assert judged_by(search, explained) == verdict
+
+
+@pytest.mark.parametrize(("gain", "verdict"), [(50.0, None), (35.0, "fitted anew")])
+def test_a_local_minimum_of_the_fit_from_a_recorded_state_does_not_refute_it(
+    gain: float, verdict: str | None, tmp_path: Path
+) -> None:
+    """Fits from starts nearby speak for the recorded state, too."""
+    search = search_of(session_of(tmp_path, TRUE))
+    given, layout = search.session.recorded.states[5], search.session.refinement.layout
+
+    def explained(expected: State, start: State, found: StateFit) -> StateFit:
+        if expected is not given:
+            return replace(found, state=TRUE[11], misfit=0.2, gain=40.0)
+        nearby = float(layout.increments_between(given, start).abs().max()) > 1e-6
+        return replace(found, misfit=0.2 if gain > 40.0 and nearby else 0.9, gain=gain if nearby else 30.0)
+
+    assert judged_by(search, explained) == verdict
+
+
+@pytest.mark.parametrize(("misfit", "included"), [(0.22, True), (0.4, False)])
+def test_deviations_of_a_state_fitted_anew_include_states_that_its_image_does_not_refute(
+    misfit: float, included: bool, tmp_path: Path
+) -> None:
+    search, fits = search_of(session_of(tmp_path, TRUE)), 0
+    given, refinement = search.session.recorded.states[5], search.session.refinement
+
+    def explained(expected: State, start: State, found: StateFit) -> StateFit:
+        nonlocal fits
+        if expected is given:
+            return replace(found, misfit=0.9, gain=30.0)
+        fits += 1
+        if fits == 1:
+            return replace(found, state=TRUE[11], misfit=0.2, gain=50.0)
+        return replace(found, state=TRUE[0], misfit=misfit, gain=40.0)
+
+    assert judged_by(search, explained) == "fitted anew"
+    apart = refinement.layout.increments_between(TRUE[11], TRUE[0])
+    assert bool((refinement.deviations(5) > apart.abs() / 2).all()) == included
 
 
 def driver_session(root: Path, recorded: dict[int, State] | None = None, scale: float = 0.0) -> GaussianSession:
@@ -217,7 +268,6 @@ def test_a_mirrored_state_is_held_back_and_fitted_once_the_scene_went_on_without
 
 
 def test_states_with_usual_errors_are_not_taken_for_wrong_ones(tmp_path: Path) -> None:
-    """However far a fit from the recorded state gets: it begins at others nearby as well."""
     session = driver_session(tmp_path, scale=1.0)
     names, search = session.recorded.names, search_of(session)
     session.refinement.weights[::3] = 0

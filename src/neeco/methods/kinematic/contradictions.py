@@ -35,11 +35,18 @@ MIN_FRAMES = 8  # with fewer, no state contradicts the others
 START_SCALE = 3.0  # of the prior about another start, times usual errors
 SUSPECT = 1.0  # robust standard deviations of a log misfit above which a state may be wrong
 ALIKE = 1.15  # times a state's misfit, below which the mirrored state may be right instead
-UNDECIDED, MUCH_MORE = 0.9, 1.15  # of an own misfit, and gain: those of another state for which a frame stays held back
-N_OWN, N_NEAR = 12, 64  # states of the prior that are tried about a frame's own, and about another
+# ratios to the misfit and gain of a frame's own fit, below and above which another fit leaves the frame undecided
+UNDECIDED_MISFIT, UNDECIDED_GAIN = 0.9, 1.15
+N_OWN, N_NEAR = 12, 64  # starts sampled from the prior about a recorded state, and about another
 MAX_SHARE, MAX_SUSPECTS = 1 / 3, 24  # of all frames
 MAX_NAMED = 8  # frames in a line
 FITTED_ANEW, LEFT_OUT = "fitted anew", "left out"
+
+
+def contradicting_states(session: GaussianSession) -> dict[str, str]:
+    """Return what became of states that contradict the others, by the frame's name."""
+    noted: dict[str, str] = session.scene.diagnostics.get(CONTRADICTING, {})
+    return noted
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,7 @@ class Misfits:
 
 
 def _limit(misfits: Tensor, many: float) -> float:
-    """Return the misfit that is so many robust standard deviations of their logarithms above the median of [F]."""
+    """Return the misfit that lies `many` robust standard deviations of the log misfits [F] above their median."""
     logs = misfits.clamp(1e-3, 1e3).log()
     spread = max(1.4826 * float((logs - logs.median()).abs().median()), MIN_SPREAD)
     return math.exp(float(logs.median()) + many * spread)
@@ -82,7 +89,7 @@ def _limit(misfits: Tensor, many: float) -> float:
 
 @dataclass(frozen=True)
 class Refitted:
-    """A frame's best fit among several, and standard deviations [P] that cover all those that it does not refute."""
+    """A frame's best fit, and standard deviations [P] that include the spread of those that it does not refute."""
 
     fit: StateFit
     deviations: Tensor
@@ -95,7 +102,7 @@ def refit_outliers(search: StateSearch, scale: float, misfits: Misfits, *, large
 
     scale: of the errors of all states (see `StateSearch.fitted`).
     """
-    names, noted = search.session.recorded.names, _noted(search)
+    names, noted = search.session.recorded.names, contradicting_states(search.session)
     others = _states_of(search, [index for index, misfit in misfits.of_frame.items() if misfit <= misfits.limit])
     for index in misfits.outliers:
         if names[index] not in noted:
@@ -103,7 +110,7 @@ def refit_outliers(search: StateSearch, scale: float, misfits: Misfits, *, large
             if own is None or own.misfit > misfits.limit:
                 other = _fit_from(search, index, _other_starts(search, index, others))
                 _judge(search, index, scale, own, other, misfits)
-    if _noted(search) or large:
+    if contradicting_states(search.session) or large:
         hold_back(search, misfits)
 
 
@@ -118,23 +125,23 @@ def hold_back(search: StateSearch, misfits: Misfits) -> None:
 @torch.no_grad()
 def judge_held_back(search: StateSearch, *, last: bool) -> None:
     """Compare the states of frames that were held back, or left out, with others, by a scene that went on without them:
-    wrong ones are fitted anew, right ones count again, and undecided ones are held back until the `last` mark."""
+    wrong ones are fitted anew, right ones are used again, and undecided ones stay held back until the `last` mark."""
     session, refinement, names = search.session, search.session.refinement, search.session.recorded.names
     held: list[str] = session.scene.diagnostics.pop(HELD_BACK)
     misfits = Misfits.of(search)
     others = _states_of(search, [index for index in range(len(names)) if refinement.weights[index] > 0])
     undecided: list[str] = []
     for index, name in enumerate(names):
-        if name not in held and _noted(search).get(name) != LEFT_OUT:
+        if name not in held and contradicting_states(session).get(name) != LEFT_OUT:
             continue
         starts, own = _other_starts(search, index, others), _own_fit(search, index, 1.0)
         if search.linked:
             starts.append(mirrored_state(search, index, session.recorded.states[index]))
         other = _fit_from(search, index, starts)
         _judge(search, index, 1.0, own, other, misfits)
-        if name in _noted(search):
+        if name in contradicting_states(session):
             continue
-        if not last and own is not None and _explains_better(other, own, UNDECIDED * own.misfit, MUCH_MORE):
+        if not last and own is not None and _explains_better(other, own, UNDECIDED_MISFIT * own.misfit, UNDECIDED_GAIN):
             undecided.append(name)
         refinement.weights[index] = float(name not in undecided)
     if undecided:
@@ -148,23 +155,17 @@ def fitted_anew(search: StateSearch, index: int) -> Refitted | None:
 
 
 def leave_out_unexplained(search: StateSearch, misfits: Mapping[int, float]) -> None:
-    """Leave out frames that were fitted anew and are outliers in the end: their states remain unknown.
+    """Leave out frames that were fitted anew and are outliers after the last fits: their states remain unknown.
 
-    misfits: of all frames that count, by their number, after the last fits.
+    misfits: by frame index, of all frames with a weight.
     """
-    names, noted = search.session.recorded.names, _noted(search)
+    names, noted = search.session.recorded.names, contradicting_states(search.session)
     right = [misfit for index, misfit in misfits.items() if names[index] not in noted]
     limit = _limit(torch.tensor(right), OUTLYING) if len(right) >= MIN_FRAMES else math.inf
     for index, misfit in misfits.items():
         if names[index] in noted and misfit > limit:
             noted[names[index]] = LEFT_OUT
             search.session.refinement.weights[index] = 0
-
-
-def _noted(search: StateSearch) -> dict[str, str]:
-    """Return what became of states that contradict the others, by the frame's name."""
-    noted: dict[str, str] = search.session.scene.diagnostics.get(CONTRADICTING, {})
-    return noted
 
 
 def _judge(
@@ -191,27 +192,27 @@ def _judge(
         verdict = LEFT_OUT
     if verdict:
         session.refinement.weights[index] = float(verdict != LEFT_OUT)
-        session.scene.diagnostics[CONTRADICTING] = {**_noted(search), name: verdict}
+        session.scene.diagnostics[CONTRADICTING] = {**contradicting_states(session), name: verdict}
 
 
 def _explains_better(
     other: Refitted | None, own: StateFit | None, misfit: float, more: float = 1.0
 ) -> TypeGuard[Refitted]:
-    """Whether another fit leaves less than such a `misfit`, and explains more of the image, `more` times as much: a
-    state that hardly shows in the image leaves little unexplained there."""
+    """Whether another fit has a lower misfit than `misfit`, and more than `more` times the gain of the frame's own fit:
+    an instrument that is hardly in the image has a low misfit, too."""
     return other is not None and other.fit.misfit < misfit and (own is None or other.fit.gain > more * own.gain)
 
 
 def _own_fit(search: StateSearch, index: int, scale: float) -> StateFit | None:
-    """Return the best fit of a frame about its recorded state, from the most promising of it, its present state and
-    some of the prior: one that stops in a minimum nearby must not make another state look better."""
+    """Return the best fit of a frame with the prior about its recorded state, from several starts: a single fit may end
+    in a local minimum. None where all leave the image."""
     given, precision = search.session.recorded.states[index], search.precision(index, scale)
     starts = [given, search.state(index), *_sampled(search, index, given, precision, N_OWN)]
     return max(_fits(search, index, starts, precision, given), key=lambda fit: fit.gain, default=None)
 
 
 def _sampled(search: StateSearch, index: int, state: State, precision: Tensor, count: int) -> list[State]:
-    """Return states of a prior with such precision [P, P] about `state`, the same for the same frame."""
+    """Return `count` samples of the prior with precision [P, P] about `state`; the frame's index seeds them."""
     spread = torch.linalg.cholesky(torch.linalg.inv(precision))
     random = torch.Generator().manual_seed(index)
     samples = torch.randn((count, len(spread)), generator=random, dtype=torch.float64)
@@ -224,7 +225,7 @@ def _suspects(search: StateSearch, misfits: Misfits) -> list[int]:
     session, weights = search.session, search.session.refinement.weights
     if not (math.isfinite(misfits.limit) and search.linked):
         return []
-    noted = session.scene.diagnostics.get(CONTRADICTING, {})
+    noted = contradicting_states(session)
     scores: dict[int, float] = {}
     for index, misfit in misfits.of_frame.items():
         if not (math.isfinite(misfit) and weights[index] > 0) or session.recorded.names[index] in noted:
@@ -265,7 +266,7 @@ def mirrored_state(search: StateSearch, index: int, state: State) -> State:
 
 def report_contradictions(session: GaussianSession) -> None:
     """Report in one line which training states contradict the others, and what became of them."""
-    noted: dict[str, str] = session.scene.diagnostics.get(CONTRADICTING, {})
+    noted = contradicting_states(session)
     if not noted:
         return
     names = sorted(noted)

@@ -15,9 +15,9 @@ from neeco.capture.model import evenly_spaced
 from neeco.fitting.alignment import STATE_ERRORS
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.methods.kinematic.contradictions import (
-    CONTRADICTING,
     HELD_BACK,
     Misfits,
+    contradicting_states,
     fitted_anew,
     hold_back,
     judge_held_back,
@@ -67,7 +67,7 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
     if STATE_ERRORS not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, last = StateSearch.of(session, articulated), mark == FITTED_AT[-1]
-    contradicting = scene.diagnostics.get(CONTRADICTING, {})
+    contradicting = contradicting_states(session)
     explained: dict[int, float] = {}
     for (index,) in refinement.frames_of_instant:
         if not refinement.weights[index] > 0:
