@@ -158,7 +158,8 @@ def judged_by(search: StateSearch, explained: Callable[[State, State, StateFit],
             self, view: FrameView, expected: State, precision: Tensor, start: State | None = None, **named: Any
         ) -> StateFit | None:
             found = super().fit(view, expected, precision, start, **named)
-            return None if found is None else explained(expected, start or expected, found)
+            measured = found is None or not named["levels"]  # not fitted: the misfit of a state as it is
+            return found if measured else explained(expected, start or expected, found)
 
     fitter = Answering(search.fitter.instruments, search.fitter.parameters, search.fitter.tissue)
     diagnostics = search.session.scene.diagnostics
