@@ -25,6 +25,7 @@ from neeco.methods.kinematic.contradictions import (
     HELD_BACK,
     Misfits,
     hold_back,
+    judge_again,
     judge_held_back,
     leave_out_unexplained,
     mirrored_state,
@@ -164,7 +165,7 @@ def judged_by(search: StateSearch, explained: Callable[[State, State, StateFit],
     fitter = Answering(search.fitter.instruments, search.fitter.parameters, search.fitter.tissue)
     diagnostics = search.session.scene.diagnostics
     diagnostics[HELD_BACK] = ["000005"]
-    judge_held_back(replace(search, fitter=fitter), last=True)
+    judge_held_back(replace(search, fitter=fitter))
     verdict: str | None = diagnostics.get(CONTRADICTING, {}).get("000005")
     return verdict
 
@@ -199,6 +200,26 @@ def test_a_local_minimum_of_the_fit_from_a_recorded_state_does_not_refute_it(
         nearby = float(layout.increments_between(given, start).abs().max()) > 1e-6
         return replace(found, misfit=0.2 if gain > 40.0 and nearby else 0.9, gain=gain if nearby else 30.0)
 
+    assert judged_by(search, explained) == verdict
+
+
+@pytest.mark.parametrize(
+    ("gain", "outlier", "verdict"), [(31.0, False, None), (33.0, False, "fitted anew"), (20.0, True, "fitted anew")]
+)
+def test_a_state_that_seemed_wrong_is_right_if_it_explains_the_image_and_no_other_one_explains_more(
+    gain: float, outlier: bool, verdict: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = search_of(session_of(tmp_path, TRUE))
+    given, misfit = search.session.recorded.states[5], 2.0 if outlier else 0.9
+    limits = replace(Misfits.of(search), limit=1.0, rejection_limit=4.0)
+    monkeypatch.setattr(Misfits, "of", lambda search: limits)
+
+    def explained(expected: State, start: State, found: StateFit) -> StateFit:
+        if expected is given:
+            return replace(found, misfit=misfit, gain=30.0)
+        return replace(found, state=TRUE[11], misfit=0.8 * misfit, gain=gain)
+
+    search.session.scene.diagnostics[CONTRADICTING] = {"000005": "fitted anew"}
     assert judged_by(search, explained) == verdict
 
 
@@ -257,7 +278,7 @@ def test_a_mirrored_state_is_held_back_and_fitted_once_the_scene_went_on_without
     assert "000004" in held
     assert len(held) <= 4
     assert session.refinement.weights.tolist() == [float(name not in held) for name in scene.recorded.names]
-    judge_held_back(search, last=True)
+    judge_held_back(search)
     assert scene.diagnostics[CONTRADICTING] == {"000004": "fitted anew"}
     assert HELD_BACK not in scene.diagnostics
     assert bool((session.refinement.weights == 1).all())
@@ -273,7 +294,7 @@ def test_states_with_usual_errors_are_not_taken_for_wrong_ones(tmp_path: Path) -
     names, search = session.recorded.names, search_of(session)
     session.refinement.weights[::3] = 0
     session.scene.diagnostics[HELD_BACK] = list(names[::3])
-    judge_held_back(search, last=True)
+    judge_held_back(search)
     assert CONTRADICTING not in session.scene.diagnostics
     assert bool((session.refinement.weights == 1).all())
 
@@ -285,8 +306,27 @@ def test_frames_held_back_at_one_mark_are_not_forgotten_at_the_next(tmp_path: Pa
     search = search_of(session)
     hold_back(search, no_outliers(search))
     assert session.scene.diagnostics[HELD_BACK][0] == "000007"
-    judge_held_back(search, last=True)
+    judge_held_back(search)
     assert session.refinement.weights[7] == 1
+
+
+def test_a_state_is_judged_again_once_the_others_settled(tmp_path: Path) -> None:
+    """A right one that seemed wrong is used again as recorded, and a wrong one that seemed right is found."""
+    right = driver_session(tmp_path)
+    true = [right.recorded.states[index] for index in (2, 4)]
+    mirrored = [mirrored_state(search_of(right), index, state) for index, state in zip((2, 4), true, strict=True)]
+    session = driver_session(tmp_path, {4: mirrored[1]})
+    refinement, noted = session.refinement, session.scene.diagnostics
+    noted[CONTRADICTING] = {"000002": "fitted anew", "000007": "left out"}
+    refinement.set_state(2, true[0], mirrored[0], refinement.deviations(2))
+    refinement.weights[7] = 0
+    judge_again(search_of(session))
+    assert noted[CONTRADICTING] == {"000004": "fitted anew"}
+    assert bool((refinement.weights == 1).all())
+    for index, recorded, state in ((2, true[0], true[0]), (4, mirrored[1], true[1])):
+        off = refinement.layout.increments_between(state, refinement.state(index, recorded))
+        assert off[3:6].norm() < 1.0
+        assert off[:3].norm().rad2deg() < 5
 
 
 def test_a_frame_fitted_anew_that_stays_unexplained_is_left_out(tmp_path: Path) -> None:

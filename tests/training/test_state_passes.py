@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from neeco.methods.kinematic import state_passes as module
+from neeco.methods.kinematic.contradictions import CONTRADICTING
 from neeco.methods.kinematic.state_registration import LARGE_ERRORS
 from neeco.training.silhouettes import Silhouettes
 
@@ -68,6 +69,25 @@ def test_errors_that_images_show_only_later_are_found_then(monkeypatch: pytest.M
     session = session_of(Silhouettes((), 0.0), linked=True, expected=False)
     assert not decided(monkeypatch, session, module.DECIDED_AT[0], size=0.05)
     assert decided(monkeypatch, session, module.DECIDED_AT[1], size=0.15)
+
+
+@pytest.mark.parametrize(
+    ("diagnostics", "judged"),
+    [({}, []), ({module.STATE_ERRORS: 1.0}, [0.45]), ({CONTRADICTING: {"000001": "fitted anew"}}, [0.45])],
+)
+def test_states_are_judged_again_where_some_may_be_wrong(
+    diagnostics: dict[str, Any], judged: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, seen = session_of(None, linked=True, expected=False), []
+    session.scene.diagnostics = diagnostics | {LARGE_ERRORS: False}
+    session.refinement.frames_of_instant = []  # nothing else is to be fitted
+    monkeypatch.setattr(module.StateSearch, "of", lambda session, articulated: None)
+    monkeypatch.setattr(module, "leave_out_unexplained", lambda search, misfits: None)
+    for mark in module.MARKS:
+        if mark not in module.DECIDED_AT:
+            monkeypatch.setattr(module, "judge_again", lambda search, mark=mark: seen.append(mark))
+            module.fit_states(session, None, mark)  # type: ignore[arg-type]
+    assert seen == judged
 
 
 def test_outliers_do_not_count_for_the_size_of_all_errors() -> None:

@@ -2,7 +2,8 @@
 
 Outliers are found at once. Where there are any, or all states have errors, others may be wrong, too, though they are
 explained as well as right ones: a mirrored state looks alike, and the scene has learned from it. Such frames are held
-back, and judged by a scene that went on learning without them.
+back, and judged by a scene that went on learning without them. What seems wrong early may be a fault of the scene: once
+the others' states are fitted, all that contradict them, or may be wrong, are judged again.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ HELD_BACK = "held_back"  # of a scene's diagnostics: names of frames that the sc
 OUTLYING = 3.0  # robust standard deviations of a log misfit above which a state is an outlier
 REJECTED = 6.0  # above which a frame that no state explains is left out
 BETTER = 0.7  # of a state's misfit: that of another one which refutes it
+UNCLEAR = 1.05  # times the gain of a state's fit: that of another one, up to which neither is wrong
 MIN_DISTANCE = 3.0  # standard deviations of the prior, root mean square, of a state that is another one
 EXPLAINED = 1.0  # misfit up to which a state explains its image
 MIN_SPREAD = 0.25  # standard deviation of log misfits, at least
@@ -35,8 +37,6 @@ MIN_FRAMES = 8  # with fewer, no state contradicts the others
 START_SCALE = 3.0  # of the prior about another start, times usual errors
 SUSPECT = 1.0  # robust standard deviations of a log misfit above which a state may be wrong
 ALIKE = 1.15  # times a state's misfit, below which the mirrored state may be right instead
-# ratios to the misfit and gain of a frame's own fit, below and above which another fit leaves the frame undecided
-UNDECIDED_MISFIT, UNDECIDED_GAIN = 0.9, 1.15
 N_OWN, N_NEAR = 12, 64  # starts sampled from the prior about a recorded state, and about another
 MAX_SHARE, MAX_SUSPECTS = 1 / 3, 24  # of all frames
 MAX_NAMED = 8  # frames in a line
@@ -123,29 +123,37 @@ def hold_back(search: StateSearch, misfits: Misfits) -> None:
 
 
 @torch.no_grad()
-def judge_held_back(search: StateSearch, *, last: bool) -> None:
+def judge_held_back(search: StateSearch) -> None:
     """Compare the states of frames that were held back, or left out, with others, by a scene that went on without them:
-    wrong ones are fitted anew, right ones are used again, and undecided ones stay held back until the `last` mark."""
-    session, refinement, names = search.session, search.session.refinement, search.session.recorded.names
-    held: list[str] = session.scene.diagnostics.pop(HELD_BACK)
-    misfits = Misfits.of(search)
-    others = _states_of(search, [index for index in range(len(names)) if refinement.weights[index] > 0])
-    undecided: list[str] = []
+    wrong ones are fitted anew, and right ones are used again."""
+    left_out = [name for name, verdict in contradicting_states(search.session).items() if verdict == LEFT_OUT]
+    _judge_frames(search, Misfits.of(search), left_out)
+
+
+@torch.no_grad()
+def judge_again(search: StateSearch) -> None:
+    """Compare states once more, by a scene in which the others settled: also those that contradict the others, which
+    are used again as recorded where they no longer do, and those that may be wrong."""
+    names, misfits = search.session.recorded.names, Misfits.of(search)
+    suspects = [names[index] for index in _suspects(search, misfits)]
+    _judge_frames(search, misfits, [*contradicting_states(search.session), *suspects])
+
+
+def _judge_frames(search: StateSearch, misfits: Misfits, chosen: Sequence[str]) -> None:
+    """Judge the states of frames that are held back, and of those with the names `chosen`."""
+    session, weights = search.session, search.session.refinement.weights
+    names, noted = session.recorded.names, contradicting_states(session)
+    judged = {*session.scene.diagnostics.pop(HELD_BACK, []), *chosen}
+    others = _states_of(search, [index for index in range(len(names)) if weights[index] > 0])
     for index, name in enumerate(names):
-        if name not in held and contradicting_states(session).get(name) != LEFT_OUT:
-            continue
-        starts, own = _other_starts(search, index, others), _own_fit(search, index, 1.0)
-        if search.linked:
-            starts.append(mirrored_state(search, index, session.recorded.states[index]))
-        other = _fit_from(search, index, starts)
-        _judge(search, index, 1.0, own, other, misfits)
-        if name in contradicting_states(session):
-            continue
-        if not last and own is not None and _explains_better(other, own, UNDECIDED_MISFIT * own.misfit, UNDECIDED_GAIN):
-            undecided.append(name)
-        refinement.weights[index] = float(name not in undecided)
-    if undecided:
-        session.scene.diagnostics[HELD_BACK] = undecided
+        if name in judged:
+            starts, own = _other_starts(search, index, others), _own_fit(search, index, 1.0)
+            if search.linked:
+                starts.append(mirrored_state(search, index, session.recorded.states[index]))
+            if name in noted:
+                starts.append(search.state(index))
+            _judge(search, index, 1.0, own, _fit_from(search, index, starts), misfits)
+            weights[index] = float(contradicting_states(session).get(name) != LEFT_OUT)
 
 
 @torch.no_grad()
@@ -177,14 +185,14 @@ def _judge(
     misfits: Misfits,
 ) -> None:
     """Replace the state of frame `index` where another explains its image much better, leave the frame out where none
-    does, and note either.
+    does, and note either. A frame noted before is used again as recorded if no other state explains more of its image.
 
     own: the best fit about the recorded state, None where it leaves the image. other: that of other states.
     """
     session, name = search.session, search.session.recorded.names[index]
     misfit, given = misfits.of_frame[index] if own is None else own.misfit, session.recorded.states[index]
     verdict = ""
-    if _explains_better(other, own, BETTER * misfit):
+    if _refutes(other, own, misfit):
         if _distance(search, index, given, other.fit.state, scale) > MIN_DISTANCE:
             verdict = FITTED_ANEW if other.fit.misfit < misfits.limit else LEFT_OUT
             session.refinement.set_state(index, given, other.fit.state, other.deviations)
@@ -192,15 +200,18 @@ def _judge(
         verdict = LEFT_OUT
     if verdict:
         session.refinement.weights[index] = float(verdict != LEFT_OUT)
-        session.scene.diagnostics[CONTRADICTING] = {**contradicting_states(session), name: verdict}
+        session.scene.diagnostics.setdefault(CONTRADICTING, {})[name] = verdict
+    elif own is None or misfit > misfits.limit or name not in contradicting_states(session):
+        return
+    elif other is None or other.fit.gain < UNCLEAR * own.gain:
+        session.refinement.set_state(index, given, own.state, search.deviations(index, scale))
+        del session.scene.diagnostics[CONTRADICTING][name]
 
 
-def _explains_better(
-    other: Refitted | None, own: StateFit | None, misfit: float, more: float = 1.0
-) -> TypeGuard[Refitted]:
-    """Whether another fit has a lower misfit than `misfit`, and more than `more` times the gain of the frame's own fit:
+def _refutes(other: Refitted | None, own: StateFit | None, misfit: float) -> TypeGuard[Refitted]:
+    """Whether another fit has a much lower misfit than the recorded state's `misfit`, and a larger gain than its fit:
     an instrument that is hardly in the image has a low misfit, too."""
-    return other is not None and other.fit.misfit < misfit and (own is None or other.fit.gain > more * own.gain)
+    return other is not None and other.fit.misfit < BETTER * misfit and (own is None or other.fit.gain > own.gain)
 
 
 def _own_fit(search: StateSearch, index: int, scale: float) -> StateFit | None:

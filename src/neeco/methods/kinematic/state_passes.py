@@ -20,6 +20,7 @@ from neeco.methods.kinematic.contradictions import (
     contradicting_states,
     fitted_anew,
     hold_back,
+    judge_again,
     judge_held_back,
     leave_out_unexplained,
     refit_outliers,
@@ -34,6 +35,7 @@ from neeco.training.session import GaussianSession
 DECIDED_AT = (0.12, 0.32)
 CARVED_AT = (0.2, 0.32, 0.45)  # shares at which states are fitted, and shapes carved anew from them
 FITTED_AT = (0.6, 0.75, 0.9)  # shares at which states are fitted
+JUDGED_AGAIN_AT = CARVED_AT[-1]
 MARKS = tuple(sorted({*DECIDED_AT, *CARVED_AT, *FITTED_AT}))
 N_SAMPLED = 16  # frames by which errors are sized
 LARGE = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
@@ -49,8 +51,10 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
     several = any(len(frames) > 1 for frames in refinement.frames_of_instant)
     if several or not (scene.instruments and session.config.refine.frame_poses):
         return  # gradients of several cameras' images determine an instant's state better than each image does
-    if mark in CARVED_AT and HELD_BACK in scene.diagnostics:
-        judge_held_back(StateSearch.of(session, articulated), last=mark == CARVED_AT[-1])
+    if mark == JUDGED_AGAIN_AT and (STATE_ERRORS in scene.diagnostics or contradicting_states(session)):
+        judge_again(StateSearch.of(session, articulated))
+    elif mark in CARVED_AT and HELD_BACK in scene.diagnostics:
+        judge_held_back(StateSearch.of(session, articulated))
     if mark in DECIDED_AT and STATE_ERRORS not in scene.diagnostics:
         search, first = StateSearch.of(session, articulated), mark == DECIDED_AT[0]
         misfits = Misfits.of(search) if first else None
