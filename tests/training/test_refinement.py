@@ -229,6 +229,19 @@ def test_standard_deviations_of_exact_states_are_of_the_size_of_their_correction
     assert torch.allclose(refinement.deviations(4), 3 * before)  # a fit has its own
 
 
+def test_standard_deviations_stay_where_an_image_could_not_be_fitted() -> None:
+    """One that hardly shows the instrument corrects nothing, however wrong its state is."""
+    frames, instrument = on_scopes(apart=False)
+    refinement = Refinement(RefineConfig(frame_poses=True, frame_joints=True), frames, (instrument,), CPU)
+    before = refinement.deviations(0)
+    refinement.frame_steps += 10
+    refinement.poses = 1e-4 * refinement.pose_sd
+    for index in range(2, len(frames)):
+        refinement.set_state(index, frames[index].state, frames[index].state, before)
+    refinement.scale_deviations(refinement.prior_shares())
+    assert torch.allclose(refinement.deviations(0), before)
+
+
 def test_standard_deviations_stay_where_nothing_was_corrected() -> None:
     frames, instrument = on_scopes(apart=False)
     refinement = Refinement(RefineConfig(frame_poses=True), frames, (instrument,), CPU)

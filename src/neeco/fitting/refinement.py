@@ -219,9 +219,13 @@ class Refinement:
         of turns, shifts and readings; at most 1.
 
         Exact states are corrected only by as much as corrections are wrong; of the errors of others most is corrected.
+        Where most states were fitted, images of the others hardly show an instrument, and correct nothing: 1.
         """
         steps = torch.stack([self.frame_steps[frames].sum() for frames in self.frames_of_instant])
-        taken = (steps >= MIN_STEPS) & ~torch.stack([self.fitted[frames[0]] for frames in self.frames_of_instant])
+        fitted = torch.stack([self.fitted[frames[0]] for frames in self.frames_of_instant])
+        if 2 * int(fitted.sum()) > len(fitted):
+            return self.pose_sd.new_ones(3)
+        taken = (steps >= MIN_STEPS) & ~fitted
         used, readings = taken.to(self.poses.device), self.learned[~self.unrecorded[self.learned]]
         poses, joints = self.poses[used] / self.pose_sd[used], self.joints[used] / self.joint_sd[used]
         parts = (poses[..., :3], poses[..., 3:], joints[:, readings])
