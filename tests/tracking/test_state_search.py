@@ -151,7 +151,11 @@ def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
     assert session.refinement.weights.tolist() == [float(index != 5) for index in range(len(TRUE))]
 
 
-def judged_by(search: StateSearch, explained: Callable[[State, State, StateFit], StateFit]) -> str | None:
+def judged_by(
+    search: StateSearch,
+    explained: Callable[[State, State, StateFit], StateFit | None],
+    judge: Callable[[StateSearch], None] = judge_held_back,
+) -> str | None:
     """What becomes of frame 5, held back, if its fits with a prior about a state, from a start, are as `explained`."""
 
     class Answering(Fitter[StateParameters]):
@@ -165,22 +169,25 @@ def judged_by(search: StateSearch, explained: Callable[[State, State, StateFit],
     fitter = Answering(search.fitter.instruments, search.fitter.parameters, search.fitter.tissue)
     diagnostics = search.session.scene.diagnostics
     diagnostics[HELD_BACK] = ["000005"]
-    judge_held_back(replace(search, fitter=fitter))
+    judge(replace(search, fitter=fitter))
     verdict: str | None = diagnostics.get(CONTRADICTING, {}).get("000005")
     return verdict
 
 
-@pytest.mark.parametrize(("gain", "verdict"), [(20.0, None), (40.0, "fitted anew")])
+@pytest.mark.parametrize(
+    ("own", "gain", "verdict"), [(30.0, 20.0, None), (30.0, 40.0, "fitted anew"), (-30.0, -5.0, None)]
+)
 def test_a_state_refutes_another_only_if_more_of_the_image_is_explained(
-    gain: float, verdict: str | None, tmp_path: Path
+    own: float, gain: float, verdict: str | None, tmp_path: Path
 ) -> None:
-    """One that hardly shows in the image leaves little unexplained there."""
+    """One that hardly shows in the image leaves little unexplained there; one that explains less than none tells
+    nothing."""
     search = search_of(session_of(tmp_path, TRUE))
     given = search.session.recorded.states[5]
 
     def explained(expected: State, start: State, found: StateFit) -> StateFit:
         if expected is given:
-            return replace(found, misfit=0.9, gain=30.0)
+            return replace(found, misfit=0.9, gain=own)
         return replace(found, state=TRUE[11], misfit=0.2, gain=gain)
 
     assert judged_by(search, explained) == verdict
@@ -221,6 +228,36 @@ def test_a_state_that_seemed_wrong_is_right_if_it_explains_the_image_and_no_othe
 
     search.session.scene.diagnostics[CONTRADICTING] = {"000005": "fitted anew"}
     assert judged_by(search, explained) == verdict
+
+
+@pytest.mark.parametrize("noted", [True, False])
+@pytest.mark.parametrize(("gain", "verdict"), [(-5.0, None), (20.0, "fitted anew")])
+def test_an_instrument_outside_of_the_image_is_refuted_only_by_one_that_explains_something(
+    gain: float, verdict: str | None, noted: bool, tmp_path: Path
+) -> None:
+    search = search_of(session_of(tmp_path, TRUE))
+    given, diagnostics = search.session.recorded.states[5], search.session.scene.diagnostics
+
+    def explained(expected: State, start: State, found: StateFit) -> StateFit | None:
+        return None if expected is given else replace(found, state=TRUE[11], misfit=0.2, gain=gain)
+
+    diagnostics[CONTRADICTING] = {"000005": "left out"} if noted else {}
+    assert judged_by(search, explained) == verdict
+    assert search.session.refinement.weights[5] == 1
+
+
+@pytest.mark.parametrize(("judge", "verdict"), [(judge_held_back, "left out"), (judge_again, None)])
+def test_no_frame_is_left_out_later_because_others_are_explained_ever_better(
+    judge: Callable[[StateSearch], None], verdict: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = search_of(session_of(tmp_path, TRUE))
+    given, limits = search.session.recorded.states[5], replace(Misfits.of(search), limit=1.0, rejection_limit=4.0)
+    monkeypatch.setattr(Misfits, "of", lambda search: limits)
+
+    def explained(expected: State, start: State, found: StateFit) -> StateFit:
+        return replace(found, misfit=5.0, gain=30.0) if expected is given else replace(found, misfit=4.5, gain=31.0)
+
+    assert judged_by(search, explained, judge) == verdict
 
 
 @pytest.mark.parametrize(("misfit", "included"), [(0.22, True), (0.4, False)])

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeGuard
 
 import torch
 from torch import Tensor
@@ -133,8 +132,8 @@ def judge_held_back(search: StateSearch) -> None:
 @torch.no_grad()
 def judge_again(search: StateSearch) -> None:
     """Compare states once more, by a scene in which the others settled: also those that contradict the others, which
-    are used again as recorded where they no longer do, and those that may be wrong."""
-    names, misfits = search.session.recorded.names, Misfits.of(search)
+    are used again as recorded where they no longer do, and those that may be wrong. No other frame is left out."""
+    names, misfits = search.session.recorded.names, replace(Misfits.of(search), rejection_limit=math.inf)
     suspects = [names[index] for index in _suspects(search, misfits)]
     _judge_frames(search, misfits, [*contradicting_states(search.session), *suspects])
 
@@ -187,31 +186,28 @@ def _judge(
     """Replace the state of frame `index` where another explains its image much better, leave the frame out where none
     does, and note either. A frame noted before is used again as recorded if no other state explains more of its image.
 
-    own: the best fit about the recorded state, None where it leaves the image. other: that of other states.
+    own: the best fit about the recorded state; None where it leaves the image, which is right unless another one
+    explains something. other: the best fit of other states.
     """
-    session, name = search.session, search.session.recorded.names[index]
-    misfit, given = misfits.of_frame[index] if own is None else own.misfit, session.recorded.states[index]
+    session, name, given = search.session, search.session.recorded.names[index], search.session.recorded.states[index]
+    misfit, gain = (math.inf, 0.0) if own is None else (own.misfit, max(own.gain, 0.0))
     verdict = ""
-    if _refutes(other, own, misfit):
+    # an instrument that is hardly in the image has a low misfit, too
+    if other is not None and other.fit.misfit < BETTER * misfit and other.fit.gain > gain:
         if _distance(search, index, given, other.fit.state, scale) > MIN_DISTANCE:
             verdict = FITTED_ANEW if other.fit.misfit < misfits.limit else LEFT_OUT
             session.refinement.set_state(index, given, other.fit.state, other.deviations)
-    elif misfit > misfits.rejection_limit:
+    elif misfits.rejection_limit < misfit < math.inf:
         verdict = LEFT_OUT
     if verdict:
         session.refinement.weights[index] = float(verdict != LEFT_OUT)
         session.scene.diagnostics.setdefault(CONTRADICTING, {})[name] = verdict
-    elif own is None or misfit > misfits.limit or name not in contradicting_states(session):
+    elif name not in contradicting_states(session) or misfits.limit < misfit < math.inf:
         return
-    elif other is None or other.fit.gain < UNCLEAR * own.gain:
-        session.refinement.set_state(index, given, own.state, search.deviations(index, scale))
+    elif other is None or other.fit.gain <= UNCLEAR * gain:
+        recorded = given if own is None else own.state
+        session.refinement.set_state(index, given, recorded, search.deviations(index, scale))
         del session.scene.diagnostics[CONTRADICTING][name]
-
-
-def _refutes(other: Refitted | None, own: StateFit | None, misfit: float) -> TypeGuard[Refitted]:
-    """Whether another fit has a much lower misfit than the recorded state's `misfit`, and a larger gain than its fit:
-    an instrument that is hardly in the image has a low misfit, too."""
-    return other is not None and other.fit.misfit < BETTER * misfit and (own is None or other.fit.gain > own.gain)
 
 
 def _own_fit(search: StateSearch, index: int, scale: float) -> StateFit | None:
