@@ -233,10 +233,13 @@ def test_a_state_that_seemed_wrong_is_right_if_it_explains_the_image_and_no_othe
 @pytest.mark.parametrize("noted", [True, False])
 @pytest.mark.parametrize(("gain", "verdict"), [(-5.0, None), (20.0, "fitted anew")])
 def test_an_instrument_outside_of_the_image_is_refuted_only_by_one_that_explains_something(
-    gain: float, verdict: str | None, noted: bool, tmp_path: Path
+    gain: float, verdict: str | None, noted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     search = search_of(session_of(tmp_path, TRUE))
     given, diagnostics = search.session.recorded.states[5], search.session.scene.diagnostics
+    misfits = Misfits.of(search)
+    misfits.of_frame[5] = math.inf
+    monkeypatch.setattr(Misfits, "of", lambda search: misfits)
 
     def explained(expected: State, start: State, found: StateFit) -> StateFit | None:
         return None if expected is given else replace(found, state=TRUE[11], misfit=0.2, gain=gain)

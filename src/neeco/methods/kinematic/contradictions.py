@@ -190,7 +190,7 @@ def _judge(
     explains something. other: the best fit of other states.
     """
     session, name, given = search.session, search.session.recorded.names[index], search.session.recorded.states[index]
-    misfit, gain = (math.inf, 0.0) if own is None else (own.misfit, max(own.gain, 0.0))
+    misfit, gain = (misfits.of_frame[index], 0.0) if own is None else (own.misfit, max(own.gain, 0.0))
     verdict = ""
     # an instrument that is hardly in the image has a low misfit, too
     if other is not None and other.fit.misfit < BETTER * misfit and other.fit.gain > gain:
