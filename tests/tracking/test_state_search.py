@@ -180,8 +180,7 @@ def judged_by(
 def test_a_state_refutes_another_only_if_more_of_the_image_is_explained(
     own: float, gain: float, verdict: str | None, tmp_path: Path
 ) -> None:
-    """One that hardly shows in the image leaves little unexplained there; one that explains less than none tells
-    nothing."""
+    """One that hardly shows in the image leaves little unexplained there; one with a negative gain explains nothing."""
     search = search_of(session_of(tmp_path, TRUE))
     given = search.session.recorded.states[5]
 

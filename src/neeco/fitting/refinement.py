@@ -219,7 +219,8 @@ class Refinement:
         of turns, shifts and readings; at most 1.
 
         Exact states are corrected only by as much as corrections are wrong; of the errors of others most is corrected.
-        Where most states were fitted, images of the others hardly show an instrument, and correct nothing: 1.
+        Where most states were fitted, the shares are 1: images of the others hardly show an instrument, so that their
+        corrections tell nothing.
         """
         steps = torch.stack([self.frame_steps[frames].sum() for frames in self.frames_of_instant])
         fitted = torch.stack([self.fitted[frames[0]] for frames in self.frames_of_instant])

@@ -26,7 +26,7 @@ HELD_BACK = "held_back"  # of a scene's diagnostics: names of frames that the sc
 OUTLYING = 3.0  # robust standard deviations of a log misfit above which a state is an outlier
 REJECTED = 6.0  # above which a frame that no state explains is left out
 BETTER = 0.7  # of a state's misfit: that of another one which refutes it
-UNCLEAR = 1.05  # times the gain of a state's fit: that of another one, up to which neither is wrong
+UNCLEAR = 1.05  # ratio of another fit's gain to that of the fit about the recorded state, up to which the latter holds
 MIN_DISTANCE = 3.0  # standard deviations of the prior, root mean square, of a state that is another one
 EXPLAINED = 1.0  # misfit up to which a state explains its image
 MIN_SPREAD = 0.25  # standard deviation of log misfits, at least
@@ -131,8 +131,9 @@ def judge_held_back(search: StateSearch) -> None:
 
 @torch.no_grad()
 def judge_again(search: StateSearch) -> None:
-    """Compare states once more, by a scene in which the others settled: also those that contradict the others, which
-    are used again as recorded where they no longer do, and those that may be wrong. No other frame is left out."""
+    """Compare states once more, when the states of the others are fitted: those that contradict the others, which are
+    used again as recorded where they no longer do, and those that may be wrong. None is left out by its misfit alone:
+    the limit sinks as all others are explained better."""
     names, misfits = search.session.recorded.names, replace(Misfits.of(search), rejection_limit=math.inf)
     suspects = [names[index] for index in _suspects(search, misfits)]
     _judge_frames(search, misfits, [*contradicting_states(search.session), *suspects])
@@ -152,7 +153,6 @@ def _judge_frames(search: StateSearch, misfits: Misfits, chosen: Sequence[str]) 
             if name in noted:
                 starts.append(search.state(index))
             _judge(search, index, 1.0, own, _fit_from(search, index, starts), misfits)
-            weights[index] = float(contradicting_states(session).get(name) != LEFT_OUT)
 
 
 @torch.no_grad()
@@ -186,8 +186,8 @@ def _judge(
     """Replace the state of frame `index` where another explains its image much better, leave the frame out where none
     does, and note either. A frame noted before is used again as recorded if no other state explains more of its image.
 
-    own: the best fit about the recorded state; None where it leaves the image, which is right unless another one
-    explains something. other: the best fit of other states.
+    own: the best fit about the recorded state; None where it leaves the image, and its gain is 0. other: the best fit
+    of other states.
     """
     session, name, given = search.session, search.session.recorded.names[index], search.session.recorded.states[index]
     misfit, gain = (misfits.of_frame[index], 0.0) if own is None else (own.misfit, max(own.gain, 0.0))
@@ -199,15 +199,14 @@ def _judge(
             session.refinement.set_state(index, given, other.fit.state, other.deviations)
     elif misfits.rejection_limit < misfit < math.inf:
         verdict = LEFT_OUT
+    explained = not misfits.limit < misfit < math.inf and (other is None or other.fit.gain <= UNCLEAR * gain)
     if verdict:
-        session.refinement.weights[index] = float(verdict != LEFT_OUT)
         session.scene.diagnostics.setdefault(CONTRADICTING, {})[name] = verdict
-    elif name not in contradicting_states(session) or misfits.limit < misfit < math.inf:
-        return
-    elif other is None or other.fit.gain <= UNCLEAR * gain:
+    elif explained and name in contradicting_states(session):
         recorded = given if own is None else own.state
         session.refinement.set_state(index, given, recorded, search.deviations(index, scale))
         del session.scene.diagnostics[CONTRADICTING][name]
+    session.refinement.weights[index] = float(contradicting_states(session).get(name) != LEFT_OUT)
 
 
 def _own_fit(search: StateSearch, index: int, scale: float) -> StateFit | None:
