@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from neeco.geometry.rotations import rigid_from_vector
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.report.run_page import write_annotated_page
-from neeco.scene import GaussianScene
+from neeco.scene import GaussianScene, Recorded
 from neeco.synthesis.annotated import annotate_capture
 from neeco.synthesis.settings import ImageSettings
 
@@ -153,6 +154,21 @@ def test_recorded_images_get_the_labels_that_the_scene_draws_at_fitted_poses(mad
         assert line["trust"]["value"] > 0.9
         assert line["moved"]["rod"]["mm"] + line["moved"]["camera"]["mm"] > 0.2
     assert {line["recorded_split"] for line in lines} == {"train", "test"}
+
+
+def test_a_frame_that_training_fitted_is_labelled_about_the_fitted_state(recorded: RecordedRun, tmp_path: Path) -> None:
+    """Its recorded state may be that of another moment."""
+    capture, scene, true = recorded.capture(), copy(recorded.scene), rod_state(x=-1.0, y=3.0, jaw=0.3)
+    wrong = replace(capture.frames[3], state=rod_state(x=20.0, y=-9.0, jaw=0.3))
+    scene.recorded = Recorded.of([replace(wrong, state=true)], scene.instruments)
+    frames = tuple(wrong if frame.name == "003" else frame for frame in capture.frames)
+    annotate_capture(RecordedRun(recorded.path, scene, replace(capture, frames=frames)), tmp_path / "set")
+    line = next(line for line in (tmp_path / "set" / "states.jsonl").read_text().splitlines() if '"003"' in line)
+    with Image.open(tmp_path / "set" / "masks" / "000003.png") as stored:
+        mask = np.asarray(stored) > 0
+    label = layers(scene, true).parts.numpy() > 0
+    assert (mask & label).sum() / (mask | label).sum() > 0.97
+    assert json.loads(line)["moved"]["rod"]["mm"] > 15  # from the recorded state
 
 
 def test_a_frame_that_is_not_trusted_is_listed_and_not_written(made: Path) -> None:

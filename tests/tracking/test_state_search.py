@@ -24,6 +24,8 @@ from neeco.methods.kinematic.contradictions import (
     CONTRADICTING,
     HELD_BACK,
     Misfits,
+    fitted_anew,
+    half_turned_state,
     hold_back,
     judge_again,
     judge_held_back,
@@ -326,6 +328,29 @@ def test_a_mirrored_state_is_held_back_and_fitted_once_the_scene_went_on_without
     assert off[3:6].norm() < 1.0
     assert off[:3].norm().rad2deg() < 5
     assert bool((off.abs() < 3 * session.refinement.deviations(4)).all())
+
+
+def test_a_state_fitted_anew_on_its_other_side_is_turned_back(tmp_path: Path) -> None:
+    """Half a turn about the shaft moves no outline: jaws change places, and the wrist bends the other way."""
+    session = driver_session(tmp_path)
+    search, true = search_of(session), session.recorded.states[4]
+    session.refinement.set_state(4, true, half_turned_state(search, true), session.refinement.deviations(4))
+    found = fitted_anew(search, 4)
+    assert found is not None
+    off = session.refinement.layout.increments_between(true, found.fit.state)
+    assert off[:3].norm().rad2deg() < 5
+    assert bool((off.abs() < 3 * found.deviations).all())
+
+
+def test_the_scene_learns_no_longer_from_a_state_fitted_anew_until_it_is_judged(tmp_path: Path) -> None:
+    session = driver_session(tmp_path)
+    search, name = search_of(session), session.recorded.names[4]
+    session.scene.diagnostics[CONTRADICTING] = {name: "fitted anew"}
+    hold_back(search, no_outliers(search))
+    assert session.refinement.weights[4] == 0
+    judge_held_back(search)
+    assert session.refinement.weights[4] == 1
+    assert CONTRADICTING not in session.scene.diagnostics or name not in session.scene.diagnostics[CONTRADICTING]
 
 
 def test_states_with_usual_errors_are_not_taken_for_wrong_ones(tmp_path: Path) -> None:

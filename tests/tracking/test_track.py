@@ -359,6 +359,21 @@ def test_a_trust_that_is_no_share_is_reported(tracked: Tracked, tmp_path: Path) 
     assert any("trust" in problem.field for problem in errors_only(check_capture(tmp_path)))
 
 
+@pytest.mark.parametrize(("share", "how"), [(0.5, "followed"), (1.5, "beside")])
+def test_another_state_is_taken_only_if_it_explains_more_of_the_image(
+    tracked_run: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, how: str
+) -> None:
+    """One that hardly shows in the image leaves little unexplained."""
+    frames = record(tracked_run.scene, tmp_path, [moving(0), moving(1)], "new").frames
+    follower = Follower.of(frames, fitter_of(tracked_run.scene), Reference(TypicalErrors(0.02, 0.02), 1e-3, 1.0))
+    begun = follower.begin(0, moving(0))
+    fit = follower.fitter.fit(follower.fitter.view(frames[1], moving(1)), moving(1), torch.eye(7, dtype=torch.float64))
+    assert fit is not None
+    other = replace(fit, misfit=0.0, gain=share * fit.gain)
+    monkeypatch.setattr(type(follower.search), "near", lambda *given: other)
+    assert follower.follow(replace(begun, misfit=0.0, recent=()), 1).how == how
+
+
 @pytest.mark.parametrize(("x", "shown"), [(0.0, True), (44.0, False)])
 def test_an_opening_that_the_image_does_not_show_is_not_trusted(
     tracked_run: RecordedRun, tmp_path: Path, x: float, shown: bool

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from wristed_world import shifted
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
-from neeco.fitting.link_silhouette import ArticulatedModel, joint_values
+from neeco.fitting.link_silhouette import ArticulatedModel, half_turned, joint_values, mirrored
 from neeco.fitting.link_states import LinkViews
 from neeco.fitting.silhouette_states import FoundStates, find_states, sds_of
 
@@ -126,3 +126,50 @@ def test_states_of_other_moments_contradict_the_others(sizes: tuple[float, ...])
     refitted = np.flatnonzero(found.refitted)
     before, after = errors_of(poses, readings), errors_of(found.poses, found.readings)
     assert rms(after[refitted]) < 0.5 * rms(before[refitted]) if len(refitted) else True
+
+
+def tips(tree: KinematicTree, pose: np.ndarray, readings: dict[str, float]) -> dict[str, np.ndarray]:
+    """Points [3] on the links' far ends, in the world."""
+    ends = {"shaft": -30.0, "wrist": 9.0, "jaw_left": 10.0, "jaw_right": 10.0}
+    found = {}
+    for name, here in tree.poses(readings).items():
+        at_rest = tree.rest_poses[name]
+        found[name] = (pose @ here @ np.linalg.inv(at_rest) @ np.append(at_rest[:3, 3] + [0, 0, ends[name]], 1.0))[:3]
+    return found
+
+
+def in_other_frames(tree: KinematicTree, seed: int) -> KinematicTree:
+    """The same links, stated in frames that are turned against each other, as those of Denavit and Hartenberg are."""
+    rng = np.random.default_rng(seed)
+    turns: dict[str | None, np.ndarray] = {None: np.eye(4), "shaft": np.eye(4)}
+    links = []
+    for link in tree.links:
+        turns.setdefault(link.name, np.eye(4))
+        if link.parent is not None:
+            turns[link.name][:3, :3] = Rotation.random(random_state=rng).as_matrix()
+        back = np.linalg.inv(turns[link.parent])
+        links.append(replace(link, origin=back @ link.origin @ turns[link.name], axis=back[:3, :3] @ link.axis))
+    return KinematicTree(tuple(links))
+
+
+@pytest.mark.parametrize("tree", [TREE, in_other_frames(TREE, 1), in_other_frames(TREE, 2)])
+def test_states_that_look_alike_whichever_frames_links_are_stated_in(tree: KinematicTree) -> None:
+    axis, pose = np.array([0.0, 0, 1]), exact_views().poses[0]
+    readings = {"pitch": 0.6, "yaw": -0.5, "jaw": 0.7}
+    recorded = tips(tree, pose, readings)
+    turned = tips(tree, *half_turned(tree, axis, pose, readings))
+    deep = tips(tree, *mirrored(tree, axis, np.eye(4), pose, readings))
+    depth = float((pose @ shifted(0, 0, 2))[2, 3])  # of the first pivot
+    for name, other in {"shaft": "shaft", "wrist": "wrist", "jaw_left": "jaw_right", "jaw_right": "jaw_left"}.items():
+        x, y, z = recorded[name]
+        assert turned[other] == pytest.approx([x, y, z], abs=1e-9)
+        assert deep[other] == pytest.approx([x, y, 2 * depth - z], abs=1e-9)
+
+
+def test_a_roll_before_the_wrist_does_not_bend() -> None:
+    roll = Link("rolled", "shaft", REVOLUTE, np.eye(4), np.array([0.0, 0, 1]), {"roll": 1.0})
+    links = (roll, *(replace(link, parent="rolled") if link.parent == "shaft" else link for link in TREE.links[1:]))
+    tree, axis, readings = KinematicTree((TREE.links[0], *links)), np.array([0.0, 0, 1]), {"roll": 0.4, "pitch": 0.6}
+    readings |= {"yaw": -0.5, "jaw": 0.7}
+    _, values = half_turned(tree, axis, np.eye(4), readings)
+    assert values == {"roll": 0.4, "pitch": -0.6, "yaw": 0.5, "jaw": 0.7}

@@ -7,13 +7,13 @@ links and the errors of what is stated (pivots, axes, offsets of readings) are p
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.kinematics import FIXED, PRISMATIC, REVOLUTE, KinematicTree
+from neeco.capture.kinematics import FIXED, PRISMATIC, KinematicTree, Link
 from neeco.geometry.lines import frame_about, unit
 from neeco.geometry.projection import project
 from neeco.geometry.trocar import line_through_trocar
@@ -37,6 +37,7 @@ MIN_PIVOT_MM = 5.0  # from the root's origin, for a direction
 STATIONS = np.array([0.04, 0.15, 0.3, 0.5, 0.7, 0.85, 0.96])  # along a cone, of outline points
 TUBE_STATIONS = 1 - np.array([1, 3, 6, 9, 13, 18, 24, 31, 40, 50, 62, 75, 90]) / TUBE_MM
 CAP_ANGLES = np.radians([-80, -50, -25, 0, 25, 50, 80])  # about a cone's outer end
+MAX_ALONG = 0.9  # cosine between a joint's axis and the shaft, above which it turns the shaft about itself
 MIN_MOTION = 0.02  # standard deviation of a joint's value, rad, from which it bends
 MIN_SLIDE_MM = 0.5
 
@@ -337,23 +338,52 @@ def mirrored(
     readings: Mapping[str, float],
 ) -> tuple[np.ndarray, dict[str, float]]:
     """Return the state with nearly the same silhouette as (pose [4, 4] world_from_root, readings): mirrored in depth
-    about the first joint and, in its own frame, along that joint's axis; what bends across it then bends the other way.
-    axis [3]: the shaft's, unit, in the root's frame."""
-    bending = [link for link in tree.links if link.type in (REVOLUTE, PRISMATIC)]
-    first = unit(bending[0].axis - (bending[0].axis @ axis) * axis) if abs(bending[0].axis @ axis) < 0.9 else None
-    if first is None:
-        first = np.linalg.svd(axis[None])[2][1]
-    pivot = bending[0].origin[:3, 3]
+    about the first joint across the shaft and, in its own frame, along that joint's axis; what bends across it then
+    bends the other way. axis [3]: the shaft's, unit, in the root's frame."""
+    pivot, direction, across = _first_joint_across(tree, axis)
     here = camera_from_world @ pose
     center = here[:3, :3] @ pivot + here[:3, 3]
-    here[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ here[:3, :3] @ (np.eye(3) - 2 * np.outer(first, first))
+    here[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ here[:3, :3] @ (np.eye(3) - 2 * np.outer(direction, direction))
     here[:3, 3] = center - here[:3, :3] @ pivot
-    values = dict(readings)
-    for reading in tree.readings:
-        gains = [link.value[reading] for link in bending if reading in link.value and abs(link.axis @ first) < 0.5]
-        if gains and abs(sum(gains)) > 0.5 * len(gains):
-            values[reading] = -values[reading]
+    values = _bent_back(readings, [link for link, own in across if abs(own @ direction) < 0.5])
     return np.linalg.inv(camera_from_world) @ here, values
+
+
+def half_turned(
+    tree: KinematicTree, axis: np.ndarray, pose: np.ndarray, readings: Mapping[str, float]
+) -> tuple[np.ndarray, dict[str, float]]:
+    """Return the state that shows the other sides of the same links: (pose [4, 4] world_from_root, readings) turned by
+    180 degrees about the shaft, through the first joint across it; what bends across the shaft then bends the other
+    way, and jaws change places. axis [3]: the shaft's, unit, in the root's frame."""
+    pivot, _, across = _first_joint_across(tree, axis)
+    turn = np.eye(4)
+    turn[:3, :3] = 2 * np.outer(axis, axis) - np.eye(3)
+    turn[:3, 3] = pivot - turn[:3, :3] @ pivot
+    return pose @ turn, _bent_back(readings, [link for link, _ in across])
+
+
+def _first_joint_across(
+    tree: KinematicTree, axis: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[tuple[Link, np.ndarray]]]:
+    """Return a point [3] (mm) and the direction [3] of the first joint that does not turn about the shaft's `axis` [3],
+    and every such joint with its direction, innermost first; directions are across the shaft, in the root's frame, at
+    rest. Without one: the root's origin and any direction across."""
+    points, axes = (part[::-1] for part in tree.axes_at_rest)
+    joints = zip(tree.joints[::-1], points, axes, strict=True)
+    across = [(link, point, own - (own @ axis) * axis) for link, point, own in joints if abs(own @ axis) < MAX_ALONG]
+    if not across:
+        return np.zeros(3), np.linalg.svd(axis[None])[2][1], []
+    return across[0][1], unit(across[0][2]), [(link, unit(own)) for link, _, own in across]
+
+
+def _bent_back(readings: Mapping[str, float], links: Sequence[Link]) -> dict[str, float]:
+    """Return readings that bend `links` the other way; those that open jaws remain."""
+    values = dict(readings)
+    for reading in {name for link in links for name in link.value}:
+        gains = [link.value[reading] for link in links if reading in link.value]
+        if abs(sum(gains)) > 0.5 * len(gains):
+            values[reading] = -values[reading]
+    return values
 
 
 def _tube_axis(tree: KinematicTree, pivot: np.ndarray, poses: np.ndarray) -> np.ndarray:

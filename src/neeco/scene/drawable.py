@@ -82,6 +82,19 @@ class Recorded:
         """Return the training frames of each tissue; all of them where there is one."""
         return tuple(self.over(tissue) for tissue in self.tissues) or (self,)
 
+    def as_fitted(self, capture: Capture) -> Capture:
+        """Return `capture`, which the scene learned from, with the states of training frames as fitted to their images,
+        where they were."""
+        fitted = {(name, state.tissue): state for name, state in zip(self.names, self.states, strict=True)}
+        frames = []
+        for frame in capture.frames:
+            state = fitted.get((frame.name, frame.state.tissue)) if frame.split == "train" else None
+            if state is not None:
+                instruments = {**frame.state.instruments, **state.instruments}
+                frame = replace(frame, state=replace(frame.state, instruments=instruments))
+            frames.append(frame)
+        return replace(capture, frames=tuple(frames))
+
     def completed(self, capture: Capture, instruments: Sequence[Instrument]) -> Capture:
         """Return `capture`, of the scene's `instruments`, with the joints that neither recording states, interpolated
         from the training frames nearest to each frame."""

@@ -15,7 +15,7 @@ import cv2
 import torch
 from torch import Tensor
 
-from neeco.capture.model import Capture, Frame
+from neeco.capture.model import Capture, Frame, State
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import Trust, TypicalErrors, estimate_trust, typical_errors_of
@@ -67,8 +67,9 @@ def annotate_capture(
 ) -> Annotated:
     """Label every frame of `capture`, a recording of the run's instruments over its tissue (None: the run's own), and
     write those that can be trusted as a data set: the recorded images with the labels that the scene renders at poses
-    fitted to them. Both are resized and distorted by the recording's lens as `images` request; what the recorded image
-    does not show of the lens's field, since undistorting left it out, is black and ignored.
+    fitted to them, about the recorded ones or, where training fitted a frame's state, about that. Both are resized and
+    distorted by the recording's lens as `images` request; what the recorded image does not show of the lens's field,
+    since undistorting left it out, is black and ignored.
 
     Frame k of the capture is image k of the data set, whichever are written. Interrupted (Ctrl-C) or failing, it keeps
     what is done, for `resume`. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError for
@@ -80,7 +81,9 @@ def annotate_capture(
     scene = run.scene
     labeller = CompositedLabels(scene)
     trained_on = run.capture()
-    capture = trained_on if capture is None else scene.recorded.completed(capture, scene.instruments)
+    learned = scene.recorded.as_fitted(trained_on)
+    given = learned if capture is None else scene.recorded.completed(capture, scene.instruments)
+    capture = trained_on if capture is None else given
     _check_instruments(scene, capture)
     settings = {"annotates": os.path.abspath(capture.root), "frames": len(capture.frames), "min_trust": min_trust}
     settings["captures_sha256"] = [fingerprint(recorded) for recorded in (capture, trained_on)]
@@ -101,7 +104,7 @@ def annotate_capture(
         formats=formats,
     )
     with folder.being_written() as records:
-        typical = typical_errors(scene, labeller, trained_on)
+        typical = typical_errors(scene, labeller, learned)
         info["usual_errors"] = asdict(typical)
         annotator = _Annotator(
             scene=scene,
@@ -116,7 +119,7 @@ def annotate_capture(
         in_time = sorted(range(len(capture.frames)), key=lambda k: capture.frames[k].state.time)
         for done, index in enumerate(in_time, 1):
             if index not in records:
-                records[index] = annotator.annotate(index, capture.frames[index], start)
+                records[index] = annotator.annotate(index, given.frames[index], capture.frames[index].state, start)
             start = torch.tensor(records[index]["increments"], dtype=torch.float64)
             on_progress(done, len(in_time))
         if not with_image(records.values()):
@@ -139,8 +142,9 @@ class _Annotator:
     images: ImageSettings
     cameras: DrawnCameras
 
-    def annotate(self, index: int, frame: Frame, start: Tensor | None) -> Record:
-        """Write frame `index`, or that it is not trusted; `start`: a neighbour's increments."""
+    def annotate(self, index: int, frame: Frame, recorded: State, start: Tensor | None) -> Record:
+        """Write frame `index`, or that it is not trusted; `recorded`: its state where that of `frame` was fitted to the
+        image in training; `start`: a neighbour's increments."""
         image = frame.load_image()
         fit, drawing, trust = self._fitted(frame, image, start)
         if start is not None and trust.value < self.min_trust:  # the neighbour's start may have misled the fit
@@ -150,7 +154,7 @@ class _Annotator:
             "frame": frame.name,
             "recorded_split": frame.split,
             "trust": trust.to_json(),
-            "moved": pose_changes(frame, fit.state, fit.camera),
+            "moved": pose_changes(replace(frame, state=recorded), fit.state, fit.camera),
             "increments": fit.increments.tolist(),
         }
         if trust.value < self.min_trust:

@@ -126,7 +126,7 @@ class Follower:
         how: How = "followed"
         if fit is None or fit.misfit > unusual:
             other = self.search.near(view, predicted, [before.motion.state], unusual)
-            if other is not None and (fit is None or other.misfit < BETTER * fit.misfit):
+            if other is not None and (fit is None or _refutes(other, fit)):
                 fit, how, predicted = other, "beside", self.motion.released(predicted)
         if fit is None:
             return self._searched(before, frame, view)
@@ -146,7 +146,7 @@ class Follower:
         searched_at, motion = before.searched_at, self.motion.update(predicted, fit)
         if trust.value < LOW_TRUST and abs(time - searched_at) >= LOW_TRUST_SEARCH_EVERY_S:
             best, searched_at = self.search.anywhere(view), time
-            if best is not None and best.misfit < BETTER * fit.misfit:
+            if best is not None and _refutes(best, fit):
                 fit, how, motion = best, "found", self.motion.begin(replace(best.state, time=time), best.information)
                 trust, _ = self.judge.judge(fit)
         return Step(
@@ -204,6 +204,12 @@ class Follower:
 
     def _view(self, frame: int, state: State | None) -> FrameView:
         return self.fitter.view(self.frames[frame], state)
+
+
+def _refutes(other: StateFit, fit: StateFit) -> bool:
+    """Return whether another fit leaves much less unexplained, and explains more of the image: an instrument that
+    hardly shows in it leaves little unexplained, too."""
+    return other.misfit < BETTER * fit.misfit and other.gain > fit.gain
 
 
 def is_lost(trust: TrackTrust) -> bool:

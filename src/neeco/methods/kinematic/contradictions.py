@@ -9,14 +9,16 @@ the others' states are fitted, all that contradict them, or may be wrong, are ju
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import InstrumentState, State, evenly_spaced
-from neeco.fitting.link_silhouette import mirrored
+from neeco.fitting.link_silhouette import half_turned, mirrored
 from neeco.fitting.state_fitter import StateFit
 from neeco.methods.kinematic.state_search import LEVELS, STEPS, StateSearch
 from neeco.training.session import GaussianSession
@@ -93,6 +95,17 @@ class Refitted:
     fit: StateFit
     deviations: Tensor
 
+    @classmethod
+    def of(cls, search: StateSearch, index: int, fits: Sequence[StateFit]) -> Refitted:
+        """Return the best of fits about states that nothing is known of; of sides that look alike, too."""
+        precision, best = search.precision(index, START_SCALE), _best(fits)
+        if search.linked:
+            fits = [*fits, *_fits_near(search, index, half_turned_state(search, best.state))]
+            best = _best(fits)
+        apart = search.session.refinement.layout.increments_between
+        possible = torch.stack([apart(best.state, fit.state) for fit in fits if BETTER * fit.misfit <= best.misfit])
+        return cls(best, (best.deviations(precision).square() + possible.square().mean(0)).sqrt())
+
 
 @torch.no_grad()
 def refit_outliers(search: StateSearch, scale: float, misfits: Misfits, *, large: bool) -> None:
@@ -107,18 +120,22 @@ def refit_outliers(search: StateSearch, scale: float, misfits: Misfits, *, large
         if names[index] not in noted:
             own = _own_fit(search, index, scale)
             if own is None or own.misfit > misfits.limit:
-                other = _fit_from(search, index, _other_starts(search, index, others))
-                _judge(search, index, scale, own, other, misfits)
+                found = _fits_from(search, index, _other_starts(search, index, others))
+                _judge(search, index, scale, own, found, misfits)
     if contradicting_states(search.session) or large:
         hold_back(search, misfits)
 
 
 def hold_back(search: StateSearch, misfits: Misfits) -> None:
-    """Let the scene no longer learn from frames whose states may be wrong; note their names in its diagnostics."""
-    session, suspects = search.session, _suspects(search, misfits)
-    session.refinement.weights[suspects] = 0
-    held = session.scene.diagnostics.setdefault(HELD_BACK, [])
-    held += [session.recorded.names[index] for index in suspects]
+    """Let the scene no longer learn from frames whose states may be wrong, or were found so and fitted anew: it agrees
+    with what it learned from. Note their names in its diagnostics. Where links are not stated none is held back."""
+    if not search.linked:
+        return
+    session, noted = search.session, contradicting_states(search.session)
+    names = session.recorded.names
+    held = [index for index, name in enumerate(names) if noted.get(name) == FITTED_ANEW] + _suspects(search, misfits)
+    session.refinement.weights[held] = 0
+    session.scene.diagnostics.setdefault(HELD_BACK, []).extend(names[index] for index in held)
 
 
 @torch.no_grad()
@@ -152,13 +169,14 @@ def _judge_frames(search: StateSearch, misfits: Misfits, chosen: Sequence[str]) 
                 starts.append(mirrored_state(search, index, session.recorded.states[index]))
             if name in noted:
                 starts.append(search.state(index))
-            _judge(search, index, 1.0, own, _fit_from(search, index, starts), misfits)
+            _judge(search, index, 1.0, own, _fits_from(search, index, starts), misfits)
 
 
 @torch.no_grad()
 def fitted_anew(search: StateSearch, index: int) -> Refitted | None:
     """Return the fit of a frame whose recorded state is wrong, about its present one; None if it leaves the image."""
-    return _fit_from(search, index, [search.state(index)])
+    fits = _fits_from(search, index, [search.state(index)])
+    return Refitted.of(search, index, fits) if fits else None
 
 
 def leave_out_unexplained(search: StateSearch, misfits: Mapping[int, float]) -> None:
@@ -180,26 +198,27 @@ def _judge(
     index: int,
     scale: float,
     own: StateFit | None,
-    other: Refitted | None,
+    others: Sequence[StateFit],
     misfits: Misfits,
 ) -> None:
     """Replace the state of frame `index` where another explains its image much better, leave the frame out where none
     does, and note either. A frame noted before is used again as recorded if no other state explains more of its image.
 
-    own: the best fit about the recorded state; None where it leaves the image, and its gain is 0. other: the best fit
-    of other states.
+    own: the best fit about the recorded state; None where it leaves the image, and its gain is 0. others: fits of other
+    states.
     """
     session, name, given = search.session, search.session.recorded.names[index], search.session.recorded.states[index]
     misfit, gain = (misfits.of_frame[index], 0.0) if own is None else (own.misfit, max(own.gain, 0.0))
-    verdict = ""
+    other, verdict = _best(others) if others else None, ""
     # an instrument that is hardly in the image has a low misfit, too
-    if other is not None and other.fit.misfit < BETTER * misfit and other.fit.gain > gain:
-        if _distance(search, index, given, other.fit.state, scale) > MIN_DISTANCE:
-            verdict = FITTED_ANEW if other.fit.misfit < misfits.limit else LEFT_OUT
-            session.refinement.set_state(index, given, other.fit.state, other.deviations)
+    if other is not None and other.misfit < BETTER * misfit and other.gain > gain:
+        if _distance(search, index, given, other.state, scale) > MIN_DISTANCE:
+            verdict = FITTED_ANEW if other.misfit < misfits.limit else LEFT_OUT
+            found = Refitted.of(search, index, others)
+            session.refinement.set_state(index, given, found.fit.state, found.deviations)
     elif misfits.rejection_limit < misfit < math.inf:
         verdict = LEFT_OUT
-    explained = not misfits.limit < misfit < math.inf and (other is None or other.fit.gain <= UNCLEAR * gain)
+    explained = not misfits.limit < misfit < math.inf and (other is None or other.gain <= UNCLEAR * gain)
     if verdict:
         session.scene.diagnostics.setdefault(CONTRADICTING, {})[name] = verdict
     elif explained and name in contradicting_states(session):
@@ -259,13 +278,26 @@ def _distance(search: StateSearch, index: int, given: State, state: State, scale
 def mirrored_state(search: StateSearch, index: int, state: State) -> State:
     """Return the state that looks alike from afar in frame `index`, of instruments with stated links."""
     camera_from_world = search.session.recorded.cameras[index].world_from_camera.inverse().cpu().double().numpy()
+    return _changed(search, state, lambda tree, shaft, *own: mirrored(tree, shaft, camera_from_world, *own))
+
+
+def half_turned_state(search: StateSearch, state: State) -> State:
+    """Return the state with the links of instruments where they are, their other sides to the camera."""
+    return _changed(search, state, half_turned)
+
+
+def _changed(
+    search: StateSearch,
+    state: State,
+    change: Callable[[KinematicTree, np.ndarray, np.ndarray, dict[str, float]], tuple[np.ndarray, dict[str, float]]],
+) -> State:
+    """Return the state with pose and readings of each instrument by `change` of (tree, shaft, pose, readings)."""
     found: dict[str, InstrumentState] = {}
     for item, shaft in zip(search.session.scene.instruments, search.shafts, strict=True):
         own = state.instruments[item.name]
         assert item.kinematics is not None
-        pose = own.pose.cpu().double().numpy()
         joints = {name: float(value) for name, value in own.joints.items()}
-        pose, joints = mirrored(item.kinematics, shaft.numpy(), camera_from_world, pose, joints)
+        pose, joints = change(item.kinematics, shaft.numpy(), own.pose.cpu().double().numpy(), joints)
         found[item.name] = InstrumentState(torch.from_numpy(pose).to(own.pose), joints)
     return replace(state, instruments={**state.instruments, **found})
 
@@ -295,21 +327,23 @@ def _other_starts(search: StateSearch, index: int, others: Sequence[State]) -> l
     ]
 
 
-def _fit_from(search: StateSearch, index: int, starts: Sequence[State]) -> Refitted | None:
-    """Return the best fit of a frame from the most promising starts, and from states about the first found; None where
-    none stays in the image."""
+def _fits_from(search: StateSearch, index: int, starts: Sequence[State]) -> list[StateFit]:
+    """Return fits of a frame from the most promising starts, and from states about the best of these; none where all
+    leave the image."""
+    fits = _fits(search, index, starts, search.precision(index, START_SCALE))
+    return [*fits, *_fits_near(search, index, _best(fits).state)] if fits else []
+
+
+def _fits_near(search: StateSearch, index: int, state: State) -> list[StateFit]:
+    """Return fits of a frame from states about `state`, and about its mirrored one."""
     precision = search.precision(index, START_SCALE)
-    fits = _fits(search, index, starts, precision)
-    if not fits:
-        return None
-    first = max(fits, key=lambda fit: fit.gain)
-    about = [first.state, *([mirrored_state(search, index, first.state)] if search.linked else [])]
-    near = [state for center in about for state in _sampled(search, index, center, precision, N_NEAR // len(about))]
-    fits += _fits(search, index, near, precision)
-    best = max(fits, key=lambda fit: fit.gain)
-    possible = [fit.state for fit in fits if BETTER * fit.misfit <= best.misfit]
-    apart = torch.stack([search.session.refinement.layout.increments_between(best.state, state) for state in possible])
-    return Refitted(best, (best.deviations(precision).square() + apart.square().mean(0)).sqrt())
+    about = [state, *([mirrored_state(search, index, state)] if search.linked else [])]
+    near = [start for center in about for start in _sampled(search, index, center, precision, N_NEAR // len(about))]
+    return _fits(search, index, near, precision)
+
+
+def _best(fits: Sequence[StateFit]) -> StateFit:
+    return max(fits, key=lambda fit: fit.gain)
 
 
 def _fits(
