@@ -81,8 +81,7 @@ def annotate_capture(
     scene = run.scene
     labeller = CompositedLabels(scene)
     trained_on = run.capture()
-    learned = scene.recorded.as_fitted(trained_on)
-    given = learned if capture is None else scene.recorded.completed(capture, scene.instruments)
+    given = scene.recorded.completed(capture, scene.instruments) if capture else scene.recorded.as_fitted(trained_on)
     capture = trained_on if capture is None else given
     _check_instruments(scene, capture)
     settings = {"annotates": os.path.abspath(capture.root), "frames": len(capture.frames), "min_trust": min_trust}
@@ -104,7 +103,7 @@ def annotate_capture(
         formats=formats,
     )
     with folder.being_written() as records:
-        typical = typical_errors(scene, labeller, learned)
+        typical = typical_errors(scene, labeller, trained_on)
         info["usual_errors"] = asdict(typical)
         annotator = _Annotator(
             scene=scene,
