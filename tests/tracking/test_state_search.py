@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import grasper_world as world
 import numpy as np
@@ -17,9 +17,12 @@ from torch import Tensor
 from wristed_world import make_driver
 
 from neeco.capture.model import InstrumentState, State, Uncertainty
+from neeco.errors import NeecoError
 from neeco.fitting.crop_rendering import FrameView
 from neeco.fitting.parameters import StateParameters
 from neeco.fitting.state_fitter import Fitter, StateFit
+from neeco.methods.kinematic import discovery
+from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.methods.kinematic.contradictions import (
     CONTRADICTING,
     HELD_BACK,
@@ -424,3 +427,29 @@ def test_the_size_of_stated_errors_is_told_in_those_of_a_robot(tmp_path: Path) -
             own = replace(state.instruments["grasper"], uncertainty=stated)
             states.append(replace(state, instruments={"grasper": own}))
         assert search_of(session_of(tmp_path / str(size), states)).stated_scale() == pytest.approx(size, rel=0.1)
+
+
+def test_a_shape_that_carving_no_longer_finds_goes_on_as_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Among few frames, half a run's states may be too far off for carving, while the learned shape explains them."""
+
+    def none(*given: object) -> None:
+        raise NeecoError("nothing in the images moves")
+
+    session = driver_session(tmp_path)
+    scene = session.scene
+    reports: list[str] = []
+    for name in ("fit_tissue", "tissue_evidence", "corrected_evidence"):
+        monkeypatch.setattr(discovery, name, lambda *given, **options: None)
+    monkeypatch.setattr(discovery, "carved_shape", none)
+    monkeypatch.setattr(session, "report", reports.append)
+    articulated = cast(ArticulatedInstruments, scene.deformation)
+    with torch.no_grad():
+        articulated.articulations[0].shaft_tilt += 0.01
+    before = {name: tensor.clone() for name, tensor in articulated.state_dict().items()}
+    canonical = scene.canonical
+    discovery.carve_again(session, articulated)
+    assert scene.canonical is canonical
+    torch.testing.assert_close(dict(articulated.state_dict()), before, rtol=0, atol=0, equal_nan=True)
+    assert reports == ["carving the instruments anew finds no shape: they go on as learned"]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from neeco.errors import NeecoError
 from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
 from neeco.methods.kinematic.hinge_search import start_hinges
@@ -45,7 +46,9 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
 
 def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Replace the instruments' Gaussians by seeds on shapes carved anew, at the states as corrected so far: what the
-    former states taught is forgotten. The session's views are those of searches."""
+    former states taught is forgotten. Where carving finds none, those that were learned stay. The session's views are
+    those of searches."""
+    before, articulations = session.scene.canonical, {key: t.clone() for key, t in articulated.state_dict().items()}
     scene, breathing = session.scene, articulated.breathing if isinstance(articulated, BreathingTissue) else None
     scene.canonical = tissue = scene.canonical.map(
         lambda tensor: tensor[scene.canonical.body(0)].detach().clone(), scene.canonical.counts[:1]
@@ -64,7 +67,13 @@ def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -
         for articulation in articulated.articulations:
             articulation.shaft_tilt.zero_()
             articulation.shaft_shift.zero_()
-        scene.canonical = _with_instruments(session, articulated, evidence, list(zip(shafts, axes, strict=True)))
+        try:
+            scene.canonical = _with_instruments(session, articulated, evidence, list(zip(shafts, axes, strict=True)))
+        except NeecoError:  # without shape, few frames whose states are still off
+            scene.canonical = before
+            articulated.load_state_dict(articulations)
+            session.report("carving the instruments anew finds no shape: they go on as learned")
+            return
     rows = torch.arange(len(scene.canonical), device=scene.center.device)
     fresh = rows >= len(tissue)
     session.adam.select_rows(list(scene.canonical.tensors()), torch.where(fresh, 0, rows), fresh)
