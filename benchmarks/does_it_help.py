@@ -30,6 +30,7 @@ PASTED = "real+paste+strong"
 FEW, ALL = 10, 86  # labelled frames in the upper panels
 CUT, CUT_APART = 0.55, 0.25  # the axis of IoU begins here; that of the last panel
 OTHER_STUDY = "("  # in the names of pairs in other studies than that of the upper panels: `back (96 px)`
+OWN_TISSUE = "{} (own tissue)"  # pairs of the study of synthetic images over the first recording's tissue
 APART = "back (96 px)"  # of the last panel: the pair that no choice was made by
 CURVES = (  # of it, by labelled frames: conditions, colour, marker, name
     ("recipe+strong", "#009E73", "*", "synthetic alone (the recipe): no labelled frame"),
@@ -47,6 +48,11 @@ SHOWN = {
     (BASELINES, ALL): ("#E69F00", "s", "all 86 labelled frames"),
     (("recipe+strong",), 0): ("#009E73", "*", "synthetic alone (the recipe): no labelled frame"),
 }
+# and of pairs of OWN_TISSUE in the same recording
+SHOWN_WITHIN = {
+    (("own+real",), FEW): ("#56B4E9", "^", "synthetic over its own tissue, then 10 labelled"),
+    (("own+real",), ALL): ("#0072B2", "v", "the same, then all 86 labelled"),
+}
 
 
 def joined(job: dict[str, Any]) -> dict[str, Any]:
@@ -54,7 +60,8 @@ def joined(job: dict[str, Any]) -> dict[str, Any]:
     splits = {}
     for name, parts in TESTS.items():
         frames = [frame for part in parts for frame in job["splits"][part]["per_frame"]]
-        splits[name] = {"iou": sum(frame["iou"] for frame in frames) / len(frames), "per_frame": frames}
+        known = [frame["iou"] for frame in frames if frame["iou"] is not None]  # without instrument there is none
+        splits[name] = {"iou": sum(known) / len(known), "per_frame": frames}
     return job | {"splits": splits}
 
 
@@ -100,11 +107,12 @@ def points(
 
 def panel(axes: Axes, rows: list[dict[str, str]], test: str) -> None:
     pairs = list(dict.fromkeys(row["pair"] for row in rows if OTHER_STUDY not in row["pair"]))
-    for k, (key, (colour, marker, _)) in enumerate(SHOWN.items()):
+    shown = SHOWN | (SHOWN_WITHIN if test == "within" else {})
+    for k, (key, (colour, marker, _)) in enumerate(shown.items()):
         for g, pair in enumerate(pairs):
-            if (found := points(rows, pair, test, *key)) is None:
+            if (found := points(rows, OWN_TISSUE.format(pair) if key in SHOWN_WITHIN else pair, test, *key)) is None:
                 continue
-            x = g + (k - (len(SHOWN) - 1) / 2) * 0.14
+            x = g + (k - (len(shown) - 1) / 2) * 0.14
             face = "white" if found[3] == 1 else colour
             axes.plot([x, x], found[1:3], color=colour, linewidth=1.6)
             axes.plot(x, found[0], marker, color=colour, markersize=9 if marker == "*" else 6, markerfacecolor=face)
@@ -168,7 +176,7 @@ def draw(rows: list[dict[str, str]]) -> None:
     curves(last, rows)
     handles = [
         Line2D([], [], color=colour, marker=marker, linewidth=1.6, markersize=9 if marker == "*" else 6, label=name)
-        for colour, marker, name in SHOWN.values()
+        for colour, marker, name in (SHOWN | SHOWN_WITHIN).values()
     ]
     legend_below(panels[-1], 0.13, handles=handles)
     write(figure, TABLE.with_suffix(".svg"))

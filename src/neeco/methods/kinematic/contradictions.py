@@ -129,11 +129,10 @@ def refit_outliers(search: StateSearch, scale: float, misfits: Misfits, *, large
 def hold_back(search: StateSearch, misfits: Misfits) -> None:
     """Let the scene no longer learn from frames whose states may be wrong, or were found so and fitted anew: it agrees
     with what it learned from. Note their names in its diagnostics. Where links are not stated none is held back."""
-    if not search.linked:
-        return
     session, noted = search.session, contradicting_states(search.session)
     names = session.recorded.names
-    held = [index for index, name in enumerate(names) if noted.get(name) == FITTED_ANEW] + _suspects(search, misfits)
+    held = [index for index, name in enumerate(names) if search.linked and noted.get(name) == FITTED_ANEW]
+    held += _suspects(search, misfits)
     session.refinement.weights[held] = 0
     session.scene.diagnostics.setdefault(HELD_BACK, []).extend(names[index] for index in held)
 
