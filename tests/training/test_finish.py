@@ -314,3 +314,23 @@ def test_tissue_is_never_inside_a_shaft(session: GaussianSession) -> None:
     fade_interior_tissue(session, scene.deformation)
     assert float(torch.sigmoid(scene.canonical.opacity_logits[:12]).max()) < 0.01
     assert torch.equal(scene.canonical.opacity_logits[12:], before[12:])
+
+
+@pytest.mark.parametrize(("share", "kept"), [(1.0, False), (0.5, True)])
+def test_tissue_is_not_before_a_shaft_whenever_it_is_in_view(
+    session: GaussianSession, share: float, kept: bool
+) -> None:
+    """Elsewhere it is seen without the instrument, and hides it now and then."""
+    scene, count = session.scene, len(session.given)
+    state, camera = session.corrected(0)
+    pose, center = state.instruments[scene.instruments[0].name].pose.float(), camera.world_from_camera[:3, 3].float()
+    start, direction = hinges_of(session).shaft()
+    with torch.no_grad():
+        axis = pose[:3, :3] @ (start + (PIVOT_MM - 15) * direction) + pose[:3, 3]
+        scene.canonical.means[:12] = axis + 0.15 * (center - axis)
+    before = scene.canonical.opacity_logits.clone()
+    same = round(share * count)
+    session.given = [session.given[0]] * same + session.given[same:]
+    fade_interior_tissue(session, scene.deformation)
+    assert torch.equal(scene.canonical.opacity_logits[:12], before[:12]) == kept
+    assert torch.equal(scene.canonical.opacity_logits[12:], before[12:])

@@ -1,4 +1,5 @@
-"""Tissue inside the instruments' shafts: impossible, since a shaft is solid and tissue stays where it is.
+"""Tissue inside the instruments' shafts, or before them wherever it is in view: it is none, since a shaft is solid and
+tissue stays where it is.
 
 Where a dark shaft stands over the same pixels in most frames, dark tissue explains it as well, takes its place in the
 images, and leaves holes in its labels.
@@ -11,6 +12,7 @@ import math
 import torch
 from torch import Tensor
 
+from neeco.geometry.projection import in_image
 from neeco.methods.kinematic.articulation import ArticulatedInstruments, Articulation
 from neeco.methods.kinematic.wrist import MIN_SOLID_GAUSSIANS, SOLID_OPACITY, solid_gaussians
 from neeco.scene.canonical import CanonicalGaussians
@@ -19,13 +21,14 @@ from neeco.training.session import GaussianSession
 RADIUS_SHARE = 0.9  # quantile of the solid Gaussians' distances from the axis: the shaft's surface
 INTERIOR = 0.9  # of the radius: errors of states and the surface's own thickness stay outside
 MIN_FRAMES = 0.1  # share of the training frames: a wrong state puts the shaft anywhere
+ALWAYS = 0.8  # share of the frames with a point in view in which it is before a shaft, above which it is no tissue
 REMOVED_OPACITY = 1e-4  # of tissue that is to be pruned
 
 
 @torch.no_grad()
 def fade_interior_tissue(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Make tissue inside a shaft transparent, so that it is pruned and the instrument takes its place, where enough of
-    it is solid to be taken for the shaft."""
+    """Make tissue inside a shaft, or always before it, transparent, so that it is pruned and the instrument takes its
+    place, where enough of it is solid to be taken for the shaft."""
     canonical = session.scene.canonical
     inside = interior_tissue(session, articulated)
     logits = canonical.opacity_logits[canonical.body(0)]
@@ -36,11 +39,14 @@ def fade_interior_tissue(session: GaussianSession, articulated: ArticulatedInstr
 
 @torch.no_grad()
 def interior_tissue(session: GaussianSession, articulated: ArticulatedInstruments) -> Tensor:
-    """Return which tissue Gaussians [T] are inside a shaft in at least MIN_FRAMES of the training frames, bool."""
+    """Return which tissue Gaussians [T] are inside a shaft in at least MIN_FRAMES of the training frames, or before one
+    in as many and whenever they are in view, bool."""
     scene = session.scene
     canonical = scene.canonical
     points = canonical.means[canonical.body(0)]
-    states = [scene.registered(session.corrected(index)[0]) for index in range(len(session.given))]
+    corrected = [session.corrected(index) for index in range(len(session.given))]
+    states = [scene.registered(state) for state, _ in corrected]
+    seen = torch.stack([in_image(points, camera) for _, camera in corrected])  # [F, T]
     inside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for index, articulation in enumerate(articulated.articulations):
         cylinder = _cylinder(canonical, index, articulation)
@@ -48,8 +54,8 @@ def interior_tissue(session: GaussianSession, articulated: ArticulatedInstrument
             continue
         rear, front, radius = cylinder
         origin, direction = articulation.shaft()
-        frames = torch.zeros_like(points[:, 0])
-        for state in states:
+        frames, before = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
+        for number, state in enumerate(states):
             if (given := state.instruments.get(scene.instruments[index].name)) is None:
                 continue
             pose = given.pose.to(points)
@@ -57,8 +63,22 @@ def interior_tissue(session: GaussianSession, articulated: ArticulatedInstrument
             along = arm @ direction
             across = (arm - along[:, None] * direction).norm(dim=1)
             frames += (across < radius) & (along > rear) & (along < front)
-        inside |= frames >= max(2.0, MIN_FRAMES * len(states))
+            camera = (corrected[number][1].world_from_camera[:3, 3].to(points) - pose[:3, 3]) @ pose[:3, :3] - origin
+            before += seen[number] & _hides(camera, arm, direction, radius, front)
+        least = max(2.0, MIN_FRAMES * len(states))
+        inside |= (frames >= least) | ((before >= least) & (before > ALWAYS * seen.sum(0)))
     return inside
+
+
+def _hides(camera: Tensor, points: Tensor, direction: Tensor, radius: Tensor, front: Tensor) -> Tensor:
+    """Return which points [T, 3] the line of sight from `camera` [3] passes before it enters a cylinder about the
+    origin's axis `direction`, which ends at `front` mm, bool [T]."""
+    sight = points - camera
+    ahead = sight @ direction
+    across, start = sight - ahead[:, None] * direction, camera - (camera @ direction) * direction
+    reach = -(across @ start) / across.square().sum(1).clamp(min=1e-12)  # to where the line is nearest to the axis
+    nearest = (start + reach[:, None] * across).norm(dim=1)
+    return (reach > 1) & (nearest < radius) & (camera @ direction + reach * ahead < front)
 
 
 def _cylinder(
