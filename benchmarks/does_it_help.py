@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from result_plots import GREY, PAGE, write
 
+from neeco.evaluation.mask_metrics import mean_of
 from neeco.files import read_json
 from neeco.studies.downstream.conditions import BASELINES, PERMUTED
 from neeco.studies.downstream.experiment import FILE
@@ -60,8 +61,7 @@ def joined(job: dict[str, Any]) -> dict[str, Any]:
     splits = {}
     for name, parts in TESTS.items():
         frames = [frame for part in parts for frame in job["splits"][part]["per_frame"]]
-        known = [frame["iou"] for frame in frames if frame["iou"] is not None]  # without instrument there is none
-        splits[name] = {"iou": sum(known) / len(known), "per_frame": frames}
+        splits[name] = {"iou": mean_of([frame["iou"] for frame in frames]), "per_frame": frames}
     return job | {"splits": splits}
 
 

@@ -432,7 +432,7 @@ def test_the_size_of_stated_errors_is_told_in_those_of_a_robot(tmp_path: Path) -
 def test_a_shape_that_carving_no_longer_finds_goes_on_as_learned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Among few frames, half a run's states may be too far off for carving, while the learned shape explains them."""
+    """States of few frames may be too far off for carving, while the learned shape explains their images."""
 
     def none(*given: object) -> None:
         raise NeecoError("nothing in the images moves")

@@ -153,7 +153,7 @@ def in_other_frames(tree: KinematicTree, seed: int) -> KinematicTree:
 
 
 @pytest.mark.parametrize("tree", [TREE, in_other_frames(TREE, 1), in_other_frames(TREE, 2)])
-def test_states_that_look_alike_whichever_frames_links_are_stated_in(tree: KinematicTree) -> None:
+def test_states_with_similar_silhouettes_do_not_depend_on_the_frames_of_links(tree: KinematicTree) -> None:
     axis, pose = np.array([0.0, 0, 1]), exact_views().poses[0]
     readings = {"pitch": 0.6, "yaw": -0.5, "jaw": 0.7}
     recorded = tips(tree, pose, readings)

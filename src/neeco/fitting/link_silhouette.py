@@ -352,9 +352,9 @@ def mirrored(
 def half_turned(
     tree: KinematicTree, axis: np.ndarray, pose: np.ndarray, readings: Mapping[str, float]
 ) -> tuple[np.ndarray, dict[str, float]]:
-    """Return the state that shows the other sides of the same links: (pose [4, 4] world_from_root, readings) turned by
-    180 degrees about the shaft, through the first joint across it; what bends across the shaft then bends the other
-    way, and jaws change places. axis [3]: the shaft's, unit, in the root's frame."""
+    """Return the state (pose [4, 4] world_from_root, readings) turned by 180 degrees about the shaft, with nearly the
+    same silhouette: joints across the shaft are bent the other way, and jaws change places. axis [3]: the shaft's,
+    unit, in the root's frame."""
     pivot, _, across = _first_joint_across(tree, axis)
     turn = np.eye(4)
     turn[:3, :3] = 2 * np.outer(axis, axis) - np.eye(3)
@@ -377,7 +377,7 @@ def _first_joint_across(
 
 
 def _bent_back(readings: Mapping[str, float], links: Sequence[Link]) -> dict[str, float]:
-    """Return readings that bend `links` the other way; those that open jaws remain."""
+    """Return `readings`, negated where they bend the joints of `links`; those that open jaws remain."""
     values = dict(readings)
     for reading in {name for link in links for name in link.value}:
         gains = [link.value[reading] for link in links if reading in link.value]

@@ -97,7 +97,8 @@ class Refitted:
 
     @classmethod
     def of(cls, search: StateSearch, index: int, fits: Sequence[StateFit]) -> Refitted:
-        """Return the best of fits about states that nothing is known of; of sides that look alike, too."""
+        """Return the best of `fits`, and, with stated links, of fits about the best one turned by half a turn about its
+        shaft, which has a similar outline."""
         precision, best = search.precision(index, START_SCALE), _best(fits)
         if search.linked:
             fits = [*fits, *_fits_near(search, index, half_turned_state(search, best.state))]
@@ -281,7 +282,7 @@ def mirrored_state(search: StateSearch, index: int, state: State) -> State:
 
 
 def half_turned_state(search: StateSearch, state: State) -> State:
-    """Return the state with the links of instruments where they are, their other sides to the camera."""
+    """Return the state with every instrument, of stated links, turned by half a turn about its shaft."""
     return _changed(search, state, half_turned)
 
 

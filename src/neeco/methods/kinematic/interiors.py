@@ -1,5 +1,5 @@
-"""Tissue inside the instruments' shafts, or before them wherever it is in view: it is none, since a shaft is solid and
-tissue stays where it is.
+"""Removal of tissue Gaussians inside the instruments' shafts, or in front of a shaft whenever they are in view: a shaft
+is solid, and tissue stays where it is.
 
 Where a dark shaft stands over the same pixels in most frames, dark tissue explains it as well, takes its place in the
 images, and leaves holes in its labels.
@@ -21,14 +21,14 @@ from neeco.training.session import GaussianSession
 RADIUS_SHARE = 0.9  # quantile of the solid Gaussians' distances from the axis: the shaft's surface
 INTERIOR = 0.9  # of the radius: errors of states and the surface's own thickness stay outside
 MIN_FRAMES = 0.1  # share of the training frames: a wrong state puts the shaft anywhere
-ALWAYS = 0.8  # share of the frames with a point in view in which it is before a shaft, above which it is no tissue
+ALWAYS = 0.8  # share of the frames with a point in view in which it is in front of a shaft, above which it is no tissue
 REMOVED_OPACITY = 1e-4  # of tissue that is to be pruned
 
 
 @torch.no_grad()
 def fade_interior_tissue(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Make tissue inside a shaft, or always before it, transparent, so that it is pruned and the instrument takes its
-    place, where enough of it is solid to be taken for the shaft."""
+    """Make tissue inside a shaft, or always in front of it, transparent, so that it is pruned and the instrument takes
+    its place, where enough of it is solid to be taken for the shaft."""
     canonical = session.scene.canonical
     inside = interior_tissue(session, articulated)
     logits = canonical.opacity_logits[canonical.body(0)]
@@ -39,8 +39,8 @@ def fade_interior_tissue(session: GaussianSession, articulated: ArticulatedInstr
 
 @torch.no_grad()
 def interior_tissue(session: GaussianSession, articulated: ArticulatedInstruments) -> Tensor:
-    """Return which tissue Gaussians [T] are inside a shaft in at least MIN_FRAMES of the training frames, or before one
-    in as many and whenever they are in view, bool."""
+    """Return which tissue Gaussians [T] are inside a shaft in at least MIN_FRAMES of the training frames, or in front
+    of one in as many and in more than ALWAYS of those with the Gaussian in view, bool."""
     scene = session.scene
     canonical = scene.canonical
     points = canonical.means[canonical.body(0)]
@@ -71,8 +71,9 @@ def interior_tissue(session: GaussianSession, articulated: ArticulatedInstrument
 
 
 def _hides(camera: Tensor, points: Tensor, direction: Tensor, radius: Tensor, front: Tensor) -> Tensor:
-    """Return which points [T, 3] the line of sight from `camera` [3] passes before it enters a cylinder about the
-    origin's axis `direction`, which ends at `front` mm, bool [T]."""
+    """Return whether each of `points` [T, 3] is in front of a cylinder, as observed from `camera` [3], bool [T]. The
+    cylinder's axis goes through the origin along `direction` and ends at `front` mm; towards the rear it is unbounded,
+    since a shaft enters from outside of the image."""
     sight = points - camera
     ahead = sight @ direction
     across, start = sight - ahead[:, None] * direction, camera - (camera @ direction) * direction
