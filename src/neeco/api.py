@@ -138,17 +138,18 @@ class Run:
     path: Path  # the run's folder
     scene: Scene
     config: Mapping[str, Any]  # every setting, as config.yaml has it
+    force: bool = False  # see `load`
 
     @cached_property
     def capture(self) -> Capture:
         """The capture that the run was trained on; joints that nobody recorded are as training found them. Raises
-        NeecoError when it has moved."""
+        NeecoError when it has moved, or has changed since (see `load`)."""
         return self.trained.capture()
 
     @property
     def trained(self) -> runs.TrainedRun:
         """The run as the rest of the program sees it."""
-        return runs.TrainedRun(self.path, self.scene.learned, dict(self.config))
+        return runs.TrainedRun(self.path, self.scene.learned, dict(self.config), self.force)
 
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r}, {self.scene!r})"
@@ -191,20 +192,21 @@ def _view_fault(camera: Camera) -> Fault | None:
 
 
 @naming_arguments()
-def load(path: PathLike, device: str = "auto") -> Run:
+def load(path: PathLike, device: str = "auto", *, force: bool = False) -> Run:
     """Open a run.
 
     Args:
         path: folder that `train` or `neeco train` wrote
         device: where its scene goes: cpu, cuda, cuda:N, or auto (see `Scene`)
+        force: use the run although its capture has changed since training, or its labels are doubtful
 
     Raises NeecoError when it is no run folder, or its training has not finished.
 
         run = neeco.load("runs/sample")
         run.scene, run.capture, run.config["method"]
     """
-    opened = runs.load_run(Path(path), device_of(device))
-    return Run(opened.path, Scene.of(opened.scene), opened.config)
+    opened = runs.load_run(Path(path), device_of(device), force=force)
+    return Run(opened.path, Scene.of(opened.scene), opened.config, force)
 
 
 @naming_arguments()
@@ -277,6 +279,7 @@ def synthesize(
     resume: bool = False,
     workers: int = 1,
     device: str = "auto",
+    force: bool = False,
     progress: Progress | None = None,
     **settings: Any,
 ) -> Synthesized:
@@ -292,20 +295,23 @@ def synthesize(
         workers: processes that share the work; more than one need `if __name__ == "__main__"` around the program's
             start
         device: where runs given as folders are opened (see `Scene`)
+        force: use runs given as folders although their labels are doubtful
         progress: is called with what is being done, how much of it is done, and of how much
         settings: any option of `neeco synthesize`, such as states="extrapolate", views="orbit", seed=1, size="640x512"
             or camera_effects="effects.yaml"
 
     The result has `output` (the folder), `images` (how many), `refused` (states refused, by reason) and `skipped`.
-    Raises NeecoError for settings that do not fit, an `output` that is not empty or was begun otherwise, and where
-    every state is refused.
+    Raises NeecoError for settings that do not fit, an `output` that is not empty or was begun otherwise, where labels
+    are doubtful (see `load`), and where every state is refused.
 
         made = neeco.synthesize("runs/sample", "dataset-4", 4, states="extrapolate")
         images = neeco.StoredImages(made.output)
     """
     chosen = Settings.from_values("synthesize", count=count, **settings)
     report = progress or _silent
-    first, *others = (_opened(one, device).gaussians("synthesize") for one in (run, *instruments))
+    first, *others = (_opened(one, device, force).gaussians("synthesize") for one in (run, *instruments))
+    for labelled in others or (first,):
+        labelled.require_trusted("synthesize")
     with first.scene.torch_threads():
         return synthesize_run(
             first,
@@ -330,6 +336,7 @@ def track(
     min_trust: float = 0.5,
     resume: bool = False,
     device: str = "auto",
+    force: bool = False,
     progress: Progress | None = None,
 ) -> Tracked:
     """Find the states of a run's instruments in footage, from its images alone; writes the frames that can be trusted
@@ -345,6 +352,7 @@ def track(
         min_trust: the least confidence in [0, 1] of a frame that is written
         resume: continue interrupted work in `output`
         device: where a run given as a folder is opened (see `Scene`)
+        force: use a run given as a folder although its capture has changed since training
         progress: is called with what is being done, how much of it is done, and of how much
 
     The result has `output`, `records` (one for each frame), `written` (how many are in the capture) and `verdict`.
@@ -362,7 +370,7 @@ def track(
     is_video = Path(footage).is_file()
     if is_video and tissue == "run":
         raise NeecoError(f"--tissue: run: {footage} is a video, whose cameras are in no run's world; leave it out")
-    opened = _opened(run, device).gaussians("track")
+    opened = _opened(run, device, force).gaussians("track")
     with opened.scene.torch_threads():
         tracked = track_footage(
             opened,
@@ -445,8 +453,8 @@ def ingest(
     return ingest_and_report([recording], output, report)
 
 
-def _opened(run: Run | PathLike, device: str) -> runs.TrainedRun:
-    return run.trained if isinstance(run, Run) else runs.load_run(Path(run), device_of(device))
+def _opened(run: Run | PathLike, device: str, force: bool) -> runs.TrainedRun:
+    return run.trained if isinstance(run, Run) else runs.load_run(Path(run), device_of(device), force=force)
 
 
 def _path(path: PathLike | None) -> Path | None:

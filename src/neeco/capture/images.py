@@ -166,6 +166,11 @@ def to_bytes(image: Tensor) -> Tensor:
     return image.clamp(0, 1).mul_(255).round_().to(torch.uint8)
 
 
+def area_averaged_bytes(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels uint8 [H, W, ...], area-averaged to the camera's size."""
+    return cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+
 def area_averaged(image: Tensor, width: int, height: int) -> Tensor:
     """An image [H, W, C] reduced to another size, each pixel the mean of those that it covers."""
     planes = image.permute(2, 0, 1)[None]

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from neeco.capture.images import read_image, read_image_bytes, read_mask_pixels, read_pixels
+from neeco.capture.images import area_averaged_bytes, byte_pixels, read_mask_pixels, read_pixels
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
@@ -210,6 +210,7 @@ class Frame:
     split: str  # train, test, unseen, or any other name
     mask_path: Path | None = None  # black pixels are ignored by the loss
     background: float = 1.0  # colour behind transparent pixels: 0 black, 1 white
+    stored_size: tuple[int, int] | None = None  # (width, height) of the files, pixels; None: that of the camera
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image_path", Path(self.image_path))
@@ -222,17 +223,25 @@ class Frame:
         """The image file's stem; it names everything rendered for this frame."""
         return self.image_path.stem
 
+    def scaled(self, scale: float) -> Frame:
+        """The frame at `scale` times its size: pixels are area-averaged when they are read, and a mask pixel is set
+        where all of its area is."""
+        size = (self.camera.width, self.camera.height)
+        return replace(self, camera=self.camera.scaled(scale), stored_size=self.stored_size or size)
+
     def load_image(self) -> Tensor:
         """float32 [H, W, 3] in [0, 1], sRGB as stored. Raises NeecoError when unreadable or of another size."""
-        return read_image(self.image_path, (self.camera.width, self.camera.height), self.background)
+        pixels = self.load_pixels()
+        return torch.from_numpy(pixels / np.float32(255) if pixels.dtype == np.uint8 else pixels)
 
     def load_image_bytes(self) -> Tensor:
         """`load_image` in uint8 [H, W, 3]."""
-        return read_image_bytes(self.image_path, (self.camera.width, self.camera.height), self.background)
+        return torch.from_numpy(byte_pixels(self.load_pixels()))
 
     def load_pixels(self) -> np.ndarray:
-        """`load_image` as an array: uint8 where that is exact, else float32."""
-        return read_pixels(self.image_path, (self.camera.width, self.camera.height), self.background)
+        """`load_image` as an array: uint8 where that is exact or the frame is scaled, else float32."""
+        pixels = read_pixels(self.image_path, self._stored_size, self.background)
+        return pixels if self.stored_size is None else area_averaged_bytes(byte_pixels(pixels), self.camera)
 
     def load_mask(self) -> Tensor | None:
         """bool [H, W], True where the loss counts, or None when the frame has no mask. Raises NeecoError."""
@@ -243,7 +252,14 @@ class Frame:
         """`load_mask` as an array."""
         if self.mask_path is None:
             return None
-        return read_mask_pixels(self.mask_path, (self.camera.width, self.camera.height))
+        mask = read_mask_pixels(self.mask_path, self._stored_size)
+        if self.stored_size is None:
+            return mask
+        return area_averaged_bytes(mask.astype(np.uint8) * 255, self.camera) == 255
+
+    @property
+    def _stored_size(self) -> tuple[int, int]:
+        return self.stored_size or (self.camera.width, self.camera.height)
 
 
 @dataclass(frozen=True)

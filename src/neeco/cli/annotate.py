@@ -29,6 +29,8 @@ class Arguments:
     images: tyro.conf.OmitArgPrefixes[ImageSettings] = AS_RECORDED
     resume: bool = False
     """Continue a data set begun with the same settings."""
+    force: bool = False
+    """Use the run although its capture has changed since training, or its labels are doubtful."""
     device: Device = "auto"
 
 
@@ -42,7 +44,9 @@ def run(arguments: Arguments) -> int:
     from neeco.training.run import open_gaussian_run
 
     arguments.images.check()
-    with open_gaussian_run(arguments.run, "annotate", device_of(arguments.device)) as trained:
+    device = device_of(arguments.device)
+    with open_gaussian_run(arguments.run, "annotate", device, force=arguments.force) as trained:
+        trained.require_trusted("annotate")
         capture = None if arguments.capture is None else read_checked(arguments.capture)
         with (
             counting("annotate") as advance,

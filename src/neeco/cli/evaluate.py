@@ -43,6 +43,8 @@ class Evaluate:
     lpips_weights: Path | None = None
     """Folder with alexnet.safetensors and/or vgg16.safetensors. Default: that of NEECO_LPIPS_WEIGHTS."""
     json: JsonTarget = None
+    force: bool = False
+    """Use the run although its capture has changed since training."""
     device: Device = "auto"
 
 
@@ -59,7 +61,7 @@ def run(args: Evaluate) -> int:
 
     console = whole_lines()
     networks = find_lpips(args.lpips_weights)
-    with ready_for_json(args.json), open_run(args.run, device_of(args.device)) as trained:
+    with ready_for_json(args.json), open_run(args.run, device_of(args.device), force=args.force) as trained:
         capture = trained.capture()
         with new_folder(args.run), Bars() as bars:
             evaluation = evaluate_run(
@@ -71,9 +73,8 @@ def run(args: Evaluate) -> int:
     console.print(evaluation_table(evaluation))
     for note in evaluation["notes"]:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
-    for name, joint in trained.scene.diagnostics.get("joints", {}).items():
-        if joint.get("found") is False:
-            console.print(f"DOUBTFUL: joint {name}: {joint['verdict']}", markup=False, highlight=False, soft_wrap=True)
+    for doubt in evaluation["doubts"]:
+        console.print(f"DOUBTFUL: {doubt}", markup=False, highlight=False, soft_wrap=True)
     console.print(f"report: {page}", markup=False, highlight=False, soft_wrap=True)
     return 0
 

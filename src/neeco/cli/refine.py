@@ -25,6 +25,8 @@ class Arguments:
     """Folder to write; must be empty or absent unless --resume."""
     resume: bool = False
     """Continue interrupted work."""
+    force: bool = False
+    """Use the run although its capture has changed since training."""
     device: Device = "auto"
 
 
@@ -39,7 +41,7 @@ def run(arguments: Arguments) -> int:
         raise NeecoError("refine: give the captures that `neeco track` made, after the run")
     device = device_of(arguments.device)
     with (
-        open_gaussian_run(arguments.run, "refine", device) as opened,
+        open_gaussian_run(arguments.run, "refine", device, force=arguments.force) as opened,
         Bars() as bars,
         resumable("run the same command again with --resume", arguments.output),
     ):

@@ -31,6 +31,8 @@ class Arguments:
     states: Path | None = None
     """Render these states (JSON lines) instead of a split."""
     images: tyro.conf.OmitArgPrefixes[ImageSettings] = AS_RECORDED
+    force: bool = False
+    """Use the run although its capture has changed since training."""
     device: Device = "auto"
 
 
@@ -53,7 +55,7 @@ def run(arguments: Arguments) -> int:
         raise NeecoError("--frames: goes with --video; leave it out")
     if arguments.frames is not None and arguments.frames < 2:
         raise NeecoError(f"--frames: {arguments.frames} is no path; give at least 2")
-    with open_run(arguments.run, device_of(arguments.device)) as trained:
+    with open_run(arguments.run, device_of(arguments.device), force=arguments.force) as trained:
         if arguments.states is not None:
             views, folder = state_views(trained.scene, arguments.states), STATES_FOLDER
         else:

@@ -41,6 +41,8 @@ class Arguments:
     push_to_hub: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Upload the complete data set with its card to this repository (owner/name) of the Hugging Face Hub, private when
     new; needs the extra hub, and an account (`hf auth login`)."""
+    force: bool = False
+    """Use the run although its labels are doubtful."""
     device: Device = "auto"
 
 
@@ -66,6 +68,7 @@ def run(arguments: Arguments) -> int:
             resume=arguments.resume,
             workers=arguments.workers,
             device=arguments.device,
+            force=arguments.force,
             progress=bars.stage,
             **vars(settings),
         )

@@ -33,6 +33,8 @@ class Arguments:
     """Frames trusted less are left out of the capture: 0 to 1. With --resume another value chooses anew."""
     resume: bool = False
     """Continue interrupted tracking."""
+    force: bool = False
+    """Use the run although its capture has changed since training."""
     device: Device = "auto"
 
 

@@ -144,7 +144,8 @@ def evaluate_run(
     """Score a trained run on splits of its capture (see `held_out_splits`) and write `evaluation.json` into its folder.
 
     Returns {"given": {split: numbers}, "aligned": the same when `align`, "notes": [why a number is null], "labels":
-    {how masks were made and compared}, "per_frame": {kind: {split: [row]}}}, and of several tissues "by_tissue": {kind:
+    {how masks were made and compared}, "doubts": [reasons to doubt the labels], "per_frame": {kind: {split: [row]}}},
+    and of several tissues "by_tissue": {kind:
     {split: {tissue: means}}}. None is "not known", never zero; psnr* in dB. networks: of `find_lpips`. The caller sets
     the number of torch threads (`open_run`). Raises NeecoError for unknown splits and unreadable frames.
     """
@@ -183,7 +184,9 @@ def evaluate_run(
         "pair_assignment": pair_assignment,
     }
     parts = {"by_tissue": by_tissue} if len(scene.recorded.tissues) > 1 else {}
-    evaluation: dict[str, Any] = finite(result | {"notes": notes, "labels": labels, "per_frame": per_frame} | parts)
+    evaluation: dict[str, Any] = finite(
+        result | {"notes": notes, "doubts": run.doubts, "labels": labels, "per_frame": per_frame} | parts
+    )
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
 
@@ -367,7 +370,11 @@ def _scene_notes(scene: DrawableScene, networks: Mapping[str, Lpips], names: Map
 def _split_notes(split: str, numbers: dict[str, Any]) -> list[str]:
     masked, frames = numbers["mask_frames"], numbers["frames"]
     if masked == 0:
-        return [f"{split}: psnr_instrument, mask_iou, part_iou: null, no frame has a true or reference mask"]
+        return [
+            f"{split}: psnr_instrument, mask_iou, part_iou: null, no frame has a true or reference mask, so the labels "
+            "are not measured; draw the instrument in five frames, save each as truth/masks/NAME_OF_THE_IMAGE.png of "
+            "the capture (0 tissue, else part ids), and evaluate again"
+        ]
     notes = []
     if masked < frames:
         notes.append(f"{split}: psnr_instrument, mask_iou: over the {masked} of {frames} frames that have a mask")

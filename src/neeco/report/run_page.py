@@ -99,7 +99,7 @@ def write_report(
         train_scored="train" in evaluation["given"],
         tiles=_tiles(evaluation, kind),
         **_numbers(evaluation),
-        notes=evaluation.get("notes", ()),
+        notes=[*(f"Doubtful: {doubt}" for doubt in evaluation.get("doubts", ())), *evaluation.get("notes", ())],
         **_parts(evaluation),
         figures=frame_figures(evaluation, capture, scene, kind),
         pose_kind=KIND_NAMES[kind],
@@ -188,6 +188,8 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
     for split, numbers in evaluation[labelled].items():
         if numbers["mask_iou"] is not None:
             tiles.append((f"{numbers['mask_iou']:.3f}", f"mask IoU, {split}, {KIND_NAMES[labelled]}"))
+    doubts = evaluation.get("doubts", ())
+    tiles.append(("doubtful" if doubts else "no doubt", "labels, by what training measured"))
     first = next(iter(evaluation["given"].values()), None)
     if first is not None:
         tiles.append((f"{first['fps']:.1f}", "posed images rendered per second"))

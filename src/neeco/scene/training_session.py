@@ -29,13 +29,20 @@ class RunLength:
 
     iterations: int
     minutes: float | None = None
+    min_iterations: int = 300  # before which minutes do not end the run
+    judged_share: float = 0.25  # of `iterations`: after fewer, labels and joints are not judged
 
     def progress(self, iteration: int, seconds: float) -> float:
-        """Return the completed share of the run in [0, 1], by iterations or minutes, whichever is larger."""
+        """Return the completed share of the run in [0, 1], by iterations or minutes, whichever is larger. seconds: of
+        the iterations."""
         done = iteration / self.iterations
         if self.minutes is not None:
-            done = max(done, seconds / (60 * self.minutes))
+            done = max(done, min(iteration / self.min_iterations, seconds / (60 * self.minutes)))
         return min(1.0, done)
+
+    def is_short(self, iteration: int) -> bool:
+        """Whether a run that ended after so many iterations is too short to judge what it learned."""
+        return iteration < self.judged_share * self.iterations
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
-import cv2
 import torch
 from torch import Tensor
 
+from neeco.capture.images import area_averaged_bytes
 from neeco.capture.model import Camera, Frame
 
 MAX_MEMORY_SHARE = 0.5  # of a CUDA device's free memory that all pixels may take
@@ -30,14 +30,11 @@ class TrainingViews:
 
     @classmethod
     def read(cls, frames: Sequence[Frame], scale: float = 1.0) -> TrainingViews:
-        """Load every frame's pixels, at `scale` times their size (see `scaled`). Raises NeecoError where a file cannot
+        """Load every frame's pixels, at `scale` times their size. Raises NeecoError where a file cannot
         be read."""
-        read = [cls((frame,), (frame.load_image_bytes(),), (frame.load_mask(),)).scaled(scale) for frame in frames]
-        return cls(
-            tuple(view.frames[0] for view in read),
-            tuple(view.images[0] for view in read),
-            tuple(view.masks[0] for view in read),
-        )
+        chosen = tuple(frames) if scale == 1 else tuple(frame.scaled(scale) for frame in frames)
+        pixels = [(frame.load_image_bytes(), frame.load_mask()) for frame in chosen]
+        return cls(chosen, tuple(image for image, _ in pixels), tuple(mask for _, mask in pixels))
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -72,8 +69,8 @@ class TrainingViews:
             return self
         frames, images, masks = [], [], []
         for frame, image, mask in zip(self.frames, self.images, self.masks, strict=True):
-            camera = frame.camera.scaled(scale)
-            frames.append(replace(frame, camera=camera))
+            frames.append(frame.scaled(scale))
+            camera = frames[-1].camera
             images.append(_resized(image, camera))
             masks.append(None if mask is None else _resized(mask.to(torch.uint8) * 255, camera) == 255)
         prefetcher = None if self.prefetcher is None else PixelPrefetcher(self.prefetcher.device)
@@ -104,8 +101,7 @@ def mean_pixels(frames: Sequence[Frame]) -> float:
 
 def _resized(pixels: Tensor, camera: Camera) -> Tensor:
     """Return bytes [H, W, ...] area-averaged to the camera's size, on the same device or in the same kind of memory."""
-    resized = cv2.resize(pixels.cpu().numpy(), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    found = torch.from_numpy(resized)
+    found = torch.from_numpy(area_averaged_bytes(pixels.cpu().numpy(), camera))
     return found.pin_memory() if pixels.is_pinned() else found.to(pixels.device)
 
 

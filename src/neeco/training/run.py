@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from neeco import __version__
-from neeco.capture import Capture, read_capture
+from neeco.capture import Capture, fingerprint, read_capture
 from neeco.errors import NeecoError
 from neeco.files import (
     YamlDumper,
@@ -36,7 +36,7 @@ from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import DAMAGED, load_scene, pack_scene, save_tensors, unpack_scene
 from neeco.scene.method_registry import current_name, without_removed
 from neeco.scene.training_session import Session, StepResult, members
-from neeco.training.config import TrainConfig, check_ranges, config_from_dict, config_to_dict
+from neeco.training.config import TrainConfig, check_ranges, config_from_dict, config_to_dict, method_defaults
 
 SCHEMA = "neeco-run/1"
 CONFIG_FILE, SCENE_FILE = "config.yaml", "scene.safetensors"
@@ -53,20 +53,43 @@ class TrainedRun:
     path: Path
     scene: DrawableScene
     config: dict[str, Any]
+    force: bool = False  # use it although its capture has changed, or its labels are doubtful
 
     def capture(self) -> Capture:
         """Return the capture it was trained on, unrecorded joints as training estimated them (`Recorded.completed`).
-        Raises NeecoError when it has moved."""
+        Raises NeecoError when it has moved, and unless `force` when it has changed since."""
         root = Path(self.config["capture"])
         if not root.exists():
             config = self.path / CONFIG_FILE
             raise NeecoError(f"{config}: capture: {root} no longer exists; put it back, or write there where it is")
-        return self.scene.recorded.completed(read_capture(root, self.config["transforms"]), self.scene.instruments)
+        capture = read_capture(root, self.config["transforms"])
+        if not self.force:
+            remedy = "put its files back as they were, train again, or use it as it is now with --force"
+            require_same_capture(self.path, root, fingerprint(capture), remedy)
+        return self.scene.recorded.completed(capture, self.scene.instruments)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Reasons to doubt the labels, by what training measured: too few iterations, joints that were not found."""
+        recorded, noted = len(self.scene.recorded.names), getattr(self.scene, "diagnostics", {})
+        usual = replace(method_defaults(self.config["method"]), iterations=None).for_frames(recorded).length
+        if usual.is_short(done := noted.get("iterations", usual.iterations)):
+            return (f"training ended after {done:,} iterations, usual are {usual.iterations:,}",)
+        joints = noted.get("joints", {}).items()
+        return tuple(f"joint {name}: {joint['verdict']}" for name, joint in joints if joint.get("found") is False)
+
+    def require_trusted(self, verb: str) -> None:
+        """Raise NeecoError where the labels that `verb` is to write are doubtful, unless `force`."""
+        if not self.force and (doubts := self.doubts):
+            raise NeecoError(
+                f"{self.path}: its labels are doubtful: {'; '.join(doubts)}; train longer or record again, or {verb} "
+                "all the same with --force"
+            )
 
     def gaussians(self, asked_by: str) -> GaussianRun:
         """Return the run as one whose scene consists of Gaussians. Raises NeecoError, in the words of the option or
         verb `asked_by`, for a radiance field."""
-        return GaussianRun(self.path, require_gaussians(self.scene, asked_by), self.config)
+        return GaussianRun(self.path, require_gaussians(self.scene, asked_by), self.config, self.force)
 
 
 @dataclass(frozen=True)
@@ -82,30 +105,32 @@ def scene_digest(path: Path) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def load_run(path: Path, device: torch.device | None = None) -> TrainedRun:
-    """Open a run folder, its scene on `device` (None: the CPU). Raises NeecoError when it is not one, is unfinished or
-    comes from another version's format."""
+def load_run(path: Path, device: torch.device | None = None, *, force: bool = False) -> TrainedRun:
+    """Open a run folder, its scene on `device` (None: the CPU); `force`: see `TrainedRun`. Raises NeecoError when it is
+    not one, is unfinished or comes from another version's format."""
     path = Path(path)
     config = read_config(path)
     if not (path / SCENE_FILE).is_file():
         raise NeecoError(f"{path}: training has not finished here; continue it with `neeco train … --resume`")
     scene = load_scene(path / SCENE_FILE)
-    return TrainedRun(path, scene if device is None else scene.to(device), config)
+    return TrainedRun(path, scene if device is None else scene.to(device), config, force)
 
 
 @contextmanager
-def open_run(path: Path, device: torch.device | None = None) -> Iterator[TrainedRun]:
+def open_run(path: Path, device: torch.device | None = None, *, force: bool = False) -> Iterator[TrainedRun]:
     """`load_run` for a block that renders: until its end torch uses as many threads as pay for the run's method."""
-    run = load_run(path, device)
+    run = load_run(path, device, force=force)
     with run.scene.torch_threads():
         yield run
 
 
 @contextmanager
-def open_gaussian_run(path: Path, asked_by: str, device: torch.device | None = None) -> Iterator[GaussianRun]:
+def open_gaussian_run(
+    path: Path, asked_by: str, device: torch.device | None = None, *, force: bool = False
+) -> Iterator[GaussianRun]:
     """`open_run` for a verb that poses or labels Gaussians. Raises NeecoError, in the words of the option or verb
     `asked_by`, for a run of a radiance field."""
-    with open_run(path, device) as run:
+    with open_run(path, device, force=force) as run:
         yield run.gaussians(asked_by)
 
 
@@ -129,24 +154,24 @@ def read_config(path: Path) -> dict[str, Any]:
     return config | {"method": current_name(config["method"])}
 
 
-def write_config(path: Path, capture: Path, config: TrainConfig, fingerprint: str) -> None:
-    """Write config.yaml of run folder `path`; `fingerprint`: the capture's."""
+def write_config(path: Path, capture: Path, config: TrainConfig, digest: str) -> None:
+    """Write config.yaml of run folder `path`; `digest`: the capture's fingerprint."""
     values = {"schema": SCHEMA, "version": __version__, "capture": os.path.abspath(capture)}
-    values |= {CAPTURE_DIGEST: fingerprint}
+    values |= {CAPTURE_DIGEST: digest}
     values |= config_to_dict(config)
     write_text(path / CONFIG_FILE, yaml.dump(values, Dumper=YamlDumper, sort_keys=False))
 
 
-def require_same_capture(path: Path, root: Path, fingerprint: str) -> None:
-    """Raise NeecoError when a run was begun in `path` on the capture at `root` before it had this `fingerprint`."""
+def require_same_capture(
+    path: Path, root: Path, digest: str, remedy: str = "put its files back as they were, or give another --output"
+) -> None:
+    """Raise NeecoError, with the `remedy`, when a run was begun in `path` on the capture at `root` before it had this
+    fingerprint `digest`."""
     file = path / CONFIG_FILE
     if not file.exists():
         return
-    if read_config(path).get(CAPTURE_DIGEST, fingerprint) != fingerprint:  # older versions noted none
-        raise NeecoError(
-            f"{file}: capture: {root} has changed since this run was begun; put its files back as they were, or give "
-            "another --output"
-        )
+    if read_config(path).get(CAPTURE_DIGEST, digest) != digest:  # older versions noted none
+        raise NeecoError(f"{file}: capture: {root} has changed since this run was begun; {remedy}")
 
 
 def begun_config(path: Path) -> TrainConfig | None:

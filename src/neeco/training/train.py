@@ -44,6 +44,7 @@ from neeco.training.run import (
 from neeco.training.schedule import due
 
 CPU = torch.device("cpu")
+MIN_SIDE_PX = 16  # of images at a share of their size: smaller ones show no instrument
 BASE_BYTES, PIXEL_BYTES = 0.6e9, 300  # of memory for a process, and for one pixel while it is rendered and compared
 
 
@@ -139,7 +140,6 @@ def train(
 
 def _begin(capture: Capture, views: TrainingViews, resumed: Path | None, config: TrainConfig, log: _Log) -> Session:
     """Return the session before its first step, or as the checkpoint of the run `resumed` holds it."""
-    started = log.clock()
     torch.manual_seed(config.seed)
     if resumed is None or not checkpoint_path(resumed).exists():  # or interrupted before its first checkpoint
         session = begin_session(capture, views, config, log.note)
@@ -148,7 +148,6 @@ def _begin(capture: Capture, views: TrainingViews, resumed: Path | None, config:
         with reporting_damage(checkpoint_path(resumed)):
             session = begin_session(capture, views, config, log.note, scene)
             restore_session(session, header, tensors)
-    session.seconds += log.clock() - started
     return session
 
 
@@ -193,7 +192,14 @@ def _training_frames(capture: Capture, path: Path, config: TrainConfig) -> tuple
             f"{path}: time: the recording does not say when frames were taken; method {config.method} needs it (give "
             "each frame its `time` in seconds), 3dgs does not"
         )
-    return capture.split("train")
+    frames = capture.split("train")
+    shortest = min(min(frame.camera.width, frame.camera.height) for frame in frames)
+    if config.scale < 1 and config.scale * shortest < MIN_SIDE_PX:
+        raise NeecoError(
+            f"--scale: {config.scale:g} leaves images {max(1, round(config.scale * shortest))} pixels high or wide; "
+            f"give at least {math.ceil(100 * min(1, MIN_SIDE_PX / shortest)) / 100:g}"
+        )
+    return frames
 
 
 def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: threading.Event, go_on: str) -> None:
@@ -222,6 +228,10 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
                 save_checkpoint(session, output)
             if stop.is_set():
                 raise KeyboardInterrupt
+        planned = session.length.iterations
+        if session.iteration < planned:
+            minutes = f"--minutes {config.minutes:g} are over"
+            log.note(f"stopped after {session.iteration:,} of {planned:,} iterations, as {minutes}")
         if session.window and session.iteration > config.log_interval:  # of what came after the last row
             log.row(session)
         save_checkpoint(session, output)

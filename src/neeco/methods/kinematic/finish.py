@@ -51,7 +51,7 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
         for reading in articulation.reading_names:
             verdict = _verdict(session, articulated, index, reading)
             verdicts[f"{instrument.name}.{reading}"] = verdict
-            if not verdict["found"]:
+            if verdict["found"] is False:
                 session.report(f"warning: {instrument.name}: joint {reading} {verdict['verdict']}")
         scene = session.scene
         count = int(solid_gaussians(scene.canonical, index).sum())
@@ -114,7 +114,10 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
     explained = 1 - given / middle if middle > 0 else 0.0
     explains = bool(explained > MIN_JOINT_EXPLAINED and math.isfinite(explained))
     warning = scene.diagnostics.get("doubted_readings", {}).get(f"{instrument.name}.{name}")
-    if warning is not None:
+    cut_short = session.length.minutes is not None and session.length.is_short(session.iteration)
+    if cut_short:
+        verdict = f"not judged: {session.iteration} of {session.length.iterations:,} iterations are too few"
+    elif warning is not None:
         verdict = f"NOT found: {warning}"
     elif explains:
         verdict = f"found: the reading explains {explained:.0%} of the moving parts' error"
@@ -129,7 +132,7 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
             "unseen joint angles will look wrong (record a wider joint range, or check the joint's log)"
         )
     return {
-        "found": explains and warning is None,
+        "found": None if cut_short else explains and warning is None,
         "explained": round(explained, 4),
         **articulation.describe(name),
         "verdict": verdict,
