@@ -223,7 +223,7 @@ def write_colmap(folder, root: Path, binary: bool, model: str = "PINHOLE", disto
         poses.append((w, x, y, z, *inverse[:3, 3]))
     points = capture.points
     if binary:
-        ids = {"PINHOLE": 1, "OPENCV": 4}
+        ids = {"PINHOLE": 1, "OPENCV": 4, "FISHEYE": 15, "EUCM": 16, "DIVISION": 13, "OF_TOMORROW": 99}
         params = (40.0, 41.0, 16.5, 12.0, *distortion)
         cameras = struct.pack("<QiiQQ", 1, 1, ids[model], 32, 24) + struct.pack(f"<{len(params)}d", *params)
         images = struct.pack("<Q", len(poses))
@@ -246,6 +246,28 @@ def write_colmap(folder, root: Path, binary: bool, model: str = "PINHOLE", disto
         }
     for name, content in contents.items():
         (sparse / name).write_bytes(content)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize(
+    ("model", "parameters", "message"),
+    [
+        ("FISHEYE", (), "FISHEYE: the images are distorted .*; undistort them: neeco ingest"),
+        ("EUCM", (0.5, 1.1), "camera model is EUCM .*; run `colmap image_undistorter` first"),
+        ("DIVISION", (-0.1,), "camera model is DIVISION .*; run `colmap image_undistorter` first"),
+    ],
+)
+def test_camera_models_of_newer_colmap_are_named(folder, tmp_path, binary, model, parameters, message):
+    write_colmap(folder, tmp_path, binary, model, parameters)
+    with pytest.raises(NeecoError, match=message) as raised:
+        read_capture(tmp_path)
+    assert "damaged" not in str(raised.value)
+
+
+def test_an_unknown_camera_model_of_colmap_is_newer_and_not_damage(folder, tmp_path):
+    write_colmap(folder, tmp_path, True, "OF_TOMORROW")
+    with pytest.raises(NeecoError, match=r"camera model 99 is newer than this version"):
+        read_capture(tmp_path)
 
 
 @pytest.mark.parametrize("binary", [True, False])

@@ -31,6 +31,7 @@ FISHEYE = {
     "camera_model": "OPENCV_FISHEYE", "w": 640, "h": 480, "fl_x": 330, "fl_y": 335, "cx": 322, "cy": 241,
     "k1": -0.02, "k2": 0.01, "k3": -0.004, "k4": 0.0007,
 }  # fmt: skip
+OMNIDIRECTIONAL = {"width": 1350, "height": 1080, "cx": 678.5, "cy": 543.0, "a0": 769.0, "a1": 0.0, "a2": -8e-4}
 ROS = """image_width: 320
 image_height: 240
 distortion_model: plumb_bob
@@ -138,6 +139,20 @@ projection_parameters: {k2: -0.02, k3: 0.01, k4: -0.004, k5: 0.0007, mu: 300.5, 
     assert read_lens(world.text(camodocal, "camodocal.yaml")) == lens
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("K.txt", "300.5 0 159.5\n0 301.5 119.5\n0 0 1\n"),
+        ("K.csv", "300.5,0,159.5\n0,301.5,119.5\n0,0,1"),
+        ("K.json", "[[300.5, 0, 159.5], [0, 301.5, 119.5], [0, 0, 1]]"),
+        ("K.yaml", "[300.5, 0, 159.5, 0, 301.5, 119.5, 0, 0, 1]"),
+        ("K.txt", "3.005e2 0.0e0 1.595e2\n0.0e0 3.015e2 1.195e2\n0 0 1.0e0"),
+    ],
+)
+def test_nine_numbers_are_a_camera_matrix(world, name, text):
+    assert read_lens(world.text(text, name)) == Lens(300.5, 301.5, 160.0, 120.0)
+
+
 def test_four_numbers_or_nothing():
     assert read_lens((290, 291, 160, 128)) == Lens(290.0, 291.0, 160.0, 128.0)
     assert read_lens(None) is None
@@ -170,6 +185,11 @@ def test_a_field_of_view_is_a_focal_length(world):
         ("a.yaml", OPENCV.replace("300.5", "1" + "0" * 400), "is not a usable number"),
         ("a.yaml", ROS.replace("plumb_bob", "equidistant"), "a fisheye lens has 4 coefficients, not 5"),
         ("a.json", "{}", "fl_x: missing"),
+        *(("a.json", text, "expected an object with fl_x") for text in ("null", "3", '"fl_x"', "[1, 2]", "true")),
+        *(("a.yaml", text, "no keys; expected") for text in ("null", "3", "fl_x", "[1, 2]", "true")),
+        ("a.json", json.dumps(OMNIDIRECTIONAL), "omnidirectional lens .* is not read; undistort"),
+        ("a.yaml", json.dumps(OMNIDIRECTIONAL), "omnidirectional lens .* is not read; undistort"),
+        ("a.txt", "300 0 160\n0 300 120\n0 0 2", "no keys; expected camera_matrix"),
         ("a.json", '{"fl_x": "x", "cx": 1, "cy": 1}', "'x' is not a usable number"),
         ("a.json", json.dumps(FISHEYE | {"fl_x": 90, "fl_y": 90}), "covers more than 80 degrees off its axis"),
         ("a.json", json.dumps(FISHEYE | {"k1": -0.9}), "or folds the image over"),

@@ -31,12 +31,14 @@ _MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
     9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4), 16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
 }  # fmt: skip
 _COEFFICIENTS = {  # in a model's parameters, behind the focal lengths and the principal point
     "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"),
     "OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
     "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "SIMPLE_RADIAL_FISHEYE": ("k1",), "RADIAL_FISHEYE": ("k1", "k2"),
+    "SIMPLE_RADIAL_FISHEYE": ("k1",), "RADIAL_FISHEYE": ("k1", "k2"), "SIMPLE_FISHEYE": (), "FISHEYE": (),
 }  # fmt: skip
 
 
@@ -159,6 +161,8 @@ def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:
     content = read_bytes(path, "a file of a COLMAP model", "no such file; export the whole COLMAP model")
     try:
         return parse(content)
+    except NeecoError as error:  # which names no file
+        raise NeecoError(f"{path}: {error}") from None
     except (struct.error, ValueError, IndexError, KeyError, OverflowError):
         raise NeecoError(f"{path}: is damaged or not a COLMAP model file; export it again") from None
 
@@ -188,9 +192,14 @@ class _Stream:
 
 def _cameras_binary(content: bytes) -> dict[int, _Intrinsics]:
     stream = _Stream(content)
-    cameras = {}
+    cameras: dict[int, _Intrinsics] = {}
     for _ in range(stream.take("Q")[0]):
         camera_id, model_id, width, height = stream.take("iiQQ")
+        if model_id > max(_MODELS) and not cameras:
+            raise NeecoError(
+                f"camera model {model_id} is newer than this version of neeco; export the model as text, or run "
+                "`colmap image_undistorter` first"
+            )
         model, count = _MODELS[model_id]
         cameras[camera_id] = _Intrinsics(model, width, height, stream.take(f"{count}d"))
     return cameras

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -35,6 +36,7 @@ _INTRINSICS = ("intrinsics", "projectionparameters")  # four numbers, or by name
 _FOCAL = (("fx", "fy", "cx", "cy"), ("mu", "mv", "u0", "v0"))
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_COEFFICIENTS = (("k1", "k2", "k3", "k4"), ("k2", "k3", "k4", "k5"))  # of OpenCV, and with mu, mv, u0, v0
+_OMNIDIRECTIONAL = ("a0", "a1", "a2", "cx", "cy")  # and the affine c, d, e
 _SIZES = (("imagewidth", "imageheight"), ("width", "height"), ("w", "h"), ("cols", "rows"))
 _SIZE_LISTS = ("resolution", "imagesize", "size")  # width, height
 _MODELS = ("distortionmodel", "cameramodel", "modeltype", "type", "model")
@@ -71,7 +73,7 @@ def read_calibration(path: Path) -> Any:
     cv2.FileStorage what only OpenCV takes for YAML, as `data:[1, 2]` and `%PATH`. Raises NeecoError.
     """
     if path.suffix.lower() == ".json":
-        return read_json(path)
+        return _with_bare_matrix(read_json(path))
     text = read_text(path, "OpenCV's calibration as YAML or XML")
     if text.lstrip().startswith("<"):
         if "<opencv_storage" not in text:
@@ -94,7 +96,21 @@ def read_calibration(path: Path) -> Any:
             raise
     if not isinstance(document, dict) and isinstance(again := _by_opencv(text), dict):
         return again
-    return document
+    return _with_bare_matrix(document)
+
+
+def _with_bare_matrix(document: Any) -> Any:
+    """Return the document of nine numbers, row by row, that are a camera matrix and nothing else; others as they are.
+    YAML takes lines of numbers for text."""
+    words = re.split(r"[\s,;]+", document.strip()) if isinstance(document, str) else document
+    if not isinstance(words, list) or len(words) not in (3, 9):
+        return document
+    values = [as_float(word) for row in words for word in (row if isinstance(row, list) else [row])]
+    numbers = [] if None in values else values
+    if isinstance(document, str):
+        with suppress(ValueError):
+            numbers = [float(word) for word in words]
+    return {"camera_matrix": numbers} if len(numbers) == 9 and numbers[6:] == [0, 0, 1] else document
 
 
 def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
@@ -103,6 +119,11 @@ def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
     if not isinstance(document, dict):
         return ()
     keys = _plain(document)
+    if all(name in keys for name in _OMNIDIRECTIONAL):
+        raise NeecoError(
+            f"{where}: a0, a1, a2: an omnidirectional lens (Scaramuzza's polynomial), which is not read; undistort the "
+            "images, or calibrate a pinhole with radial and tangential, or equidistant, distortion"
+        )
     for pair in SIDES:
         sides = [_side(keys, side) for side in pair]
         if all(_has_camera(side) for side in sides):

@@ -208,6 +208,11 @@ class _Scan:
         try:
             container = av.open(str(self.path))
         except (av.error.FFmpegError, OSError, ValueError) as error:
+            if self.path.is_file() and self.path.open("rb").read(132)[128:] == b"DICM":
+                raise NeecoError(
+                    f"{self.path}: is DICOM; take the video stream out of it first, by pydicom: next(pydicom.encaps."
+                    "generate_frames(dataset.PixelData, number_of_frames=1)) is the content of a video file"
+                ) from None
             raise NeecoError(
                 f"{self.path}: cannot be opened as a video ({_reason(error)}); give an intact video file"
             ) from None

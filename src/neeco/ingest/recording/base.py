@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.errors import NeecoError
-from neeco.files import read_text
+from neeco.files import parse_yaml, read_text
 from neeco.geometry.conventions import DVRK_ECM
+from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_of
 from neeco.ingest.recording.sections import Fault, existing_file, join_places, read_section, word
@@ -22,6 +24,7 @@ BASE_KEY, WORLD_KEY = "camera_from_base", "world_from_base"  # to a still camera
 UNKNOWN = "unknown"
 DVRK_SD_MM, DVRK_SD_DEG = 8.0, 5.0  # accuracy of the dVRK's registration by a marker, by its own README: 5 to 10 mm
 MM = 1000.0  # per m
+EASY_HANDEYE = ("transformation", "transform")  # base_from_camera, m, in its files for ROS 1 and ROS 2
 WHAT = "a camera registration of the dVRK: JSON"
 _AXES = word((*CAMERA_FRAMES,), "is no convention", f"write one of {', '.join(CAMERA_FRAMES)}")
 
@@ -111,12 +114,54 @@ def read_dvrk_registration(path: Path) -> StatedBase:
     return StatedBase(DVRK_ECM.poses_to_opencv(matrix) if turned else matrix, DVRK_SD_MM, DVRK_SD_DEG)
 
 
+def read_registration(path: Path) -> StatedBase:
+    """Read a file that states a base to a still camera: easy_handeye's YAML, or the dVRK's registration. Raises
+    NeecoError for another file."""
+    if path.suffix.lower() not in (".yaml", ".yml", ".calib"):
+        return read_dvrk_registration(path)
+    document = parse_yaml(path, read_text(path, "a hand-eye calibration as YAML"), "save the calibration again")
+    node = Node(document, str(path), "", RaisingReport())
+    if not isinstance(document, dict) or not any(key in document for key in EASY_HANDEYE):
+        node.error(
+            f"is neither {WHAT} nor easy_handeye's YAML, which has `transformation`",
+            "write {transform: 4 rows, mm} of camera_from_base instead",
+        )
+    parameters = node.child("parameters")
+    held = parameters.value if isinstance(parameters.value, dict) else {}
+    if held.get("eye_on_hand") is True or held.get("calibration_type") in ("eye_in_hand", "eye_on_hand"):
+        parameters.error("the camera was on the robot's hand", "give the calibration of a camera that stands beside it")
+    stated = held.get("tracking_base_frame")
+    frame = CAMERA if stated is None else meaning_of(str(stated)).frame or ""
+    if frame not in CAMERA_FRAMES:
+        parameters.child("tracking_base_frame").error(
+            f"is {printable(stated)}, and nothing says in which axes it is",
+            "write {transform: 4 rows of camera_from_base, mm, axes: opencv or ros_body} instead",
+        )
+    transform = node.child(next(key for key in EASY_HANDEYE if key in document))
+    place, turn = (
+        transform.child(key) if isinstance(transform.value, dict) and key in transform.value else transform
+        for key in ("translation", "rotation")
+    )
+    if turn is transform:
+        values = {key: transform.child(key).number() for key in ("x", "y", "z", "qx", "qy", "qz", "qw")}
+    else:
+        values = {key: place.child(key).number() for key in "xyz"}
+        values |= {f"q{key}": turn.child(key).number() for key in "xyzw"}
+    position = MM * np.array([values[key] for key in "xyz"], np.float64)
+    quaternion = np.array([values[f"q{key}"] for key in "xyzw"], np.float64)
+    if not 0.99 < np.linalg.norm(quaternion) < 1.01:
+        turn.error("is no unit quaternion", "save the calibration again")
+    base_from_camera = rigid(Rotation.from_quat(quaternion).as_matrix(), position)
+    camera_from_base = np.linalg.inv(base_from_camera)
+    return StatedBase(CAMERA_FRAMES[frame].poses_to_opencv(camera_from_base), DVRK_SD_MM, DVRK_SD_DEG)
+
+
 def parse_base(node: Node) -> StatedBase:
-    """Return the base of `camera_from_base`: `unknown`, a file of the dVRK's registration, or a BaseSection."""
+    """Return the base of `camera_from_base`: `unknown`, a file (`read_registration`), or a BaseSection."""
     if node.value == UNKNOWN:
         return StatedBase()
     if isinstance(node.value, str):
-        return read_dvrk_registration(existing_file(node))
+        return read_registration(existing_file(node))
     if not isinstance(node.value, dict):
         raise Fault(node.field, f"expected `unknown`, a file or {{transform: …}}, found {printable(node.value)}")
     stated = read_section(BaseSection, node)
