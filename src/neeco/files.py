@@ -11,6 +11,7 @@ import re
 import secrets
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ except ImportError:  # Windows has no such locks
 
 TEMPORARY = ".unfinished-"  # begins the names of files and folders that are still being written
 LOCK = ".neeco.lock"
+LOCK_RETRY_S, LOCK_WAIT_S = 0.02, 20.0  # LOCK_WAIT_S: for a person who clicks, while another process writes
 MAX_VALUES = 1_000_000  # in a YAML file, aliases written out
 HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
 HEAD_BYTES = 1024  # read of a file to recognise what was stored in its place; Git LFS pointers are shorter
@@ -71,14 +73,13 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     what it did, or all of the new content. Raises NeecoError naming `path` when the disk refuses.
     """
     path = Path(path)
-    # keep the suffix: some writers choose the format by it
-    temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")
     try:
         _make_folders(path.parent)
-        # not by `tempfile`, whose files are their owner's alone
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        temporary, lock = _begin_file(path)
     except OSError as error:
         raise cannot_write(path, error) from error
+    if fcntl is None:
+        os.close(lock)  # Windows renames no open file
     try:
         write(temporary)
         with open(temporary, "rb") as stream:
@@ -90,6 +91,24 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     finally:
         with contextlib.suppress(FileNotFoundError):
             temporary.unlink()
+        if fcntl is not None:
+            os.close(lock)
+
+
+def _begin_file(path: Path) -> tuple[Path, int]:
+    """Create the temporary file of `path`; returns it and its handle, whose lock says that its writer is alive."""
+    flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
+    while True:
+        # keep the suffix: some writers choose the format by it
+        temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")
+        handle = os.open(temporary, flags, 0o666)  # not by `tempfile`, whose files are their owner's alone
+        if fcntl is None:
+            return temporary, handle
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        if os.fstat(handle).st_nlink:
+            return temporary, handle
+        os.close(handle)  # a sweep removed it between the two lines
 
 
 def write_unsynced(path: Path, content: bytes) -> None:
@@ -98,18 +117,20 @@ def write_unsynced(path: Path, content: bytes) -> None:
     For the many files of a folder that counts as complete only after `sync_disk`: a killed process leaves each whole or
     absent, a power cut may leave some empty. Raises NeecoError naming `path` when the disk refuses.
     """
-    temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")
-    flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
     try:
         try:
-            handle = os.open(temporary, flags, 0o666)
+            temporary, handle = _begin_file(path)
         except FileNotFoundError:
             _make_folders(path.parent)
-            handle = os.open(temporary, flags, 0o666)
+            temporary, handle = _begin_file(path)
         try:
             with os.fdopen(handle, "wb") as stream:
                 stream.write(content)
-            os.replace(temporary, path)
+                if fcntl is not None:  # while its lock is held
+                    stream.flush()
+                    os.replace(temporary, path)
+            if fcntl is None:
+                os.replace(temporary, path)
         except BaseException:
             with contextlib.suppress(FileNotFoundError):
                 temporary.unlink()
@@ -171,16 +192,16 @@ def new_folder(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def own_folder(path: Path, named: Path | None = None) -> Iterator[None]:
+def own_folder(path: Path, named: Path | None = None, wait_s: float = 0.0) -> Iterator[None]:
     """`new_folder` for this process alone, rid of what killed processes left half-written there.
 
-    Others that ask for the same folder meanwhile are refused (NeecoError naming `named`, by default the folder), and so
-    is a folder that holds a link out of it. The lock goes with the process that holds it, however that ends; a file
-    system without locks refuses nobody. On Windows there is none: nobody is refused, and nothing is swept, which
-    another may be writing.
+    Others that ask for the same folder meanwhile are refused (NeecoError naming `named`, by default the folder) after
+    `wait_s` seconds, and so is a folder that holds a link out of it. The lock goes with the process that holds it,
+    however that ends; a file system without locks refuses nobody. On Windows there is none: nobody is refused, and
+    nothing is swept, which another may be writing.
     """
     path = Path(path)
-    lock = contextlib.nullcontext() if fcntl is None else _locked(path, path if named is None else named)
+    lock = contextlib.nullcontext() if fcntl is None else _locked(path, path if named is None else named, wait_s)
     with new_folder(path), lock:
         sweep_unfinished(path)
         yield
@@ -188,7 +209,8 @@ def own_folder(path: Path, named: Path | None = None) -> Iterator[None]:
 
 def sweep_unfinished(folder: Path) -> None:
     """Remove what killed processes left half-written in a folder that this process owns; folders have owners of their
-    own. Raises NeecoError where the folder holds a link out of it. On Windows nothing is removed (see `own_folder`)."""
+    own, and a file that is still being written is locked. Raises NeecoError where the folder holds a link out of it. On
+    Windows nothing is removed (see `own_folder`)."""
     halves = []
     for entry in folder.rglob("*"):  # which follows no link
         if entry.is_symlink():
@@ -198,7 +220,25 @@ def sweep_unfinished(folder: Path) -> None:
     for entry in halves:
         inside = entry.relative_to(folder).parts[:-1]
         if not entry.is_dir() and not any(part.startswith(TEMPORARY) for part in inside):
+            _remove_abandoned(entry)
+
+
+def _remove_abandoned(entry: Path) -> None:
+    """Remove an unfinished file, unless a living process holds its lock."""
+    if entry.is_symlink() or not entry.is_file():
+        entry.unlink(missing_ok=True)
+        return
+    with contextlib.suppress(FileNotFoundError):
+        handle = os.open(entry, os.O_RDONLY)
+        try:
+            with contextlib.suppress(OSError):  # a file system without locks
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    return
             entry.unlink()
+        finally:
+            os.close(handle)
 
 
 def is_vacant(path: Path) -> bool:
@@ -209,8 +249,8 @@ def is_vacant(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path, named: Path) -> Iterator[None]:
-    lock = folder / LOCK
+def _locked(folder: Path, named: Path, wait_s: float) -> Iterator[None]:
+    lock, until = folder / LOCK, time.monotonic() + wait_s
     while True:
         try:
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
@@ -220,6 +260,9 @@ def _locked(folder: Path, named: Path) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             os.close(handle)
+            if time.monotonic() < until:
+                time.sleep(LOCK_RETRY_S)
+                continue
             raise NeecoError(
                 f"{named}: another neeco process is writing there; wait for its end, or give another folder"
             ) from error

@@ -45,7 +45,7 @@ def page(server: PosingServer, context: Any) -> Any:
 
 
 def ours(url: str, server: PosingServer) -> bool:
-    return url.startswith((server.address, "data:"))
+    return url.startswith((server.address.partition("?")[0], "data:"))
 
 
 def slide(page: Any, row: int, value: float) -> None:

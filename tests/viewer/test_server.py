@@ -36,6 +36,10 @@ def status(url: str, **headers: str) -> int:
         return refused.code
 
 
+def cookie_of(viewer: ViewerServer) -> str:
+    return f"neeco_{port_of(viewer)}={viewer.token}"
+
+
 def socket_status(port: int, path: str = "/", **headers: str) -> int:
     """101: the web socket was opened."""
     try:
@@ -52,13 +56,13 @@ def port_of(viewer: ViewerServer) -> int:
 def test_on_loopback_page_and_socket_open_and_other_sites_are_refused(made_run: Path, serve: Serve) -> None:
     viewer = serve(made_run)
     port = port_of(viewer)
-    assert viewer.token is None
-    assert viewer.address == f"http://127.0.0.1:{port}/"
-    assert status(viewer.address) == 200
-    assert socket_status(port) == 101
+    assert viewer.address == f"http://127.0.0.1:{port}/?token={viewer.token}"
+    assert [status(viewer.address), status(viewer.address.partition("?")[0])] == [200, 403]
+    assert [socket_status(port, Cookie=cookie_of(viewer)), socket_status(port)] == [101, 403]
     assert status(viewer.address, Host=f"evil.example:{port}") == 403
-    assert socket_status(port, Origin="http://evil.example") == 403
-    assert socket_status(port, Origin=f"http://127.0.0.1:{port}") == 101
+    assert status(viewer.address, **{"Sec-Fetch-Site": "cross-site"}) == 403
+    assert socket_status(port, Cookie=cookie_of(viewer), Origin="http://evil.example") == 403
+    assert socket_status(port, Cookie=cookie_of(viewer), Origin=f"http://127.0.0.1:{port}") == 101
     with pytest.raises(urllib.error.HTTPError) as refused:
         urllib.request.urlopen(urllib.request.Request(viewer.address, headers={"Host": "evil.example"}))
     assert b"refused: open http://127.0.0.1" in refused.value.read()
@@ -100,7 +104,8 @@ def test_a_browser_that_asks_for_a_tunnel_gets_none(
     monkeypatch.setattr("viser._viser.ViserTunnel", lambda *given: asked.append(given))
     viewer = serve(made_run)
     wish = messages.ShareUrlRequest()
-    with connect(f"ws://127.0.0.1:{port_of(viewer)}/", subprotocols=[PROTOCOL]) as wishing:
+    path = f"/?token={viewer.token}"
+    with connect(f"ws://127.0.0.1:{port_of(viewer)}{path}", subprotocols=[PROTOCOL]) as wishing:
         wishing.send(_packed(wish))
         time.sleep(0.5)
     assert asked == []

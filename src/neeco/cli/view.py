@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 import time
+import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -28,7 +32,7 @@ class Arguments:
     port: int = 8080
     """Port to listen on; the next free one where it is taken."""
     host: str = "127.0.0.1"
-    """Address to listen on. Any but this machine's own loopback needs the token in the address that is printed."""
+    """Address to listen on. Other machines reach any but this machine's own loopback, by plain HTTP."""
     no_browser: bool = False
     """Open no web browser; only print the address."""
     annotate: bool = False
@@ -64,22 +68,39 @@ def run(arguments: Arguments) -> int:
     ) as viewer:
         if len(shown := viewer.runs.loaded[0].tissues) > 1:
             print(f"the run has several tissues ({', '.join(shown)}); --tissue chooses which is shown")
-        return _serve(viewer.address, arguments.no_browser)
+        return _serve(viewer.address, arguments)
 
 
-def _serve(address: str, no_browser: bool) -> int:
+def _serve(address: str, arguments: Arguments) -> int:
     """Print the address of a server, and wait for Ctrl-C."""
+    from neeco.viewer.access import is_loopback
+
+    if not is_loopback(arguments.host):
+        warnings.warn(
+            f"--host {arguments.host}: plain HTTP: whoever listens on the network reads the images and the token; "
+            "use a network you trust, or the default host and `ssh -L`",
+            stacklevel=2,
+        )
     try:
         print(f"{address}  (Ctrl-C ends)", flush=True)
-        if not no_browser:
-            import webbrowser
-
-            webbrowser.open(address)
-        while True:  # in short waits: a signal that comes just before one begins is heard after it
-            time.sleep(POLL_S)
+        with contextlib.nullcontext() if arguments.no_browser else _opened(address):
+            while True:  # in short waits: a signal that comes just before one begins is heard after it
+                time.sleep(POLL_S)
     except KeyboardInterrupt:
         print()
     return 0
+
+
+@contextlib.contextmanager
+def _opened(address: str) -> Iterator[None]:
+    """Open a browser by way of a file that its user alone can read: all users can read a process's arguments."""
+    import webbrowser
+
+    with tempfile.TemporaryDirectory(prefix="neeco-view-") as folder:
+        page = Path(folder) / "view.html"
+        page.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={address}">', encoding="utf-8")
+        webbrowser.open(page.as_uri())
+        yield
 
 
 def _annotate(arguments: Arguments) -> int:
@@ -90,7 +111,7 @@ def _annotate(arguments: Arguments) -> int:
     if arguments.export is not None:
         raise NeecoError("--annotate, --export: give one of the two")
     with PosingServer(arguments.runs[0], arguments.host, arguments.port) as server:
-        return _serve(server.address, arguments.no_browser)
+        return _serve(server.address, arguments)
 
 
 def _export(arguments: Arguments, output: Path) -> int:

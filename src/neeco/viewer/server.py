@@ -40,6 +40,7 @@ document.documentElement.addEventListener("keydown", event => {
 });
 </script>"""
 MAX_MESSAGE = 2**20  # bytes; a browser's messages have some hundred
+MAX_CONNECTIONS = 256  # at once, those that only load the page included
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +71,7 @@ class ViewerServer:
         port = free_port(host, port)
         access = AccessControl.at(host, port)
         self.token = access.token
-        self._server = _start_server(access, host, port)
+        self._server = _start_server(access, host.strip("[]"), port)
         self.address = url_of(host, self._server.get_port(), self.token)
         self._prepare_scene()
         self._server.on_client_connect(self._connect)
@@ -188,13 +189,46 @@ def _controlled_sockets(access: AccessControl) -> Iterator[list[bool]]:
                     response.headers[name] = value
             return response
 
-        return serve(_closing_on_error(handler), *given, process_request=answer, **named | {"max_size": MAX_MESSAGE})
+        class Connection(websocket_server.ServerConnection):
+            """One of a bounded number."""
+
+            refused = False
+
+            def connection_made(self, transport: Any) -> None:
+                self.refused = len(self.server.handlers) >= MAX_CONNECTIONS
+                if self.refused:
+                    transport.abort()
+                else:
+                    super().connection_made(transport)
+
+            def connection_lost(self, error: Exception | None) -> None:
+                if not self.refused:
+                    super().connection_lost(error)
+
+        ours = {"max_size": MAX_MESSAGE, "create_connection": Connection, "logger": _connection_log()}
+        return serve(_closing_on_error(handler), *given, process_request=answer, **named | ours)
 
     websocket_server.serve = serve_controlled
     try:
         yield opened
     finally:
         websocket_server.serve = serve
+
+
+def _connection_log() -> logging.Logger:
+    """The log of connections, without tracebacks: a line for a browser that goes away or is not understood."""
+    connections = log.getChild("connections")
+
+    def shorten(record: logging.LogRecord) -> bool:
+        if record.exc_info and (error := record.exc_info[1]) is not None:
+            record.msg, record.args = "neeco view: a browser's connection ended (%s)", (type(error).__name__,)
+            record.exc_info = None
+            return not isinstance(error.__cause__, EOFError)  # opened, and left without a request
+        return True
+
+    if not connections.filters:
+        connections.addFilter(shorten)
+    return connections
 
 
 def _closing_on_error(handler: Callable[..., Any]) -> Callable[..., Any]:
