@@ -8,10 +8,8 @@ import json
 import math
 import os
 import re
-import secrets
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,15 +17,9 @@ from typing import Any
 import yaml
 
 from neeco.errors import NeecoError
+from neeco.locks import LOCK, LOCKING, TEMPORARY, begin_file, locked, remove_abandoned
 
-try:
-    import fcntl
-except ImportError:  # Windows has no such locks
-    fcntl = None  # type: ignore[assignment]
-
-TEMPORARY = ".unfinished-"  # begins the names of files and folders that are still being written
-LOCK = ".neeco.lock"
-LOCK_RETRY_S, LOCK_WAIT_S = 0.02, 20.0  # LOCK_WAIT_S: for a person who clicks, while another process writes
+LOCK_WAIT_S = 20.0  # for a person who clicks, while another process writes
 MAX_VALUES = 1_000_000  # in a YAML file, aliases written out
 HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
 HEAD_BYTES = 1024  # read of a file to recognise what was stored in its place; Git LFS pointers are shorter
@@ -75,10 +67,10 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     path = Path(path)
     try:
         _make_folders(path.parent)
-        temporary, lock = _begin_file(path)
+        temporary, lock = begin_file(path)
     except OSError as error:
         raise cannot_write(path, error) from error
-    if fcntl is None:
+    if not LOCKING:
         os.close(lock)  # Windows renames no open file
     try:
         write(temporary)
@@ -91,24 +83,8 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     finally:
         with contextlib.suppress(FileNotFoundError):
             temporary.unlink()
-        if fcntl is not None:
+        if LOCKING:
             os.close(lock)
-
-
-def _begin_file(path: Path) -> tuple[Path, int]:
-    """Create the temporary file of `path`; returns it and its handle, whose lock says that its writer is alive."""
-    flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
-    while True:
-        # keep the suffix: some writers choose the format by it
-        temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")
-        handle = os.open(temporary, flags, 0o666)  # not by `tempfile`, whose files are their owner's alone
-        if fcntl is None:
-            return temporary, handle
-        with contextlib.suppress(OSError):  # a file system without locks
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        if os.fstat(handle).st_nlink:
-            return temporary, handle
-        os.close(handle)  # a sweep removed it between the two lines
 
 
 def write_unsynced(path: Path, content: bytes) -> None:
@@ -119,17 +95,17 @@ def write_unsynced(path: Path, content: bytes) -> None:
     """
     try:
         try:
-            temporary, handle = _begin_file(path)
+            temporary, handle = begin_file(path)
         except FileNotFoundError:
             _make_folders(path.parent)
-            temporary, handle = _begin_file(path)
+            temporary, handle = begin_file(path)
         try:
             with os.fdopen(handle, "wb") as stream:
                 stream.write(content)
-                if fcntl is not None:  # while its lock is held
+                if LOCKING:  # while its lock is held
                     stream.flush()
                     os.replace(temporary, path)
-            if fcntl is None:
+            if not LOCKING:
                 os.replace(temporary, path)
         except BaseException:
             with contextlib.suppress(FileNotFoundError):
@@ -201,8 +177,15 @@ def own_folder(path: Path, named: Path | None = None, wait_s: float = 0.0) -> It
     nothing is swept, which another may be writing.
     """
     path = Path(path)
-    lock = contextlib.nullcontext() if fcntl is None else _locked(path, path if named is None else named, wait_s)
-    with new_folder(path), lock:
+    with new_folder(path), contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(locked(path, wait_s))
+        except BlockingIOError as error:
+            raise NeecoError(
+                f"{named or path}: another neeco process is writing there; wait for its end, or give another folder"
+            ) from error
+        except OSError as error:
+            raise cannot_write(path / LOCK, error) from error
         sweep_unfinished(path)
         yield
 
@@ -215,30 +198,12 @@ def sweep_unfinished(folder: Path) -> None:
     for entry in folder.rglob("*"):  # which follows no link
         if entry.is_symlink():
             require_inside(entry, folder)
-        if fcntl is not None and entry.name.startswith(TEMPORARY):
+        if LOCKING and entry.name.startswith(TEMPORARY):
             halves.append(entry)
     for entry in halves:
         inside = entry.relative_to(folder).parts[:-1]
         if not entry.is_dir() and not any(part.startswith(TEMPORARY) for part in inside):
-            _remove_abandoned(entry)
-
-
-def _remove_abandoned(entry: Path) -> None:
-    """Remove an unfinished file, unless a living process holds its lock."""
-    if entry.is_symlink() or not entry.is_file():
-        entry.unlink(missing_ok=True)
-        return
-    with contextlib.suppress(FileNotFoundError):
-        handle = os.open(entry, os.O_RDONLY)
-        try:
-            with contextlib.suppress(OSError):  # a file system without locks
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    return
-            entry.unlink()
-        finally:
-            os.close(handle)
+            remove_abandoned(entry)
 
 
 def is_vacant(path: Path) -> bool:
@@ -246,36 +211,6 @@ def is_vacant(path: Path) -> bool:
     return not path.is_dir() or all(
         entry.name == LOCK or (entry.name.startswith(TEMPORARY) and not entry.is_dir()) for entry in path.iterdir()
     )
-
-
-@contextlib.contextmanager
-def _locked(folder: Path, named: Path, wait_s: float) -> Iterator[None]:
-    lock, until = folder / LOCK, time.monotonic() + wait_s
-    while True:
-        try:
-            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            raise cannot_write(lock, error) from error
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            os.close(handle)
-            if time.monotonic() < until:
-                time.sleep(LOCK_RETRY_S)
-                continue
-            raise NeecoError(
-                f"{named}: another neeco process is writing there; wait for its end, or give another folder"
-            ) from error
-        except OSError:
-            pass  # a file system without locks
-        if lock.exists() and os.path.samestat(os.fstat(handle), lock.stat()):
-            break
-        os.close(handle)  # the one before removed it between the two lines: nobody else would see this lock
-    try:
-        yield
-    finally:
-        lock.unlink(missing_ok=True)
-        os.close(handle)
 
 
 def _remove_empty(folders: list[Path]) -> None:

@@ -107,6 +107,7 @@ def test_the_policy_lets_the_pages_own_script_run_and_connects_nowhere_else() ->
     assert "unsafe" not in directives["script-src"].replace("'wasm-unsafe-eval'", "")
     assert directives["connect-src"] == "'self' ws://lab:80 data: blob:"
     assert directives["default-src"] == "'none'"
+    assert "connect-src 'self' data: blob:" in content_security_policy(b"", "[::1]:80")
 
 
 @pytest.mark.parametrize(

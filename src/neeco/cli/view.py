@@ -1,4 +1,4 @@
-"""`neeco view`: show a run interactively, in a browser or as one file; pose frames of a capture by hand."""
+"""`neeco view`: show a run or a capture in a browser, or a run as one file; pose frames of a capture by hand."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ POLL_S = 0.5  # between two looks for Ctrl-C
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Show a run in a web browser: any state, any view, what is made up and what is wrong. Two runs side by side; one
-    that is still trained, too. With --export, write one file that does so without a server. With --annotate, set roll
-    and joints of an instrument found in a video by hand, in the frames that help most."""
+    that is still trained, too; or a capture before training. With --export, write one file that shows a run without a
+    server. With --annotate, set roll and joints of an instrument found in a video by hand, in the frames that help
+    most."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [OTHER]"), tyro.conf.Positional]
-    """Run folders that `neeco train` wrote or is writing: one, or two to compare. With --annotate: a capture, or a run
-    of one, whose scene then shows as a ghost."""
+    """Run folders that `neeco train` wrote or is writing: one, or two to compare; or one capture. With --annotate: a
+    capture, or a run of one, whose scene then shows as a ghost."""
     port: int = 8080
     """Port to listen on; the next free one where it is taken."""
     host: str = "127.0.0.1"
@@ -60,6 +61,14 @@ def run(arguments: Arguments) -> int:
             raise NeecoError("--size, --scale: an exported page renders at the size of its window; leave them out")
         return _export(arguments, arguments.export)
     arguments.size.check()
+    captures = [path for path in arguments.runs if is_capture(path)]
+    if captures:
+        if len(arguments.runs) > 1:
+            raise NeecoError(f"view: {captures[0]}: a capture, no run; give it alone, or two runs to compare")
+        from neeco.viewer.recording import RecordingServer
+
+        with RecordingServer(captures[0], arguments.host, arguments.port) as recording:
+            return _serve(recording.address, arguments)
     from neeco.viewer.server import ViewerServer
 
     device = device_of(arguments.device)
@@ -69,6 +78,11 @@ def run(arguments: Arguments) -> int:
         if len(shown := viewer.runs.loaded[0].tissues) > 1:
             print(f"the run has several tissues ({', '.join(shown)}); --tissue chooses which is shown")
         return _serve(viewer.address, arguments)
+
+
+def is_capture(path: Path) -> bool:
+    """Whether a folder is a capture, and no run."""
+    return (path / "transforms.json").is_file() and not (path / "config.yaml").exists()
 
 
 def _serve(address: str, arguments: Arguments) -> int:

@@ -92,7 +92,8 @@ def content_security_policy(page: bytes, host: str) -> str:
             "style-src 'unsafe-inline'",
             "img-src 'self' data: blob:",
             "font-src data:",
-            f"connect-src 'self' ws://{host} data: blob:",
+            # such a policy cannot name an IPv6 address; browsers that know them include web sockets in 'self'
+            f"connect-src 'self'{'' if host.startswith('[') else f' ws://{host}'} data: blob:",
             "base-uri 'none'",
             "form-action 'none'",
             "frame-ancestors 'none'",
