@@ -83,10 +83,10 @@ def test_images_axes_and_tracks_are_shown(served: RecordingServer, root: Path, c
     assert (np.abs(first - red).sum(-1) < 90).mean() > 0.3
     for frame in (4, 8):
         session.frame.value = frame
-        session.show()
+        session.show(True)
         settled(page)
         pose = to_numpy(read_capture(root).frames[frame].state.instruments["grasper"].pose)
-        assert np.asarray(session._axes[0].position) / served.unit == pytest.approx(pose[:3, 3], abs=1e-3)
+        assert np.asarray(session.axes["grasper"].position) / served.unit == pytest.approx(pose[:3, 3], abs=1e-3)
         assert f"{frame:06d}, train" in page.text()
     page.drag(150, 200, 260, 240)
     assert (np.abs(settled(page) - red).sum(-1) < 90).mean() < 0.05  # no image where nobody recorded one

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 IMAGE_PX = 720  # high at most, of the image behind the scene
 AXIS_UNITS = 0.1 * DISTANCE_UNITS
+UNREGISTERED = "instruments are not shown: their poses are not in the cameras' frame"
 TRACK_COLORS = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167))
 
 
@@ -49,93 +51,81 @@ class RecordingSession:
 
     def __init__(self, client: viser.ClientHandle, capture: Capture, unit: float, distance: float) -> None:
         self._client, self._capture, self._unit, self._distance = client, capture, unit, distance
-        self._lock = threading.RLock()
-        self._shown: tuple[object, ...] = ()
+        self._lock, self._shown = threading.RLock(), (-1, 0.0)
+        gui, scene = client.gui, client.scene
         cameras = [frame.camera for frame in capture.frames]
-        self.overlays = Overlays(client, cameras, capture.points, unit, self.go_to, lambda: None)
-        client.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        with client.gui.add_folder("Recording"):
-            last = max(1, len(cameras) - 1)
-            self.frame = client.gui.add_slider("frame", 0, last, 1, 0, disabled=len(cameras) == 1)
-            self.follows = client.gui.add_checkbox("camera of the frame", True)
-            back = client.gui.add_button("go to this frame's camera")
-            shown = {name: client.gui.add_checkbox(name, on) for name, on in (("axes", True), ("tracks", False))}
-            cones = client.gui.add_checkbox("recorded cameras", False)
-            points = client.gui.add_checkbox("sparse points", False, disabled=self.overlays.points is None)
-            self.status = client.gui.add_html("")
-        names = [item.name for item in capture.instruments] if capture.registered else []
-        scene, width = client.scene, AXIS_UNITS / 25
+        overlays = Overlays(client, cameras, capture.points, unit, self.go_to, lambda: None)
+        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        with gui.add_folder("Recording"):
+            self.frame = gui.add_slider("frame", 0, max(1, len(cameras) - 1), 1, 0, disabled=len(cameras) == 1)
+            self._follows = gui.add_checkbox("camera of the frame", True)
+            back = gui.add_button("go to this frame's camera")
+            paths, cones = gui.add_checkbox("tracks", False), gui.add_checkbox("recorded cameras", False)
+            points = gui.add_checkbox("sparse points", False, disabled=overlays.points is None)
+            self._status = gui.add_html("")
         tracks = scene.add_frame("/tracks", show_axes=False, visible=False)
-        self._axes = [
-            scene.add_frame(f"/axes/{k}", axes_length=AXIS_UNITS, axes_radius=width) for k in range(len(names))
-        ]
-        for number, name in enumerate(names):
-            self._add_track(number, name)
-        self._names, self._axes_shown = names, shown["axes"]
-        for handle in (self.frame, shown["axes"]):
-            handle.on_update(lambda _: self.show())
-        shown["tracks"].on_update(lambda _: setattr(tracks, "visible", shown["tracks"].value))
+        self.axes = {}
+        for number, name in enumerate(item.name for item in capture.instruments if capture.registered):
+            poses = [
+                to_numpy(frame.state.instruments[name].pose)
+                for frame in capture.frames
+                if name in frame.state.instruments
+            ]
+            path = np.array([pose[:3, 3] * unit for pose in poses], np.float32).reshape(-1, 3)
+            ends, color = np.stack([path[:-1], path[1:]], 1), TRACK_COLORS[number % len(TRACK_COLORS)]
+            if len(ends):
+                scene.add_line_segments(f"/tracks/{number}", ends, color, thickness=2, thickness_units="screen")
+            self.axes[name] = scene.add_frame(f"/axes/{number}", axes_length=AXIS_UNITS, axes_radius=AXIS_UNITS / 25)
+        paths.on_update(lambda _: setattr(tracks, "visible", paths.value))
         for handle in (cones, points):
-            handle.on_update(lambda _: self.overlays.show(cones.value, points.value))
-        back.on_click(lambda _: self.go_to(int(self.frame.value)))
+            handle.on_update(lambda _: overlays.show(cones.value, points.value))
+        self.frame.on_update(lambda _: self.show(self._follows.value))
+        back.on_click(lambda _: self.show(True))
         client.camera.on_update(lambda _: self._show_image())
-        self.show()
+        self.show(True)
 
     def go_to(self, frame: int) -> None:
-        """Stand at a frame's camera, and show that frame."""
+        """Show a frame, from its camera."""
         self.frame.value = frame
-        jump(self._client, self._capture.frames[frame].camera, self._unit, self._distance)
-        self.show()
+        self.show(True)
 
-    def show(self) -> None:
-        """Show the frame of the slider: its axes, its image, what it is."""
+    def show(self, jumping: bool) -> None:
+        """Show the slider's frame: its axes, its image where the window stands at its camera. jumping: there first."""
         with self._lock:
-            index = int(np.clip(self.frame.value, 0, len(self._capture.frames) - 1))
-            frame = self._capture.frames[index]
-            if self.follows.value:
+            frame = self._capture.frames[self._index]
+            if jumping:
                 jump(self._client, frame.camera, self._unit, self._distance)
-            for name, axes in zip(self._names, self._axes, strict=True):
-                item = frame.state.instruments.get(name)
-                axes.visible = item is not None and self._axes_shown.value
-                if item is not None:
-                    pose = to_numpy(item.pose)
+            for name, axes in self.axes.items():
+                axes.visible = name in frame.state.instruments
+                if axes.visible:
+                    pose = to_numpy(frame.state.instruments[name].pose)
                     axes.wxyz, axes.position = wxyz_of(pose), pose[:3, 3] * self._unit
             self._show_image()
+
+    @property
+    def _index(self) -> int:
+        """The slider's frame, whatever a browser said."""
+        return int(np.clip(np.nan_to_num(self.frame.value), 0, len(self._capture.frames) - 1))
 
     def _show_image(self) -> None:
         """Put the frame's image behind the scene where the window stands at its camera; elsewhere, nothing."""
         with self._lock:
-            index = int(np.clip(self.frame.value, 0, len(self._capture.frames) - 1))
-            frame, window = self._capture.frames[index], self._client.camera
-            aspect = aspect_of(window)
-            there = stands_at(browser_camera(window, self._unit, IMAGE_PX), frame.camera, self._distance)
-            wanted = (index, aspect) if there else (index, None)
-            if wanted == self._shown:
+            index, window = self._index, self._client.camera
+            frame, aspect = self._capture.frames[index], aspect_of(window)
+            with contextlib.suppress(ValueError):  # a camera that is none
+                if not stands_at(browser_camera(window, self._unit, IMAGE_PX), frame.camera, self._distance):
+                    aspect = 0.0
+            if (index, aspect) == self._shown:
                 return
-            self._shown = wanted
-            note = (
-                ""
-                if self._capture.registered
-                else "; instruments are not shown: their poses are not in the cameras' frame"
-            )
+            self._shown = index, aspect
+            picture, note = None, "" if self._capture.registered else "; " + UNREGISTERED
             try:
-                picture = image_behind(frame, aspect) if there else None
-                if there:
-                    window.fov = fitting_view(frame.camera, aspect)
+                if aspect:
+                    picture, window.fov = image_behind(frame, aspect), fitting_view(frame.camera, aspect)
             except NeecoError as error:
-                picture, note = None, f"; {error}"
+                note = f"; {error}"
             self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90)
-            self.status.content = message_html(f"{frame.name}, {frame.split}, {frame.state.time:.2f} s{note}")
-
-    def _add_track(self, number: int, name: str) -> None:
-        """The path of an instrument's origin."""
-        states = [frame.state.instruments.get(name) for frame in self._capture.frames]
-        path = np.array([to_numpy(item.pose)[:3, 3] * self._unit for item in states if item is not None])
-        if len(path) > 1:
-            ends, color = np.stack([path[:-1], path[1:]], 1), TRACK_COLORS[number % len(TRACK_COLORS)]
-            self._client.scene.add_line_segments(
-                f"/tracks/{number}", ends.astype(np.float32), color, thickness=2, thickness_units="screen"
-            )
+            self._status.content = message_html(f"{frame.name}, {frame.split}, {frame.state.time:.2f} s{note}")
 
 
 def image_behind(frame: Frame, aspect: float) -> np.ndarray:
