@@ -10,6 +10,8 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import pytest
 
@@ -185,6 +187,38 @@ def test_it_prints_its_address_and_ends_quietly_on_interrupt(made_run: Path) -> 
         rest, errors = process.communicate(timeout=30)
     assert process.returncode == 0
     assert (rest.strip(), errors) == ("", "")
+
+
+def test_the_browser_is_opened_without_the_token_in_its_arguments(
+    made_run: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    """By way of a file that nobody else can read and that goes again."""
+    opened: list[Path] = []
+
+    def open_page(address: str) -> None:
+        page = Path(url2pathname(urlsplit(address).path))
+        opened.append(page)
+        token = capsys.readouterr().out.split()[0].partition("token=")[2]
+        assert token not in address
+        assert token in page.read_text()
+        assert page.parent.stat().st_mode & 0o077 == 0
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("webbrowser.open", open_page)
+    assert main(["view", str(made_run), "--device", "cpu"]) == 0
+    assert not opened[0].parent.exists()
+
+
+def test_a_host_that_others_reach_is_warned_of_as_plain_http(
+    made_run: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    def stop(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("neeco.cli.view.time.sleep", stop)
+    for host, warned in (("127.0.0.1", False), ("0.0.0.0", True)):
+        assert main(["view", str(made_run), "--no-browser", "--device", "cpu", "--host", host]) == 0
+        assert ("plain HTTP" in capsys.readouterr().err) is warned
 
 
 class Browser:
