@@ -1,10 +1,10 @@
-# make demo | test | test-cpus | lint | docs | bench | viewer. Everything happens in .venv; nothing outside this folder is touched.
+# make demo | test | test-cpus | lint | docs | bench | viewer | sample-page. Everything happens in .venv; nothing outside this folder is touched.
 
 PYTHON ?= python3
 BIN := .venv/bin
 NATIVE := $(shell find CMakeLists.txt native -type f 2>/dev/null)
 
-.PHONY: demo test test-cpus lint docs bench viewer clean
+.PHONY: demo test test-cpus lint docs bench viewer sample-page clean
 
 demo: .venv/installed
 	rm -rf demo
@@ -37,6 +37,14 @@ viewer: build/zig/bin/python
 	  native/web/viewer.cpp native/web/system.cpp native/rasterize.cpp native/binning.cpp native/memory.cpp \
 	  -Wl,--strip-all -Wl,--gc-sections -o src/neeco/viewer/viewer.wasm
 	chmod 644 src/neeco/viewer/viewer.wasm
+
+# The documentation's page of the sample, trained and written by this version; an hour. After a change of the page's code
+# alone, tools/sample_page.py is enough.
+sample-page: .venv/installed
+	rm -rf build/liver-mini
+	$(BIN)/neeco train samples/liver-mini --output build/liver-mini
+	$(BIN)/neeco evaluate build/liver-mini
+	$(BIN)/neeco view build/liver-mini --export docs/liver-mini.html --sh 1
 
 build/zig/bin/python:
 	$(PYTHON) -m venv build/zig

@@ -84,6 +84,43 @@ def test_a_killed_process_holds_no_folder_and_what_it_left_is_swept(tmp_path: Pa
     assert not (tmp_path / LOCK).exists()
 
 
+WRITE = """\
+import sys, time
+from pathlib import Path
+from neeco.files import write_atomically
+def write(temporary):
+    temporary.write_text("whole")
+    print(flush=True)
+    sys.stdin.readline()
+write_atomically(Path(sys.argv[1]), write)
+"""
+
+
+def test_a_file_that_a_living_process_writes_is_not_swept_and_that_of_a_killed_one_is(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", WRITE, str(tmp_path / "file.txt")]
+    for killed in (False, True):
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            if killed:
+                process.kill()
+                process.wait()
+            with own_folder(tmp_path):
+                assert any(path.name.startswith(TEMPORARY) for path in tmp_path.iterdir()) is not killed
+            if not killed:
+                process.communicate("\n")
+                assert (process.returncode, (tmp_path / "file.txt").read_text()) == (0, "whole")
+
+
+def test_a_folder_of_another_process_is_waited_for(tmp_path: Path) -> None:
+    hold = HOLD.replace("sleep(60)", "sleep(0.3)")
+    with subprocess.Popen([sys.executable, "-c", hold, str(tmp_path)], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        with own_folder(tmp_path, wait_s=20):
+            assert process.wait(20) == 0
+
+
 def test_half_a_character_is_no_json_and_a_pair_of_halves_is_one_letter(tmp_path: Path) -> None:
     file = tmp_path / "file.json"
     file.write_text(r'{"name": "\ud83d\ude00"}')

@@ -8,7 +8,6 @@ import json
 import math
 import os
 import re
-import secrets
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -18,14 +17,9 @@ from typing import Any
 import yaml
 
 from neeco.errors import NeecoError
+from neeco.locks import LOCK, LOCKING, TEMPORARY, begin_file, locked, remove_abandoned
 
-try:
-    import fcntl
-except ImportError:  # Windows has no such locks
-    fcntl = None  # type: ignore[assignment]
-
-TEMPORARY = ".unfinished-"  # begins the names of files and folders that are still being written
-LOCK = ".neeco.lock"
+LOCK_WAIT_S = 20.0  # for a person who clicks, while another process writes
 MAX_VALUES = 1_000_000  # in a YAML file, aliases written out
 HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
 HEAD_BYTES = 1024  # read of a file to recognise what was stored in its place; Git LFS pointers are shorter
@@ -71,14 +65,13 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     what it did, or all of the new content. Raises NeecoError naming `path` when the disk refuses.
     """
     path = Path(path)
-    # keep the suffix: some writers choose the format by it
-    temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")
     try:
         _make_folders(path.parent)
-        # not by `tempfile`, whose files are their owner's alone
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        temporary, lock = begin_file(path)
     except OSError as error:
         raise cannot_write(path, error) from error
+    if not LOCKING:
+        os.close(lock)  # Windows renames no open file
     try:
         write(temporary)
         with open(temporary, "rb") as stream:
@@ -90,6 +83,8 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     finally:
         with contextlib.suppress(FileNotFoundError):
             temporary.unlink()
+        if LOCKING:
+            os.close(lock)
 
 
 def write_unsynced(path: Path, content: bytes) -> None:
@@ -98,18 +93,20 @@ def write_unsynced(path: Path, content: bytes) -> None:
     For the many files of a folder that counts as complete only after `sync_disk`: a killed process leaves each whole or
     absent, a power cut may leave some empty. Raises NeecoError naming `path` when the disk refuses.
     """
-    temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")
-    flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
     try:
         try:
-            handle = os.open(temporary, flags, 0o666)
+            temporary, handle = begin_file(path)
         except FileNotFoundError:
             _make_folders(path.parent)
-            handle = os.open(temporary, flags, 0o666)
+            temporary, handle = begin_file(path)
         try:
             with os.fdopen(handle, "wb") as stream:
                 stream.write(content)
-            os.replace(temporary, path)
+                if LOCKING:  # while its lock is held
+                    stream.flush()
+                    os.replace(temporary, path)
+            if not LOCKING:
+                os.replace(temporary, path)
         except BaseException:
             with contextlib.suppress(FileNotFoundError):
                 temporary.unlink()
@@ -171,34 +168,42 @@ def new_folder(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def own_folder(path: Path, named: Path | None = None) -> Iterator[None]:
+def own_folder(path: Path, named: Path | None = None, wait_s: float = 0.0) -> Iterator[None]:
     """`new_folder` for this process alone, rid of what killed processes left half-written there.
 
-    Others that ask for the same folder meanwhile are refused (NeecoError naming `named`, by default the folder), and so
-    is a folder that holds a link out of it. The lock goes with the process that holds it, however that ends; a file
-    system without locks refuses nobody. On Windows there is none: nobody is refused, and nothing is swept, which
-    another may be writing.
+    Others that ask for the same folder meanwhile are refused (NeecoError naming `named`, by default the folder) after
+    `wait_s` seconds, and so is a folder that holds a link out of it. The lock goes with the process that holds it,
+    however that ends; a file system without locks refuses nobody. On Windows there is none: nobody is refused, and
+    nothing is swept, which another may be writing.
     """
     path = Path(path)
-    lock = contextlib.nullcontext() if fcntl is None else _locked(path, path if named is None else named)
-    with new_folder(path), lock:
+    with new_folder(path), contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(locked(path, wait_s))
+        except BlockingIOError as error:
+            raise NeecoError(
+                f"{named or path}: another neeco process is writing there; wait for its end, or give another folder"
+            ) from error
+        except OSError as error:
+            raise cannot_write(path / LOCK, error) from error
         sweep_unfinished(path)
         yield
 
 
 def sweep_unfinished(folder: Path) -> None:
     """Remove what killed processes left half-written in a folder that this process owns; folders have owners of their
-    own. Raises NeecoError where the folder holds a link out of it. On Windows nothing is removed (see `own_folder`)."""
+    own, and a file that is still being written is locked. Raises NeecoError where the folder holds a link out of it. On
+    Windows nothing is removed (see `own_folder`)."""
     halves = []
     for entry in folder.rglob("*"):  # which follows no link
         if entry.is_symlink():
             require_inside(entry, folder)
-        if fcntl is not None and entry.name.startswith(TEMPORARY):
+        if LOCKING and entry.name.startswith(TEMPORARY):
             halves.append(entry)
     for entry in halves:
         inside = entry.relative_to(folder).parts[:-1]
         if not entry.is_dir() and not any(part.startswith(TEMPORARY) for part in inside):
-            entry.unlink()
+            remove_abandoned(entry)
 
 
 def is_vacant(path: Path) -> bool:
@@ -206,33 +211,6 @@ def is_vacant(path: Path) -> bool:
     return not path.is_dir() or all(
         entry.name == LOCK or (entry.name.startswith(TEMPORARY) and not entry.is_dir()) for entry in path.iterdir()
     )
-
-
-@contextlib.contextmanager
-def _locked(folder: Path, named: Path) -> Iterator[None]:
-    lock = folder / LOCK
-    while True:
-        try:
-            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            raise cannot_write(lock, error) from error
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            os.close(handle)
-            raise NeecoError(
-                f"{named}: another neeco process is writing there; wait for its end, or give another folder"
-            ) from error
-        except OSError:
-            pass  # a file system without locks
-        if lock.exists() and os.path.samestat(os.fstat(handle), lock.stat()):
-            break
-        os.close(handle)  # the one before removed it between the two lines: nobody else would see this lock
-    try:
-        yield
-    finally:
-        lock.unlink(missing_ok=True)
-        os.close(handle)
 
 
 def _remove_empty(folders: list[Path]) -> None:

@@ -18,7 +18,8 @@ from neeco.viewer.runs import WatchedRun
 from neeco.viewer.views import Picture, RunPicture
 
 TOKEN = "a-token"
-OPEN, LOCKED = AccessControl(None), AccessControl(TOKEN, "neeco_80")
+OWN, LOCKED = AccessControl(TOKEN, "neeco_80", loopback=True), AccessControl(TOKEN, "neeco_80")
+COOKIE = f"neeco_80={TOKEN}"
 HOSTILE = '<img src=x onerror="alert(1)">{1+1}[a](javascript:alert(1))'
 
 
@@ -28,34 +29,50 @@ def asked(guard: AccessControl, path: str = "/", **headers: str) -> str | None:
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:8080", "LOCALHOST", "[::1]:80", "127.3.2.1:9"])
 def test_loopback_is_let_in_by_its_names(host: str) -> None:
-    assert asked(OPEN, host=host) is None
-    assert asked(OPEN, host=host, origin=f"http://{host}") is None
+    assert asked(OWN, host=host, cookie=COOKIE) is None
+    assert asked(OWN, host=host, cookie=COOKIE, origin=f"http://{host}") is None
 
 
 @pytest.mark.parametrize(
     "host", ["evil.example:8080", "127.0.0.1.evil.example", "192.168.0.7:80", "localhost.evil", ""]
 )
 def test_a_name_that_was_made_to_lead_here_is_refused(host: str) -> None:
-    assert asked(OPEN, host=host) is not None
+    assert asked(OWN, host=host, cookie=COOKIE) is not None
 
 
 @pytest.mark.parametrize(
     "origin", ["http://evil.example", "null", "http://127.0.0.1:81", "http://localhost:80", "http://127.0.0.1:80.evil"]
 )
-@pytest.mark.parametrize("guard", [OPEN, LOCKED])
+@pytest.mark.parametrize("guard", [OWN, LOCKED])
 def test_pages_of_other_sites_are_refused(guard: AccessControl, origin: str) -> None:
     assert "another site" in asked(guard, f"/?token={TOKEN}", origin=origin)
 
 
 def test_two_hosts_or_none_are_refused() -> None:
-    assert OPEN.refusal("/", {"host": ["127.0.0.1", "evil.example"]}) is not None
-    assert OPEN.refusal("/", {}) is not None
+    assert OWN.refusal("/", {"host": ["127.0.0.1", "evil.example"], "cookie": [COOKIE]}) is not None
+    assert OWN.refusal("/", {"cookie": [COOKIE]}) is not None
 
 
+@pytest.mark.parametrize("guard", [OWN, LOCKED])
+def test_what_a_page_of_another_site_fetches_is_refused_and_a_link_with_the_token_is_not(guard: AccessControl) -> None:
+    def fetched(path: str, site: str, mode: str = "no-cors") -> str | None:
+        return asked(guard, path, cookie=COOKIE, **{"sec-fetch-site": site, "sec-fetch-mode": mode})
+
+    assert fetched("/overview", "same-origin", "cors") is None
+    assert fetched("/", "none", "navigate") is None
+    for site in ("cross-site", "same-site", "odd"):
+        assert "another site" in fetched("/overview", site)
+        assert "another site" in fetched(f"/picture?token={TOKEN}", site)
+        assert "another site" in fetched("/", site, "navigate")
+        assert fetched(f"/?token={TOKEN}", site, "navigate") is None
+
+
+@pytest.mark.parametrize("guard", [OWN, LOCKED])
 @pytest.mark.parametrize(
     ("path", "cookie"), [(f"/?token={TOKEN}", ""), (f"/?a=1&token={TOKEN}", "x=y"), ("/", f"a=b; neeco_80={TOKEN}")]
 )
-def test_the_token_is_taken_from_the_address_or_the_cookie(path: str, cookie: str) -> None:
+def test_the_token_is_taken_from_the_address_or_the_cookie(guard: AccessControl, path: str, cookie: str) -> None:
+    assert asked(guard, path, cookie=cookie) is None
     assert asked(LOCKED, path, host="lab:80", cookie=cookie) is None
 
 
@@ -70,8 +87,9 @@ def test_the_token_is_taken_from_the_address_or_the_cookie(path: str, cookie: st
         ("/?token=ä", ""),
     ],
 )
-def test_without_the_token_nobody_is_let_in(path: str, cookie: str) -> None:
+def test_without_the_token_nobody_is_let_in_on_loopback_neither(path: str, cookie: str) -> None:
     assert "token" in asked(LOCKED, path, cookie=cookie)
+    assert "token" in asked(OWN, path, cookie=cookie)
 
 
 def test_the_cookie_is_hidden_from_scripts_and_other_sites() -> None:
@@ -79,7 +97,6 @@ def test_the_cookie_is_hidden_from_scripts_and_other_sites() -> None:
     assert headers["Set-Cookie"] == f"neeco_80={TOKEN}; HttpOnly; SameSite=Strict; Path=/"
     assert headers["Referrer-Policy"] == "no-referrer"
     assert "Set-Cookie" not in LOCKED.page_headers("/", b"", "lab:80")
-    assert "Set-Cookie" not in OPEN.page_headers("/?token=None", b"", "lab:80")
 
 
 def test_the_policy_lets_the_pages_own_script_run_and_connects_nowhere_else() -> None:
@@ -90,19 +107,23 @@ def test_the_policy_lets_the_pages_own_script_run_and_connects_nowhere_else() ->
     assert "unsafe" not in directives["script-src"].replace("'wasm-unsafe-eval'", "")
     assert directives["connect-src"] == "'self' ws://lab:80 data: blob:"
     assert directives["default-src"] == "'none'"
+    assert "connect-src 'self' data: blob:" in content_security_policy(b"", "[::1]:80")
 
 
 @pytest.mark.parametrize(
     ("host", "own"),
     [("127.0.0.1", True), ("::1", True), ("localhost", True), ("0.0.0.0", False), ("lab", False), ("10.0.0.1", False)],
 )
-def test_only_loopback_goes_without_a_token(host: str, own: bool) -> None:
+def test_every_address_has_a_token_and_loopback_is_known(host: str, own: bool) -> None:
     assert is_loopback(host) is own
+    assert AccessControl.at(host, 80).loopback is own
+    assert len(AccessControl.at(host, 80).token) >= 32
+    assert AccessControl.at(host, 80).token != AccessControl.at(host, 80).token
 
 
 def test_the_printed_address_carries_the_token() -> None:
-    assert url_of("127.0.0.1", 8080, None) == "http://127.0.0.1:8080/"
-    assert url_of("::1", 8080, None) == "http://[::1]:8080/"
+    assert url_of("127.0.0.1", 8080, "t") == "http://127.0.0.1:8080/?token=t"
+    assert url_of("::1", 8080, "t") == "http://[::1]:8080/?token=t"
     assert url_of("lab", 8080, "t") == "http://lab:8080/?token=t"
     assert url_of("0.0.0.0", 8080, "t") == f"http://{socket.gethostname()}:8080/?token=t"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import shutil
@@ -62,8 +63,14 @@ def answer(port: int, *lines: bytes, wait: float = 20.0) -> bytes:
         return raw.recv(4096).partition(b"\r\n")[0]
 
 
-def opened(port: int) -> ClientConnection:
-    return connect(f"ws://127.0.0.1:{port}/", subprotocols=[PROTOCOL], max_size=None)
+def cookie_of(viewer: ViewerServer) -> str:
+    return f"neeco_{port_of(viewer)}={viewer.token}"
+
+
+def opened(viewer: ViewerServer) -> ClientConnection:
+    cookie = {"Cookie": cookie_of(viewer)}
+    address = f"ws://127.0.0.1:{port_of(viewer)}/"
+    return connect(address, subprotocols=[PROTOCOL], max_size=None, additional_headers=cookie)
 
 
 def looks(connection: ClientConnection, **changed: Any) -> None:
@@ -91,8 +98,9 @@ def client_of(viewer: ViewerServer, known: Collection[Any] = ()) -> Any:
 def is_served(viewer: ViewerServer) -> bool:
     """Does a new browser get a page, and a picture?"""
     port = port_of(viewer)
-    assert answer(port, b"GET / HTTP/1.1", f"Host: 127.0.0.1:{port}".encode()) == b"HTTP/1.1 200 OK"
-    with opened(port) as connection:
+    page = f"GET /?token={viewer.token} HTTP/1.1".encode()
+    assert answer(port, page, f"Host: 127.0.0.1:{port}".encode()) == b"HTTP/1.1 200 OK"
+    with opened(viewer) as connection:
         before = set(viewer.render_thread.sessions)
         looks(connection)
         until = time.monotonic() + 20
@@ -147,9 +155,39 @@ def test_odd_hosts_and_origins_are_refused(shared: ViewerServer, header: bytes, 
 )
 def test_only_the_pages_own_files_are_served(shared: ViewerServer, path: bytes, caplog) -> None:
     port = port_of(shared)
-    status = answer(port, b"GET " + path + b" HTTP/1.1", f"Host: 127.0.0.1:{port}".encode())
+    headers = f"Host: 127.0.0.1:{port}".encode(), f"Cookie: {cookie_of(shared)}".encode()
+    status = answer(port, b"GET " + path + b" HTTP/1.1", *headers)
     assert status.split(b" ")[1] in (b"400", b"404")
     assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_a_request_with_a_body_or_without_an_end_is_a_line_in_the_log_and_no_trouble(
+    shared: ViewerServer, caplog, capfd
+) -> None:
+    port = port_of(shared)
+    host = f"Host: 127.0.0.1:{port}".encode()
+    assert b"200" not in answer(port, b"GET / HTTP/1.1", host, b"Content-Length: 5")
+    assert b"200" not in answer(port, b"GET / HTTP/1.1", host, b"Transfer-Encoding: chunked")
+    for sent in (b"", b"GET / HT"):
+        with socket.create_connection(("127.0.0.1", port)) as raw:
+            raw.sendall(sent)
+    assert is_served(shared)
+    assert not [record for record in caplog.records if record.exc_info and record.levelno >= logging.WARNING]
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_connections_are_bounded(made_run: Path, serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "MAX_CONNECTIONS", 3)
+    viewer = serve(made_run)
+    held = [socket.create_connection(("127.0.0.1", port_of(viewer)), timeout=5) for _ in range(3)]
+    time.sleep(0.2)
+    further = socket.create_connection(("127.0.0.1", port_of(viewer)), timeout=5)
+    with further, contextlib.suppress(ConnectionResetError):
+        assert further.recv(1) == b""
+    for connection in held:
+        connection.close()
+    time.sleep(0.2)
+    assert is_served(viewer)
 
 
 def test_a_token_of_odd_bytes_is_wrong_and_no_trouble(made_run: Path, serve: Serve) -> None:
@@ -177,9 +215,9 @@ def test_a_token_of_odd_bytes_is_wrong_and_no_trouble(made_run: Path, serve: Ser
 def test_what_is_not_understood_ends_that_connection_alone(
     shared: ViewerServer, message: str | bytes, caplog, capfd
 ) -> None:
-    with opened(port_of(shared)) as other:
+    with opened(shared) as other:
         looks(other)
-        with opened(port_of(shared)) as connection:
+        with opened(shared) as connection:
             looks(connection)
             connection.send(message)
             with pytest.raises(ConnectionClosed):
@@ -208,7 +246,7 @@ def test_the_buttons_of_a_page_save_states_and_images(made_run: Path, serve: Ser
     run = tmp_path / "run"
     shutil.copytree(made_run, run)
     viewer = serve(run)
-    with opened(port_of(viewer)) as connection:
+    with opened(viewer) as connection:
         looks(connection)
         client = client_of(viewer)
         (session,) = viewer.render_thread.sessions
@@ -233,7 +271,7 @@ def test_the_buttons_of_a_page_save_states_and_images(made_run: Path, serve: Ser
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e300, 1e9])
 def test_a_place_that_is_none_does_not_end_the_others_pictures(shared: ViewerServer, value: float) -> None:
     known = set(shared.render_thread.sessions)
-    with opened(port_of(shared)) as connection:
+    with opened(shared) as connection:
         looks(connection)
         client = client_of(shared, known)
         for label, number in (("frame", value), ("along shaft (mm)", value), ("play", True)):
@@ -260,7 +298,7 @@ def test_a_place_that_is_none_does_not_end_the_others_pictures(shared: ViewerSer
 )
 def test_a_camera_that_is_none_does_not_end_the_others_pictures(shared: ViewerServer, changed: dict[str, Any]) -> None:
     known = set(shared.render_thread.sessions)
-    with opened(port_of(shared)) as connection:
+    with opened(shared) as connection:
         looks(connection)
         client_of(shared, known)
         looks(connection, **changed)
@@ -269,7 +307,7 @@ def test_a_camera_that_is_none_does_not_end_the_others_pictures(shared: ViewerSe
 
 
 def test_a_storm_of_messages_leaves_the_others_their_pictures(shared: ViewerServer) -> None:
-    with opened(port_of(shared)) as connection:
+    with opened(shared) as connection:
         for step in range(3000):
             looks(connection, position=[0.001 * step, 0.0, 0.0])
         assert is_served(shared)
@@ -280,8 +318,8 @@ def test_more_browsers_than_there_is_room_for_are_told_so(
 ) -> None:
     monkeypatch.setattr(server, "MAX_BROWSERS", 2)
     viewer = serve(made_run)
-    with opened(port_of(viewer)), opened(port_of(viewer)), pytest.raises(InvalidStatus) as refused:
-        opened(port_of(viewer))
+    with opened(viewer), opened(viewer), pytest.raises(InvalidStatus) as refused:
+        opened(viewer)
     assert refused.value.response.status_code == 503
     assert is_served(viewer)
 

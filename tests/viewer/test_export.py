@@ -15,6 +15,7 @@ import pytest
 import torch
 from scene_worlds import make_scene
 
+import neeco
 from neeco.errors import NeecoError
 from neeco.scene.canonical import SH_C0
 from neeco.scene.gaussian_scene import GaussianScene
@@ -163,3 +164,15 @@ def test_degrees_that_are_none_are_refused(tmp_path: Path, degree: int) -> None:
     with pytest.raises(NeecoError, match=r"--sh: "):
         export_page(tmp_path, tmp_path / "page.html", degree, CPU)
     assert not (tmp_path / "page.html").exists()
+
+
+def test_the_documentations_page_is_of_this_code_and_version() -> None:
+    """Else: python tools/sample_page.py."""
+    page = (Path(__file__).parents[2] / "docs" / "liver-mini.html").read_text(encoding="utf-8")
+    assert f"<dd>neeco {neeco.__version__}</dd>" in page
+    folder = Path(neeco.__file__).parent / "viewer"
+    for script in sorted((folder / "page").glob("*.js")):
+        assert script.read_text(encoding="utf-8") in page, script.name
+    wasm = re.search(r'id="wasm">(.*?)</script>', page)
+    assert wasm is not None
+    assert zlib.decompress(base64.b64decode(wasm[1])) == (folder / "viewer.wasm").read_bytes()

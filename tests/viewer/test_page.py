@@ -242,6 +242,91 @@ def test_dragging_turns_the_camera_and_the_button_brings_it_back(page: Page) -> 
     assert np.array_equal(page.drawn()[0], before)
 
 
+@torch.no_grad()
+def test_a_camera_moved_by_hand_keeps_the_light_where_it_was_recorded(page: Page, scene: GaussianScene) -> None:
+    """Nearer by a third, the scene is as bright as before; a headlight that moves along would make it brighter."""
+    page.page.evaluate("window.neeco.toFrame(2)")
+    page.page.evaluate("window.neeco.eye.nearer(0.4)")
+    matrix = torch.tensor(page.page.evaluate("window.neeco.eye.matrix"), dtype=torch.float64).reshape(3, 4)
+    recorded = scene.recorded.cameras[2]
+    camera = replace(recorded, world_from_camera=torch.cat([matrix, torch.tensor([[0.0, 0, 0, 1]])]))
+    state, strengths = scene.recorded.states[2], scene.shadow_strengths.clone()
+    apart = float((camera.world_from_camera[:3, 3] - recorded.world_from_camera[:3, 3]).norm())
+    assert apart > 20
+    shown, truth = page.drawn()[0], scene.render(state, camera).color.clamp(0, 1).numpy()
+    falloff = scene.falloff.clone()
+    try:
+        scene.falloff.zero_()
+        scene.shadow_strengths.zero_()
+        unlit = [scene.render(state, view).color.clamp(0, 1).numpy() for view in (recorded, camera)]
+    finally:
+        scene.falloff.copy_(falloff)
+        scene.shadow_strengths.copy_(strengths)
+    # brightness by the light alone, at the image's middle
+    middle = np.s_[38:58, 50:76]
+    before = page_at(page, 2)[middle].mean() / unlit[0][middle].mean()
+    assert shown[middle].mean() / unlit[1][middle].mean() == pytest.approx(before, rel=0.15)
+    assert truth[middle].mean() > 1.2 * shown[middle].mean()
+
+
+def page_at(page: Page, frame: int) -> np.ndarray:
+    return page.drawn(frame)[0]
+
+
+def badge(page: Page) -> bool:
+    page.drawn()
+    page.page.wait_for_timeout(400)
+    return bool(page.page.locator("#unobserved").is_visible())
+
+
+def test_a_hand_leads_not_far_from_what_was_recorded_and_the_page_says_what_no_frame_observed(page: Page) -> None:
+    assert not badge(page)
+    page.page.locator("canvas").hover()
+    page.page.mouse.wheel(0, -30)
+    assert not badge(page)
+    strayed = "window.neeco.eye.strayed(window.neeco.eye.matrix)"
+    for act in ("orbit(25, 3)", "shift(-25, 10)", "nearer(0.2)", "nearer(-0.2)"):
+        for _ in range(60):
+            page.page.evaluate(f"window.neeco.eye.{act}")
+        assert 0.5 < page.page.evaluate(strayed) <= 1
+        assert badge(page)
+        page.page.evaluate("window.neeco.follow(true)")
+        assert not badge(page)
+
+
+@pytest.mark.parametrize("how", ["key", "double click"])
+def test_the_recorded_view_comes_back(page: Page, how: str) -> None:
+    before = page.drawn()[0]
+    page.slide("roll", 0.8)
+    for _ in range(30):
+        page.page.evaluate("window.neeco.eye.orbit(25, 3)")
+    if how == "key":
+        page.page.keyboard.press("r")
+        assert page.value("roll") == pytest.approx(0)
+    else:
+        page.page.locator("canvas").dblclick()
+        page.slide("roll", 0.0)
+    assert np.array_equal(page.drawn()[0], before)
+
+
+WIDTHS = """window.widths = [];
+addEventListener("DOMContentLoaded", () => {
+  const canvas = document.querySelector("canvas"), watch = { attributes: true, attributeFilter: ["width"] };
+  new MutationObserver(() => widths.push(canvas.width)).observe(canvas, watch);
+});"""
+
+
+@pytest.mark.parametrize("size", [(900, 600), (390, 844)])
+def test_the_first_picture_is_a_sharp_one(chromium: Any, exported: Path, size: tuple[int, int]) -> None:
+    page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
+    page.add_init_script(WIDTHS)
+    page.goto(exported.as_uri())
+    page.get_by_text("000000 ·").wait_for(timeout=1e3 * READY_S)
+    page.wait_for_timeout(800)
+    assert page.evaluate("widths") == [256]  # twice the recorded width
+    page.close()
+
+
 def test_sliders_have_names_and_values_with_units_and_keep_their_arrows(page: Page) -> None:
     jaw = page.page.get_by_role("slider", name="grasper: jaw angle", exact=True)
     before = float(jaw.input_value())

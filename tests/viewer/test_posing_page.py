@@ -45,7 +45,7 @@ def page(server: PosingServer, context: Any) -> Any:
 
 
 def ours(url: str, server: PosingServer) -> bool:
-    return url.startswith((server.address, "data:"))
+    return url.startswith((server.address.partition("?")[0], "data:"))
 
 
 def slide(page: Any, row: int, value: float) -> None:
@@ -163,3 +163,28 @@ def test_arrows_on_a_focused_slider_move_that_slider_alone(page: Any) -> None:
     page.keyboard.press("ArrowRight")
     assert (float(roll.input_value()), float(jaw.input_value())) == (before[0], before[1] + 1)
     assert jaw.evaluate("input => input.ariaValueText").startswith(f"{before[1] + 1:.0f}°")
+
+
+def test_a_file_that_leads_to_the_address_opens_the_page_and_another_page_gets_nothing(
+    server: PosingServer, context: Any, tmp_path: Path
+) -> None:
+    """As `neeco view` opens a browser; the file's origin is another site's."""
+    leading = tmp_path / "view.html"
+    leading.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={server.address}">')
+    opened = context.new_page()
+    opened.goto(leading.as_uri())
+    opened.locator("#strip figure").first.wait_for(timeout=30_000)
+    opened.reload()
+    opened.locator("#strip figure").first.wait_for(timeout=30_000)
+    address = server.address.partition("?")[0]
+    other = context.new_page()
+    (tmp_path / "other.html").write_text(f'<!doctype html><img src="{server.address}"><a href="{address}">there</a>')
+    answers: list[int] = []
+    other.on("response", lambda got: answers.append(got.status) if got.url.startswith("http") else None)
+    other.goto((tmp_path / "other.html").as_uri())
+    other.get_by_text("there").click()
+    other.wait_for_url(address)
+    assert answers
+    assert set(answers) == {403}
+    other.close()
+    opened.close()

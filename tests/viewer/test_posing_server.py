@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import io
 import json
 import shutil
+import socket
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 import numpy as np
 import pytest
@@ -19,7 +26,10 @@ from viewer_world import grasper_scene, write_run
 
 from neeco.capture.readers import read_capture
 from neeco.cli import main
+from neeco.errors import NeecoError
 from neeco.ingest.posing.hand_posed import read_answers
+from neeco.viewer import posing_server
+from neeco.viewer.access import free_port
 from neeco.viewer.posing_server import PosingServer
 
 JSON = {"Content-Type": "application/json"}
@@ -36,14 +46,24 @@ def server(made: PosingWorld, tmp_path: Path) -> Iterator[PosingServer]:
         yield started
 
 
+def place_of(server: PosingServer) -> tuple[str, int]:
+    address = urlsplit(server.address)
+    return str(address.hostname), int(address.port or 0)
+
+
+def cookie_of(server: PosingServer) -> str:
+    return f"neeco_{place_of(server)[1]}={urlsplit(server.address).query.removeprefix('token=')}"
+
+
 def ask(
     server: PosingServer, path: str, body: Any = None, headers: dict[str, str] | None = None
 ) -> tuple[int, dict[str, str], bytes]:
-    host, port = server.address.split("/")[2].split(":")
-    connection = http.client.HTTPConnection(host, int(port), timeout=30)
+    host, port = place_of(server)
+    connection = http.client.HTTPConnection(host, port, timeout=30)
     method = "GET" if body is None else "POST"
     sent = body if body is None or isinstance(body, bytes) else json.dumps(body).encode()
-    connection.request(method, path, sent, (JSON if body is not None else {}) if headers is None else headers)
+    given = (JSON if body is not None else {}) if headers is None else headers
+    connection.request(method, path, sent, {"Cookie": cookie_of(server)} | given)
     answer = connection.getresponse()
     return answer.status, dict(answer.getheaders()), answer.read()
 
@@ -155,11 +175,128 @@ def test_what_cannot_be_is_answered_in_a_line_and_nothing_is_written(
 def test_others_may_not_ask(server: PosingServer, made: PosingWorld) -> None:
     answer = answer_for(made, 3)
     assert ask(server, "/", headers={"Host": "evil.example"})[0] == 403
+    assert ask(server, "/", headers={"Cookie": ""})[0] == 403
+    assert ask(server, "/save", answer, JSON | {"Cookie": ""})[0] == 403
+    assert ask(server, "/save", answer, JSON | {"Sec-Fetch-Site": "cross-site"})[0] == 403
+    assert ask(server, "/?" + urlsplit(server.address).query, headers={"Cookie": ""})[0] == 200
     assert ask(server, "/save", answer, JSON | {"Origin": "http://evil.example"})[0] == 403
     assert ask(server, "/save", answer, {"Content-Type": "text/plain"})[0] == 403
     assert ask(server, "/save", b"x" * 100_000)[0] == 400
     assert ask(server, "/etc/passwd")[0] == 404
     assert read_answers(server.session.posed.root) == []
+
+
+def raw(server: PosingServer, *lines: str, body: bytes = b"") -> tuple[bytes, float]:
+    """All that a raw request gets, and after how many seconds the connection ended."""
+    began = time.monotonic()
+    with socket.create_connection(place_of(server), timeout=20) as connection:
+        connection.sendall("".join(f"{line}\r\n" for line in [*lines, ""]).encode() + body)
+        heard = b""
+        while more := connection.recv(65536):
+            heard += more
+    return heard, time.monotonic() - began
+
+
+def test_a_body_is_read_only_from_those_who_may_ask(server: PosingServer) -> None:
+    host = f"Host: 127.0.0.1:{place_of(server)[1]}"
+    with socket.create_connection(place_of(server), timeout=5) as stranger:
+        # the body never comes
+        stranger.sendall(f"POST /save HTTP/1.1\r\n{host}\r\nContent-Length: 100\r\n\r\n".encode())
+        assert stranger.recv(4096).startswith(b"HTTP/1.1 403 ")
+
+
+@pytest.mark.parametrize("header", ["Content-Length: 3", "Content-Length: x", "Transfer-Encoding: chunked"])
+def test_a_get_with_a_body_is_refused_and_its_body_is_no_request(server: PosingServer, header: str) -> None:
+    host = f"Host: 127.0.0.1:{place_of(server)[1]}"
+    heard, _ = raw(
+        server, "GET / HTTP/1.1", host, f"Cookie: {cookie_of(server)}", header, body=b"GET / HTTP/1.1\r\n\r\n"
+    )
+    assert heard.startswith(b"HTTP/1.1 400 ")
+    assert heard.count(b"HTTP/1.1 ") == 1
+
+
+def test_requests_are_bounded_in_time_and_size(server: PosingServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(posing_server, "WAIT_S", 0.5)
+    with socket.create_connection(place_of(server), timeout=10) as slow:
+        began = time.monotonic()
+        with contextlib.suppress(OSError):
+            for _ in range(50):  # a byte now and then keeps no connection open
+                slow.sendall(b"G")
+                time.sleep(0.1)
+        assert time.monotonic() - began < 4
+    with contextlib.suppress(ConnectionError):
+        heard, _ = raw(server, "GET / HTTP/1.1", *(f"X-{number}: {'x' * 60_000}" for number in range(4)))
+        assert b" 200 " not in heard
+    assert ask(server, "/overview")[0] == 200
+
+
+def test_connections_are_bounded(made: PosingWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(posing_server, "MAX_CONNECTIONS", 3)
+    with PosingServer(made.root, port=18340) as server:
+        held = [socket.create_connection(place_of(server), timeout=5) for _ in range(3)]
+        time.sleep(0.2)
+        with socket.create_connection(place_of(server), timeout=5) as further:
+            assert further.recv(1) == b""
+        for connection in held:
+            connection.close()
+        time.sleep(0.2)
+        assert ask(server, "/overview")[0] == 200
+
+
+def test_a_browser_that_goes_away_is_a_line_in_the_log(server: PosingServer, caplog, capfd, monkeypatch) -> None:
+    def gone() -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(server.session, "overview", lambda _: gone())
+    host = f"Host: 127.0.0.1:{place_of(server)[1]}"
+    raw(server, "GET /overview HTTP/1.1", host, f"Cookie: {cookie_of(server)}")
+    assert "a browser went away (BrokenPipeError)" in caplog.text
+    assert "Traceback" not in caplog.text + capfd.readouterr().err
+
+
+def test_it_listens_on_ipv6_loopback(made: PosingWorld) -> None:
+    try:
+        free_port("::1", 18345)
+    except NeecoError:
+        pytest.skip("no IPv6 here")
+    for host in ("::1", "[::1]"):
+        with PosingServer(made.root, host, 18345) as server:
+            assert server.address.startswith("http://[::1]:18345/?token=")
+            assert ask(server, "/overview")[0] == 200
+
+
+SERVE = """\
+import sys, time
+from pathlib import Path
+from neeco.viewer.posing_server import PosingServer
+with PosingServer(Path(sys.argv[1]), port=18360) as server:
+    print(server.address, flush=True)
+    time.sleep(120)
+"""
+
+
+def test_answers_to_two_servers_on_one_capture_are_all_kept(made: PosingWorld, tmp_path: Path) -> None:
+    """And an answer that one of them took is in the other's overview."""
+    root = Path(shutil.copytree(made.root, tmp_path / "capture"))
+    command = [sys.executable, "-c", SERVE, str(root)]
+    with contextlib.ExitStack() as stack:
+        started = [stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True)) for _ in range(2)]
+        for process in started:
+            stack.callback(process.kill)
+        servers = [
+            SimpleNamespace(address=str(process.stdout and process.stdout.readline()).strip()) for process in started
+        ]
+        frames = range(6)
+        with ThreadPoolExecutor() as pool:
+            saved = pool.map(lambda k: ask(servers[k % 2], "/save", answer_for(made, k))[0], frames)
+            assert list(saved) == [200] * 6
+        assert sorted(answer.frame for answer in read_answers(root)) == [made.capture.frames[k].name for k in frames]
+        with ThreadPoolExecutor() as pool:
+            undone = pool.map(lambda k: ask(servers[k % 2], "/undo", {"instrument": NAME})[0], range(4))
+            assert list(undone) == [200] * 4
+        assert len(read_answers(root)) == 2
+        assert [json.loads(ask(server, "/overview")[2])["done"] for server in servers] == [2, 2]
+    assert [path.name for path in root.iterdir() if path.name.startswith(".")] == []
 
 
 def test_one_capture_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

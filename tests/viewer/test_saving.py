@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -121,3 +122,14 @@ def test_a_folder_that_cannot_be_written_is_named(saved: SavedStates, loaded: Lo
     saved.folder.write_text("a file stands here")
     with pytest.raises(NeecoError, match="kept"):
         saved.add(loaded, some_state(loaded), VIEW)
+
+
+def test_what_two_servers_keep_at_once_is_all_kept(loaded: LoadedRun, tmp_path: Path) -> None:
+    servers = [SavedStates(tmp_path / "run"), SavedStates(tmp_path / "run")]
+    state = some_state(loaded, roll=0.3)
+    with ThreadPoolExecutor() as pool:
+        counts = list(pool.map(lambda k: servers[k % 2].add(loaded, state, VIEW), range(8)))
+        images = list(pool.map(lambda server: server.save_image(loaded, state, VIEW), servers))
+    assert sorted(counts) == list(range(1, 9))
+    assert len(servers[0].read(loaded)) == 8
+    assert len(set(images)) == 2

@@ -10,6 +10,8 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import pytest
 
@@ -36,6 +38,10 @@ def status(url: str, **headers: str) -> int:
         return refused.code
 
 
+def cookie_of(viewer: ViewerServer) -> str:
+    return f"neeco_{port_of(viewer)}={viewer.token}"
+
+
 def socket_status(port: int, path: str = "/", **headers: str) -> int:
     """101: the web socket was opened."""
     try:
@@ -52,13 +58,13 @@ def port_of(viewer: ViewerServer) -> int:
 def test_on_loopback_page_and_socket_open_and_other_sites_are_refused(made_run: Path, serve: Serve) -> None:
     viewer = serve(made_run)
     port = port_of(viewer)
-    assert viewer.token is None
-    assert viewer.address == f"http://127.0.0.1:{port}/"
-    assert status(viewer.address) == 200
-    assert socket_status(port) == 101
+    assert viewer.address == f"http://127.0.0.1:{port}/?token={viewer.token}"
+    assert [status(viewer.address), status(viewer.address.partition("?")[0])] == [200, 403]
+    assert [socket_status(port, Cookie=cookie_of(viewer)), socket_status(port)] == [101, 403]
     assert status(viewer.address, Host=f"evil.example:{port}") == 403
-    assert socket_status(port, Origin="http://evil.example") == 403
-    assert socket_status(port, Origin=f"http://127.0.0.1:{port}") == 101
+    assert status(viewer.address, **{"Sec-Fetch-Site": "cross-site"}) == 403
+    assert socket_status(port, Cookie=cookie_of(viewer), Origin="http://evil.example") == 403
+    assert socket_status(port, Cookie=cookie_of(viewer), Origin=f"http://127.0.0.1:{port}") == 101
     with pytest.raises(urllib.error.HTTPError) as refused:
         urllib.request.urlopen(urllib.request.Request(viewer.address, headers={"Host": "evil.example"}))
     assert b"refused: open http://127.0.0.1" in refused.value.read()
@@ -100,7 +106,8 @@ def test_a_browser_that_asks_for_a_tunnel_gets_none(
     monkeypatch.setattr("viser._viser.ViserTunnel", lambda *given: asked.append(given))
     viewer = serve(made_run)
     wish = messages.ShareUrlRequest()
-    with connect(f"ws://127.0.0.1:{port_of(viewer)}/", subprotocols=[PROTOCOL]) as wishing:
+    path = f"/?token={viewer.token}"
+    with connect(f"ws://127.0.0.1:{port_of(viewer)}{path}", subprotocols=[PROTOCOL]) as wishing:
         wishing.send(_packed(wish))
         time.sleep(0.5)
     assert asked == []
@@ -180,6 +187,38 @@ def test_it_prints_its_address_and_ends_quietly_on_interrupt(made_run: Path) -> 
         rest, errors = process.communicate(timeout=30)
     assert process.returncode == 0
     assert (rest.strip(), errors) == ("", "")
+
+
+def test_the_browser_is_opened_without_the_token_in_its_arguments(
+    made_run: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    """By way of a file that nobody else can read and that goes again."""
+    opened: list[Path] = []
+
+    def open_page(address: str) -> None:
+        page = Path(url2pathname(urlsplit(address).path))
+        opened.append(page)
+        token = capsys.readouterr().out.split()[0].partition("token=")[2]
+        assert token not in address
+        assert token in page.read_text()
+        assert page.parent.stat().st_mode & 0o077 == 0
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("webbrowser.open", open_page)
+    assert main(["view", str(made_run), "--device", "cpu"]) == 0
+    assert not opened[0].parent.exists()
+
+
+def test_a_host_that_others_reach_is_warned_of_as_plain_http(
+    made_run: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    def stop(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("neeco.cli.view.time.sleep", stop)
+    for host, warned in (("127.0.0.1", False), ("0.0.0.0", True)):
+        assert main(["view", str(made_run), "--no-browser", "--device", "cpu", "--host", host]) == 0
+        assert ("plain HTTP" in capsys.readouterr().err) is warned
 
 
 class Browser:

@@ -1,8 +1,12 @@
-"""`neeco view`: show a run interactively, in a browser or as one file; pose frames of a capture by hand."""
+"""`neeco view`: show a run or a capture in a browser, or a run as one file; pose frames of a capture by hand."""
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 import time
+import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -19,16 +23,17 @@ POLL_S = 0.5  # between two looks for Ctrl-C
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Show a run in a web browser: any state, any view, what is made up and what is wrong. Two runs side by side; one
-    that is still trained, too. With --export, write one file that does so without a server. With --annotate, set roll
-    and joints of an instrument found in a video by hand, in the frames that help most."""
+    that is still trained, too; or a capture before training. With --export, write one file that shows a run without a
+    server. With --annotate, set roll and joints of an instrument found in a video by hand, in the frames that help
+    most."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [OTHER]"), tyro.conf.Positional]
-    """Run folders that `neeco train` wrote or is writing: one, or two to compare. With --annotate: a capture, or a run
-    of one, whose scene then shows as a ghost."""
+    """Run folders that `neeco train` wrote or is writing: one, or two to compare; or one capture. With --annotate: a
+    capture, or a run of one, whose scene then shows as a ghost."""
     port: int = 8080
     """Port to listen on; the next free one where it is taken."""
     host: str = "127.0.0.1"
-    """Address to listen on. Any but this machine's own loopback needs the token in the address that is printed."""
+    """Address to listen on. Other machines reach any but this machine's own loopback, by plain HTTP."""
     no_browser: bool = False
     """Open no web browser; only print the address."""
     annotate: bool = False
@@ -56,6 +61,14 @@ def run(arguments: Arguments) -> int:
             raise NeecoError("--size, --scale: an exported page renders at the size of its window; leave them out")
         return _export(arguments, arguments.export)
     arguments.size.check()
+    captures = [path for path in arguments.runs if is_capture(path)]
+    if captures:
+        if len(arguments.runs) > 1:
+            raise NeecoError(f"view: {captures[0]}: a capture, no run; give it alone, or two runs to compare")
+        from neeco.viewer.recording import RecordingServer
+
+        with RecordingServer(captures[0], arguments.host, arguments.port) as recording:
+            return _serve(recording.address, arguments)
     from neeco.viewer.server import ViewerServer
 
     device = device_of(arguments.device)
@@ -64,22 +77,44 @@ def run(arguments: Arguments) -> int:
     ) as viewer:
         if len(shown := viewer.runs.loaded[0].tissues) > 1:
             print(f"the run has several tissues ({', '.join(shown)}); --tissue chooses which is shown")
-        return _serve(viewer.address, arguments.no_browser)
+        return _serve(viewer.address, arguments)
 
 
-def _serve(address: str, no_browser: bool) -> int:
+def is_capture(path: Path) -> bool:
+    """Whether a folder is a capture, and no run."""
+    return (path / "transforms.json").is_file() and not (path / "config.yaml").exists()
+
+
+def _serve(address: str, arguments: Arguments) -> int:
     """Print the address of a server, and wait for Ctrl-C."""
+    from neeco.viewer.access import is_loopback
+
+    if not is_loopback(arguments.host):
+        warnings.warn(
+            f"--host {arguments.host}: plain HTTP: whoever listens on the network reads the images and the token; "
+            "use a network you trust, or the default host and `ssh -L`",
+            stacklevel=2,
+        )
     try:
         print(f"{address}  (Ctrl-C ends)", flush=True)
-        if not no_browser:
-            import webbrowser
-
-            webbrowser.open(address)
-        while True:  # in short waits: a signal that comes just before one begins is heard after it
-            time.sleep(POLL_S)
+        with contextlib.nullcontext() if arguments.no_browser else _opened(address):
+            while True:  # in short waits: a signal that comes just before one begins is heard after it
+                time.sleep(POLL_S)
     except KeyboardInterrupt:
         print()
     return 0
+
+
+@contextlib.contextmanager
+def _opened(address: str) -> Iterator[None]:
+    """Open a browser by way of a file that its user alone can read: all users can read a process's arguments."""
+    import webbrowser
+
+    with tempfile.TemporaryDirectory(prefix="neeco-view-") as folder:
+        page = Path(folder) / "view.html"
+        page.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={address}">', encoding="utf-8")
+        webbrowser.open(page.as_uri())
+        yield
 
 
 def _annotate(arguments: Arguments) -> int:
@@ -90,7 +125,7 @@ def _annotate(arguments: Arguments) -> int:
     if arguments.export is not None:
         raise NeecoError("--annotate, --export: give one of the two")
     with PosingServer(arguments.runs[0], arguments.host, arguments.port) as server:
-        return _serve(server.address, arguments.no_browser)
+        return _serve(server.address, arguments)
 
 
 def _export(arguments: Arguments, output: Path) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import math
 import threading
@@ -15,6 +16,7 @@ import torch
 
 from neeco.capture.images import open_image
 from neeco.errors import NeecoError
+from neeco.files import LOCK_WAIT_S, own_folder
 from neeco.ingest.posing.along_shaft import crop
 from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
 from neeco.ingest.posing.posed_capture import N_SUGGESTED, PosedCapture, SolvedPosing, half_turn
@@ -51,6 +53,8 @@ class PosingSession:
     def overview(self, instrument: str) -> dict[str, Any]:
         """Requests, answers and estimates of an instrument, as JSON for the page. Raises NeecoError."""
         with self._lock:
+            if (answers := read_answers(self.posed.root)) != self._answers:  # another server's, or an editor's
+                self._answers, self._posings = answers, self.posed.solve(answers)
             return self._overview(instrument)
 
     def frame(self, instrument: str, index: int) -> dict[str, Any]:
@@ -111,7 +115,7 @@ class PosingSession:
     def save(self, instrument: str, index: int, roll_deg: float, joints_deg: dict[str, float]) -> dict[str, Any]:
         """Add an answer, solve again and write both; the overview, and under `said` what contradicts the answer. Raises
         NeecoError."""
-        with self._lock:
+        with self._lock, self._own_capture():
             posing = self._posing(instrument, index)
             if not _possible(posing, roll_deg, joints_deg):
                 names = ", ".join(["roll", *posing.joints])
@@ -125,7 +129,7 @@ class PosingSession:
     def undo(self, instrument: str) -> dict[str, Any]:
         """Take the last answer for an instrument out again; the overview, and under `frame` what it was of. Raises
         NeecoError."""
-        with self._lock:
+        with self._lock, self._own_capture():
             answers = read_answers(self.posed.root)
             own = [position for position, answer in enumerate(answers) if answer.instrument == instrument]
             if not own:
@@ -133,6 +137,10 @@ class PosingSession:
             gone = answers.pop(own[-1])
             self._keep(answers)
             return self._overview(instrument) | {"frame": self.posed.frames.index(gone.frame)}
+
+    def _own_capture(self) -> contextlib.AbstractContextManager[None]:
+        """The capture for this process alone, from reading its answers to writing them and its states."""
+        return own_folder(self.posed.root, wait_s=LOCK_WAIT_S)
 
     def _keep(self, answers: list[HandPose]) -> None:
         posings = self.posed.solve(answers)  # raises before anything is written

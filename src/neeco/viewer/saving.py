@@ -13,7 +13,7 @@ import torch
 from neeco.capture.model import State
 from neeco.capture.readers import StateLine, read_states
 from neeco.capture.writer import camera_to_json, state_to_json
-from neeco.files import own_folder, write_text
+from neeco.files import LOCK_WAIT_S, own_folder, write_text
 from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers, to_numpy
 from neeco.labels.labellers import CompositedLabels
@@ -47,12 +47,12 @@ class SavedStates:
         """Add a state and the camera [4, 4] that sees it (OpenCV axes, mm); returns how many are saved. Raises
         NeecoError where the file cannot be written, or holds states of another scene."""
         line = json.dumps(state_to_json(state) | {"camera": camera_to_json(world_from_camera)}, allow_nan=False)
-        with self._lock:
+        with self._lock, own_folder(self.folder, wait_s=LOCK_WAIT_S):
             return self._write([*self._lines(loaded), line])
 
     def remove_last(self, loaded: LoadedRun) -> int:
         """Take the last one out again; returns how many are left. Raises NeecoError."""
-        with self._lock:
+        with self._lock, own_folder(self.folder, wait_s=LOCK_WAIT_S):
             return self._write(self._lines(loaded)[:-1])
 
     def read(self, loaded: LoadedRun) -> list[StateLine]:
@@ -71,7 +71,7 @@ class SavedStates:
             drawing = draw_layers(scene, labeller, state, camera, Settings.min_component)
             labels = annotate(scene, drawing, labeller.names)
         root = self.folder / SAMPLES
-        with self._lock, own_folder(root):
+        with self._lock, own_folder(root, wait_s=LOCK_WAIT_S):
             index = 0
             while record_path(root, index).exists() and load_record(root, index) is not None:
                 index += 1

@@ -13,11 +13,12 @@ import io
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 
 from neeco.errors import NeecoError, install_hint
+from neeco.geometry.camera import Camera
 from neeco.labels.drawing import to_numpy
 from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 from neeco.viewer.access import HOST, PORT, AccessControl, free_port, url_of
@@ -40,12 +41,45 @@ document.documentElement.addEventListener("keydown", event => {
 });
 </script>"""
 MAX_MESSAGE = 2**20  # bytes; a browser's messages have some hundred
+MAX_CONNECTIONS = 256  # at once, those that only load the page included
 
 log = logging.getLogger(__name__)
 
 
-class ViewerServer:
-    """A running server; `address` is what to open. Use as a context manager, or call `stop`."""
+class ViserPage:
+    """viser's running server; `address` is what to open. Use as a context manager, or call `stop`."""
+
+    def __init__(self, host: str, port: int, cameras: Sequence[Camera], distance: float, unit: float) -> None:
+        """The up direction is that of the recorded `cameras`; a browser begins at the first, `distance` mm before what
+        it looks at. unit: viser's per mm. Raises NeecoError."""
+        require_viser()
+        port = free_port(host, port)
+        access = AccessControl.at(host, port)
+        self.token = access.token
+        self._server = _start_server(access, host.strip("[]"), port)
+        self.address = url_of(host, self._server.get_port(), self.token)
+        pose = to_numpy(cameras[0].world_from_camera)
+        scene, initial = self._server.scene, self._server.initial_camera
+        scene.set_up_direction(tuple(upward(cameras)))
+        scene.world_axes.visible = False
+        initial.position = tuple(pose[:3, 3] * unit)
+        initial.look_at = tuple((pose[:3, 3] + distance * pose[:3, 2]) * unit)
+        initial.up = tuple(-pose[:3, 1])
+        initial.fov = field_of_view(cameras[0])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """End the server."""
+        _stop_server(self._server)
+
+
+class ViewerServer(ViserPage):
+    """A server that shows runs."""
 
     def __init__(
         self,
@@ -67,41 +101,17 @@ class ViewerServer:
         self._sharp_px = None if size == RECORDED_SIZE else height
         self.saved = SavedStates(runs[0], size)
         self.render_thread = RenderThread(self.runs.advance_timelines)
-        port = free_port(host, port)
-        access = AccessControl.at(host, port)
-        self.token = access.token
-        self._server = _start_server(access, host, port)
-        self.address = url_of(host, self._server.get_port(), self.token)
-        self._prepare_scene()
+        super().__init__(host, port, self.runs.loaded[0].recorded.cameras, self.runs.distance, self.runs.unit)
         self._server.on_client_connect(self._connect)
         self._server.on_client_disconnect(lambda client: self.render_thread.remove(client.client_id))
         self.render_thread.start()
         self.runs.watch(self.render_thread.request)
 
-    def __enter__(self) -> ViewerServer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
     def stop(self) -> None:
         """End the rendering, then the server."""
         self.runs.end_watch()
         self.render_thread.stop()
-        _stop_server(self._server)
-
-    def _prepare_scene(self) -> None:
-        """Set what all browsers share: the up direction and the initial camera."""
-        first, unit = self.runs.loaded[0], self.runs.unit
-        camera = first.recorded.cameras[0]
-        pose = to_numpy(camera.world_from_camera)
-        scene, initial = self._server.scene, self._server.initial_camera
-        scene.set_up_direction(tuple(upward(first.recorded.cameras)))
-        scene.world_axes.visible = False
-        initial.position = tuple(pose[:3, 3] * unit)
-        initial.look_at = tuple((pose[:3, 3] + self.runs.distance * pose[:3, 2]) * unit)
-        initial.up = tuple(-pose[:3, 1])
-        initial.fov = field_of_view(camera)
+        super().stop()
 
     def _connect(self, client: viser.ClientHandle) -> None:
         def connected() -> bool:
@@ -188,13 +198,46 @@ def _controlled_sockets(access: AccessControl) -> Iterator[list[bool]]:
                     response.headers[name] = value
             return response
 
-        return serve(_closing_on_error(handler), *given, process_request=answer, **named | {"max_size": MAX_MESSAGE})
+        class Connection(websocket_server.ServerConnection):
+            """One of a bounded number."""
+
+            refused = False
+
+            def connection_made(self, transport: Any) -> None:
+                self.refused = len(self.server.handlers) >= MAX_CONNECTIONS
+                if self.refused:
+                    transport.abort()
+                else:
+                    super().connection_made(transport)
+
+            def connection_lost(self, error: Exception | None) -> None:
+                if not self.refused:
+                    super().connection_lost(error)
+
+        ours = {"max_size": MAX_MESSAGE, "create_connection": Connection, "logger": _connection_log()}
+        return serve(_closing_on_error(handler), *given, process_request=answer, **named | ours)
 
     websocket_server.serve = serve_controlled
     try:
         yield opened
     finally:
         websocket_server.serve = serve
+
+
+def _connection_log() -> logging.Logger:
+    """The log of connections, without tracebacks: a line for a browser that goes away or is not understood."""
+    connections = log.getChild("connections")
+
+    def shorten(record: logging.LogRecord) -> bool:
+        if record.exc_info and (error := record.exc_info[1]) is not None:
+            record.msg, record.args = "neeco view: a browser's connection ended (%s)", (type(error).__name__,)
+            record.exc_info = None
+            return not isinstance(error.__cause__, EOFError)  # opened, and left without a request
+        return True
+
+    if not connections.filters:
+        connections.addFilter(shorten)
+    return connections
 
 
 def _closing_on_error(handler: Callable[..., Any]) -> Callable[..., Any]:

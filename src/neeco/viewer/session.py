@@ -270,7 +270,8 @@ class ClientSession:
             save_image=self._save_image,
             dark=self._set_dark,
         )
-        overlays = Overlays(self._client, runs[0], self._runs.unit, self._go_to, self._request)
+        points = None if runs[0].capture is None else runs[0].capture.points
+        overlays = Overlays(self._client, runs[0].recorded.cameras, points, self._runs.unit, self._go_to, self._request)
         return runs, overlays, Panel(self._client, runs, actions)
 
     def _request(self) -> None:

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.model import evenly_spaced
+from neeco.capture.model import PointCloud, evenly_spaced
 from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
-from neeco.viewer.runs import DISTANCE_UNITS, LoadedRun
+from neeco.viewer.runs import DISTANCE_UNITS
 
 if TYPE_CHECKING:
     import viser
@@ -100,7 +100,8 @@ class Overlays:
     def __init__(
         self,
         client: viser.ClientHandle,
-        loaded: LoadedRun,
+        cameras: Sequence[Camera],
+        points: PointCloud | None,
         unit: float,
         clicked: Callable[[int], None],
         dragged: Callable[[], None],
@@ -108,8 +109,8 @@ class Overlays:
         """clicked: gets the frame whose camera was clicked on; dragged: called when a gizmo moved."""
         self._scene, self._unit, self._dragged = client.scene, unit, dragged
         self.cameras = self._scene.add_frame("/cameras", show_axes=False, visible=False)
-        for frame in _frustum_frames(loaded):
-            camera = loaded.recorded.cameras[frame]
+        for frame in _frustum_frames(cameras):
+            camera = cameras[frame]
             pose = to_numpy(camera.world_from_camera)
             frustum = self._scene.add_camera_frustum(
                 f"/cameras/{frame}",
@@ -123,7 +124,7 @@ class Overlays:
                 position=pose[:3, 3] * unit,
             )
             frustum.on_click(partial(_click, clicked, frame))
-        self.points = self._add_points(loaded)
+        self.points = self._add_points(points)
         self._gizmos: dict[str, Any] = {}
 
     @property
@@ -160,10 +161,9 @@ class Overlays:
         gizmo = self._gizmos.get(name)
         return None if gizmo is None else pose_of(gizmo.wxyz, gizmo.position, self._unit)
 
-    def _add_points(self, loaded: LoadedRun) -> Any:
-        if loaded.capture is None or not len(loaded.capture.points.positions):
+    def _add_points(self, points: PointCloud | None) -> Any:
+        if points is None or not len(points.positions):
             return None
-        points = loaded.capture.points
         chosen = evenly_spaced(len(points.positions), MAX_POINTS)
         return self._scene.add_point_cloud(
             "/points",
@@ -180,10 +180,10 @@ def _click(clicked: Callable[[int], None], frame: int, _: object) -> None:
     clicked(frame)
 
 
-def _frustum_frames(loaded: LoadedRun) -> list[int]:
+def _frustum_frames(cameras: Sequence[Camera]) -> list[int]:
     """Frames whose cameras are shown: some from everywhere, none twice in one place."""
     chosen: dict[bytes, int] = {}
-    for frame in evenly_spaced(len(loaded.recorded.cameras), MAX_FRUSTA):
-        pose = to_numpy(loaded.recorded.cameras[frame].world_from_camera)
+    for frame in evenly_spaced(len(cameras), MAX_FRUSTA):
+        pose = to_numpy(cameras[frame].world_from_camera)
         chosen.setdefault(pose.round(3).tobytes(), frame)
     return list(chosen.values())

@@ -14,7 +14,7 @@ import numpy as np
 from neeco.capture.model import UNKNOWN_DEG, Capture, Instrument
 from neeco.capture.readers import read_capture
 from neeco.errors import NeecoError
-from neeco.files import own_folder, read_json, write_json
+from neeco.files import read_json, write_json
 from neeco.ingest.posing.along_shaft import Load, Shafts
 from neeco.ingest.posing.angles import HAND_SD_DEG, AnglePosterior, chain_breaks, solve_joint, solve_rolls
 from neeco.ingest.posing.hand_posed import HandPose, answers_for, read_answers
@@ -188,16 +188,15 @@ class PosedCapture:
         return found
 
     def write_states(self, posings: dict[str, SolvedPosing]) -> None:
-        """Write the solved rolls and joints, and their uncertainties, into transforms.json, whole or not at all. Raises
-        NeecoError."""
+        """Write the solved rolls and joints, and their uncertainties, into transforms.json, whole or not at all. The
+        caller owns the folder where others may write. Raises NeecoError."""
         path = self.root / "transforms.json"
-        with own_folder(self.root, path):
-            document = read_json(path)
-            for index, frame in enumerate(document["frames"]):
-                for item in frame["instruments"]:
-                    if item["name"] in posings:
-                        self._write_state(item, posings[item["name"]], index)
-            write_json(path, document)
+        document = read_json(path)
+        for index, frame in enumerate(document["frames"]):
+            for item in frame["instruments"]:
+                if item["name"] in posings:
+                    self._write_state(item, posings[item["name"]], index)
+        write_json(path, document)
 
     def _write_state(self, item: dict[str, Any], posing: SolvedPosing, frame: int) -> None:
         pose = np.array(item["pose"], float)

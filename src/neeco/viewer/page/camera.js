@@ -1,4 +1,8 @@
-// The camera: of a recorded frame, or turned by hand about the middle of the tissue.
+// The camera: of a recorded frame, or turned by hand about the middle of the tissue, not far from where one was recorded.
+const MOST_TURNED = Math.PI / 6; // from the nearest recorded camera
+const FARTHEST_AWAY = 0.6; // of the way to the middle of the tissue, from the nearest recorded camera
+const OBSERVED = 0.5; // of both: beyond, the page says that no frame observed what is shown
+
 class Eye {
   // `changed` is called whenever a hand moves it.
   constructor(head, canvas, changed) {
@@ -8,10 +12,27 @@ class Eye {
   }
 
   atFrame(frame) {
-    const { cameras, lenses } = this.head.recorded, [k, l, share] = neighbours(this.head, frame);
-    this.matrix = between(cameras[k], cameras[l], share);
-    this.lens = lenses[k];
-    this.reach = this.middleDepth();
+    this.matrix = this.recordedAt(frame);
+    this.lens = this.head.recorded.lenses[neighbours(this.head, frame)[0]];
+    this.home = this.reach = this.middleDepth();
+  }
+
+  recordedAt(frame) {
+    const { cameras } = this.head.recorded, [k, l, share] = neighbours(this.head, frame);
+    return between(cameras[k], cameras[l], share);
+  }
+
+  // How far a camera is from the nearest recorded one; 1: as far as a hand may move it.
+  strayed(m) {
+    return this.head.recorded.cameras.reduce((least, c) => {
+      const turned = Math.acos(Math.min(1, m[2] * c[2] + m[6] * c[6] + m[10] * c[10]));
+      const away = Math.hypot(m[3] - c[3], m[7] - c[7], m[11] - c[11]);
+      return Math.min(least, Math.max(turned / MOST_TURNED, away / (FARTHEST_AWAY * this.home)));
+    }, Infinity);
+  }
+
+  get unobserved() {
+    return !this.follows && this.strayed(this.matrix) > OBSERVED;
   }
 
   // mm from the camera to the middle of the tissue.
@@ -48,9 +69,13 @@ class Eye {
     canvas.onwheel = (event) => { event.preventDefault(); this.nearer(-0.001 * event.deltaY); };
   }
 
+  // Moves there and returns true, unless that leads farther away from what was recorded.
   move(matrix) {
+    const away = this.strayed(matrix);
+    if (away > 1 && away > this.strayed(this.matrix)) return false;
     this.matrix = matrix;
     this.changed();
+    return true;
   }
 
   orbit(dx, dy) {
@@ -65,7 +90,6 @@ class Eye {
 
   nearer(by) {
     const way = this.reach * (1 - Math.exp(-by));
-    this.reach -= way;
-    this.move(multiply(this.matrix, shifted([0, 0, way])));
+    if (this.move(multiply(this.matrix, shifted([0, 0, way])))) this.reach -= way;
   }
 }

@@ -2,7 +2,7 @@
 const STILL_MS = 150; // without a change, after which it is rendered sharp
 const SHARPEST = 2; // times the recorded size
 const BUDGET_MS = 60; // of a rendering while something moves; above that it is rendered smaller
-const SMALLEST = 0.25;
+const SMALLEST = 0.75;
 const NEAREST = 0.3, FARTHEST = 1.3; // of the way to the middle of the tissue: white and black where depth is shown
 const FRAMES_A_SECOND = 10; // of playing
 
@@ -16,12 +16,13 @@ class Page {
     this.panel = new Panel(this);
     window.onresize = () => { this.fit(); this.moved(); };
     window.onkeydown = (event) => this.key(event);
+    this.canvas.ondblclick = () => this.follow(true);
     this.fit();
-    this.moved();
+    this.moved(-STILL_MS); // the first picture is a sharp one
   }
 
-  moved() {
-    this.changed = performance.now();
+  moved(later = 0) {
+    this.changed = performance.now() + later;
     this.settled = false;
     this.panel.refresh();
     if (this.sharpening) this.drawing.drop();
@@ -51,7 +52,8 @@ class Page {
 
   wished(scale, show, all) {
     const depths = [NEAREST * this.eye.reach, FARTHEST * this.eye.reach];
-    return { ...this.eye.lensAt(scale), state: packedState(this.head, this.wish), matrix: Float32Array.from(this.eye.matrix), show, depths, all };
+    const [matrix, light] = [this.eye.matrix, this.eye.recordedAt(this.wish.frame)].map((rows) => Float32Array.from(rows));
+    return { ...this.eye.lensAt(scale), state: packedState(this.head, this.wish), matrix, light, show, depths, all };
   }
 
   // Renders and shows; false where it was dropped on the way.
@@ -60,9 +62,10 @@ class Page {
     const bands = await this.drawing.draw(wish);
     if (!bands) return false;
     this.took = performance.now() - began;
-    if (scale <= 1) this.scale = Math.min(1, Math.max(SMALLEST, this.scale * Math.sqrt(BUDGET_MS / this.took)));
+    if (!this.sharpening) this.scale = Math.min(this.sharpScale(), Math.max(SMALLEST, scale * Math.sqrt(BUDGET_MS / this.took)));
     put(bands, this.canvas, wish);
     this.drawn++;
+    element("unobserved").hidden = !this.eye.unobserved;
     const [k] = neighbours(this.head, this.wish.frame);
     element("said").textContent = `${this.head.recorded.names[k]} · ${wish.width}x${wish.height} · ${this.took.toFixed(0)} ms`;
     return true;
@@ -137,7 +140,10 @@ class Page {
       arrowright: () => this.toFrame(Math.floor(this.wish.frame) + 1),
       " ": () => this.play(),
       c: () => this.follow(true),
-      r: () => this.head.instruments.forEach((item, index) => this.reset(index)),
+      r: () => {
+        this.head.instruments.forEach((item, index) => this.reset(index));
+        this.follow(true);
+      },
       v: () => this.toView(views[(views.indexOf(this.wish.view) + 1) % views.length]),
     };
     const act = acts[event.key.toLowerCase()];

@@ -1,0 +1,153 @@
+"""`neeco view CAPTURE`: a recording before training: its images with the instruments' axes, cameras, tracks, points."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from neeco.capture import read_capture
+from neeco.capture.model import Capture, Frame
+from neeco.errors import NeecoError
+from neeco.labels.drawing import to_numpy
+from neeco.viewer.access import HOST, PORT
+from neeco.viewer.panel import message_html
+from neeco.viewer.runs import ASSUMED_MM, DISTANCE_UNITS
+from neeco.viewer.server import ViserPage
+from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fitting_view, jump, stands_at, wxyz_of
+
+if TYPE_CHECKING:
+    import viser
+
+IMAGE_PX = 720  # high at most, of the image behind the scene
+AXIS_UNITS = 0.1 * DISTANCE_UNITS
+UNREGISTERED = "instruments are not shown: their poses are not in the cameras' frame"
+TRACK_COLORS = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167))
+
+
+class RecordingServer(ViserPage):
+    """A server that shows a capture."""
+
+    def __init__(self, root: Path, host: str = HOST, port: int = PORT) -> None:
+        """Raises NeecoError."""
+        self.capture = read_capture(root)
+        self.distance = _distance(self.capture)
+        self.unit = DISTANCE_UNITS / self.distance
+        super().__init__(host, port, [frame.camera for frame in self.capture.frames], self.distance, self.unit)
+        self.sessions: dict[int, RecordingSession] = {}
+        self._server.on_client_connect(self._connect)
+        self._server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
+
+    def _connect(self, client: viser.ClientHandle) -> None:
+        self.sessions[client.client_id] = RecordingSession(client, self.capture, self.unit, self.distance)
+
+
+class RecordingSession:
+    """One browser's view of a capture. viser draws everything over the image of the frame whose camera it stands at."""
+
+    def __init__(self, client: viser.ClientHandle, capture: Capture, unit: float, distance: float) -> None:
+        self._client, self._capture, self._unit, self._distance = client, capture, unit, distance
+        self._lock, self._shown = threading.RLock(), (-1, 0.0)
+        gui, scene = client.gui, client.scene
+        cameras = [frame.camera for frame in capture.frames]
+        overlays = Overlays(client, cameras, capture.points, unit, self.go_to, lambda: None)
+        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        with gui.add_folder("Recording"):
+            self.frame = gui.add_slider("frame", 0, max(1, len(cameras) - 1), 1, 0, disabled=len(cameras) == 1)
+            self._follows = gui.add_checkbox("camera of the frame", True)
+            back = gui.add_button("go to this frame's camera")
+            paths, cones = gui.add_checkbox("tracks", False), gui.add_checkbox("recorded cameras", False)
+            points = gui.add_checkbox("sparse points", False, disabled=overlays.points is None)
+            self._status = gui.add_html("")
+        tracks = scene.add_frame("/tracks", show_axes=False, visible=False)
+        self.axes = {}
+        for number, name in enumerate(item.name for item in capture.instruments if capture.registered):
+            poses = [
+                to_numpy(frame.state.instruments[name].pose)
+                for frame in capture.frames
+                if name in frame.state.instruments
+            ]
+            path = np.array([pose[:3, 3] * unit for pose in poses], np.float32).reshape(-1, 3)
+            ends, color = np.stack([path[:-1], path[1:]], 1), TRACK_COLORS[number % len(TRACK_COLORS)]
+            if len(ends):
+                scene.add_line_segments(f"/tracks/{number}", ends, color, thickness=2, thickness_units="screen")
+            self.axes[name] = scene.add_frame(f"/axes/{number}", axes_length=AXIS_UNITS, axes_radius=AXIS_UNITS / 25)
+        paths.on_update(lambda _: setattr(tracks, "visible", paths.value))
+        for handle in (cones, points):
+            handle.on_update(lambda _: overlays.show(cones.value, points.value))
+        self.frame.on_update(lambda _: self.show(self._follows.value))
+        back.on_click(lambda _: self.show(True))
+        client.camera.on_update(lambda _: self._show_image())
+        self.show(True)
+
+    def go_to(self, frame: int) -> None:
+        """Show a frame, from its camera."""
+        self.frame.value = frame
+        self.show(True)
+
+    def show(self, jumping: bool) -> None:
+        """Show the slider's frame: its axes, its image where the window stands at its camera. jumping: there first."""
+        with self._lock:
+            frame = self._capture.frames[self._index]
+            if jumping:
+                jump(self._client, frame.camera, self._unit, self._distance)
+            for name, axes in self.axes.items():
+                axes.visible = name in frame.state.instruments
+                if axes.visible:
+                    pose = to_numpy(frame.state.instruments[name].pose)
+                    axes.wxyz, axes.position = wxyz_of(pose), pose[:3, 3] * self._unit
+            self._show_image()
+
+    @property
+    def _index(self) -> int:
+        """The slider's frame, whatever a browser said."""
+        return int(np.clip(np.nan_to_num(self.frame.value), 0, len(self._capture.frames) - 1))
+
+    def _show_image(self) -> None:
+        """Put the frame's image behind the scene where the window stands at its camera; elsewhere, nothing."""
+        with self._lock:
+            index, window = self._index, self._client.camera
+            frame, aspect = self._capture.frames[index], aspect_of(window)
+            with contextlib.suppress(ValueError):  # a camera that is none
+                if not stands_at(browser_camera(window, self._unit, IMAGE_PX), frame.camera, self._distance):
+                    aspect = 0.0
+            if (index, aspect) == self._shown:
+                return
+            self._shown = index, aspect
+            picture, note = None, "" if self._capture.registered else "; " + UNREGISTERED
+            try:
+                if aspect:
+                    picture, window.fov = image_behind(frame, aspect), fitting_view(frame.camera, aspect)
+            except NeecoError as error:
+                note = f"; {error}"
+            self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90)
+            self._status.content = message_html(f"{frame.name}, {frame.split}, {frame.state.time:.2f} s{note}")
+
+
+def image_behind(frame: Frame, aspect: float) -> np.ndarray:
+    """The image as a window of that width by height shows it, uint8 [H, W, 3]: its principal point in the middle, as
+    viser has it. Raises NeecoError."""
+    camera = frame.camera
+    image = (frame.load_image().numpy() * 255).round().astype(np.uint8)
+    focal = IMAGE_PX / 2 / np.tan(fitting_view(camera, aspect) / 2)
+    size = max(1, round(IMAGE_PX * aspect)), IMAGE_PX
+    across, down = focal / camera.fx, focal / camera.fy
+    place = np.array([[across, 0, size[0] / 2 - across * camera.cx], [0, down, size[1] / 2 - down * camera.cy]])
+    place[:, 2] += (place[:, :2].sum(1) - 1) / 2  # OpenCV counts from the first pixel's centre
+    return cv2.warpAffine(image, place, size, flags=cv2.INTER_LINEAR)
+
+
+def _distance(capture: Capture) -> float:
+    """Median distance in mm from the cameras, along what they look at, of the points, or else of the instruments."""
+    middle = np.median(capture.points.positions, 0) if len(capture.points.positions) else None
+    depths = []
+    for frame in capture.frames:
+        pose = to_numpy(frame.camera.world_from_camera)
+        origins = [to_numpy(item.pose)[:3, 3] for item in frame.state.instruments.values()]
+        depths += [float((place - pose[:3, 3]) @ pose[:3, 2]) for place in (origins if middle is None else [middle])]
+    ahead = [depth for depth in depths if depth > 0]
+    return float(np.median(ahead)) if ahead else ASSUMED_MM
