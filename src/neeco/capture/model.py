@@ -210,6 +210,7 @@ class Frame:
     split: str  # train, test, unseen, or any other name
     mask_path: Path | None = None  # black pixels are ignored by the loss
     background: float = 1.0  # colour behind transparent pixels: 0 black, 1 white
+    _: KW_ONLY
     stored_size: tuple[int, int] | None = None  # (width, height) of the files, pixels; None: that of the camera
 
     def __post_init__(self) -> None:
