@@ -27,7 +27,7 @@ ROOMS = (  # from the top down; rooms of one line do not know each other
     ("raster",),
     ("geometry",),
     ("files", "registry", "settings", "workers"),
-    ("errors", "locks", "plausible"),
+    ("errors", "locks", "placeholders", "plausible"),
 )
 LEVELS = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
 # folders of ingest from the top down, below its own modules

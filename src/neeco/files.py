@@ -11,6 +11,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -18,27 +19,12 @@ import yaml
 
 from neeco.errors import NeecoError
 from neeco.locks import LOCK, LOCKING, TEMPORARY, begin_file, locked, remove_abandoned
+from neeco.placeholders import placeholder
 
 LOCK_WAIT_S = 20.0  # for a person who clicks, while another process writes
 MAX_VALUES = 1_000_000  # in a YAML file, aliases written out
+MAX_BYTES = 2**30  # of a file that is read whole
 HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
-HEAD_BYTES = 1024  # read of a file to recognise what was stored in its place; Git LFS pointers are shorter
-_XML = rb"\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*"
-_LFS = "is a Git LFS pointer, not the file; run `git lfs pull`"
-_ANNEX = "is a git-annex pointer, not the file; run `git annex get`"
-_MAC = "is macOS metadata (AppleDouble), not the file; give the file without `._`"
-_PAGE = "is a web page, not the file; download the file again (does it need a login?)"
-_ANSWER = "is a server's error message, not the file; download the file again"
-_PLACEHOLDERS = (
-    (rb"version https://(?:git-lfs|hawser)\.github\.com/spec/", _LFS),
-    (rb"[./\\][\w./\\-]*annex[/\\]objects[/\\]\S+\s*\Z", _ANNEX),
-    (rb"\0\x05\x16[\0\x07]\0", _MAC),
-    (_XML + rb"<(?:!doctype\s+html|html[\s>])", _PAGE),
-    (_XML + rb"<Error>\s*<Code>|(?:404: Not Found|Entry not found|Access to \S+ \S+ is restricted\b.*)\s*\Z", _ANSWER),
-)  # what clones and downloads leave in a file's place: how it begins, and what to do
-PLACEHOLDERS = [(re.compile(start, re.DOTALL | re.IGNORECASE), problem) for start, problem in _PLACEHOLDERS]
-
-
 _REMEDIES = {
     errno.ENOSPC: "free space there, or write to another disk",
     errno.EDQUOT: "free space of your quota, or write to another disk",
@@ -265,33 +251,25 @@ def require_inside(file: Path, folder: Path) -> Path:
     raise NeecoError(f"{file}: a link leads out of {folder}; put there what it leads to, or remove it")
 
 
+def open_file(path: Path, expected: str) -> BufferedReader:
+    """Open an input for reading; `require_file` for those that a library opens. Raises NeecoError as that, and OSError
+    when it is absent or may not be read."""
+    require_file(path, expected)
+    return path.open("rb")
+
+
 def require_file(path: Path, expected: str) -> None:
     """Raise NeecoError when `path` is there but is no file (a folder, or a pipe or device whose reading may not end),
-    or holds a `placeholder`."""
+    or a `placeholder` is in its place."""
     if path.exists() and not path.is_file():
         raise NeecoError(f"{path}: is not a file; expected {expected}")
     require_content(path)
 
 
 def require_content(path: Path) -> None:
-    """Raise NeecoError for a file that holds a `placeholder`: for those that a library opens."""
+    """Raise NeecoError for a `placeholder`."""
     if problem := placeholder(path):
         raise NeecoError(f"{path}: {problem}")
-
-
-def placeholder(path: Path) -> str | None:
-    """Name what a clone or a download left in a file's place (a Git LFS or git-annex pointer, a web page), and the
-    remedy; None for content, and where there is no file to read."""
-    try:
-        if path.is_symlink() and not path.exists():
-            return _ANNEX if "annex/objects/" in os.readlink(path).replace("\\", "/") else None
-        if not path.is_file():
-            return None
-        with path.open("rb") as stream:
-            head = stream.read(HEAD_BYTES).removeprefix(b"\xef\xbb\xbf")
-    except (OSError, ValueError):
-        return None  # the reader says why
-    return next((problem for start, problem in PLACEHOLDERS if start.match(head)), None)
 
 
 def visible_entries(folder: Path, pattern: str = "*") -> list[Path]:
@@ -303,12 +281,14 @@ def visible_entries(folder: Path, pattern: str = "*") -> list[Path]:
 def read_bytes(path: Path, expected: str, missing: str = "no such file") -> bytes:
     """Read a file's bytes.
 
-    Raises NeecoError saying `missing` when it is absent, what was `expected` when it is a folder or a pipe, and why
-    when it cannot be read.
+    Raises NeecoError saying `missing` when it is absent, what was `expected` when it is no file or has over MAX_BYTES,
+    and why when it cannot be read.
     """
     try:
-        require_file(path, expected)
-        return path.read_bytes()
+        with open_file(path, expected) as stream:
+            if os.fstat(stream.fileno()).st_size > MAX_BYTES:
+                raise NeecoError(f"{path}: has over {MAX_BYTES >> 30} GiB; expected {expected}: give a part of it")
+            return stream.read()
     except FileNotFoundError:
         raise NeecoError(f"{path}: {missing}") from None
     except (OSError, ValueError) as error:

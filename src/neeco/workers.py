@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neeco.errors import NeecoError, install_hint
+from neeco.placeholders import read_head
 
 MAX_RETRIES = 3  # of a task whose worker died
 CONNECT_S = 5.0  # that a cluster's head gets to answer
@@ -368,7 +369,7 @@ def require_shared(ray: Any, file: Path, inputs: Collection[Path]) -> None:
 def node_problem(file: Path, token: str, inputs: tuple[Path, ...]) -> str | None:
     """Return, on a node, what it lacks, in words; None: nothing."""
     remedy = "mount it there under the same path"
-    if not file.is_file() or file.read_text(encoding="utf-8") != token:
+    if read_head(file, len(token) + 1) != token.encode():
         return f"does not see {file.parent} as this machine has it; {remedy}"
     if missing := next((path for path in inputs if not path.exists()), None):
         return f"does not see {missing}; {remedy}"

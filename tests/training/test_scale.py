@@ -32,7 +32,7 @@ def test_a_scaled_frame_reads_pixels_of_its_cameras_size(scale: float, tmp_path:
     mask = small.load_mask()
     assert mask is not None
     assert small.load_image().shape[:2] == small.load_image_bytes().shape[:2] == mask.shape == size
-    assert mask.float().mean() == pytest.approx(inside.mean() / 255, abs=0.02)
+    assert mask.float().mean() == pytest.approx(inside.mean() / 255, abs=0.03)  # only pixels whose whole area counts
     assert float(small.load_image().mean()) == pytest.approx(float(frame.load_image().mean()), abs=2e-3)
 
 

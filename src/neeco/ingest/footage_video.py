@@ -12,7 +12,7 @@ import torch
 from neeco.capture.model import Capture
 from neeco.capture.readers import read_capture
 from neeco.errors import NeecoError
-from neeco.files import read_begun, require_content, require_same, write_json
+from neeco.files import open_file, read_begun, require_same, write_json
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.result import IngestResult
 from neeco.ingest.sources import recording_from_flags
@@ -36,9 +36,8 @@ def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, r
         raise NeecoError(f"{path}: no such file or folder; give a capture or a video")
     if not path.is_file():
         return read_capture(path)
-    require_content(path)
     capture_folder = output / FOOTAGE
-    with path.open("rb") as stream:
+    with open_file(path, "a video") as stream:
         source = {"video_sha256": hashlib.file_digest(stream, "sha256").hexdigest()}
     name = f"{FOOTAGE}/{SOURCE}"
     if (begun := read_begun(output, name, resume, "tracked footage")) is not None:

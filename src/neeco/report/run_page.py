@@ -19,6 +19,7 @@ from neeco.capture.model import Capture, Frame, State
 from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, overlay_parts, part_color
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import pairs_of
+from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.report.charts import SMALL, Series, line_chart, short
@@ -110,7 +111,7 @@ def write_report(
         preview=synthesis_preview and preview_uri(synthesis_preview),
         playable=playable,
         facts=_facts(capture, scene, rows),
-        config=config.read_text(encoding="utf-8", errors="replace") if config.is_file() else "",
+        config=read_bytes(config, "settings").decode("utf-8", "replace") if config.is_file() else "",
     )
 
 
@@ -292,7 +293,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     if not path.is_file():
         return []
     rows = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_bytes(path, "metrics").decode("utf-8", "replace").splitlines():
         try:
             row = json.loads(line)
         except (ValueError, RecursionError):

@@ -16,7 +16,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.files import write_text
+from neeco.files import read_bytes, write_text
 from neeco.labels.drawing import draw
 from neeco.report.charts import Series, binned, legend, line_chart
 from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
@@ -369,7 +369,7 @@ def _configs(comparison: ComparisonResult, output: Path) -> list[tuple[str, str]
         seed = next((job["seed"] for job in comparison.jobs if job["name"] == name and "error" not in job), None)
         config = job_folder(output, name, seed) / "config.yaml" if seed is not None else None
         if config is not None and config.is_file():
-            listings.append((f"{name}: config.yaml", config.read_text(encoding="utf-8", errors="replace")))
+            listings.append((f"{name}: config.yaml", read_bytes(config, "settings").decode("utf-8", "replace")))
     return listings
 
 

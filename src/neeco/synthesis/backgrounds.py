@@ -19,6 +19,7 @@ from torch import Tensor
 
 from neeco.capture.images import image_files, image_size, read_image_bytes
 from neeco.errors import NeecoError
+from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.raster import rasterize
 from neeco.raster.reference import SH_C0
@@ -62,7 +63,7 @@ class ImageFolder:
 
     def digest(self) -> str:
         """SHA-256 of the files' content, in order."""
-        content = b"".join(hashlib.sha256(file.read_bytes()).digest() for file in self.files)
+        content = b"".join(hashlib.sha256(read_bytes(file, "an image")).digest() for file in self.files)
         return hashlib.sha256(content).hexdigest()
 
     def colors(self, number: int) -> Colors:

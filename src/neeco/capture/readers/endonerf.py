@@ -19,9 +19,10 @@ from neeco.capture.model import TEST_EVERY, Frame, PointCloud, State
 from neeco.capture.points import random_points
 from neeco.capture.readers.parsed import Parsed, inside
 from neeco.errors import NeecoError
-from neeco.files import placeholder, visible_entries
+from neeco.files import visible_entries
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import LLFF
+from neeco.placeholders import placeholder
 from neeco.plausible import focal_fault, size_fault
 
 POSES_FILE = "poses_bounds.npy"

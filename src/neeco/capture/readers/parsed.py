@@ -14,8 +14,8 @@ from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, Instrument, InstrumentState
 from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
-from neeco.files import placeholder
 from neeco.geometry.lens import Lens
+from neeco.placeholders import placeholder
 from neeco.plausible import Fault
 
 NOWHERE = "put it there or correct the path"

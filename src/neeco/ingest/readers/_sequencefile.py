@@ -17,7 +17,7 @@ import numpy as np
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
-from neeco.files import require_content
+from neeco.files import open_file, require_content
 from neeco.ingest.readers import VideoSource
 
 META, NRRD = (".mha", ".mhd"), (".nrrd", ".nhdr")
@@ -81,7 +81,7 @@ class _Header:
 def read_sequence(path: Path) -> FrameSequence:
     """The header of a sequence. Raises NeecoError where it is none, is damaged, or says what the file does not hold."""
     try:
-        with path.open("rb") as stream:
+        with open_file(path, "a sequence") as stream:
             header = _read_meta(path, stream) if path.suffix.lower() in META else _read_nrrd(path, stream)
     except OSError as error:
         raise NeecoError(f"{path}: cannot read: {error.strerror or error}; correct the path") from None
@@ -253,7 +253,7 @@ def _pixels(sequence: FrameSequence, numbers: list[int]) -> Iterator[np.ndarray]
         return
     file, start = sequence.data
     try:
-        with file.open("rb") as stream:
+        with open_file(file, "images of a sequence") as stream:
             for number in numbers:
                 stream.seek(start + number * length)
                 content = stream.read(length)
@@ -271,7 +271,7 @@ def _unpacked(sequence: FrameSequence, numbers: list[int]) -> Iterator[bytes]:
     length = sequence.size[0] * sequence.size[1] * sequence.channels
     assert sequence.window is not None
     try:
-        with file.open("rb") as stream:
+        with open_file(file, "images of a sequence") as stream:
             stream.seek(start)
             parts, held, first = _inflated(stream, sequence.window), bytearray(), 0  # first: the byte where held begins
             for number in numbers:

@@ -35,6 +35,7 @@ from neeco.ingest.readers.delimited import DelimitedText
 from neeco.ingest.readers.frame_names import meaning_of
 from neeco.ingest.readers.rosbag import DVRK_HINT, POSE_HEADER, RosBag, joint_column, wrist_joints
 from neeco.ingest.readers.video import ChosenFrames, ImageFiles, open_video
+from neeco.placeholders import read_head
 
 INDEX, TYPES = "index.json", ("dc_index_v1", "dc::index@", "dvrk_data:index@")
 TOPIC = "# Topic: /"  # begins a CSV file of `extract`
@@ -66,13 +67,8 @@ class DvrkSession(RecordingFormat):
     def claims(self, path: Path) -> bool:
         if not path.is_dir():
             return False
-        try:
-            with (path / INDEX).open(encoding="utf-8", errors="replace") as file:
-                if any(kind in file.read(1 << 16) for kind in TYPES):
-                    return True
-        except OSError:
-            pass
-        return any(_topic_of(file) for file in _tables_in(path)[:1])
+        index = read_head(path / INDEX, 1 << 16)
+        return any(kind.encode() in index for kind in TYPES) or any(_topic_of(file) for file in _tables_in(path)[:1])
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         films, absent = _films(path)
@@ -236,11 +232,7 @@ def _topics(path: Path) -> dict[str, Path]:
 
 
 def _topic_of(file: Path) -> str | None:
-    try:
-        with file.open(encoding="utf-8", errors="replace") as stream:
-            line = stream.readline(400)
-    except OSError:
-        return None
+    line = read_head(file, 400).decode("utf-8", "replace").partition("\n")[0]
     return "/" + line.removeprefix(TOPIC).strip() if line.startswith(TOPIC) else None
 
 

@@ -18,6 +18,7 @@ from neeco.files import read_bytes
 from neeco.ingest.readers import POSES, RecordingFormat, Stream, Table, choose_stream
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.frame_names import NamedFrame
+from neeco.placeholders import read_head
 
 ARMS = ("master left", "master right", "slave left", "slave right")  # in the order of their columns
 COLUMNS = 19  # of an arm
@@ -35,13 +36,7 @@ class JigsawsKinematics(RecordingFormat):
     holds = "poses and gripper angles of the arms: text of 76 columns without a header"
 
     def claims(self, path: Path) -> bool:
-        if path.suffix.lower() != ".txt":
-            return False
-        try:
-            with path.open("rb") as file:
-                return _row(file.readline(4096)) is not None
-        except OSError:
-            return False
+        return path.suffix.lower() == ".txt" and _row(read_head(path, 4096).partition(b"\n")[0]) is not None
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         count = len(_numbers(path))

@@ -40,6 +40,7 @@ from neeco.ingest.readers.columns import QUATERNION_WXYZ, ROTATION_MATRIX, pose_
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
 from neeco.ingest.readers.lerobot_files import FIXED, DataSet, Episode, Feature, ParquetFile, read_data_set
 from neeco.ingest.readers.video import ChosenFrames, open_video
+from neeco.placeholders import read_head
 
 TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names
@@ -59,11 +60,7 @@ class LeRobot(RecordingFormat):
     extra = "lerobot"
 
     def claims(self, path: Path) -> bool:
-        try:
-            with (path / "meta" / "info.json").open("rb") as file:
-                return b'"codebase_version"' in file.read(2**20)
-        except (OSError, ValueError):
-            return False
+        return b'"codebase_version"' in read_head(path / "meta" / "info.json", 2**20)
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         """Return those of the first episode that was downloaded; all others have the same."""

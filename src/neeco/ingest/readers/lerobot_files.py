@@ -15,7 +15,7 @@ import numpy as np
 
 from neeco.capture.documents import as_float, printable
 from neeco.errors import NeecoError
-from neeco.files import read_json, require_content, require_inside, visible_entries
+from neeco.files import open_file, read_json, require_content, require_inside, visible_entries
 
 INFO = "meta/info.json"
 EPISODES_2 = "meta/episodes.jsonl"
@@ -181,8 +181,7 @@ class DataSet:
         file = self.path / EPISODES_2
         if not file.is_file():
             raise NeecoError(f"{file}: no such file; download it, too")
-        require_content(require_inside(file, _boundary(self.path)))
-        with file.open("rb") as stream:
+        with open_file(require_inside(file, _boundary(self.path)), "episodes") as stream:
             line = 0
             while text := stream.readline(MAX_LINE):
                 line += 1

@@ -19,6 +19,7 @@ from neeco.errors import NeecoError
 from neeco.ingest.readers import Body, RecordingFormat, Table, numbers
 from neeco.ingest.readers.columns import UNITS, canonical_unit
 from neeco.ingest.readers.delimited import read_lines, unique_names
+from neeco.placeholders import read_head
 
 FIRST = b"Format Version"  # words of a file
 BODY_TYPE = "rigid body"
@@ -33,13 +34,7 @@ class MotiveExport(RecordingFormat):
     holds = "poses of rigid bodies by name: OptiTrack's CSV with its preamble (Format Version, ...)"
 
     def claims(self, path: Path) -> bool:
-        if not path.is_file():  # opening a pipe might never end
-            return False
-        try:
-            with path.open("rb") as file:
-                return file.read(64).lstrip(b'\xef\xbb\xbf"').startswith(FIRST)
-        except OSError:
-            return False
+        return read_head(path, 64).lstrip(b'\xef\xbb\xbf"').startswith(FIRST)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         if stream is not None:

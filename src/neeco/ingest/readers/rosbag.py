@@ -32,6 +32,7 @@ from neeco.ingest.readers import (
 )
 from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, meaning_of, of_dvrk
+from neeco.placeholders import read_head
 
 if TYPE_CHECKING:
     from neeco.ingest.readers._bagsurvey import Joints, Samples, Survey
@@ -62,11 +63,7 @@ class RosBag(RecordingFormat):
     def claims(self, path: Path) -> bool:
         if not path.is_dir():
             return super().claims(path)
-        try:
-            with (path / "metadata.yaml").open("rb") as file:
-                return b"rosbag2_bagfile_information" in file.read(4096)
-        except OSError:
-            return False
+        return b"rosbag2_bagfile_information" in read_head(path / "metadata.yaml", 4096)
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         survey = self._survey(path)

@@ -205,6 +205,7 @@ class _Scan:
         import av
         from av.stream import Disposition
 
+        require_content(self.path)
         try:
             container = av.open(str(self.path))
         except (av.error.FFmpegError, OSError, ValueError) as error:

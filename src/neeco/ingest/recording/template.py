@@ -16,7 +16,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from neeco.errors import NeecoError
-from neeco.files import placeholder, read_json, require_content
+from neeco.files import read_json, require_content
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers import IMAGES as IMAGE_STREAMS
 from neeco.ingest.readers import POSES, READINGS, Stream, format_of, numbers, read_table
@@ -37,6 +37,7 @@ from neeco.ingest.readers.ndi import tool_columns, tool_names
 from neeco.ingest.readers.rosbag import DVRK_WRIST
 from neeco.ingest.readers.video import IMAGES
 from neeco.ingest.recording.drafted_scope import FoundFrames, StandsStill, draft_scope
+from neeco.placeholders import placeholder
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts", ".wmv", ".mxf")
 MAX_FILES = 400  # looked at; a folder with more is not one recording

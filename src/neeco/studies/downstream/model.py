@@ -19,7 +19,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from neeco.errors import NeecoError, install_hint
-from neeco.files import placeholder, write_atomically
+from neeco.files import write_atomically
+from neeco.placeholders import placeholder
 from neeco.registry import plugins
 from neeco.studies.downstream.batches import Batch, BatchSampler, collate, training_image
 from neeco.studies.downstream.scores import Prediction

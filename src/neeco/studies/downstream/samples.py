@@ -18,7 +18,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth, truth_file, truth_names
 from neeco.evaluation.mask_metrics import pairs_of
-from neeco.files import read_json, read_text, require_inside
+from neeco.files import read_bytes, read_json, read_text, require_inside
 
 ClassNames = Literal["instrument", "parts"]
 Edges = Literal["hard", "soft", "ignore"]
@@ -270,7 +270,7 @@ class ImageSet:
     def described(self) -> dict[str, Any]:
         """Return its identity; `sha256` of its dataset.json changes when it is synthesized anew."""
         file = self.file(DATASET_FILE)
-        digest = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
+        digest = hashlib.sha256(read_bytes(file, "a data set")).hexdigest() if file.is_file() else None
         return {"name": self.name, "path": str(self.path.absolute()), "count": self.count, "sha256": digest}
 
     def error(self, problem: str) -> NeecoError:

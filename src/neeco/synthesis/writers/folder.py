@@ -21,7 +21,7 @@ import torch
 from neeco.capture.images import encoded_image, encoded_png
 from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.errors import NeecoError
-from neeco.files import read_json_lines, read_text, write_atomically, write_text, write_unsynced
+from neeco.files import read_bytes, read_json_lines, read_text, write_atomically, write_text, write_unsynced
 from neeco.geometry.lens import Lens
 from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import LayeredDrawing, to_numpy
@@ -162,7 +162,7 @@ def link(source: Path, target: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         os.link(source, target)
     except OSError:
-        write_atomically(target, lambda temporary: temporary.write_bytes(source.read_bytes()))
+        write_atomically(target, lambda temporary: temporary.write_bytes(read_bytes(source, "an image")))
 
 
 def files_of(record: Record) -> list[str]:

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 
 from neeco.errors import NeecoError, install_hint
-from neeco.files import write_atomically, write_text
+from neeco.files import read_bytes, write_atomically, write_text
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import Record, link, public_record, stem
 
@@ -82,8 +82,10 @@ def _write_shard(root: Path, records: Sequence[Record], path: Path) -> None:
         for record in records:
             key = stem(record["index"])
             image = root / record["image"]
-            contents = {image.suffix[1:]: image.read_bytes()}
-            contents |= {ending: (root / folder / f"{key}.png").read_bytes() for folder, ending in SHARDED.items()}
+            contents = {image.suffix[1:]: read_bytes(image, "an image")}
+            contents |= {
+                ending: read_bytes(root / folder / f"{key}.png", "labels") for folder, ending in SHARDED.items()
+            }
             contents["json"] = json.dumps(public_record(record), allow_nan=False).encode()
             for ending, content in contents.items():
                 entry = tarfile.TarInfo(f"{key}.{ending}")  # dated 1970 and nobody's: bytes depend on content alone

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from neeco.errors import NeecoError
-from neeco.files import write_text
+from neeco.files import read_text, write_text
 from neeco.studies.downstream.model import Model, TrainedModel, TrainingTask, missing_packages
 from neeco.studies.downstream.samples import Example, Sample
 from neeco.studies.downstream.scores import Detections, Prediction
@@ -130,7 +130,7 @@ def _predict(work: Path, weights: Path, images: Sequence[np.ndarray], task: Trai
 
 def _boxes(file: Path, image: np.ndarray) -> Detections:
     """Read the program's detections in one image; it writes no file where there are none."""
-    lines = file.read_text().splitlines() if file.is_file() else []
+    lines = read_text(file, "detections").splitlines() if file.is_file() else []
     try:
         table = [[float(word) for word in line.split()] for line in lines]
         rows = np.array(table, np.float64).reshape(len(table), 6)
