@@ -163,3 +163,14 @@ def test_degrees_that_are_none_are_refused(tmp_path: Path, degree: int) -> None:
     with pytest.raises(NeecoError, match=r"--sh: "):
         export_page(tmp_path, tmp_path / "page.html", degree, CPU)
     assert not (tmp_path / "page.html").exists()
+
+
+def test_numbers_that_are_not_finite_are_in_no_page() -> None:
+    scene = make_scene("kinematic")
+    header, planes = pack(scene, 3)
+    header["light"]["falloff"][0] = float("inf")
+    with pytest.raises(NeecoError, match="--export: the scene holds numbers that are not finite"):
+        page_of(header, planes, "title", [])
+    scene.canonical.means[0] = torch.nan
+    with pytest.raises(NeecoError, match="--export: the scene holds numbers that are not finite"):
+        pack(scene, 3)
