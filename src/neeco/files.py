@@ -9,6 +9,7 @@ import math
 import os
 import re
 import secrets
+import stat
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -64,6 +65,20 @@ def cannot_write(path: Path, error: OSError) -> NeecoError:
     return NeecoError(f"{path}: cannot write: {error.strerror or error}; {remedy}")
 
 
+def require_replaceable(path: Path) -> None:
+    """Raise NeecoError where a file written to `path` would replace a link, a device, a pipe or a socket."""
+    with contextlib.suppress(OSError):  # nothing is there, or writing says why not
+        mode = path.lstat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            kind = "a symbolic link" if stat.S_ISLNK(mode) else "a device, pipe or socket"
+            raise NeecoError(f"{path}: is {kind}, not a file, and is not replaced; give another path, or remove it")
+
+
+def _temporary_name(path: Path) -> Path:
+    require_replaceable(path)
+    return path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")  # some writers go by the suffix
+
+
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write(temporary_path)` produce a file next to `path`, sync it to disk and rename it to `path`.
 
@@ -71,8 +86,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     what it did, or all of the new content. Raises NeecoError naming `path` when the disk refuses.
     """
     path = Path(path)
-    # keep the suffix: some writers choose the format by it
-    temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")
+    temporary = _temporary_name(path)
     try:
         _make_folders(path.parent)
         # not by `tempfile`, whose files are their owner's alone
@@ -88,8 +102,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     except OSError as error:
         raise cannot_write(path, error) from error
     finally:
-        with contextlib.suppress(FileNotFoundError):
-            temporary.unlink()
+        temporary.unlink(missing_ok=True)
 
 
 def write_unsynced(path: Path, content: bytes) -> None:
@@ -98,7 +111,7 @@ def write_unsynced(path: Path, content: bytes) -> None:
     For the many files of a folder that counts as complete only after `sync_disk`: a killed process leaves each whole or
     absent, a power cut may leave some empty. Raises NeecoError naming `path` when the disk refuses.
     """
-    temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")
+    temporary = _temporary_name(path)
     flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
     try:
         try:
@@ -111,8 +124,7 @@ def write_unsynced(path: Path, content: bytes) -> None:
                 stream.write(content)
             os.replace(temporary, path)
         except BaseException:
-            with contextlib.suppress(FileNotFoundError):
-                temporary.unlink()
+            temporary.unlink(missing_ok=True)
             raise
     except OSError as error:
         raise cannot_write(path, error) from error
@@ -188,11 +200,13 @@ def own_folder(path: Path, named: Path | None = None) -> Iterator[None]:
 
 def sweep_unfinished(folder: Path) -> None:
     """Remove what killed processes left half-written in a folder that this process owns; folders have owners of their
-    own. Raises NeecoError where the folder holds a link out of it. On Windows nothing is removed (see `own_folder`)."""
+    own. Raises NeecoError where it holds a link out of it, a device or a pipe. On Windows nothing is removed."""
     halves = []
     for entry in folder.rglob("*"):  # which follows no link
         if entry.is_symlink():
             require_inside(entry, folder)
+        else:
+            require_replaceable(entry)
         if fcntl is not None and entry.name.startswith(TEMPORARY):
             halves.append(entry)
     for entry in halves:
@@ -243,11 +257,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write `text` to `path` atomically (see `write_atomically`)."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_text(text, encoding="utf-8")
-
-    write_atomically(path, write)
+    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def write_json(path: Path, value: Any, indent: int | None = 1) -> None:

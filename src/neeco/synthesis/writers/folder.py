@@ -21,7 +21,7 @@ import torch
 from neeco.capture.images import encoded_image, encoded_png
 from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.errors import NeecoError
-from neeco.files import read_json_lines, read_text, write_atomically, write_text, write_unsynced
+from neeco.files import read_json_lines, read_text, require_replaceable, write_atomically, write_text, write_unsynced
 from neeco.geometry.lens import Lens
 from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import LayeredDrawing, to_numpy
@@ -154,6 +154,7 @@ def load_record(root: Path, index: int) -> Record | None:
 def link(source: Path, target: Path) -> None:
     """Make `target` the same file as `source`: a hard link, or a copy where the file system has none. Raises
     NeecoError."""
+    require_replaceable(target)
     with contextlib.suppress(FileNotFoundError):
         if os.path.samefile(source, target):
             return
