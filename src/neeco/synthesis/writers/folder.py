@@ -37,6 +37,7 @@ LABELS = ("masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders
 MAX_INSTRUMENTS = (
     8  # in `silhouettes`, whose bit k is set where instrument k would be visible if nothing else were there
 )
+POLYGONS = ("polygons", "segmentation")  # of a label or part, left out of states.jsonl
 FOLDERS = ("images", *LABELS, RECORDS)
 PUBLIC = {  # what every line of states.jsonl holds, among others
     "index": int,
@@ -192,7 +193,6 @@ def public_record(record: Record) -> dict[str, Any]:
 
 
 def _without_polygons(label: dict[str, Any]) -> dict[str, Any]:
-    parts = {
-        name: {key: value for key, value in part.items() if key != "polygons"} for name, part in label["parts"].items()
-    }
-    return {key: value for key, value in label.items() if key != "polygons"} | {"parts": parts}
+    shapes = {None: label, **label["parts"]}
+    without = {name: {k: v for k, v in shape.items() if k not in POLYGONS} for name, shape in shapes.items()}
+    return without.pop(None) | {"parts": without}
