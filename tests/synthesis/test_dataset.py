@@ -51,7 +51,7 @@ def states_file(path, states) -> str:
 
 def test_the_folder_is_laid_out_as_promised(made):
     assert {path.name for path in made.iterdir()} == {
-        ".records", "images", "masks", "soft", "ignore", "parts", "depth", "silhouettes", "coco", "yolo",
+        ".records", "images", "masks", "soft", "ignore", "parts", "depth", "silhouettes", "coco", "yolo", "imagefolder",
         "states.jsonl", "dataset.json", "preview.png", "README.md",
     }  # fmt: skip
     image, mask, parts = (pixels(made / folder / "000002.png") for folder in ("images", "masks", "parts"))

@@ -15,7 +15,7 @@ from neeco.settings import structure
 LabelWay = Literal["composited", "threshold"]
 Views = Literal["recorded", "perturbed", "orbit"]
 FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")  # of our own writers
-DEFAULT_FORMATS = ("coco", "yolo")
+DEFAULT_FORMATS = ("coco", "yolo", "imagefolder")  # the last for `datasets.load_dataset` of the folder
 WRITERS = "neeco.writers"  # the group of entry points of others'
 PATH_PREFIX = "path:"
 SIZE = re.compile(r"[1-9]\d{0,5}[xX][1-9]\d{0,5}")

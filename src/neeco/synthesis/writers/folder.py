@@ -54,6 +54,11 @@ PUBLIC = {  # what every line of states.jsonl holds, among others
 VALIDATION_EVERY = 5  # every fifth image is for validation; by the index alone, so a data set can grow
 
 
+def split_of(index: int) -> str:
+    """Return the split of image `index`, "train" or "val"."""
+    return "val" if index % VALIDATION_EVERY == VALIDATION_EVERY - 1 else "train"
+
+
 def stem(index: int) -> str:
     """File stem of image `index`."""
     return f"{index:06d}"
@@ -106,7 +111,7 @@ def encoded_sample(
     record = {
         "index": index,
         "image": image,
-        "split": "val" if index % VALIDATION_EVERY == VALIDATION_EVERY - 1 else "train",
+        "split": split_of(index),
         "width": camera.width,
         "height": camera.height,
         **state_to_json(drawing.state),
