@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
 
 from neeco.capture.images import open_image
@@ -46,7 +47,7 @@ from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers import read_table
 from neeco.ingest.readers.plus import PlusSequence
 from neeco.ingest.readers.video import open_video
-from neeco.scene.io import load_scene
+from neeco.scene.io import load_scene, save_tensors
 from neeco.synthesis.writers.folder import link
 
 HOLD = """\
@@ -101,14 +102,15 @@ def test_half_a_character_is_no_json_and_a_pair_of_halves_is_one_letter(tmp_path
 
 @pytest.mark.parametrize(("umask", "file", "folder"), [(0o077, 0o600, 0o700), (0o002, 0o664, 0o775)])
 def test_the_umask_decides_who_may_read(tmp_path: Path, umask: int, file: int, folder: int) -> None:
-    path = tmp_path / "made" / "file.txt"
+    path, tensors = tmp_path / "made" / "file.txt", tmp_path / "made" / "file.safetensors"
     before = os.umask(umask)
     try:
         write_atomically(path, lambda temporary: temporary.write_text("x"))
+        save_tensors({"a": torch.zeros(2)}, {}, tensors)  # by a library that may replace the file
         assert os.umask(umask) == umask  # it is the process's own, which other threads share
     finally:
         os.umask(before)
-    assert stat.S_IMODE(path.stat().st_mode) == file
+    assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE(tensors.stat().st_mode) == file
     assert stat.S_IMODE(path.parent.stat().st_mode) == folder
 
 

@@ -89,12 +89,13 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     temporary = _temporary_name(path)
     try:
         _make_folders(path.parent)
-        # not by `tempfile`, whose files are their owner's alone
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        temporary.touch(exist_ok=False)  # not by `tempfile`, whose files are their owner's alone
+        mode = stat.S_IMODE(temporary.stat().st_mode)
     except OSError as error:
         raise cannot_write(path, error) from error
     try:
         write(temporary)
+        temporary.chmod(mode)  # some libraries replace the file
         with open(temporary, "rb") as stream:
             os.fsync(stream.fileno())
         os.replace(temporary, path)
@@ -112,22 +113,18 @@ def write_unsynced(path: Path, content: bytes) -> None:
     absent, a power cut may leave some empty. Raises NeecoError naming `path` when the disk refuses.
     """
     temporary = _temporary_name(path)
-    flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
     try:
         try:
-            handle = os.open(temporary, flags, 0o666)
+            temporary.write_bytes(content)
         except FileNotFoundError:
             _make_folders(path.parent)
-            handle = os.open(temporary, flags, 0o666)
-        try:
-            with os.fdopen(handle, "wb") as stream:
-                stream.write(content)
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+            temporary.write_bytes(content)
+        os.replace(temporary, path)
     except OSError as error:
         raise cannot_write(path, error) from error
+    finally:
+        with contextlib.suppress(OSError):  # it was never made, or is `path` now
+            temporary.unlink()
 
 
 def sync_disk() -> None:
