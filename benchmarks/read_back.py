@@ -24,7 +24,6 @@ import numpy as np
 import yaml
 from PIL import Image
 
-LEAST_IOU = 0.9  # of all polygons filled with the mask: corners are simplified
 VARIANTS = ("", "segment", "pose", "obb", "parts")  # of yolo/
 
 
@@ -70,7 +69,7 @@ def read_pycocotools(root: Path) -> str:
                     require(wanted.sum() == annotation["area"], f"{file}: area of annotation {annotation['id']}")
                     count += 1
     overlap, union = np.sum(shares, axis=0)
-    require(overlap / union > LEAST_IOU, f"polygons overlap with masks by {overlap / union:.3f} only")
+    require(overlap == union, f"polygons overlap with masks by {overlap / union:.3f} only")
     return f"{count} annotations, IoU with masks and parts {overlap / union:.3f}"
 
 
@@ -127,6 +126,9 @@ def read_yolo_rules(root: Path) -> str:
                 fits = {"": size == 4, "pose": True, "obb": size == 8, "segment": polygon, "parts": polygon}
                 require(fits[variant], f"{label}: {size} columns")
                 require(values[0] in data["names"], f"{label}: class {values[0]}")
+                if variant == "obb":  # corners may lie outside: the centre and size of their box are checked
+                    low, high = points.reshape(4, 2).min(0), points.reshape(4, 2).max(0)
+                    points = np.concatenate([(low + high) / 2, high - low]) / 1.01
                 require(points.min() >= 0 and points.max() <= 1, f"{label}: beyond the image")
                 count += 1
     return f"{count} rows"

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import signal
+import socket
 import stat
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 import yaml
 
 from neeco.capture.images import open_image
@@ -27,6 +31,7 @@ from neeco.files import (
     YamlDumper,
     YamlLoader,
     is_vacant,
+    new_folder,
     own_folder,
     parse_yaml,
     placeholder,
@@ -42,7 +47,8 @@ from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers import read_table
 from neeco.ingest.readers.plus import PlusSequence
 from neeco.ingest.readers.video import open_video
-from neeco.scene.io import load_scene
+from neeco.scene.io import load_scene, save_tensors
+from neeco.synthesis.writers.folder import link
 
 HOLD = """\
 import sys, time
@@ -133,14 +139,15 @@ def test_half_a_character_is_no_json_and_a_pair_of_halves_is_one_letter(tmp_path
 
 @pytest.mark.parametrize(("umask", "file", "folder"), [(0o077, 0o600, 0o700), (0o002, 0o664, 0o775)])
 def test_the_umask_decides_who_may_read(tmp_path: Path, umask: int, file: int, folder: int) -> None:
-    path = tmp_path / "made" / "file.txt"
+    path, tensors = tmp_path / "made" / "file.txt", tmp_path / "made" / "file.safetensors"
     before = os.umask(umask)
     try:
         write_atomically(path, lambda temporary: temporary.write_text("x"))
+        save_tensors({"a": torch.zeros(2)}, {}, tensors)  # by a library that may replace the file
         assert os.umask(umask) == umask  # it is the process's own, which other threads share
     finally:
         os.umask(before)
-    assert stat.S_IMODE(path.stat().st_mode) == file
+    assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE(tensors.stat().st_mode) == file
     assert stat.S_IMODE(path.parent.stat().st_mode) == folder
 
 
@@ -372,3 +379,48 @@ def test_whoever_cannot_write_learns_what_to_do(tmp_path: Path, write: Callable[
         assert message.startswith(f"{path}: cannot write: "), message
         assert f"; {remedy}" in message
     assert {entry.name for entry in tmp_path.iterdir()} == {"file", "folder"}
+
+
+WRITERS: list[Callable[[Path], object]] = [
+    lambda path: write_text(path, "x"),
+    lambda path: write_unsynced(path, b"x"),
+    lambda path: link(Path(__file__), path),
+]
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_links_pipes_sockets_and_devices_are_not_replaced(tmp_path: Path, write: Callable[[Path], object]) -> None:
+    (tmp_path / "file").write_text("kept")
+    (tmp_path / "link").symlink_to("file")
+    (tmp_path / "dangling").symlink_to("absent")
+    os.mkfifo(tmp_path / "pipe")
+    names = ["link", "dangling", "pipe"]
+    with socket.socket(socket.AF_UNIX) as server:
+        handle = os.open(tmp_path, os.O_RDONLY)
+        server.bind(f"/proc/self/fd/{handle}/socket")  # whose names are short
+        os.close(handle)
+        names.append("socket")
+    with contextlib.suppress(PermissionError):  # root's alone
+        os.mknod(tmp_path / "null", stat.S_IFCHR | 0o666, os.makedev(1, 3))
+        names.append("null")
+    before = {name: os.lstat(tmp_path / name) for name in names}
+    for name in names:
+        with pytest.raises(NeecoError, match=rf"{name}: is a .*, not a file, and is not replaced; give another path"):
+            write(tmp_path / name)
+        after = os.lstat(tmp_path / name)
+        assert (after.st_ino, after.st_mode) == (before[name].st_ino, before[name].st_mode)
+    assert (tmp_path / "file").read_text() == "kept"
+    assert {entry.name for entry in tmp_path.iterdir()} == {"file", *names}
+
+
+@pytest.mark.parametrize("open_folder", [new_folder, own_folder])
+def test_a_pipe_is_no_folder_and_none_is_within_a_folder_of_ours(tmp_path: Path, open_folder: Any) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(NeecoError, match="pipe"), open_folder(tmp_path / "pipe"):
+        raise AssertionError
+    (tmp_path / "dangling").symlink_to("absent")
+    with pytest.raises(NeecoError, match="dangling"), open_folder(tmp_path / "dangling"):
+        raise AssertionError
+    assert stat.S_ISFIFO(os.lstat(tmp_path / "pipe").st_mode)
+    with pytest.raises(NeecoError, match="pipe: is a device, pipe or socket, not a file"), own_folder(tmp_path):
+        raise AssertionError

@@ -52,6 +52,7 @@ OPENED = {
 }  # no files of the user's
 ALLOWED = {
     "neeco.files": "holds the helpers",
+    "neeco.locks": "opens files of neeco's own",
     "neeco.placeholders": "holds the helpers",
     "neeco.ingest.cameras._sfm_worker": "a program of its own, which reads the job that its parent wrote",
     "neeco.ingest.cameras.sfm": "reads what its own worker wrote into a temporary folder",

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import re
+import stat
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -44,6 +45,15 @@ def cannot_write(path: Path, error: OSError) -> NeecoError:
     return NeecoError(f"{path}: cannot write: {error.strerror or error}; {remedy}")
 
 
+def require_replaceable(path: Path) -> None:
+    """Raise NeecoError where a file written to `path` would replace a link, a device, a pipe or a socket."""
+    with contextlib.suppress(OSError):  # nothing is there, or writing says why not
+        mode = path.lstat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            kind = "a symbolic link" if stat.S_ISLNK(mode) else "a device, pipe or socket"
+            raise NeecoError(f"{path}: is {kind}, not a file, and is not replaced; give another path, or remove it")
+
+
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write(temporary_path)` produce a file next to `path`, sync it to disk and rename it to `path`.
 
@@ -51,15 +61,18 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     what it did, or all of the new content. Raises NeecoError naming `path` when the disk refuses.
     """
     path = Path(path)
+    require_replaceable(path)
     try:
         _make_folders(path.parent)
         temporary, lock = begin_file(path)
+        mode = stat.S_IMODE(temporary.stat().st_mode)
     except OSError as error:
         raise cannot_write(path, error) from error
     if not LOCKING:
         os.close(lock)  # Windows renames no open file
     try:
         write(temporary)
+        temporary.chmod(mode)  # some libraries replace the file
         with open(temporary, "rb") as stream:
             os.fsync(stream.fileno())
         os.replace(temporary, path)
@@ -79,6 +92,7 @@ def write_unsynced(path: Path, content: bytes) -> None:
     For the many files of a folder that counts as complete only after `sync_disk`: a killed process leaves each whole or
     absent, a power cut may leave some empty. Raises NeecoError naming `path` when the disk refuses.
     """
+    require_replaceable(path)
     try:
         try:
             temporary, handle = begin_file(path)
@@ -178,12 +192,14 @@ def own_folder(path: Path, named: Path | None = None, wait_s: float = 0.0) -> It
 
 def sweep_unfinished(folder: Path) -> None:
     """Remove what killed processes left half-written in a folder that this process owns; folders have owners of their
-    own, and a file that is still being written is locked. Raises NeecoError where the folder holds a link out of it. On
-    Windows nothing is removed (see `own_folder`)."""
+    own, and a file that is still being written is locked. Raises NeecoError where the folder holds a link out of it, a
+    device or a pipe. On Windows nothing is removed (see `own_folder`)."""
     halves = []
     for entry in folder.rglob("*"):  # which follows no link
         if entry.is_symlink():
             require_inside(entry, folder)
+        else:
+            require_replaceable(entry)
         if LOCKING and entry.name.startswith(TEMPORARY):
             halves.append(entry)
     for entry in halves:
@@ -207,11 +223,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write `text` to `path` atomically (see `write_atomically`)."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_text(text, encoding="utf-8")
-
-    write_atomically(path, write)
+    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def write_json(path: Path, value: Any, indent: int | None = 1) -> None:

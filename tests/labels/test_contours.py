@@ -5,9 +5,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pycocotools import mask as coco_mask
 
-from neeco.labels.annotation import bounding_box, minimum_rectangle, outer_polygons, signed_area
+from neeco.labels.annotation import (
+    bounding_box,
+    exact_polygons,
+    minimum_rectangle,
+    outer_polygons,
+    shape_of,
+    signed_area,
+)
 from neeco.labels.drawing import without_part_islands, without_small_components
-from neeco.synthesis.writers.yolo import joined_polygon
+from neeco.synthesis.writers.yolo import joined_polygon, oriented_row
 
 masks = hnp.arrays(bool, st.tuples(st.integers(1, 14), st.integers(1, 14))).filter(lambda mask: mask.any())
 
@@ -86,12 +93,45 @@ def test_a_polygon_drawn_again_is_the_mask_with_few_corners():
     assert len(polygons[0]) < 40
 
 
+@given(masks)
+@settings(max_examples=150, deadline=None)
+def test_exact_polygons_read_back_as_the_mask_holes_too(mask):
+    polygons = exact_polygons(mask)
+    assert iou_with(polygons, mask) == 1.0
+    assert sum(map(signed_area, polygons)) == mask.sum()
+
+
+def test_nested_rings_are_exact():
+    rows, columns = np.mgrid[:61, :61]
+    rings = np.hypot(rows - 30, columns - 30).astype(int) % 8 < 4
+    assert iou_with(exact_polygons(rings), rings) == 1.0
+
+
 def test_pieces_joined_for_yolo_cover_the_same_pixels():
     mask = ellipse()
     mask[:, 35:42] = False
     polygons = outer_polygons(mask)
     assert len(polygons) == 2
     assert abs(signed_area(joined_polygon(polygons))) == pytest.approx(sum(map(signed_area, polygons)))
+
+
+def test_an_oriented_box_of_an_instrument_that_the_border_cuts_is_the_rectangle_of_its_visible_pixels():
+    rows, columns = np.mgrid[:60, :80]
+    mask = (np.abs(rows - 0.6 * columns + 5) < 9) & (columns < 50)
+    size = np.array([80, 60])
+    label = vars(shape_of(mask))
+    corners = np.array(oriented_row(label, size)).reshape(4, 2) * size
+    assert corners.min() < 0
+    assert corners == pytest.approx(minimum_rectangle(mask), abs=0.01)
+    assert corners - corners.mean(0) == pytest.approx(-np.roll(corners - corners.mean(0), 2, axis=0))  # a rectangle
+
+
+def test_an_oriented_box_that_ultralytics_would_reject_is_the_upright_box():
+    rows, columns = np.mgrid[:60, :80]
+    mask = np.abs(rows - 0.75 * columns) < 12  # from corner to corner
+    corners = np.array(oriented_row(vars(shape_of(mask)), np.array([80, 60]))).reshape(4, 2)
+    assert np.ptp(minimum_rectangle(mask), axis=0).max() > 80
+    assert corners.tolist() == [[0, 0], [1, 0], [1, 1], [0, 1]]
 
 
 def test_small_components_go_and_large_ones_stay():

@@ -44,9 +44,28 @@ def test_a_card_has_what_hubs_ask_for(made):
     assert "| 2 | rod | jaw |" in text
     info = json.loads((made / "dataset.json").read_text())
     assert info["scene_sha256"] in text
+    assert front["task_categories"] == [
+        "image-segmentation", "object-detection", "keypoint-detection", "depth-estimation",
+    ]  # fmt: skip
+    (line, *_) = map(json.loads, (made / "imagefolder/validation/metadata.jsonl").read_text().splitlines())
+    assert {"mask_file_name", "depth_file_name"} < set(line)
+    assert {"bbox", "keypoints", "pose"} < set(line["objects"])
     for name in made.iterdir():
         if name.name not in (".records", "README.md"):
             assert f"`{name.name}" in text
+
+
+def test_a_set_without_a_format_of_the_hub_trains_on_no_validation_image(run, tmp_path):
+    with torch_threads(1):
+        synthesize(run, tmp_path / "set", SETTINGS, ("coco",))
+    front, _ = front_and_text(tmp_path / "set")
+    (config,) = front["configs"]
+    found = {
+        item["split"]: {file.name for file in (tmp_path / "set").glob(item["path"])} for item in config["data_files"]
+    }
+    assert found["train"] == {f"{k:06d}.png" for k in range(4)}
+    assert found["validation"] == {"000004.png"}
+    assert front["task_categories"] == []  # the images are found alone
 
 
 def command_of(folder: Path) -> list[str]:

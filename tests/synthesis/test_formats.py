@@ -161,6 +161,9 @@ def test_imagefolder_has_a_line_for_every_image_and_mask(made: Path) -> None:
             line = json.loads(text)
             mask = pixels(folder / line["mask_file_name"]) > 0
             assert pixels(folder / line["file_name"]).shape == (48, 64, 3)
+            for plane, of in (("parts", "parts"), ("ignore", "ignore"), ("depth", "depth")):
+                original = made / of / line["file_name"]
+                assert (folder / line[f"{plane}_file_name"]).read_bytes() == original.read_bytes()
             objects = line["objects"]
             assert len({len(values) for values in objects.values()}) == 1
             assert mask.sum() == sum(objects["area"])

@@ -253,7 +253,14 @@ def test_a_run_killed_before_its_first_whole_file_begins_again(capture: Path, tm
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("window", "[1.5]"), ("window", "[[1, 2, 3]]"), ("window", "3"), ("window", '[["a", {}]]'), ("scene", '{"a": 1}')],
+    [
+        ("window", "[1.5]"),
+        ("window", "[[1, 2, 3]]"),
+        ("window", "3"),
+        ("window", '[["a", {}]]'),
+        ("window", "[[NaN, 1]]"),
+        ("scene", '{"a": 1}'),
+    ],
 )
 def test_a_checkpoint_whose_fields_do_not_fit_is_refused(
     field: str, value: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -269,6 +276,19 @@ def test_a_checkpoint_whose_fields_do_not_fit_is_refused(
     save_file(tensors, path, {"neeco": json.dumps(header)})
     with pytest.raises(NeecoError, match=r"session.safetensors: cannot resume from this checkpoint"):
         train(capture, tmp_path / "run", CONFIG, resume=True)
+
+
+@pytest.mark.parametrize("number", [1e30, float("inf"), float("nan")])
+def test_a_checkpoint_of_impossible_numbers_is_refused(number: float, capture: Path, tmp_path: Path) -> None:
+    train(capture, tmp_path / "run", CONFIG)
+    path = checkpoint_path(tmp_path / "run")
+    with safe_open(path, framework="pt") as stream:
+        header, tensors = stream.metadata(), {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+    changed = next(name for name in tensors if name.startswith("adam/") and tensors[name].is_floating_point())
+    for name in ("statistics/total", changed):
+        save_file(tensors | {name: torch.full_like(tensors[name], number)}, path, header)
+        with pytest.raises(NeecoError, match=f"session.safetensors: cannot resume .*{name} contains NaN"):
+            read_checkpoint(tmp_path / "run")
 
 
 def test_rows_that_a_full_disk_cut_off_are_written_again(capture: Path, tmp_path: Path) -> None:

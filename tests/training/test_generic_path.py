@@ -12,6 +12,7 @@ from capture_files import write_capture, write_grasper
 from neeco.capture import read_capture
 from neeco.raster import kernels
 from neeco.raster.native import Family
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.method_registry import methods
 from neeco.scene.training_session import Session
 from neeco.scene.training_views import TrainingViews
@@ -68,3 +69,10 @@ def test_sixty_steps_agree(method: str, tmp_path: Path) -> None:
         assert float(apart.max()) < 256 * 2**-24 * 100
     assert float(plain[-20:].mean()) == pytest.approx(float(native[-20:].mean()), rel=5e-3)
     assert float(native[-20:].mean()) < 0.97 * float(native[:20].mean())  # and they learn
+
+
+def test_no_instrument_begins_with_more_gaussians_than_it_may_have(tmp_path: Path) -> None:
+    """Carved are 300 seeds, for at most 60."""
+    session = begun("kinematic", tmp_path / "capture")
+    assert isinstance(session.scene, GaussianScene)
+    assert session.scene.canonical.counts[1:] == (60,)

@@ -176,3 +176,14 @@ def test_the_documentations_page_is_of_this_code_and_version() -> None:
     wasm = re.search(r'id="wasm">(.*?)</script>', page)
     assert wasm is not None
     assert zlib.decompress(base64.b64decode(wasm[1])) == (folder / "viewer.wasm").read_bytes()
+
+
+def test_numbers_that_are_not_finite_are_in_no_page() -> None:
+    scene = make_scene("kinematic")
+    header, planes = pack(scene, 3)
+    header["light"]["falloff"][0] = float("inf")
+    with pytest.raises(NeecoError, match="--export: the scene holds numbers that are not finite"):
+        page_of(header, planes, "title", [])
+    scene.canonical.means[0] = torch.nan
+    with pytest.raises(NeecoError, match="--export: the scene holds numbers that are not finite"):
+        pack(scene, 3)

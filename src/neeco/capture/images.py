@@ -29,6 +29,7 @@ warnings.simplefilter("error", Image.DecompressionBombWarning)
 REPEATED_MEAN, REPEATED_MAX = 0.2, 24
 VISIBLE_MM, VISIBLE_RAD = 1.0, 0.03  # changes that a picture shows: of a position; of an angle, or a rotation's entries
 PNG_NONE, PNG_SUB, PNG_AVERAGE = 8, 16, 64  # filters of a PNG's rows: the best of labels, of depths, and of images
+FORMATS = ("PNG", "JPEG")  # that are opened, whatever a file's name says: Pillow's other decoders stay unused
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
@@ -85,10 +86,11 @@ def read_labels(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     return torch.from_numpy(np.array(image, dtype=np.uint8))
 
 
-def open_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
-    """An image file, decoded, in its own mode. `size`: (width, height) it must have. Raises NeecoError."""
+def open_image(path: Path, size: tuple[int, int] | None = None, formats: tuple[str, ...] = FORMATS) -> Image.Image:
+    """An image file, decoded, in its own mode. `size`: (width, height) it must have. Raises NeecoError, also for other
+    `formats` than Pillow's of these names."""
     path = Path(path)
-    with _opened(path) as image:
+    with _opened(path, formats) as image:
         if size is not None and image.size != tuple(size):  # before its pixels, of which there may be billions
             found, wanted = "x".join(map(str, image.size)), "x".join(map(str, size))
             raise NeecoError(f"{path}: image is {found}, its camera says {wanted}; resize it or correct w and h")
@@ -190,18 +192,20 @@ def _write(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
+def _opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Image.Image]:
     """An image file for the block, not yet decoded. Raises NeecoError when it cannot be read there."""
     try:
         require_file(path, "an image")
-        with Image.open(path) as image:
+        with Image.open(path, formats=formats) as image:
             yield image
     except (NeecoError, MemoryError):
         raise
     except FileNotFoundError as error:
         raise NeecoError(f"{path}: no such file") from error
     except Image.UnidentifiedImageError as error:
-        raise NeecoError(f"{path}: not an image file; expected PNG or JPEG") from error
+        raise NeecoError(
+            f"{path}: not an image file that is read; expected {' or '.join(formats)}: convert or replace it"
+        ) from error
     # damaged files make pillow's decoders raise nearly anything: SyntaxError, struct.error, ValueError, EOFError ...
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__

@@ -19,7 +19,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from neeco.errors import NeecoError
-from neeco.files import finite, new_folder, write_json
+from neeco.files import finite, new_folder, require_replaceable, write_json
 from neeco.settings import described, field_texts, value_words
 
 if TYPE_CHECKING:
@@ -158,6 +158,7 @@ def ready_for_json(path: Path | None) -> Iterator[None]:
         raise NeecoError(f"--json: {file} is a folder; name a file")
     if file is not None:
         require_ending("--json", file, ".json")
+        require_replaceable(file)
     with nullcontext() if file is None else new_folder(file.parent):
         yield
 

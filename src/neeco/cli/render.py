@@ -9,7 +9,7 @@ import tyro
 
 from neeco.errors import NeecoError
 from neeco.settings import Device
-from neeco.synthesis.settings import AS_RECORDED, ImageSettings
+from neeco.synthesis.settings import AS_RECORDED, MAX_IMAGES, ImageSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +53,8 @@ def run(arguments: Arguments) -> int:
         require_pyav()
     elif arguments.frames is not None:
         raise NeecoError("--frames: goes with --video; leave it out")
-    if arguments.frames is not None and arguments.frames < 2:
-        raise NeecoError(f"--frames: {arguments.frames} is no path; give at least 2")
+    if arguments.frames is not None and not 2 <= arguments.frames <= MAX_IMAGES:
+        raise NeecoError(f"--frames: {arguments.frames} is no path; give 2 to {MAX_IMAGES:,}")
     with open_run(arguments.run, device_of(arguments.device), force=arguments.force) as trained:
         if arguments.states is not None:
             views, folder = state_views(trained.scene, arguments.states), STATES_FOLDER

@@ -42,7 +42,8 @@ class Shape:
     area: int  # px
     box: tuple[int, int, int, int]  # x, y, width, height, of the extreme pixels
     rectangle: list[list[float]]  # 4 corners of the minimum-area rectangle
-    polygons: list[list[list[float]]]  # outer contours, largest first
+    polygons: list[list[list[float]]]  # outer contours, simplified, largest first
+    segmentation: list[list[list[float]]]  # polygons that cover exactly its pixels
 
 
 class Keypoint(NamedTuple):
@@ -123,8 +124,8 @@ def shape_of(mask: np.ndarray) -> Shape | None:
     rectangle = minimum_rectangle(mask)
     if rectangle is None:
         return None
-    polygons = [_rounded(polygon, 2) for polygon in outer_polygons(mask)]
-    return Shape(cv2.countNonZero(mask.view(np.uint8)), bounding_box(mask), _rounded(rectangle, 2), polygons)
+    polygons, exact = ([_rounded(polygon, 2) for polygon in find(mask)] for find in (outer_polygons, exact_polygons))
+    return Shape(cv2.countNonZero(mask.view(np.uint8)), bounding_box(mask), _rounded(rectangle, 2), polygons, exact)
 
 
 def visibility(visible: np.ndarray, unoccluded: np.ndarray) -> float:
@@ -231,8 +232,18 @@ def minimum_rectangle(mask: np.ndarray) -> np.ndarray | None:
 
 def outer_polygons(mask: np.ndarray) -> list[np.ndarray]:
     """Return the simplified outer contour [P, 2] (x, y) of every component of a mask, largest first."""
-    polygons = [_simplified(loop) for loop in _outer_loops(mask)]
+    polygons = [_simplified(loop) for loop in _outer_loops(mask)[0]]
     return sorted(polygons, key=lambda polygon: -abs(signed_area(polygon)))
+
+
+def exact_polygons(mask: np.ndarray) -> list[np.ndarray]:
+    """Return polygons [P, 2] (x, y) on pixel edges that together cover exactly the pixels of a mask, which is cut below
+    the top row of every hole: no piece has one."""
+    loops, cuts = _outer_loops(mask)
+    if cuts:
+        bands = zip([0, *cuts], np.split(mask, cuts), strict=True)
+        loops = [loop + np.array([0, top]) for top, band in bands for loop in _outer_loops(band)[0]]
+    return [_approximated(loop, 1e-6) for loop in loops]  # without collinear corners
 
 
 def signed_area(polygon: np.ndarray) -> float:
@@ -241,15 +252,16 @@ def signed_area(polygon: np.ndarray) -> float:
     return float(0.5 * np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]))
 
 
-def _outer_loops(mask: np.ndarray) -> list[np.ndarray]:
-    """Return a closed loop of corners [P, 2] (x, y) about every (edge-connected) component of a mask, on pixel edges.
+def _outer_loops(mask: np.ndarray) -> tuple[list[np.ndarray], list[int]]:
+    """Return a closed loop of corners [P, 2] (x, y) about every (edge-connected) component of a mask, on pixel edges,
+    and the rows below the top rows of its holes, sorted.
 
     OpenCV's contours join pixel centres, and pixels that touch at a corner only. In a magnified mask every centre has
     one nearest corner; where two pixels touch at a corner only, the touching ones are cut away.
     """
     x, y, width, height = bounding_box(mask)
     if not width:
-        return []
+        return [], []
     inside = mask[y : y + height, x : x + width].astype(np.uint8)
     fine = inside.repeat(MAGNIFICATION, 0).repeat(MAGNIFICATION, 1)
     upper_left, upper_right = inside[:-1, :-1], inside[:-1, 1:]
@@ -258,15 +270,16 @@ def _outer_loops(mask: np.ndarray) -> list[np.ndarray]:
     for row, column in MAGNIFICATION * (np.argwhere(touching) + 1):
         fine[row - 1 : row + 1, column - 1 : column + 1] = 0
     contours, hierarchy = cv2.findContours(fine, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    loops = []
+    loops, holes = [], set()
     for contour, (*_, parent) in zip(contours[::-1], hierarchy[0][::-1], strict=True):
-        if parent >= 0:  # a hole
+        if parent >= 0:  # a hole, along the pixels about it
+            holes.add(y + int(contour[:, 0, 1].min() + 1) // MAGNIFICATION + 1)
             continue
         corners = (contour[::-1, 0] + MAGNIFICATION // 2) // MAGNIFICATION  # clockwise in the image
         corners = corners[(corners != np.roll(corners, 1, axis=0)).any(1)]
         first = np.lexsort(corners.T)[0]  # the leftmost of the top row
         loops.append(np.roll(corners, -first, axis=0) + np.array([x, y], dtype=float))
-    return loops
+    return loops, sorted(holes)
 
 
 def _simplified(loop: np.ndarray) -> np.ndarray:

@@ -15,8 +15,8 @@ from PIL import Image
 from torch import Tensor
 
 import neeco
+from neeco.capture.images import open_image
 from neeco.capture.model import Capture
-from neeco.errors import NeecoError
 from neeco.evaluation.image_metrics import difference_map, to_uint8
 from neeco.files import write_text
 
@@ -65,11 +65,7 @@ def jpeg(pixels: np.ndarray) -> str:
 
 def preview_uri(path: Path) -> str:
     """The file of a preview of synthesised images as a data URI. Raises NeecoError when it cannot be read."""
-    try:
-        with Image.open(path) as image:
-            return _data_uri(image.convert("RGB"), "JPEG", PREVIEW_WIDTH, quality=86)
-    except (OSError, SyntaxError, ValueError) as error:
-        raise NeecoError(f"{path}: synthesis preview: cannot be read: {error}") from error
+    return _data_uri(open_image(path).convert("RGB"), "JPEG", PREVIEW_WIDTH, quality=86)
 
 
 def _data_uri(image: Image.Image, form: str, max_width: int = MAX_WIDTH, **options: Any) -> str:

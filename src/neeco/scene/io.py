@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,8 @@ ADDED_SINCE = {"base_corrections", "anchors", "weights", "lengths"}  # that file
 MAX_REASON = 200  # characters of an error's message
 MAX_PIXELS = 2**26  # of a recorded image
 MAX_NUMBER = 1e9  # mm, rad, s or px: larger numbers are damage
+# what stands for unknown in a tensor of that name: not every shaft has a known end
+UNKNOWN = {"wrist_start": -math.inf, "radius": math.inf, "closed": math.nan, "tips": math.nan}
 # errors that reading a damaged file raises; endless nesting is a RuntimeError
 DAMAGED = (SafetensorError, OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, OverflowError)
 HEADER = {  # fields of every scene's header, whatever its method
@@ -150,6 +152,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Drawable
     if HALVES.search(json.dumps(header, ensure_ascii=False)):
         raise ValueError("its header holds an unpaired surrogate character")
     instruments, recorded = _recording(tensors, header)
+    require_numbers(tensors)
     method = header["method"] = current_name(header["method"])
     settings = method_settings(method, without_removed(header["deformation"]))
     kind = method_class(method)
@@ -162,11 +165,21 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Drawable
     may_lack = ADDED_SINCE | (ADDED if header.get("schema") == OLD_SCHEMA else set())
     module = {n: t for n, t in scene.state_dict().items() if n.rsplit(".", 1)[-1] in may_lack} | module
     scene.load_state_dict(module)
-    for name, parameter in scene.named_parameters():  # buffers may be infinite: not every shaft has a known end
-        if not torch.isfinite(parameter).all():
-            raise ValueError(f"{name} contains NaN or infinity")
+    json.dumps(header, allow_nan=False)  # raises ValueError for NaN and infinity
     scene.requires_grad_(False)
     return scene
+
+
+def require_numbers(tensors: Mapping[str, Tensor]) -> None:
+    """Raise ValueError for a tensor that holds a number that cannot be learned, other than its UNKNOWN."""
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point():
+            unknown = UNKNOWN.get(name.rpartition(".")[2])
+            known = tensor.abs() <= MAX_NUMBER
+            if unknown is not None:
+                known |= tensor.isnan() if math.isnan(unknown) else tensor == unknown
+            if not known.all():
+                raise ValueError(f"{name} contains NaN, infinity or a number beyond {MAX_NUMBER:g}")
 
 
 def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tuple[Instrument, ...], Recorded]:

@@ -12,6 +12,7 @@ import yaml
 
 from neeco.files import write_text
 from neeco.synthesis.settings import ImageSettings, Settings
+from neeco.synthesis.writers.folder import split_of
 from neeco.synthesis.writers.hub import SPLITS, ImageFolder, WebDataset
 
 CARD = "README.md"
@@ -76,18 +77,22 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
     annotated = "annotates" in info["settings"]
     title = f"{'Recorded' if annotated else 'Synthetic'} images of surgical instruments, labelled"
     suffix = "png" if info["settings"].get("quality") is None else "jpg"
-    config: dict[str, Any] = {
-        "config_name": "default",
-        "data_files": f"images/*.{suffix}",
-    }  # what the hub's viewer shows
+    digits = {k: "".join(str(digit) for digit in range(10) if split_of(digit) == k) for k in info["splits"]}
+    paths = {k: f"images/*[{last}].{suffix}" for k, last in digits.items()}  # the index's last digit decides
+    tasks = [task for task in TASKS if info["keypoints"] or task != "keypoint-detection"]
+    config: dict[str, Any] = {"config_name": "default"}  # what `datasets.load_dataset` and the hub's viewer show
     if ImageFolder.format in info["formats"]:
-        config = {"config_name": "default", "data_dir": ImageFolder.format}
-    elif WebDataset.format in info["formats"]:
-        config["data_files"] = [{"split": SPLITS[k], "path": f"{WebDataset.format}/{k}-*.tar"} for k in info["splits"]]
+        config["data_dir"] = ImageFolder.format
+    else:
+        if WebDataset.format in info["formats"]:
+            paths = {k: f"{WebDataset.format}/{k}-*.tar" for k in info["splits"]}
+        else:
+            tasks = []  # that configuration has images alone
+        config["data_files"] = [{"split": SPLITS[k], "path": path} for k, path in paths.items()]
     front = {
         "license": "unknown",
         "pretty_name": title,
-        "task_categories": TASKS,
+        "task_categories": tasks,
         "tags": TAGS if annotated else [*TAGS, "synthetic"],
         "size_categories": [next((name for name, limit in SIZES.items() if info["images"] < limit), "n>10M")],
         "configs": [config],

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from neeco.capture.images import open_image
 from neeco.capture.model import evenly_spaced
 from neeco.evaluation.image_metrics import PART_COLORS, outline, part_color
 from neeco.files import write_atomically
@@ -46,10 +47,8 @@ def write_preview(
 
 def draw_tile(root: Path, record: Record, bones: Sequence[tuple[str, str]] = ()) -> Image.Image:
     """Return one image, beside it the same with its labels, and a caption below; `bones` join keypoints."""
-    with Image.open(root / record["image"]) as stored:
-        pixels = np.asarray(stored.convert("RGB"), dtype=float)
-    with Image.open(root / "parts" / f"{stem(record['index'])}.png") as stored:
-        parts = np.asarray(stored)
+    pixels = np.asarray(open_image(root / record["image"]).convert("RGB"), dtype=float)
+    parts = np.asarray(open_image(root / "parts" / f"{stem(record['index'])}.png"))
     scale = TILE_WIDTH / pixels.shape[1]
     size = (TILE_WIDTH, round(pixels.shape[0] * scale))
     image = np.asarray(Image.fromarray(pixels.astype(np.uint8)).resize(size, Image.Resampling.LANCZOS), dtype=float)

@@ -15,13 +15,14 @@ from neeco.settings import structure
 LabelWay = Literal["composited", "threshold"]
 Views = Literal["recorded", "perturbed", "orbit"]
 FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")  # of our own writers
-DEFAULT_FORMATS = ("coco", "yolo")
+DEFAULT_FORMATS = ("coco", "yolo", "imagefolder")  # the last for `datasets.load_dataset` of the folder
 WRITERS = "neeco.writers"  # the group of entry points of others'
 PATH_PREFIX = "path:"
 SIZE = re.compile(r"[1-9]\d{0,5}[xX][1-9]\d{0,5}")
 SAMPLERS = ("interpolate", "extrapolate", "grid")  # values of `states` other than a file
 
 MAX_PIXELS = 2**26  # of an image
+MAX_IMAGES = 10**6  # of a data set: their names have six digits
 JPEG_QUALITY = 95  # of 100, by default
 
 MIN_TRUST = 0.8  # of a recorded frame's label, below which `annotate` does not write it
@@ -182,6 +183,10 @@ class Settings(ImageSettings):
             raise NeecoError(f"--min-share: {self.min_share} is not a share; give 0 to 1")
         if self.count < 1:
             raise NeecoError(f"--count: {self.count} images is nothing to make; give at least 1")
+        if self.count > MAX_IMAGES:
+            raise NeecoError(
+                f"--count: {self.count} is more than {MAX_IMAGES:,}; make several data sets, each with --seed"
+            )
         if self.seed < 0:
             raise NeecoError(f"--seed: {self.seed} is negative; give 0 or more")
         if self.max_attempts < 1:

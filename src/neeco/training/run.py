@@ -33,7 +33,7 @@ from neeco.files import (
 )
 from neeco.scene.drawable import DrawableScene
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
-from neeco.scene.io import DAMAGED, load_scene, pack_scene, save_tensors, unpack_scene
+from neeco.scene.io import DAMAGED, load_scene, pack_scene, require_numbers, save_tensors, unpack_scene
 from neeco.scene.method_registry import current_name, without_removed
 from neeco.scene.training_session import Session, StepResult, members
 from neeco.training.config import TrainConfig, check_ranges, config_from_dict, config_to_dict, method_defaults
@@ -239,7 +239,10 @@ def read_checkpoint(run: Path) -> tuple[DrawableScene, dict[str, Any], dict[str,
             scene = unpack_scene(parts, header["scene"])
         except NeecoError as error:  # which knows no file
             raise ValueError(str(error)) from None
-    return scene, header, {name: t for name, t in tensors.items() if not name.startswith("scene/")}
+        others = {name: t for name, t in tensors.items() if not name.startswith("scene/")}
+        require_numbers(others)
+        json.dumps(header, allow_nan=False)  # raises ValueError for NaN and infinity
+    return scene, header, others
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from neeco.capture.model import Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError, memory_failure
 from neeco.files import cannot_write, own_folder, read_begun, read_text, require_same, write_json, write_text
-from neeco.scene.io import pack_scene, save_scene
+from neeco.scene.io import pack_scene, require_numbers, save_scene
 from neeco.scene.method_registry import method_class, unmet_need
 from neeco.scene.training_session import Session, StepResult
 from neeco.scene.training_views import TrainingViews, mean_pixels
@@ -240,15 +240,14 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
 
 
 def _check_finite(session: Session) -> None:
-    """Raise NeecoError when a learned number is not finite."""
-    # buffers may be infinite: an unknown wrist starts at minus infinity
-    buffers = {f"module.{name}" for name, _ in session.scene.named_buffers()}
-    tensors = pack_scene(session.scene)[0]
-    if not all(bool(torch.isfinite(tensor).all()) for name, tensor in tensors.items() if name not in buffers):
+    """Raise NeecoError when a learned number is not finite, or too large to be read again."""
+    try:
+        require_numbers(pack_scene(session.scene)[0])
+    except ValueError as error:
         raise NeecoError(
-            f"training: the scene diverged: it holds numbers that are not finite after {session.iteration} iterations; "
+            f"training: the scene diverged: {error} after {session.iteration} iterations; "
             "train anew with another --seed or a milder schedule"
-        )
+        ) from None
 
 
 @contextmanager

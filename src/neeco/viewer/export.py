@@ -45,6 +45,7 @@ EMBEDDED_DEGREE = 1  # in a report: half the size, and for a first look
 MAX_INSTRUMENTS, MAX_AXES, MAX_LABELS = 8, 8, 32  # that the page's rasteriser has room for; axes of one instrument
 THINNEST_MM = 0.01  # thinner than any pixel
 POSITION_STEPS = 2**20 - 1  # of a body's box: 2**16 change the order in depth of neighbours, which costs 5 dB
+NOT_FINITE = "--export: the scene holds numbers that are not finite; train again"
 BYTES = {"uint8": 1, "int8": 1, "uint16": 2, "uint24": 3}
 SCORES = (
     ("psnr", "PSNR", "{:.1f} dB"),
@@ -101,6 +102,10 @@ def page_of(header: dict[str, Any], planes: bytes, title: str, facts: list[tuple
     """The whole page; facts: (name, value) of what it says of itself. Everything that comes from the run is escaped, or
     packed so that it holds no markup."""
     script, style = _source(*SCRIPTS), _source(STYLE)
+    try:
+        head = json.dumps(header, separators=(",", ":"), allow_nan=False)
+    except ValueError:
+        raise NeecoError(NOT_FINITE) from None
     return (
         _templates()
         .get_template("page.html")
@@ -113,7 +118,7 @@ def page_of(header: dict[str, Any], planes: bytes, title: str, facts: list[tuple
             worker=Markup(_source(WORKER)),
             script_hash=Markup(_hash(script)),
             style_hash=Markup(_hash(style)),
-            head=_deflated(json.dumps(header, separators=(",", ":"), allow_nan=False).encode()),
+            head=_deflated(head.encode()),
             scene=_deflated(planes),
             wasm=_deflated(files(__package__).joinpath(WASM).read_bytes()),
         )
@@ -252,6 +257,8 @@ def _quantized(values: Tensor, steps: int) -> tuple[np.ndarray, list[float]]:
 
 
 def _rounded(values: Tensor) -> np.ndarray:
+    if not values.isfinite().all():
+        raise NeecoError(NOT_FINITE)
     return np.rint(values.double().cpu().numpy()).astype(np.int64)
 
 

@@ -1,7 +1,8 @@
 """`neeco export`: a scene in one state, as files that other viewers of Gaussians open.
 
 They know neither joints nor lamps nor labels: instruments stand still, and the light is baked into the colours as one
-camera has it. Coordinates are those of the capture's world (mm); viewers take their own view of which way is up.
+camera has it. Coordinates are those of the capture's world (mm), right, down and front by the custom of PLY; in SPZ,
+whose axes are right, up and back, and in OpenUSD with y up they are turned about x by 180 degrees, so that all overlay.
 """
 
 from __future__ import annotations
@@ -33,9 +34,11 @@ if TYPE_CHECKING:
 
 Format = Literal["ply", "spz"]
 DIRECTIONS = 64  # by which harmonics are rotated: four times as many as there are harmonics
+MIN_SCALE = 1e-30  # mm: the logarithm of 0 is no number of a file
 SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 2
 SPZ_FRACTION = 12  # bits of a mm: positions reach 2 m
 SPZ_COLOR = 0.15  # of the first harmonic, per unit of what is stored
+SPZ_TURNED = (1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)  # signs of harmonics whose y and z are negated
 SPZ_STEPS = (8, 16, 16)  # of 256, by which harmonics of degree 1, 2 and 3 are rounded
 
 
@@ -75,7 +78,12 @@ def splats_of(scene: GaussianScene, state: State, camera: Camera) -> Splats:
         in_camera = (posed.means - view[:3, 3]) @ view[:3, :3]
         sh = brightened(sh, headlight_factor(posed.headlight, camera, in_camera)[:, None, None])
     opacities = posed.opacities.clamp(1e-6, 1 - 1e-6)
-    tensors = (posed.means, normalize(posed.quats, dim=1), posed.scales.log(), torch.logit(opacities), sh)
+    scales = posed.scales.clamp_min(MIN_SCALE).log()
+    tensors = (posed.means, normalize(posed.quats, dim=1), scales, torch.logit(opacities), sh)
+    if not all(bool(tensor.isfinite().all()) for tensor in tensors):
+        raise NeecoError(
+            "the scene has Gaussians that are not finite in this state; give another state, or train again"
+        )
     return Splats(*(tensor.float().cpu().numpy() for tensor in tensors))
 
 
@@ -101,6 +109,9 @@ def ply_bytes(splats: Splats) -> bytes:
 
 def spz_bytes(splats: Splats) -> bytes:
     """Niantic's SPZ, version 2: about a tenth of the size of PLY. Raises NeecoError where positions leave its range."""
+    turn = np.array([1, -1, -1], np.float32)
+    sh = splats.sh * np.array(SPZ_TURNED[: splats.sh.shape[1]], np.float32)[:, None]
+    splats = replace(splats, means=splats.means * turn, quats=splats.quats * np.append(1, turn), sh=sh)
     fixed = np.rint(splats.means.astype(np.float64) * 2**SPZ_FRACTION).astype(np.int64)
     if fixed.size and np.abs(fixed).max() >= 2**23:
         raise NeecoError("--format: spz holds positions within 2 m of the world's origin only; use ply")
@@ -170,6 +181,7 @@ def write_usd(splats: Splats, path: Path) -> None:
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, Sdf.Path(PRIM))
     stage.SetDefaultPrim(field.GetPrim())
+    field.AddRotateXOp().Set(180.0)
     scales = np.exp(splats.log_scales)
     reach = EXTENT_SD * scales.max(1, keepdims=True)
     extent = np.stack([(splats.means - reach).min(0), (splats.means + reach).max(0)])

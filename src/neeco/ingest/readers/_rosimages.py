@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from neeco.capture.documents import printable
+from neeco.capture.images import FORMATS
 from neeco.errors import NeecoError, counted
 from neeco.ingest.calibration.camera_fields import cameras_in
 from neeco.ingest.calibration.stereo import RosCamera
@@ -24,7 +25,6 @@ from neeco.ingest.readers._bagfile import open_bag, plain
 MAX_PIXELS = 90_000_000  # of an image, as for files of images
 MAX_SKIPPED = 30  # images that are read and dropped rather than sought over
 MIN_IMAGES = 2
-COMPRESSED = ("JPEG", "PNG")
 # encoding -> bytes a pixel, OpenCV's conversion to RGB (None: it is RGB)
 ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
@@ -92,7 +92,7 @@ class ImageLog:
     def _inspect_compressed(self, message: Any) -> str | None:
         data = message.data
         try:
-            with Image.open(BytesIO(data), formats=COMPRESSED) as image:
+            with Image.open(BytesIO(data), formats=FORMATS) as image:
                 size, mode, kind = image.size, image.mode, str(image.format)
                 if kind == "PNG":
                     image.verify()
@@ -112,7 +112,7 @@ class ImageLog:
 def decode(message: Any) -> np.ndarray:
     """Return uint8 [H, W, 3] RGB of an Image or a CompressedImage that `ImageLog` found usable."""
     if not hasattr(message, "encoding"):
-        with Image.open(BytesIO(message.data), formats=COMPRESSED) as image:
+        with Image.open(BytesIO(message.data), formats=FORMATS) as image:
             return np.array(image.convert("RGB"))
     channels, conversion = ENCODINGS[message.encoding]
     rows = message.data[: message.step * message.height].reshape(message.height, message.step)

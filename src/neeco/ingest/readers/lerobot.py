@@ -22,6 +22,7 @@ import numpy as np
 from PIL import Image
 
 from neeco.capture.documents import printable
+from neeco.capture.images import FORMATS
 from neeco.errors import NeecoError
 from neeco.ingest.readers import (
     IMAGES,
@@ -267,7 +268,7 @@ def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np
     if cell is None:
         raise NeecoError(f"{where}: has no image in it; write the data set with its images")
     try:
-        with Image.open(BytesIO(cell), formats=("PNG", "JPEG")) as image:
+        with Image.open(BytesIO(cell), formats=FORMATS) as image:
             if image.size[0] * image.size[1] > MAX_PIXELS:
                 raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
             pixels = np.array(image.convert("RGB"))

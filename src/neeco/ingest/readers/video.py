@@ -12,14 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
-from neeco.capture.images import open_image
+from neeco.capture.images import FORMATS, open_image
 from neeco.errors import NeecoError, install_hint
 from neeco.files import require_content, visible_entries
 from neeco.ingest.readers import VideoSource, numbers, read_table
 from neeco.ingest.readers.columns import recognise_time, scale_of
+from neeco.placeholders import read_head
 
-IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+FURTHER_FORMATS = {".bmp": "BMP", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}  # opened under these names alone
+IMAGES = (".png", ".jpg", ".jpeg", *FURTHER_FORMATS)
 MIN_IMAGES = 2
 SQUARE = 0.005  # by which a square pixel's width and height may differ: 1 px of 200
 MAX_RATE = 1000.0  # frames a second, beyond which a file's own number is no rate
@@ -70,7 +73,7 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     sizes: list[tuple[int, int] | None] = []
     for file in files:
         try:
-            sizes.append(open_image(file).size)
+            sizes.append(_open(file).size)
         except NeecoError:
             sizes.append(None)
     known = Counter(size for size in sizes if size is not None)
@@ -85,6 +88,11 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     notes += _left_out(folder, "cannot be read", bad) + _left_out(folder, "are of another size", other)
     usable = [index for index, found in enumerate(sizes) if found == size]
     return ImageFiles(folder, size, tuple(notes), stamps[usable], files=tuple(files[i] for i in usable))
+
+
+def _open(file: Path) -> Image.Image:
+    further = FURTHER_FORMATS.get(file.suffix.lower())
+    return open_image(file, formats=FORMATS if further is None else (*FORMATS, further))
 
 
 def _are_few(count: int, total: int) -> bool:
@@ -127,7 +135,7 @@ class ImageFiles(VideoSource):
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         for index in sorted({int(i) for i in indices}):
             try:
-                pixels = np.array(open_image(self.files[index]).convert("RGB"))
+                pixels = np.array(_open(self.files[index]).convert("RGB"))
             except NeecoError as error:
                 raise NeecoError(f"{self.files[index]}: cannot be read any more; do not change the images") from error
             if pixels.shape[1::-1] != self.size:
@@ -209,7 +217,7 @@ class _Scan:
         try:
             container = av.open(str(self.path))
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            if self.path.is_file() and self.path.open("rb").read(132)[128:] == b"DICM":
+            if read_head(self.path, 132)[128:] == b"DICM":
                 raise NeecoError(
                     f"{self.path}: is DICOM; take the video stream out of it first, by pydicom: next(pydicom.encaps."
                     "generate_frames(dataset.PixelData, number_of_frames=1)) is the content of a video file"

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
@@ -121,7 +122,8 @@ def _with_instruments(
             seeds, logits = start_hinges(
                 session, articulation, evidence, instrument.name, shape, axes, columns=columns, generator=generator
             )
-        bodies.append(seed_instrument(seeds, shape.radius).with_extras(**{LINK_LOGITS: logits}))
+        chosen = evenly_spaced(len(seeds), session.limits[1])
+        bodies.append(seed_instrument(seeds[chosen], shape.radius).with_extras(**{LINK_LOGITS: logits[chosen]}))
     return join_bodies(bodies)
 
 

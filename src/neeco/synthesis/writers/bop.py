@@ -15,10 +15,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from neeco.capture.images import encoded_png, read_labels
+from neeco.capture.images import encoded_png, open_image, read_labels
 from neeco.capture.model import InstrumentState, State
 from neeco.files import write_json, write_unsynced
 from neeco.geometry.camera import Camera
@@ -85,8 +84,7 @@ def _masks(images: WrittenImages, folder: Path, record: Record) -> list[dict[str
     name, width, height = stem(record["index"]), record["width"], record["height"]
     parts = read_labels(root / "parts" / f"{name}.png").numpy()
     bits = read_labels(root / "silhouettes" / f"{name}.png").numpy()
-    depth = cv2.imread(str(root / "depth" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
-    assert depth is not None
+    depth = np.asarray(open_image(root / "depth" / f"{name}.png"))
     given = {item["name"]: InstrumentState(item["pose"], item["joints"]) for item in record["instruments"]}
     fx, fy, cx, cy = (record["intrinsics"][key] for key in INTRINSICS)
     pose = swap_camera_axes(np.array(record["camera"]))

@@ -92,7 +92,7 @@ def _annotation(record: Record, shape: dict[str, Any], category: int) -> dict[st
     return {
         "image_id": record["index"] + 1,
         "category_id": category,
-        "segmentation": [np.ravel(polygon).tolist() for polygon in shape["polygons"]],
+        "segmentation": [np.ravel(polygon).tolist() for polygon in shape["segmentation"]],
         "bbox": shape["box"],
         "area": shape["area"],
         "iscrowd": 0,

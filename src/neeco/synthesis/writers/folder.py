@@ -21,7 +21,15 @@ import torch
 from neeco.capture.images import encoded_image, encoded_png
 from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.errors import NeecoError
-from neeco.files import read_bytes, read_json_lines, read_text, write_atomically, write_text, write_unsynced
+from neeco.files import (
+    read_bytes,
+    read_json_lines,
+    read_text,
+    require_replaceable,
+    write_atomically,
+    write_text,
+    write_unsynced,
+)
 from neeco.geometry.lens import Lens
 from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import LayeredDrawing, to_numpy
@@ -37,6 +45,7 @@ LABELS = ("masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders
 MAX_INSTRUMENTS = (
     8  # in `silhouettes`, whose bit k is set where instrument k would be visible if nothing else were there
 )
+POLYGONS = ("polygons", "segmentation")  # of a label or part, left out of states.jsonl
 FOLDERS = ("images", *LABELS, RECORDS)
 PUBLIC = {  # what every line of states.jsonl holds, among others
     "index": int,
@@ -51,6 +60,11 @@ PUBLIC = {  # what every line of states.jsonl holds, among others
     "labels": [{"name": str, "area": int, "keypoints": {str: [float]}, "camera_from_instrument": [[float]]}],
 }
 VALIDATION_EVERY = 5  # every fifth image is for validation; by the index alone, so a data set can grow
+
+
+def split_of(index: int) -> str:
+    """Return the split of image `index`, "train" or "val"."""
+    return "val" if index % VALIDATION_EVERY == VALIDATION_EVERY - 1 else "train"
 
 
 def stem(index: int) -> str:
@@ -105,7 +119,7 @@ def encoded_sample(
     record = {
         "index": index,
         "image": image,
-        "split": "val" if index % VALIDATION_EVERY == VALIDATION_EVERY - 1 else "train",
+        "split": split_of(index),
         "width": camera.width,
         "height": camera.height,
         **state_to_json(drawing.state),
@@ -154,6 +168,7 @@ def load_record(root: Path, index: int) -> Record | None:
 def link(source: Path, target: Path) -> None:
     """Make `target` the same file as `source`: a hard link, or a copy where the file system has none. Raises
     NeecoError."""
+    require_replaceable(target)
     with contextlib.suppress(FileNotFoundError):
         if os.path.samefile(source, target):
             return
@@ -191,7 +206,6 @@ def public_record(record: Record) -> dict[str, Any]:
 
 
 def _without_polygons(label: dict[str, Any]) -> dict[str, Any]:
-    parts = {
-        name: {key: value for key, value in part.items() if key != "polygons"} for name, part in label["parts"].items()
-    }
-    return {key: value for key, value in label.items() if key != "polygons"} | {"parts": parts}
+    shapes = {None: label, **label["parts"]}
+    without = {name: {k: v for k, v in shape.items() if k not in POLYGONS} for name, shape in shapes.items()}
+    return without.pop(None) | {"parts": without}

@@ -1,8 +1,8 @@
 """Formats of dataset hubs: `imagefolder/` (Hugging Face) and WebDataset shards; uploads to the Hugging Face Hub, whose
 account huggingface_hub knows (`hf auth login` or HF_TOKEN; HF_ENDPOINT names another hub).
 
-imagefolder/{train,validation}/metadata.jsonl next to the images and their masks:
-                                             datasets.load_dataset("imagefolder", data_dir="DATASET/imagefolder")
+imagefolder/{train,validation}/metadata.jsonl next to the images and their masks, parts, ignored pixels and depth:
+                                             datasets.load_dataset("DATASET"), by the card's configuration
 webdataset/{train,val}-NNNNNN.tar            samples read in a row, a sample's files with its number as key: .png or
                                              .jpg (image), .mask.png, .parts.png, .ignore.png, .depth.png and .json
                                              (its record: state, camera, labels)
@@ -29,29 +29,41 @@ SHARDED = {"masks": "mask.png", "parts": "parts.png", "ignore": "ignore.png", "d
 
 
 class ImageFolder(Writer):
-    """Images with boxes: `bbox` (x, y, width, height px), `area` px, `category` (index of the instrument), `name`."""
+    """Images with masks, parts, ignored pixels and depth, and of every visible instrument `bbox` (x, y, width, height
+    px), `area` px, `category` (its index), `name`, `keypoints` (x, y px and visibility) and `pose` (camera from
+    instrument, mm, OpenCV axes)."""
 
     format = "imagefolder"
-    description = "`imagefolder/{train,validation}/`, with metadata.jsonl"
+    description = (
+        "`imagefolder/{train,validation}/`, with metadata.jsonl: `datasets.load_dataset` of the data set's folder "
+        "gives image, mask, parts, ignore, depth and objects (bbox, area, category, name, keypoints, pose)"
+    )
 
     def write(self, images: WrittenImages) -> None:
         """(Re)write images (hard links) and metadata. Raises NeecoError."""
-        root, folder = images.root, images.root / self.format
+        root, folder, points = images.root, images.root / self.format, images.keypoint_names
         lines: dict[str, list[str]] = {}
         for record in images.records:
             split, name = SPLITS[record["split"]], stem(record["index"])
             image = Path(record["image"]).name
             link(root / record["image"], folder / split / image)
-            link(root / "masks" / f"{name}.png", folder / split / f"{name}_mask.png")
+            planes = {plane.partition(".")[0]: kind for kind, plane in SHARDED.items()}  # mask, parts, ...
+            for plane, kind in planes.items():
+                link(root / kind / f"{name}.png", folder / split / f"{name}_{plane}.png")
             shown = [label for label in record["labels"] if label["area"] > 0]
             line = {
                 "file_name": image,
-                "mask_file_name": f"{name}_mask.png",
+                **{f"{plane}_file_name": f"{name}_{plane}.png" for plane in planes},
                 "objects": {
                     "bbox": [label["box"] for label in shown],
                     "area": [label["area"] for label in shown],
                     "category": [images.instruments.index(label["name"]) for label in shown],
                     "name": [label["name"] for label in shown],
+                    "keypoints": [
+                        [[float(value) for value in label["keypoints"].get(point, [0, 0, 0])] for point in points]
+                        for label in shown
+                    ],
+                    "pose": [label["camera_from_instrument"] for label in shown],
                 },
             }
             lines.setdefault(split, []).append(json.dumps(line, allow_nan=False))
