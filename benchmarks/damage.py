@@ -6,6 +6,7 @@ import copy
 import json
 import os
 import random
+import re
 import shutil
 import struct
 import zlib
@@ -21,6 +22,7 @@ from neeco.files import parse_yaml
 
 SCRIPT = "<script>alert(1)</script>"
 DELETE = object()
+LARGE = 20 * 2**30  # bytes of a file that takes no room on the disk
 NUMBERS = [-1, 0, 1, 0.5, -0.0, 1e-300, 1e300, -1e308, 2**31, 2**63, 10**12, 10**400, float("nan"), float("inf")]
 TEXTS = [
     "",
@@ -138,13 +140,20 @@ def edit(document: Any, pick: random.Random) -> Any:
 def edit_json(path: Path, pick: random.Random) -> None:
     raw = pick.random()
     if raw < 0.03:
-        text = pick.choice(
-            ("[" * 100_000, '{"a":' * 100_000, "9" * 10_000, '{"frames": [' + "{}," * 50_000, "", "\ufeff{}")
-        )
+        deep = ("[" * 100_000, '{"a":' * 100_000, "9" * 10_000, '{"frames": [' + "{}," * 50_000)
+        text = pick.choice((*deep, "", "\ufeff{}", "null", "3", "[]", "true", '"x"'))
         path.write_text(text)
         return
-    document = edit(json.loads(path.read_text()), pick)
-    path.write_text(json.dumps(document))
+    document = json.loads(path.read_text())
+    if raw < 0.08 and isinstance(document, dict) and document:  # a key given twice
+        key = pick.choice(list(document))
+        value = json.dumps(pick.choice((document[key], None, 3, [], {})))
+        path.write_text("{" + f"{json.dumps(key)}: {value}, " + json.dumps(document)[1:])
+    elif raw < 0.12 and path.name == "transforms.json":  # a capture that is another one since training
+        other = pick.choice((20, 60, 200))
+        path.write_text(re.sub(r'"(fl_[xy])": [\d.]+', rf'"\1": {other}', json.dumps(document)))
+    else:
+        path.write_text(json.dumps(edit(document, pick)))
 
 
 def edit_lines(path: Path, pick: random.Random) -> None:
@@ -296,7 +305,7 @@ def edited_numbers(
     where = slice(None) if pick.random() < 0.4 else pick.randrange(len(values))
     with np.errstate(all="ignore"):
         odd = np.array(
-            pick.choice([float("nan"), float("inf"), -float("inf"), 1e38, -1e38, 0.0, 1e-38, -1.0, 1e6, 255.0])
+            pick.choice([float("nan"), float("inf"), -float("inf"), 1e38, 1e30, -1e38, 0.0, 1e-38, -1.0, 1e6, 255.0])
         )
         values[where] = odd.astype(values.dtype)
     begin, end = header[name]["data_offsets"]
@@ -327,7 +336,7 @@ def edit_image(path: Path, pick: random.Random) -> None:
             image = Image.new(mode, size)
             image.save(path, format="TIFF" if mode in ("F", "CMYK") else "PNG")
         case 3:
-            Image.open(path).convert("P").save(path, format="GIF")
+            Image.open(path).convert("RGB").save(path, format=pick.choice(("GIF", "BMP", "TIFF", "WEBP")))
         case 4:
             text = zlib.compress(b"x" * 200_000_000, 9)
             content = path.read_bytes()
@@ -362,7 +371,7 @@ def edit_bytes(path: Path, pick: random.Random) -> None:
 def edit_table(path: Path, pick: random.Random) -> None:
     """CSV, and columns of text: a cell, a column, a row, the header; and counts of rows that are not there."""
     rows = [line.split(",") for line in path.read_text(errors="replace").splitlines()]
-    match pick.randrange(7):
+    match pick.randrange(9):
         case 0:
             for _ in range(pick.choice((1, 5, 60))):
                 row = pick.choice(rows)
@@ -378,6 +387,11 @@ def edit_table(path: Path, pick: random.Random) -> None:
             rows = [rows[0], *[[str(10**9)] * len(rows[0])], *rows[1:]]
         case 5:
             rows = [rows[0] * 3000]
+        case 6:  # time begins anew: two runs in one file, or a counter that wraps
+            rows += rows[1:]
+        case 7:
+            half = len(rows) // 2
+            rows[1:] = rows[half:] + rows[1:half]
         case _:
             rows[1:] = [[cell[:-1] + "e9" if pick.random() < 0.1 else cell for cell in row] for row in rows[1:]]
     path.write_text("\n".join(",".join(row) for row in rows) + "\n", encoding="utf-8", errors="surrogatepass")
@@ -434,8 +448,8 @@ EDITORS: dict[str, Callable[[Path, random.Random], None]] = {
 
 
 def edit_file(path: Path, others: Sequence[Path], outside: Path, pick: random.Random) -> None:
-    """The file as such: absent, a folder, a pipe, a link, another one's content, another name."""
-    match pick.randrange(9):
+    """The file as such: absent, a folder, a pipe, a link, huge, another one's content, another name."""
+    match pick.randrange(11):
         case 0:
             path.unlink()
         case 1:
@@ -449,7 +463,7 @@ def edit_file(path: Path, others: Sequence[Path], outside: Path, pick: random.Ra
             path.symlink_to(path.name)
         case 4:
             path.unlink()
-            path.symlink_to(pick.choice(("/dev/zero", "/dev/full", "/etc/passwd", "/", "nothing")))
+            path.symlink_to(pick.choice(("/dev/zero", "/dev/null", "/etc/passwd", "/", "nothing")))
         case 5 | 6:
             other = pick.choice(others)
             shutil.copy(other, path)
@@ -457,5 +471,10 @@ def edit_file(path: Path, others: Sequence[Path], outside: Path, pick: random.Ra
             link = outside / f"secret{path.suffix}"
             path.unlink()
             path.symlink_to(link if link.exists() else outside / "secret.txt")
+        case 8:  # a link within the folder, which many make to save room
+            path.rename(kept := path.with_name(f"kept{path.suffix}"))
+            path.symlink_to(kept.name)
+        case 9:
+            os.truncate(path, pick.choice((LARGE, 3 * 2**30)))
         case _:
             path.rename(path.with_name(pick.choice(NAMES)))

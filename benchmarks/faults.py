@@ -12,7 +12,8 @@ has to be left out of this.
 
 Then the other faults, one of each for every verb: a full disk (a small tmpfs, where this user may mount one, else
 RLIMIT_FSIZE), an I/O error (a failing fsync), a folder that cannot be written to (root: a read-only tmpfs), a capture
-that changes between kill and resumption, a clock set back, two processes at once on one output. Each must end in exit
+that changes between kill and resumption, a clock set back, two processes at once on one output, an output that is a
+pipe or a link. Each must end in exit
 status 1 and one line on stderr, or in the same files, and lose nothing.
 
 Exit status 1 where anything did. Structure from motion is answered from known cameras, as in tests/ingest.
@@ -28,6 +29,7 @@ import os
 import random
 import resource
 import signal
+import stat
 import subprocess
 import sys
 import tempfile
@@ -318,6 +320,22 @@ def clock_set_back(verb: Verb, whole: Undisturbed, work: Path, pick: random.Rand
     return differences(scenes, now)
 
 
+def output_is_a_node(verb: Verb, whole: Undisturbed, work: Path, pick: random.Random) -> list[str]:
+    """Something else has the output's name: it must stay what it is."""
+    clear(verb.shelf)
+    found = []
+    for make in (os.mkfifo, lambda path: path.symlink_to("nothing"), lambda path: path.symlink_to(verb.shelf / "kept")):
+        (verb.shelf / "kept").write_text("kept")
+        make(verb.output)
+        before = stat.S_IFMT(verb.output.lstat().st_mode)
+        complaint = Child(verb.words, work).wait(60.0).in_one_line()
+        found += [complaint] if complaint else []
+        if stat.S_IFMT(verb.output.lstat().st_mode) != before or (verb.shelf / "kept").read_text() != "kept":
+            found.append("replaced what was no file")
+        clear(verb.shelf)
+    return found + resumed(verb, whole, work)
+
+
 def holds_a_lock(pid: int) -> bool:
     """Whether a process has locked a file; one that is only there may not be locked yet."""
     return any(f" {pid} " in line and "FLOCK" in line for line in Path("/proc/locks").read_text().splitlines())
@@ -347,6 +365,7 @@ FAULTS = {
     "changed-capture": changed_capture,
     "clock-set-back": clock_set_back,
     "two-at-once": two_at_once,
+    "output-is-a-node": output_is_a_node,
 }
 
 

@@ -4,10 +4,13 @@
 
 Every case takes fresh copies of a small capture, run, data set, recording and so on, damages what one verb reads in one
 to three places (fields deleted, doubled, of other types, huge, not finite, nested; files cut, with flipped bits,
-swapped with one another, absent, folders, pipes, links out of their folder; headers that promise more than there is),
-and runs the verb in a fork of this process. It must end with exit status 0 or 1 within 10 s of the processor's time and
-2 GiB of memory; a refusal is one line on stderr that names an input; nothing leaves a traceback or a terminal's control
-characters, writes out of its output or shows what lies outside the capture it was given.
+swapped with one another, absent, folders, pipes, devices, links, 20 GB long; other kinds of image; keys given twice;
+logs whose time begins anew; captures changed since training; headers that promise more than there is), gives options
+that are out of range or an output that is a pipe, a link or a device, and runs the verb in a fork of this process. It
+must end with exit status 0 or 1 (2 for an option's value that cannot be parsed) within 10 s of the processor's time and
+2 GiB of memory; a refusal is one line on stderr that names an input; nothing leaves a traceback, a class of Python's or
+a terminal's control characters, replaces a pipe, link or device, writes out of its output or shows what lies outside
+the capture it was given.
 
 Case K of seed S is always the same: `--seed S --case K` plays it again and shows everything. Exit status 1 where
 anything was wrong.
@@ -22,6 +25,7 @@ import os
 import random
 import shutil
 import signal
+import stat
 import sys
 import tempfile
 import time
@@ -77,7 +81,63 @@ def out(*words: str) -> Callable[[random.Random], list[str]]:
     return lambda pick: [*words, "--output", "out"]
 
 
+COUNTS = ("-1", "0", "1.5", "nan", "abc", "", "9999999999999", "9" * 30)
+SHARES = ("-1", "0", "2", "nan", "inf", "1e400", "abc", "1e-300")
+SYNTHESIZE = ("synthesize", "run", *DRAW, "--output", "out")
+TRAIN = ("train", "capture", "--output", "out", *STEPS)
+OPTIONS: tuple[tuple[tuple[str, ...], str, tuple[str, ...]], ...] = (  # command, option, values: none works for long
+    (SYNTHESIZE, "--count", COUNTS),
+    ((*SYNTHESIZE, "--count", "1"), "--seed", COUNTS),
+    ((*SYNTHESIZE, "--count", "1"), "--size", ("0x0", "-3x4", "1x1", "99999999x99999999", "axb", "3", "")),
+    ((*SYNTHESIZE, "--count", "1"), "--min-share", SHARES),
+    ((*SYNTHESIZE, "--count", "1"), "--workers", ("-1", "0", "abc", "1e9")),
+    (TRAIN, "--seed", COUNTS),
+    (TRAIN, "--scale", ("-1", "0", "nan", "inf", "1e-9", "1e9", "0.5", "abc")),
+    (TRAIN, "--minutes", ("-1", "0", "nan", "1e-9", "abc", "")),
+    (TRAIN[:4], "--iterations", ("-1", "0", "1.5", "nan", "abc", "")),
+    (TRAIN, "--set", ("density_start=-1", "density_start=nan", "max_tissue_gaussians=1e400", "nothing=1", "=", "a")),
+    (("view", "run"), "--port", ("-1", "65536", "99999999999", "abc", "1.5", "")),
+    (("annotate", "run", "--output", "out"), "--min-trust", ("-1", "2", "nan", "inf", "abc", "")),
+)
+
+
+def odd_option(pick: random.Random) -> list[str]:
+    words, option, values = pick.choice(OPTIONS)
+    return [*words, f"{option}={pick.choice(values)}"]
+
+
+def onto_a_node(pick: random.Random) -> list[str]:
+    """Make an output that is a pipe, a link or a device; return a command that writes there."""
+    words = pick.choice(
+        (
+            ["export", "run", "--output", "out.ply"],
+            ["export", "run", "--output", "out.spz"],
+            ["view", "run", "--export", "out.html"],
+            ["render", "run", "--output", "out"],
+            ["train", "capture", "--output", "out", *STEPS],
+            ["synthesize", "run", "--count", "1", *DRAW, "--output", "out"],
+        )
+    )
+    node = Path(words[words.index("--export" if "--export" in words else "--output") + 1])
+    match pick.randrange(4):
+        case 0:
+            os.mkfifo(node)
+        case 1:
+            Path("linked").write_text("kept")
+            node.symlink_to("linked")
+        case 2:
+            node.symlink_to("nothing")
+        case _:
+            try:
+                os.mknod(node, stat.S_IFCHR | 0o600, os.makedev(1, 3))  # swallows what is written
+            except PermissionError:
+                os.mkfifo(node)
+    return words
+
+
 CASES: dict[str, Case] = {
+    "options": Case((), odd_option, 3, ("capture", "run")),
+    "outputs": Case((), onto_a_node, 2, ("capture", "run")),
     "check": Case(CAPTURE, lambda pick: ["check", "capture", *(["--json"] if pick.random() < 0.3 else [])], 6),
     "check-others": Case(
         (
@@ -235,6 +295,11 @@ CASES: dict[str, Case] = {
 }
 
 
+def is_small(path: Path) -> bool:
+    """Return whether it is a file that no earlier damage made huge."""
+    return path.is_file() and path.stat().st_size < 2**26
+
+
 def folders_of(case: Case) -> set[str]:
     """What of the world a case takes."""
     return {*(glob.split("/")[0] for glob in case.reads), *case.needs}
@@ -275,14 +340,17 @@ class Bench:
         verb = pick.choices(self.verbs, [CASES[name].weight for name in self.verbs])[0]
         case = CASES[verb]
         self._lay_out(case)
-        damage = [self._damage(case, pick) for _ in range(pick.choice((1, 1, 1, 2, 3)))]
+        damage = [self._damage(case, pick) for _ in range(pick.choice((1, 1, 1, 2, 3)) if case.reads else 0)]
         words = case.words(pick)
+        self.nodes = self._nodes()
         child = Child(words, self.work, lambda: limit_memory(GIB))
         return self._judged(verb, words, damage, child.wait(PATIENCE))
 
     def require_sound(self) -> None:
         """Play every verb on what is not damaged: one that is refused there would try nothing."""
         for verb in self.verbs:
+            if not CASES[verb].reads:
+                continue  # nothing is sound there
             self._lay_out(CASES[verb])
             ended = Child(CASES[verb].words(random.Random(self.seed)), self.work).wait()
             assert ended.status == 0, f"{verb}: {ended.told}"
@@ -299,7 +367,7 @@ class Bench:
     def _damage(self, case: Case, pick: random.Random) -> str:
         """Damage one file; says which and how."""
         found = self.desk.glob(pick.choice(case.reads))
-        files = sorted(path for path in found if path.is_file() and not path.is_symlink())
+        files = sorted(path for path in found if not path.is_symlink() and is_small(path))
         if not files:
             return "nothing left to damage"
         path = pick.choice(files)
@@ -313,7 +381,7 @@ class Bench:
                 edit_bytes(path, pick)
                 told = "edit_bytes"
             else:
-                others = sorted(other for other in self.desk.rglob("*") if other.is_file() and other != path)
+                others = sorted(other for other in self.desk.rglob("*") if is_small(other) and other != path)
                 edit_file(path, others, self.outside, pick)
                 told = "edit_file"
         except Exception:
@@ -325,6 +393,8 @@ class Bench:
         texts = ended.said + ended.told
         if ended.status < 0 and verb == "train --resume" and self._long_training():
             pass  # it does as it is told
+        elif ended.status == 2 and verb == "options":
+            pass  # the parser's usage
         elif ended.status not in (0, 1):
             wrong.append(f"exit status {ended.status} after {ended.seconds:.1f} s: {ended.told[-1500:]}")
         elif ended.status == 1 and not (words[0] == "check" and ended.said and not ended.told):
@@ -335,6 +405,8 @@ class Bench:
                 wrong.append(f"names no input: {last}")
         if "Traceback" in texts:
             wrong.append("a traceback")
+        if "<class " in texts:
+            wrong.append("shows a class of Python's")
         if any(ord(letter) < 32 and letter not in "\n\t" for letter in texts) or "\x1b" in texts:
             wrong.append("control characters")
         if ended.processor > SECONDS:
@@ -344,6 +416,9 @@ class Bench:
         # whoever names a link themselves wants what it leads to
         if CANARY in texts and not any((self.desk / word).is_symlink() for word in words):
             wrong.append("shows what lies outside")
+        gone = [name for name, kind in self.nodes.items() if self._nodes().get(name) != kind]
+        if gone:
+            wrong.append(f"replaced {gone[0]}, which was no regular file")
         if self._outside() != self.before:
             wrong.append("changed what lies outside")
         pages = [path for path in self.desk.rglob("*.html") if path.is_file() and SCRIPT.encode() in path.read_bytes()]
@@ -363,6 +438,13 @@ class Bench:
             return config["iterations"] > 1000 or config["minutes"] is not None
         except (OSError, yaml.YAMLError, LookupError, TypeError):
             return False
+
+    def _nodes(self) -> dict[str, int]:
+        """Kinds of all links, pipes and devices on the desk."""
+        modes = {str(path.relative_to(self.desk)): path.lstat().st_mode for path in self.desk.rglob("*")}
+        return {
+            name: stat.S_IFMT(mode) for name, mode in modes.items() if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+        }
 
     def _outside(self) -> dict[str, bytes]:
         return {path.name: path.read_bytes() for path in self.outside.iterdir()}

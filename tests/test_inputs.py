@@ -70,10 +70,14 @@ ALLOWED = {
 
 def opens(tree: ast.AST) -> Iterator[str]:
     """Calls in a module that open a file past the helpers, as text."""
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    nodes = list(ast.walk(tree))
+    functions = [node for node in nodes if isinstance(node, ast.FunctionDef)]
     guarded = {call for function in functions if _calls(function) & GUARDS for call in ast.walk(function)}
-    for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
-        name, owner = _name(call.func), ast.unparse(call.func).rpartition(".")[0]
+    for call in (node for node in nodes if isinstance(node, ast.Call)):
+        name = _name(call.func)
+        if name not in READERS | {"open", "read_text", "read_bytes"}:
+            continue
+        owner = ast.unparse(call.func).rpartition(".")[0]
         arguments = [*call.args, *(keyword.value for keyword in call.keywords if keyword.arg == "mode")]
         modes = {item.value for item in arguments if isinstance(item, ast.Constant) and isinstance(item.value, str)}
         writes = any(mode[:1] in ("w", "a", "x") for mode in modes if len(mode) < 4)
