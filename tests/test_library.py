@@ -320,6 +320,8 @@ def test_the_programs_in_examples_run(folder: Path, tmp_path: Path, capsys: pyte
     example("05_own_capture").main(tmp_path / "capture", iterations=5, method="3dgs")
     example("06_other_formats").main(run, tmp_path / "dataset", count=2)
     logged: dict[int, dict[str, float]] = {}
+    example("08_jaw_sweep").main(run, tmp_path / "sweep.gif", count=3, width=60)
+    assert Image.open(tmp_path / "sweep.gif").n_frames == 3  # type: ignore[attr-defined]
     example("07_log_training").main(
         tmp_path / "watched", log=logged.__setitem__, iterations=50, method="3dgs", scale=0.5
     )

@@ -129,3 +129,8 @@ def test_cameras_that_are_turned_otherwise_than_stated_show_it_by_their_epipolar
         error = epipolar_error(left, right, (lens, lens), rigid(turn, turn @ shift))
         assert error == pytest.approx(expected, abs=0.35)
     assert epipolar_error(left, np.zeros_like(left), (lens, lens), rigid(np.eye(3), shift)) is None
+
+
+def test_images_of_a_few_pixels_neither_move_nor_end_in_an_error() -> None:
+    noise = np.random.default_rng(7).integers(0, 256, (8, 12, 16, 3), dtype=np.uint8)
+    assert not stands_still(noise.__getitem__, len(noise))

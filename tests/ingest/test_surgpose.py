@@ -18,8 +18,7 @@ COUNT = 30
 TIMES = np.arange(COUNT) / 30
 
 
-@pytest.fixture
-def trajectory(world):
+def write_trajectory(world):
     """The published layout: two arms, six joints each, two videos, a calibration, labels."""
     folder = world.folder / "000003"
     (folder / "regular").mkdir(parents=True)
@@ -38,6 +37,11 @@ def trajectory(world):
         world.video(f"000003/regular/{side}_video.mp4", COUNT, lambda i: round(i * 1000 / 30))
     ini(folder)
     return folder
+
+
+@pytest.fixture
+def trajectory(world):
+    return write_trajectory(world)
 
 
 def test_poses_and_joints_come_back(world, trajectory):

@@ -199,6 +199,14 @@ def test_one_fold_is_no_answer(capture, output):
     assert "one fold gives no verdict" in text
 
 
+def test_a_model_that_learned_nothing_is_named(capture, output):
+    nothing = dict.fromkeys(CONDITIONS, -0.5)
+    jobs = jobs_of(capture, output, models=("unet",), counts=(5,), gain=nothing)
+    text, _ = page_of(output, experiment_of(capture, jobs), capture)
+    assert "unet learned nothing that test shows: its best IoU is 0.0" in text
+    assert "unet learned nothing that unseen shows" in text
+
+
 def test_without_labelled_frames_sets_stand_alone(capture, output):
     jobs = jobs_of(capture, output, conditions=("kinematic", "nps"))
     text, page = page_of(output, experiment_of(capture, jobs, sets=("kinematic", "nps"), labelled=0), capture)

@@ -274,8 +274,15 @@ def test_the_conclusion_names_the_two_facts_behind_it(tmp_path, overlap, conclus
     assert verdict.as_json()["advice"] == conclusion.partition(":")[0]
     assert len(verdict.as_json()["facts"]) == 2
     write_ingest_page(result, tmp_path / "page.html")
-    sentence = f"{conclusion[0].upper()}{conclusion[1:]}{base_known}."
-    assert f"{sentence}</p>" in (tmp_path / "page.html").read_text()
+    page = (tmp_path / "page.html").read_text()
+    assert f"Measured: {conclusion.partition(': ')[2]}{base_known}.</p>" in page
+
+
+def test_a_page_counts_the_images_of_both_eyes(tmp_path):
+    times = np.array([frame.state.time for frame in read_capture(SAMPLE).frames])
+    one_less = made(SAMPLE, selected=np.arange(95), selected_times=times[:95], registration=None)
+    write_ingest_page(one_less, tmp_path / "page.html")
+    assert "seen by both eyes: 96 images (72 train, 12 test, 12 unseen)" in (tmp_path / "page.html").read_text()
 
 
 @pytest.mark.parametrize(("tracked", "level", "limit"), [(False, "good", "2"), (True, "careful", "1")])

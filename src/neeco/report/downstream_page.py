@@ -37,6 +37,7 @@ from neeco.studies.downstream.results import (
     findings_of,
     main_differences,
     models_and_splits,
+    scores_by_fold,
     scores_table,
     summary_text,
     title_of,
@@ -59,6 +60,7 @@ HEADLINES = {  # of questions: how the sentence begins
     "beside": "Against the better of the same labelled frames alone and augmented",
     "alone": "Without any label, against the better of all labelled frames alone and augmented",
 }
+NOTHING_LEARNED = 0.1  # best mean score of any condition below it: less than a guess of all pixels reaches
 MAX_REACH = 3.0  # times the largest difference that an interval is shown to: those of two folds would hide the rest
 
 Experiment = Mapping[str, Any]
@@ -117,6 +119,7 @@ def question(row: Row, experiment: Experiment) -> str:
 def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
     """Return the headlines: effect of synthetic images with and without labelled frames against these, in the same and
     in other recordings, and what is missing."""
+    jobs = experiment["jobs"]
     sentences = [] if experiment["complete"] else ["Not all trainings are finished: these are the numbers so far."]
     verdicts: dict[tuple[str, bool], list[str]] = {}
     for model, split in models_and_splits(experiment):
@@ -140,6 +143,12 @@ def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
         place = (" in another recording" if other else " in the same recording") if experiment["tests"] else ""
         text = Markup('<b class="{}">{}, synthetic images {} of {} comparisons{}.</b>')
         sentences.append(text.format(kind, start, ", ".join(parts), sum(counts.values()), place))
+    for model, split in models_and_splits(experiment):
+        metric = MAIN[model["answers"]]
+        means = [np.mean(list(folds.values())) for folds in scores_by_fold(jobs, model["name"], split, metric).values()]
+        if means and max(means) < NOTHING_LEARNED:
+            words = f"{model['name']} learned nothing that {split} shows: its best {TITLES[metric]} is {max(means):.3f}"
+            sentences.append(f"{words}. Its differences say nothing; give more --steps, or look at the labels.")
     if failed:
         sentences.append(f"{counted(len(failed), 'training')} failed; they are listed below.")
     return sentences

@@ -91,7 +91,7 @@ def _features(grey: np.ndarray) -> np.ndarray:
     """The best feature float32 [K, 1, 2] px of every cell of an image uint8 [H, W] that has one. The best of the whole
     image would be highlights, which come and go."""
     strength = cv2.cornerMinEigenVal(grey, 7)
-    side = grey.shape[1] // N_CELLS
+    side = max(1, grey.shape[1] // N_CELLS)
     places = []
     for top in range(side // 2, grey.shape[0] - side, side):
         for left in range(side // 2, grey.shape[1] - side, side):
