@@ -86,6 +86,7 @@ class TinyRun:
     path: Path
     scene: TinyScene
     recorded: Capture
+    doubts: tuple[str, ...] = ()
 
     def capture(self) -> Capture:
         return self.recorded

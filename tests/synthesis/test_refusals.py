@@ -86,7 +86,7 @@ def test_ctrl_c_before_anything_was_begun_tells_of_nothing_kept(run, tmp_path, m
 
 
 def test_ctrl_c_is_told_with_the_way_to_go_on(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("neeco.training.run.load_run", lambda path, device: run)
+    monkeypatch.setattr("neeco.training.run.load_run", lambda path, device, **_: run)
     real, left = SampleGenerator.draw, iter(range(2))
 
     def stopped(*arguments):

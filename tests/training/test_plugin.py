@@ -52,7 +52,7 @@ def test_an_installed_method_trains_evaluates_renders_synthesizes_and_is_viewed(
     assert main(["evaluate", str(run), "--json", str(tmp_path / "scores.json")]) == 0
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert scores["given"]["test"]["psnr"] > 12
-    data = ["--output", str(tmp_path / "data"), "--min-share", "0.0001", "--no-tissue-check"]
+    data = ["--output", str(tmp_path / "data"), "--min-share", "0.0001", "--no-tissue-check", "--force"]
     assert main(["synthesize", str(run), "--count", "6", "--formats", "yolo", "boxlist", *data]) == 0
     boxes = (tmp_path / "data" / "boxlist" / "boxes.csv").read_text().splitlines()
     assert len(boxes) == 7

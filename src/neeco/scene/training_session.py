@@ -20,6 +20,7 @@ from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import DrawableScene
 from neeco.scene.training_views import TrainingViews
 
+UNLIMITED = 1_000_000_000  # iterations: minutes end the run long before
 Report = Callable[[str], None]  # shows the user one line
 
 
@@ -29,20 +30,30 @@ class RunLength:
 
     iterations: int
     minutes: float | None = None
-    min_iterations: int = 300  # before which minutes do not end the run
+    min_share: float = 0.05  # of `iterations`, before which minutes do not end the run
     judged_share: float = 0.25  # of `iterations`: after fewer, labels and joints are not judged
 
-    def progress(self, iteration: int, seconds: float) -> float:
-        """Return the completed share of the run in [0, 1], by iterations or minutes, whichever is larger. seconds: of
-        the iterations."""
+    @property
+    def open_ended(self) -> bool:
+        """Whether minutes alone end the run: an equal budget for all methods, preparation included."""
+        return self.iterations >= UNLIMITED
+
+    def progress(self, iteration: int, seconds: float, prepared: float = 0.0) -> float:
+        """Return the completed share of the run in [0, 1], by iterations or minutes, whichever is larger.
+
+        prepared: those of `seconds` that passed before the first iteration, which do not count as minutes.
+        """
         done = iteration / self.iterations
-        if self.minutes is not None:
-            done = max(done, min(iteration / self.min_iterations, seconds / (60 * self.minutes)))
+        if self.minutes is not None and self.open_ended:
+            done = max(done, seconds / (60 * self.minutes))
+        elif self.minutes is not None:
+            floor = iteration / (self.min_share * self.iterations)
+            done = max(done, min(floor, (seconds - prepared) / (60 * self.minutes)))
         return min(1.0, done)
 
     def is_short(self, iteration: int) -> bool:
         """Whether a run that ended after so many iterations is too short to judge what it learned."""
-        return iteration < self.judged_share * self.iterations
+        return not self.open_ended and iteration < self.judged_share * self.iterations
 
 
 @dataclass(frozen=True)
@@ -95,12 +106,13 @@ class Session:
     adam: Adam = field(init=False)
     iteration: int = field(default=0, init=False)
     seconds: float = field(default=0.0, init=False)
+    prepared: float = field(default=0.0, init=False)  # those of `seconds` before the first iteration
     window: list[StepResult] = field(default_factory=list, init=False)  # steps since the last row of metrics.jsonl
 
     @property
     def progress(self) -> float:
         """Completed share of the run in [0, 1]."""
-        return self.length.progress(self.iteration, self.seconds)
+        return self.length.progress(self.iteration, self.seconds, self.prepared)
 
     @property
     def phase(self) -> int:

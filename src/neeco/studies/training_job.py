@@ -26,6 +26,7 @@ from neeco.files import finite, read_json, read_json_lines, require_like, requir
 from neeco.labels.drawing import draw
 from neeco.raster.devices import device_of
 from neeco.scene.method_registry import current_name, method_class
+from neeco.scene.training_session import UNLIMITED
 from neeco.studies.machine import peak_memory_mb, reset_peak_memory
 from neeco.studies.study import REMEDY, JobProgress, Result
 from neeco.training.config import TrainConfig
@@ -40,7 +41,6 @@ JOB_SCHEMA = "neeco-job/1"
 JOB_FILE = "job.json"  # the result of a finished job
 BEGUN_FILE = "begun.json"  # what the training took so far
 CURVE_FILE = "curve.jsonl"  # held-out PSNR over the training
-UNLIMITED = 1_000_000_000  # iterations: minutes end the run long before
 CURVE_POINTS = (0.03, *(step / 10 for step in range(1, 11)))  # shares of the run at which held-out frames are rendered
 CURVE_FRAMES = 4  # of each split, evenly spaced: the whole split is scored at the end
 FIELD_CURVE_POINTS = (0.1, 0.4, 1.0)  # a field takes seconds for an image

@@ -215,6 +215,7 @@ def save_checkpoint(session: Session, run: Path) -> None:
         "adam_steps": session.adam.steps,
         "iteration": session.iteration,
         "seconds": session.seconds,
+        "prepared": session.prepared,
         "window": [[step.loss, step.psnr] for step in session.window],
     }
     metadata = {"neeco": json.dumps(header | fields, allow_nan=False)}
@@ -276,3 +277,4 @@ def restore_session(session: Session, header: dict[str, Any], tensors: dict[str,
     window = header.get("window", [])  # not in older checkpoints
     session.window = [StepResult(float(loss), float(psnr)) for loss, psnr in window]
     session.iteration, session.seconds = header["iteration"], header["seconds"]
+    session.prepared = header.get("prepared", 0.0)  # not in older checkpoints

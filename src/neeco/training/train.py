@@ -44,7 +44,7 @@ from neeco.training.run import (
 from neeco.training.schedule import due
 
 CPU = torch.device("cpu")
-MIN_SIDE_PX = 16  # of images at a share of their size: smaller ones show no instrument
+MIN_SIDE_PX = 12  # of images at a share of their size: smaller ones show no instrument
 BASE_BYTES, PIXEL_BYTES = 0.6e9, 300  # of memory for a process, and for one pixel while it is rendered and compared
 
 
@@ -140,6 +140,7 @@ def train(
 
 def _begin(capture: Capture, views: TrainingViews, resumed: Path | None, config: TrainConfig, log: _Log) -> Session:
     """Return the session before its first step, or as the checkpoint of the run `resumed` holds it."""
+    started = log.clock()
     torch.manual_seed(config.seed)
     if resumed is None or not checkpoint_path(resumed).exists():  # or interrupted before its first checkpoint
         session = begin_session(capture, views, config, log.note)
@@ -148,6 +149,8 @@ def _begin(capture: Capture, views: TrainingViews, resumed: Path | None, config:
         with reporting_damage(checkpoint_path(resumed)):
             session = begin_session(capture, views, config, log.note, scene)
             restore_session(session, header, tensors)
+    passed = log.clock() - started
+    session.seconds, session.prepared = session.seconds + passed, session.prepared + passed
     return session
 
 
@@ -229,7 +232,7 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
             if stop.is_set():
                 raise KeyboardInterrupt
         planned = session.length.iterations
-        if session.iteration < planned:
+        if session.iteration < planned and not session.length.open_ended:
             minutes = f"--minutes {config.minutes:g} are over"
             log.note(f"stopped after {session.iteration:,} of {planned:,} iterations, as {minutes}")
         if session.window and session.iteration > config.log_interval:  # of what came after the last row
