@@ -15,6 +15,9 @@ MAX_LISTED_STATES = 8  # of those that drop rows, in the notes
 MAX_SAME_TIME = 0.5  # share of rows at the time of another: more, and times are too coarse
 STUCK_S, STUCK_SAMPLES = 0.5, 10  # a tracker's noise leaves no pose unchanged for as long
 GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
+RESTART_STEPS = 10.0  # usual steps back in time, beyond which rows are not out of order: time begins anew
+DAY_S = 86400.0  # a clock that shows the time of day begins anew
+COUNTERS = (2.0**32, 2.0**16)  # values at which unsigned counters begin anew
 
 
 class Rows:
@@ -152,9 +155,11 @@ def drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
             rows.drop(used[first + 1 : last + 1], "the pose of the row before, repeated (a tracker that lost its tool)")
 
 
-def in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left."""
+def in_order(rows: Rows, times: np.ndarray, rate_hz: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left, and where
+    time begins anew. rate_hz: of a column that counts frames."""
     table, usable = rows.table, np.flatnonzero(rows.keep)
+    times = _continued(rows, times, usable, rate_hz)
     order = usable[np.argsort(times[usable], kind="stable")]
     late = usable[1:][times[usable][1:] < np.maximum.accumulate(times[usable])[:-1]]
     doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
@@ -175,6 +180,42 @@ def in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         listed = table.list_rows(table.lines[late])
         rows.repairs.append(f"{counted(len(late), 'row')} out of order in time; sorted ({listed})")
     return times[order], order
+
+
+def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float | None) -> np.ndarray:
+    """Return times [R] that go on where a counter, or the time of day, begins anew. Raises NeecoError where time does
+    for another reason: one step back by far more than a usual step, between rows in order."""
+    table, taken = rows.table, times[usable]
+    steps = np.diff(taken)
+    if not (steps > 0).any():
+        return times
+    usual = float(np.median(steps[steps > 0]))
+    units = [1.0, 1e-3, 1e-6, 1e-9, *([] if rate_hz is None else [1 / rate_hz])]
+    periods = [DAY_S, *(count * unit for unit in units for count in COUNTERS)]
+    ordered = (steps > 0) & (steps <= GAP_STEPS * usual)
+    times = times.copy()
+    for back in np.flatnonzero(steps < -RESTART_STEPS * usual):
+        if not (ordered[back - 1 : back].all() and ordered[back + 1 : back + 2].all()):
+            continue  # a single row out of its place
+        before, after = float(taken[back]), float(taken[back + 1])
+        tolerance, line = GAP_STEPS * usual, table.lines[usable[back + 1]]
+        wraps = [
+            period
+            for period in periods  # unsigned, or signed
+            for first in (0.0, -period / 2)
+            if abs(after - first) <= tolerance and abs(first + period - before) <= tolerance < period / 10
+        ]
+        if not wraps:
+            skipped = range(usable[back] + 1, usable[back + 1])
+            headers = [table.lines[row] for row in skipped if tuple(table.rows[row]) == tuple(table.header)]
+            why = f"line {headers[0]} repeats the header" if headers else "another run, or a clock set back"
+            raise NeecoError(
+                f"{table.where}: {table.record} {line}: time begins anew ({before:.6g} s, then {after:.6g} s): {why}; "
+                "keep the rows of one run in a file"
+            )
+        times[usable[back + 1 :]] += wraps[0]
+        rows.repairs.append(f"its time begins anew after {before:.6g} s ({table.record} {line}); taken to go on")
+    return times
 
 
 def find_gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:
