@@ -184,6 +184,7 @@ _ROTATION_VECTORS = _choices(
 )
 _EULER_ANGLES = (["roll", "pitch", "yaw"], ["rx", "ry", "rz"], ["alpha", "beta", "gamma"])
 _POSE_WORDS = ("pose", "cp", "tcp", "ee", "eef", "tip", "measured", "state")  # of columns, next to their body's name
+_JOINT = re.compile(r"(^|[_.\-/\s])(jaws?|grip(per)?|finger|wrist|joint)([_.\-/\s0-9]|$)", re.IGNORECASE)
 _ROS = re.compile(r"(^|[._/])(pose|transform|transforms\d*)[._/]")
 
 
@@ -271,6 +272,11 @@ def recognise_value(header: Sequence[str], given: _Given = _NOTHING) -> tuple[st
     others = [name for name in header if name and name not in (when.time or ()) and _plain(name) not in counters]
     others = [name for name in others if not _plain(name).startswith(("field_header", "header_"))]
     return (others[0] if len(others) == 1 else None), when
+
+
+def names_joint(column: str) -> bool:
+    """Whether a column's name is that of a joint's reading."""
+    return _JOINT.search(column) is not None
 
 
 def _left(header: Sequence[str], given: _Given) -> list[str]:

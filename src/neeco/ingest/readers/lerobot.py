@@ -36,7 +36,14 @@ from neeco.ingest.readers import (
     compare_counts,
 )
 from neeco.ingest.readers.choices import find_rotations
-from neeco.ingest.readers.columns import QUATERNION_WXYZ, ROTATION_MATRIX, pose_bodies, recognise_pose, split_unit
+from neeco.ingest.readers.columns import (
+    QUATERNION_WXYZ,
+    ROTATION_MATRIX,
+    names_joint,
+    pose_bodies,
+    recognise_pose,
+    split_unit,
+)
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
 from neeco.ingest.readers.lerobot_files import FIXED, DataSet, Episode, Feature, ParquetFile, read_data_set
 from neeco.ingest.readers.video import ChosenFrames, open_video
@@ -45,9 +52,10 @@ TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names
 MAX_PIXELS = 90_000_000  # of an image, as for files of images
 IMAGES_AT_ONCE = 16  # of those that stand in Parquet
+MAX_OFF_FRAME = 0.1  # frames, by which timestamps of images are off the times of a film's frames
+MAX_IMAGES = 10**7  # of a film: timestamps beyond are those of a clock
 DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
-_JOINT = re.compile(r"(^|[_.\-/])(jaws?|grip(per)?|finger|wrist|joint)([_.\-/0-9]|$)", re.IGNORECASE)
 
 
 class LeRobot(RecordingFormat):
@@ -78,7 +86,7 @@ class LeRobot(RecordingFormat):
         data = self._data_set(path)
         episode, key = self._chosen(data, stream, (POSES, READINGS))
         feature, name = data.features[key], f"episode {episode.number}/{key}"
-        times, order, notes = _times(data, episode)
+        times, order, _, notes = _times(data, episode)
         values = ParquetFile(episode.data).read([key], episode.number)[key]
         if values[0].size != len(feature.names):
             raise NeecoError(
@@ -93,24 +101,40 @@ class LeRobot(RecordingFormat):
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         data = self._data_set(path)
         episode, key = self._chosen(data, stream, (IMAGES,))
-        times, order, notes = _times(data, episode)
+        times, order, places, notes = _times(data, episode)
         if data.features[key].dtype == "image":
             return _open_stored(data, episode, key, times, order, notes)
         if key in episode.absent:
             raise NeecoError(episode.absent[key])
         film = episode.films[key]
-        part = None if film.start is None or film.end is None else (film.start, film.end)
+        part = None
+        if film.start is not None and film.end is not None:
+            part = film.start, max(film.end, film.start + (int(places[-1]) + 1) / data.fps)
         video = open_video(film.file, part=part)
         numbers = _frame_numbers(video)
         damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
-        usable = numbers < len(times)
+        count = int(places[-1]) + 1  # images that the states belong to, and those between
         last, states = int(numbers[-1]) + 1, f"states of episode {episode.number}"
-        shown = max(last, len(times)) if damaged else max(last, len(numbers)) if last > len(times) else len(numbers)
-        remedy = "download the data set again, or name another episode"
-        notes = (*notes, *compare_counts(film.file, shown, len(times), states, remedy=remedy))
+        if last < count and last == len(times):
+            places, count = np.arange(last), last
+            notes = (*notes, f"{film.file.name}: is shorter than its timestamps; state i is taken to be of image i")
+        shown = max(last, count) if damaged else max(last, len(numbers)) if last > count else len(numbers)
+        if count == len(times):
+            remedy = "download the data set again, or name another episode"
+            notes = (*notes, *compare_counts(film.file, shown, count, states, remedy=remedy))
+        elif shown < count:
+            raise NeecoError(
+                f"{film.file}: has {shown} images, the timestamps of episode {episode.number} go to image {count}; "
+                "download the data set again"
+            )
+        else:
+            notes = (*notes, f"{film.file.name}: {shown - len(times)} of {shown} images have no state; left out")
+        row = np.full(max(last, count), -1)
+        row[places] = np.arange(len(times))
+        usable = row[numbers] >= 0
         frames = tuple(np.flatnonzero(usable).tolist())
         return ChosenFrames(
-            video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video=video, frames=frames,
+            video.path, video.size, (*notes, *video.notes), times[row[numbers[usable]]], video=video, frames=frames,
             pixel_aspect=video.pixel_aspect,
         )  # fmt: skip
 
@@ -184,13 +208,15 @@ class LeRobot(RecordingFormat):
         bodies = pose_bodies(feature.names)
         found = []
         for prefix, columns in bodies.items():
-            body = without_frame(prefix)
-            rest = [column for column in feature.names if _JOINT.search(column) and column not in columns]
-            own = [column for column in rest if len(bodies) == 1 or body in re.split(r"[_.\-/]", column)]
-            joints = tuple((_joint_name(column, body), column) for column in own)
-            poses = recognise_pose(columns)
+            body, poses = without_frame(prefix), recognise_pose(columns)
             if poses.position is None:
                 continue
+            posing = {*poses.position, *(poses.rotation or ())}
+            of_pose = {name for name in columns if name in posing or not names_joint(_joint_name(name, body))}
+            rest = [name for name in feature.names if names_joint(name) and name not in of_pose]
+            own = [name for name in rest if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
+            joints = tuple((_joint_name(name, body), name) for name in own)
+            columns = tuple(name for name in columns if name in of_pose)
             asks = () if poses.rotation else _rotation_asks(self._columns(episode, feature, columns), columns)
             meaning = _meaning(feature.key, columns)
             found.append(replace(plain, kind=POSES, offered=True, body=body or UNNAMED, joints=joints, columns=columns,
@@ -283,8 +309,9 @@ def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np
     return pixels
 
 
-def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return times [R] s of an episode's rows from the first on, the rows of its file in their order, and notes."""
+def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Return times [R] s of an episode's rows from the first on, the rows of its file in their order, the number of
+    each row's image in its film, which its timestamp says where all are multiples of a frame, and notes."""
     table = ParquetFile(episode.data).read(["timestamp", "frame_index"], episode.number)
     frames, stamps = table["frame_index"].reshape(-1), table["timestamp"].reshape(-1).astype(np.float64)
     if len(frames) != episode.length:
@@ -296,11 +323,15 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, tup
     frames, stamps = frames[order], stamps[order]
     if not np.array_equal(frames, np.arange(len(frames))):
         raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")
-    steps = np.diff(stamps)
+    rows, steps = np.arange(len(frames)), np.diff(stamps)
     if np.isfinite(stamps).all() and (steps > 0).all():
-        return stamps - stamps[0], order, ()
+        shown = stamps * data.fps
+        places = np.rint(shown)
+        exact = np.abs(shown - places).max() < MAX_OFF_FRAME and (np.diff(places) > 0).all()
+        exact &= places[0] >= 0 and places[-1] < MAX_IMAGES
+        return stamps - stamps[0], order, places.astype(np.int64) if exact else rows, ()
     note = f"episode {episode.number}: its timestamps do not increase; taken as {data.fps:g} a second"
-    return frames / data.fps, order, (f"{data.path.name}: {note}",)
+    return frames / data.fps, order, rows, (f"{data.path.name}: {note}",)
 
 
 def _frame_numbers(video: VideoSource) -> np.ndarray:
