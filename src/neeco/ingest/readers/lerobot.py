@@ -39,7 +39,7 @@ from neeco.ingest.readers.choices import find_rotations
 from neeco.ingest.readers.columns import (
     QUATERNION_WXYZ,
     ROTATION_MATRIX,
-    names_joint,
+    joint_columns,
     pose_bodies,
     recognise_pose,
     split_unit,
@@ -52,7 +52,6 @@ TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names
 MAX_PIXELS = 90_000_000  # of an image, as for files of images
 IMAGES_AT_ONCE = 16  # of those that stand in Parquet
-MAX_OFF_FRAME = 0.1  # frames, by which timestamps of images are off the times of a film's frames
 MAX_IMAGES = 10**7  # of a film: timestamps beyond are those of a clock
 DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
@@ -107,28 +106,23 @@ class LeRobot(RecordingFormat):
         if key in episode.absent:
             raise NeecoError(episode.absent[key])
         film = episode.films[key]
-        part = None
-        if film.start is not None and film.end is not None:
-            part = film.start, max(film.end, film.start + (int(places[-1]) + 1) / data.fps)
+        part = None if film.start is None or film.end is None else (film.start, film.end)
+        if part is not None and places[-1] >= len(places):  # the part was counted without the rows that were removed
+            part = part[0], max(part[1], part[0] + (int(places[-1]) + 1) / data.fps)
         video = open_video(film.file, part=part)
         numbers = _frame_numbers(video)
         damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
         count = int(places[-1]) + 1  # images that the states belong to, and those between
-        last, states = int(numbers[-1]) + 1, f"states of episode {episode.number}"
+        last = int(numbers[-1]) + 1
         if last < count and last == len(times):
             places, count = np.arange(last), last
             notes = (*notes, f"{film.file.name}: is shorter than its timestamps; state i is taken to be of image i")
         shown = max(last, count) if damaged else max(last, len(numbers)) if last > count else len(numbers)
-        if count == len(times):
-            remedy = "download the data set again, or name another episode"
-            notes = (*notes, *compare_counts(film.file, shown, count, states, remedy=remedy))
-        elif shown < count:
-            raise NeecoError(
-                f"{film.file}: has {shown} images, the timestamps of episode {episode.number} go to image {count}; "
-                "download the data set again"
-            )
-        else:
-            notes = (*notes, f"{film.file.name}: {shown - len(times)} of {shown} images have no state; left out")
+        noun, remedy = f"states of episode {episode.number}", "download the data set again, or name another episode"
+        if count > len(times):
+            notes = (*notes, f"{film.file.name}: by timestamps, not all images have {noun}; the others are left out")
+            noun, shown = f"that the timestamps of episode {episode.number} reach", min(shown, count)
+        notes = (*notes, *compare_counts(film.file, shown, count, noun, remedy=remedy))
         row = np.full(max(last, count), -1)
         row[places] = np.arange(len(times))
         usable = row[numbers] >= 0
@@ -206,17 +200,14 @@ class LeRobot(RecordingFormat):
         if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
             return [plain]
         bodies = pose_bodies(feature.names)
-        found = []
+        readings, found = joint_columns(feature.names, bodies), []
         for prefix, columns in bodies.items():
             body, poses = without_frame(prefix), recognise_pose(columns)
             if poses.position is None:
                 continue
-            posing = {*poses.position, *(poses.rotation or ())}
-            of_pose = {name for name in columns if name in posing or not names_joint(_joint_name(name, body))}
-            rest = [name for name in feature.names if names_joint(name) and name not in of_pose]
-            own = [name for name in rest if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
+            own = [name for name in readings if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
             joints = tuple((_joint_name(name, body), name) for name in own)
-            columns = tuple(name for name in columns if name in of_pose)
+            columns = tuple(name for name in columns if name not in readings)
             asks = () if poses.rotation else _rotation_asks(self._columns(episode, feature, columns), columns)
             meaning = _meaning(feature.key, columns)
             found.append(replace(plain, kind=POSES, offered=True, body=body or UNNAMED, joints=joints, columns=columns,
@@ -311,7 +302,7 @@ def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np
 
 def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
     """Return times [R] s of an episode's rows from the first on, the rows of its file in their order, the number of
-    each row's image in its film, which its timestamp says where all are multiples of a frame, and notes."""
+    each row's image in its film: the one nearest to its timestamp where no two share one, and notes."""
     table = ParquetFile(episode.data).read(["timestamp", "frame_index"], episode.number)
     frames, stamps = table["frame_index"].reshape(-1), table["timestamp"].reshape(-1).astype(np.float64)
     if len(frames) != episode.length:
@@ -325,11 +316,11 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.
         raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")
     rows, steps = np.arange(len(frames)), np.diff(stamps)
     if np.isfinite(stamps).all() and (steps > 0).all():
-        shown = stamps * data.fps
-        places = np.rint(shown)
-        exact = np.abs(shown - places).max() < MAX_OFF_FRAME and (np.diff(places) > 0).all()
-        exact &= places[0] >= 0 and places[-1] < MAX_IMAGES
-        return stamps - stamps[0], order, places.astype(np.int64) if exact else rows, ()
+        places = np.rint(stamps * data.fps)
+        if (np.diff(places) > 0).all() and places[0] >= 0 and places[-1] < MAX_IMAGES:
+            return stamps - stamps[0], order, places.astype(np.int64), ()
+        note = f"episode {episode.number}: its timestamps name no images; state i is taken to be of image i"
+        return stamps - stamps[0], order, rows, (f"{data.path.name}: {note}",)
     note = f"episode {episode.number}: its timestamps do not increase; taken as {data.fps:g} a second"
     return frames / data.fps, order, rows, (f"{data.path.name}: {note}",)
 

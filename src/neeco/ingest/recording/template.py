@@ -26,7 +26,8 @@ from neeco.ingest.readers.columns import (
     UNITS,
     PoseColumns,
     RecognisedColumns,
-    names_joint,
+    joint_columns,
+    pose_bodies,
     recognise_pose,
     recognise_time,
     recognise_value,
@@ -306,8 +307,7 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
     if pose.rotation or "rotation" in pose.unclear:
         found.poses.append((replace(log, meaning=meaning), pose))
-        used = {*(pose.position or ()), *(pose.rotation or ()), *(when.time or ())}
-        joints = [column for column in columns if names_joint(column) and column not in used]
+        joints = joint_columns(columns, pose_bodies(columns))
         found.joints += [(log, when, column, _joint_of(column)) for column in joints]
     elif value and when.time:
         found.joints.append((log, when, value, None))
