@@ -72,6 +72,23 @@ def test_a_repeated_header_is_named(world):
         read_reading_log(JointColumns(path, "jaw"))
 
 
+@pytest.mark.parametrize("times", [(4.0, 4.5), (4.48, 4.48)], ids=["gap", "same time"])
+@pytest.mark.parametrize("begins", [(0.0, 0.5), (0.0, 0.0)], ids=["gap", "same time"])
+def test_a_second_run_is_refused_however_uneven_the_rows_around_its_beginning_are(world, times, begins):
+    stamps = [*np.arange(0, 4, 0.02), *times, *begins, *(0.6 + np.arange(100) / 50)]
+    path = world.write("t_s,jaw_rad", np.column_stack([stamps, np.sin(stamps)]))
+    with pytest.raises(NeecoError, match=r"line 204: time begins anew"):
+        read_reading_log(JointColumns(path, "jaw"))
+
+
+def test_a_repeated_header_is_refused_where_rows_have_no_times(world):
+    path = world.write("jaw_rad", np.sin(np.arange(100))[:, None])
+    assert len(read_reading_log(JointColumns(path, "jaw", rate_hz=50.0)).times) == 100
+    path.write_text(path.read_text() + path.read_text())
+    with pytest.raises(NeecoError, match="line 102 repeats the header"):
+        read_reading_log(JointColumns(path, "jaw", rate_hz=50.0))
+
+
 def test_a_run_that_ends_near_a_counters_period_is_no_wrap(world):
     times = np.concatenate([np.arange(0, 4.29, 0.02), np.arange(0.5, 3, 0.02)])  # 2^32 ns are 4.295 s
     path = world.write("t_s,jaw_rad", np.column_stack([times, np.sin(times)]))

@@ -81,6 +81,11 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, found: Recognised
     """Return times [R] in s; rows without one are dropped."""
     table, names, rate = rows.table, source.time or found.time, source.rate_hz
     if names is None and rate is not None:
+        if headers := _headers(table, range(len(table.rows))):
+            raise NeecoError(
+                f"{table.where}: line {headers[0]} repeats the header, and its rows have no times; keep those of one "
+                "run in a file"
+            )
         return np.arange(len(table.rows)) / rate
     if names is None:
         raise NeecoError(
@@ -192,12 +197,11 @@ def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float
     usual = float(np.median(steps[steps > 0]))
     units = [1.0, 1e-3, 1e-6, 1e-9, *([] if rate_hz is None else [1 / rate_hz])]
     periods = [DAY_S, *(count * unit for unit in units for count in COUNTERS)]
-    ordered = (steps > 0) & (steps <= GAP_STEPS * usual)
     times = times.copy()
     for back in np.flatnonzero(steps < -RESTART_STEPS * usual):
-        if not (ordered[back - 1 : back].all() and ordered[back + 1 : back + 2].all()):
-            continue  # a single row out of its place
         before, after = float(taken[back]), float(taken[back + 1])
+        if (taken[max(back - 1, 0) : back] <= after).any() or (taken[back + 2 : back + 3] >= before).any():
+            continue  # a single row out of its place
         tolerance, line = GAP_STEPS * usual, table.lines[usable[back + 1]]
         wraps = [
             period
@@ -206,8 +210,7 @@ def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float
             if abs(after - first) <= tolerance and abs(first + period - before) <= tolerance < period / 10
         ]
         if not wraps:
-            skipped = range(usable[back] + 1, usable[back + 1])
-            headers = [table.lines[row] for row in skipped if tuple(table.rows[row]) == tuple(table.header)]
+            headers = _headers(table, range(usable[back] + 1, usable[back + 1]))
             why = f"line {headers[0]} repeats the header" if headers else "another run, or a clock set back"
             raise NeecoError(
                 f"{table.where}: {table.record} {line}: time begins anew ({before:.6g} s, then {after:.6g} s): {why}; "
@@ -216,6 +219,11 @@ def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float
         times[usable[back + 1 :]] += wraps[0]
         rows.repairs.append(f"its time begins anew after {before:.6g} s ({table.record} {line}); taken to go on")
     return times
+
+
+def _headers(table: Table, rows: range) -> list[int]:
+    """Return the lines that repeat the header."""
+    return [int(table.lines[row]) for row in rows if tuple(table.rows[row]) == tuple(table.header)]
 
 
 def find_gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:

@@ -411,5 +411,5 @@ def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[
     falling = np.flatnonzero(np.diff(times) <= 0)
     if len(falling):
         line = table.lines[rows_used[falling[0] + 1]]
-        raise NeecoError(f"{table_path}: line {line}: {column} does not increase; sort the rows")
+        raise NeecoError(f"{table_path}: line {line}: {column} does not increase; keep the rows of one run, in order")
     return files, times
