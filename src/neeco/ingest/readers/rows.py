@@ -187,21 +187,26 @@ def in_order(rows: Rows, times: np.ndarray, rate_hz: float | None = None) -> tup
     return times[order], order
 
 
+def restarts(times: np.ndarray) -> tuple[float, list[int]]:
+    """Return the usual step of times [T], and after which of them time begins anew: a step back by far more than it,
+    which no single time out of its place explains."""
+    steps = np.diff(times)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
+    far = np.flatnonzero(steps < -RESTART_STEPS * usual).tolist()
+    held = [back for back in far if (times[max(back - 1, 0) : back] > times[back + 1]).all()]
+    return usual, [back for back in held if (times[back + 2 : back + 3] < times[back]).all()]
+
+
 def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float | None) -> np.ndarray:
     """Return times [R] that go on where a counter, or the time of day, begins anew. Raises NeecoError where time does
     for another reason: one step back by far more than a usual step, between rows in order."""
     table, taken = rows.table, times[usable]
-    steps = np.diff(taken)
-    if not (steps > 0).any():
-        return times
-    usual = float(np.median(steps[steps > 0]))
+    usual, places = restarts(taken)
     units = [1.0, 1e-3, 1e-6, 1e-9, *([] if rate_hz is None else [1 / rate_hz])]
     periods = [DAY_S, *(count * unit for unit in units for count in COUNTERS)]
     times = times.copy()
-    for back in np.flatnonzero(steps < -RESTART_STEPS * usual):
+    for back in places:
         before, after = float(taken[back]), float(taken[back + 1])
-        if (taken[max(back - 1, 0) : back] <= after).any() or (taken[back + 2 : back + 3] >= before).any():
-            continue  # a single row out of its place
         tolerance, line = GAP_STEPS * usual, table.lines[usable[back + 1]]
         wraps = [
             period
