@@ -239,3 +239,15 @@ def test_a_bag_without_its_reader_s_package_says_what_to_install(session, monkey
     with pytest.raises(NeecoError, match=r"rosbag: ROS bag: needs rosbags; pip install '\.\[ros\]'") as caught:
         format_of(session).streams(session)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_frames_earlier_than_any_before_them_are_left_out(world):
+    session = write_session(world)
+    sidecar = session / "endoscope_20260117_153206.json"
+    document = json.loads(sidecar.read_text(encoding="utf-8"))
+    for number, frame in enumerate(document["frames"]):
+        frame["cpu_ts"] = BEGIN + round((number if number < 20 else number - 12) * 40e6)
+    sidecar.write_text(json.dumps(document), encoding="utf-8")
+    video = format_of(session).open_images(session, "endoscope_20260117_153206.left")
+    assert (np.diff(video.times) > 0).all()
+    assert any("10 frames are no later than" in note for note in video.notes)

@@ -322,6 +322,85 @@ def test_a_film_of_another_length_than_its_states(tmp_path, version, shown, refu
         assert "has 29 images for 30 states" in video.notes[0]
 
 
+def with_column(path: Path, pattern: str, name: str, values: Any) -> None:
+    """Replace a column in the file of a data set that a pattern names."""
+    (file,) = path.glob(pattern)
+    table = pyarrow.parquet.read_table(file)
+    place = table.schema.get_field_index(name)
+    column = pyarrow.array(values, type=table.schema.field(place).type)
+    pyarrow.parquet.write_table(table.set_column(place, name, column), file)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize(
+    "shown",
+    [np.arange(10, 30), np.delete(np.arange(30), range(5, 15)), np.arange(1, 30, 2)],
+    ids=["cut", "gap", "half"],
+)
+def test_an_image_belongs_to_the_state_with_its_timestamp(tmp_path, version, shown):
+    states = {STATE: EPISODES[1][STATE][shown], "action": np.zeros((len(shown), 3), np.float32)}
+    path = data_set(tmp_path, version=version, states=[states], shown={0: 30})
+    with_column(path, "data/*/*.parquet", "timestamp", shown / FPS)
+    if version == "v3.0":  # who removes rows may state a part as long as those that are left
+        with_column(path, "meta/episodes/*/*.parquet", f"videos/{CAMERA}/to_timestamp", [len(shown) / FPS])
+    video = format_of(path).open_images(path, f"episode 0/{CAMERA}")
+    assert [left_edge(pixels) for _, pixels in video.read(range(len(shown)))] == shown.tolist()
+    np.testing.assert_array_equal(video.times, read(path, f"episode 0/{STATE}").rows[:, 0])
+    np.testing.assert_allclose(video.times, (shown - shown[0]) / FPS, atol=1e-6)
+    assert not [note for note in video.notes if "not all images have" not in note]
+
+
+def test_timestamps_a_little_off_name_the_nearest_image_and_those_of_a_clock_none(tmp_path):
+    path = data_set(tmp_path, version="v2.1", states=[EPISODES[1]])
+    for stamps, noted in [
+        (np.arange(30) / FPS + 0.3 * np.sin(np.arange(30)) / FPS + 0.001, 0),
+        (1000.3 + np.arange(30) / FPS, 1),
+        (np.r_[0, 0.001, np.arange(2, 30) / FPS], 1),
+    ]:
+        with_column(path, "data/*/*.parquet", "timestamp", stamps)
+        video = format_of(path).open_images(path, f"episode 0/{CAMERA}")
+        assert [left_edge(pixels) for _, pixels in video.read([0, 7, 29])] == [0, 7, 29]
+        assert len([note for note in video.notes if "state i is taken to be of image i" in note]) == noted
+
+
+@pytest.mark.parametrize(("frames", "refused"), [(29, False), (25, True)])
+def test_a_film_that_ends_before_its_timestamps(tmp_path, frames, refused):
+    path = data_set(tmp_path, version="v2.1", states=[EPISODES[0]], shown={0: frames})
+    with_column(path, "data/*/*.parquet", "timestamp", np.arange(10, 30) / FPS)
+    if refused:
+        assert "25 images for 30 that the timestamps of episode 0" in refusal(path, f"episode 0/{CAMERA}", images=True)
+    else:
+        assert len(format_of(path).open_images(path, f"episode 0/{CAMERA}").times) == 19
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_no_image_of_the_next_episode_is_taken(tmp_path, version):
+    path = data_set(tmp_path, version=version, states=[EPISODES[1], EPISODES[0]], shown={0: 20})
+    if version == "v3.0":
+        with_column(path, "meta/episodes/*/*.parquet", f"videos/{CAMERA}/to_timestamp", [20 / FPS, 40 / FPS])
+    assert "has 20 images for 30 states" in refusal(path, f"episode 0/{CAMERA}", images=True)
+
+
+@pytest.mark.parametrize(
+    ("names", "joint"),
+    [
+        ((*(f"psm1_{name}" for name in BODY), "psm1_jaw"), ("jaw", "psm1_jaw")),
+        ((*(f"psm1.{name}" for name in BODY), "psm1_jaw"), ("jaw", "psm1_jaw")),
+        ((*BODY, "gripper"), ("gripper", "gripper")),
+        ((*BODY, "gripper_opening"), ("gripper_opening", "gripper_opening")),
+        ((*(f"gripper_{name}" for name in BODY), "gripper_jaw"), ("jaw", "gripper_jaw")),
+        ((*(f"gripper_{name}" for name in BODY), "gripper_vx"), None),
+    ],
+)
+def test_a_jaw_whose_column_stands_with_the_pose_is_offered(tmp_path, names, joint):
+    path = data_set(tmp_path, states=[{STATE: arm(12, 0)}], names={STATE: list(names)})
+    known = format_of(path)
+    assert known is not None
+    (stream,) = (stream for stream in known.streams(path) if stream.body is not None)
+    assert stream.joints == (() if joint is None else (joint,))
+    assert (f"value: {names[-1]}" in write_template(path)) == (joint is not None)
+
+
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [

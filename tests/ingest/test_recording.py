@@ -65,6 +65,22 @@ def test_init_offers_every_angle_of_a_robots_table_as_a_joint_on_the_clock_of_it
     assert read_reading_log(instrument.joints["jaw"]).values[0] == pytest.approx(0.2)
 
 
+@pytest.mark.parametrize("body", ["", "psm1_", "left_gripper_"])
+@pytest.mark.parametrize("jaw", ["jaw", "gripper", "opening_deg"])
+def test_init_offers_the_jaw_that_stands_in_a_table_of_poses(world, body, jaw):
+    (world.folder / "clip.mp4").write_bytes(b"film")
+    names = ",".join(body + name for name in ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw", "speed", jaw))
+    rows = [[0.01 * k, 0.1 * k, 2, 3, 0, 0, 0, 1, 9, 0.2 + 0.001 * k] for k in range(40)]
+    world.write(f"t_s,{names}", rows, "arm.csv")
+    (world.folder / "recording.yaml").write_text(
+        write_template(world.folder).replace("# units: {angle: rad}", "units: {angle: rad}")
+    )
+    [instrument] = read_recording(world.folder / "recording.yaml").instruments
+    [joint] = instrument.joints.values()
+    assert (joint.value, joint.clock) == (body + jaw, instrument.poses.clock)
+    assert len(read_reading_log(joint).values) == 40
+
+
 def test_init_writes_what_the_flags_say(folder):
     (folder / "recording.yaml").write_text(write_template(folder))
     recording = read_recording(folder / "recording.yaml")

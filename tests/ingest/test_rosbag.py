@@ -343,6 +343,14 @@ def test_images_come_by_time_and_doubled_or_damaged_ones_are_left_out(tmp_path: 
     assert "1 image shares a time with another; left out" in film.notes[2]
 
 
+def test_images_whose_time_begins_anew_are_refused(tmp_path: Path) -> None:
+    with BagWriter(tmp_path, "recording.bag") as bag:
+        for place_in_bag, number in enumerate([*range(20, 40), *range(20)]):
+            bag.late = 0.04 * place_in_bag - number / 25
+            bag.image(LEFT, number / 25, picture(number), "rgb8")
+    assert "image 21: time begins anew" in refusal(lambda: images(bag.path))
+
+
 def test_a_wanted_few_of_many_images_are_sought_and_not_read_past(tmp_path: Path) -> None:
     with BagWriter(tmp_path, "recording-mcap") as bag:
         for number in range(400):

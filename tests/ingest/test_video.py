@@ -224,3 +224,43 @@ def test_dicom_is_called_what_it_is(tmp_path):
     path.write_bytes(bytes(128) + b"DICM" + bytes(200))
     with pytest.raises(NeecoError, match=r"v\.dcm: is DICOM; take the video stream out of it first"):
         open_video(path)
+
+
+def grey_film(path, codec="libx264", first_stamp=0, **options):
+    """A film of 30 frames; the grey level of frame i is 10 + 7 i."""
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25, options=options)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for index in range(30):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 10 + 7 * index, np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize("ending", ["avi", "asf", "mp4", "mkv", "ts"])
+@pytest.mark.parametrize("b_frames", ["0", "3"])
+def test_frames_come_in_the_order_they_are_shown_whatever_the_container_stores(tmp_path, ending, b_frames):
+    opened = open_video(grey_film(tmp_path / f"film.{ending}", bf=b_frames))
+    levels = [int(np.median(pixels)) for _, pixels in opened.read(range(len(opened.times)))]
+    np.testing.assert_allclose(levels, 10 + 7 * np.arange(30), atol=3)
+    np.testing.assert_allclose(opened.times, np.arange(30) / 25, atol=2e-3)  # ASF counts ms
+    assert not [note for note in opened.notes if "left out" in note or "ends early" in note]
+
+
+def test_frames_that_an_edit_list_hides_are_not_missed(tmp_path):
+    av = pytest.importorskip("av")
+    source = grey_film(tmp_path / "whole.mp4", bf="0", g="30")
+    with av.open(str(source)) as whole, av.open(str(tmp_path / "cut.mp4"), "w") as cut:
+        film = whole.streams.video[0]
+        copied = cut.add_stream_from_template(film)
+        early = round(0.24 / film.time_base)
+        for packet in whole.demux(film):
+            if packet.dts is not None:
+                packet.dts, packet.pts = packet.dts - early, packet.pts - early
+                packet.stream = copied
+                cut.mux(packet)
+    opened = open_video(tmp_path / "cut.mp4")
+    assert len(opened.times) == 24
+    assert opened.notes == ()

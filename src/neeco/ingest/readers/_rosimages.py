@@ -21,6 +21,7 @@ from neeco.ingest.calibration.camera_fields import cameras_in
 from neeco.ingest.calibration.stereo import RosCamera
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.readers._bagfile import open_bag, plain
+from neeco.ingest.readers.rows import restarts
 
 MAX_PIXELS = 90_000_000  # of an image, as for files of images
 MAX_SKIPPED = 30  # images that are read and dropped rather than sought over
@@ -176,6 +177,9 @@ def open_topic(path: Path, topic: str, log: ImageLog, seconds: np.ndarray, notes
     name = f"{path.name}: {topic}"
     for why, count in log.bad.items():
         notes.append(f"{name}: {counted(count, 'image')} left out: one {why}")
+    for place in restarts(seconds)[1]:
+        found = f"{seconds[place]:.6g} s, then {seconds[place + 1]:.6g} s"
+        raise NeecoError(f"{where}: image {place + 2}: time begins anew ({found}); keep the images of one run in a bag")
     order = np.argsort(seconds, kind="stable")
     fresh = np.concatenate([[True], np.diff(seconds[order]) > 0])
     if not fresh.all():

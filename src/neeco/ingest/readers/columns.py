@@ -184,6 +184,9 @@ _ROTATION_VECTORS = _choices(
 )
 _EULER_ANGLES = (["roll", "pitch", "yaw"], ["rx", "ry", "rz"], ["alpha", "beta", "gamma"])
 _POSE_WORDS = ("pose", "cp", "tcp", "ee", "eef", "tip", "measured", "state")  # of columns, next to their body's name
+_JOINT = re.compile(
+    r"(^|[_.\-/\s])(jaws?|grip(per)?|fingers?|wrist|joint|opening|aperture|angle)([_.\-/\s\[(0-9]|$)", re.IGNORECASE
+)
 _ROS = re.compile(r"(^|[._/])(pose|transform|transforms\d*)[._/]")
 
 
@@ -271,6 +274,18 @@ def recognise_value(header: Sequence[str], given: _Given = _NOTHING) -> tuple[st
     others = [name for name in header if name and name not in (when.time or ()) and _plain(name) not in counters]
     others = [name for name in others if not _plain(name).startswith(("field_header", "header_"))]
     return (others[0] if len(others) == 1 else None), when
+
+
+def joint_columns(header: Sequence[str], bodies: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the columns of a table of poses that are named like readings of joints and belong to no pose of its
+    `bodies` (`pose_bodies`), whose own names do not count: `gripper_vx` is none."""
+    posing: set[str] = set()
+    for columns in bodies.values():
+        pose, words = recognise_pose(columns), [_plain(name).split("_") for name in columns]
+        start = next((place for place, held in enumerate(zip(*words, strict=False)) if len(set(held)) > 1), 0)
+        moving = [name for name in columns if not _JOINT.search("_".join(_plain(name).split("_")[start:]))]
+        posing |= {*(pose.position or ()), *(pose.rotation or ()), *moving}
+    return [name for name in header if _JOINT.search(name) and name not in posing]
 
 
 def _left(header: Sequence[str], given: _Given) -> list[str]:

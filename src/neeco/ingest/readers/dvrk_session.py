@@ -118,7 +118,7 @@ class DvrkSession(RecordingFormat):
         if name not in films:
             raise NeecoError(f"{path}: stream: {printable(name)} is in the bag; name the bag as the video's file")
         film, start = films[name], _start(path)
-        times, keep = film.times, np.diff(film.times, prepend=-np.inf) > 0
+        times, keep = film.times, np.diff(np.maximum.accumulate(film.times), prepend=-np.inf) > 0
         notes = (
             [] if keep.all() else [f"{name}: {int((~keep).sum())} frames are no later than the one before; left out"]
         )

@@ -37,7 +37,14 @@ from neeco.ingest.readers import (
     compare_counts,
 )
 from neeco.ingest.readers.choices import find_rotations
-from neeco.ingest.readers.columns import QUATERNION_WXYZ, ROTATION_MATRIX, pose_bodies, recognise_pose, split_unit
+from neeco.ingest.readers.columns import (
+    QUATERNION_WXYZ,
+    ROTATION_MATRIX,
+    joint_columns,
+    pose_bodies,
+    recognise_pose,
+    split_unit,
+)
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
 from neeco.ingest.readers.lerobot_files import FIXED, DataSet, Episode, Feature, ParquetFile, read_data_set
 from neeco.ingest.readers.video import ChosenFrames, open_video
@@ -47,9 +54,9 @@ TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names
 MAX_PIXELS = 90_000_000  # of an image, as for files of images
 IMAGES_AT_ONCE = 16  # of those that stand in Parquet
+MAX_IMAGES = 10**7  # of a film: timestamps beyond are those of a clock
 DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
-_JOINT = re.compile(r"(^|[_.\-/])(jaws?|grip(per)?|finger|wrist|joint)([_.\-/0-9]|$)", re.IGNORECASE)
 
 
 class LeRobot(RecordingFormat):
@@ -76,7 +83,7 @@ class LeRobot(RecordingFormat):
         data = self._data_set(path)
         episode, key = self._chosen(data, stream, (POSES, READINGS))
         feature, name = data.features[key], f"episode {episode.number}/{key}"
-        times, order, notes = _times(data, episode)
+        times, order, _, notes = _times(data, episode)
         values = ParquetFile(episode.data).read([key], episode.number)[key]
         if values[0].size != len(feature.names):
             raise NeecoError(
@@ -91,24 +98,35 @@ class LeRobot(RecordingFormat):
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         data = self._data_set(path)
         episode, key = self._chosen(data, stream, (IMAGES,))
-        times, order, notes = _times(data, episode)
+        times, order, places, notes = _times(data, episode)
         if data.features[key].dtype == "image":
             return _open_stored(data, episode, key, times, order, notes)
         if key in episode.absent:
             raise NeecoError(episode.absent[key])
         film = episode.films[key]
         part = None if film.start is None or film.end is None else (film.start, film.end)
+        if part is not None and places[-1] >= len(places):  # the part was counted without the rows that were removed
+            part = part[0], max(part[1], part[0] + (int(places[-1]) + 1) / data.fps)
         video = open_video(film.file, part=part)
         numbers = _frame_numbers(video)
         damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
-        usable = numbers < len(times)
-        last, states = int(numbers[-1]) + 1, f"states of episode {episode.number}"
-        shown = max(last, len(times)) if damaged else max(last, len(numbers)) if last > len(times) else len(numbers)
-        remedy = "download the data set again, or name another episode"
-        notes = (*notes, *compare_counts(film.file, shown, len(times), states, remedy=remedy))
+        count = int(places[-1]) + 1  # images that the states belong to, and those between
+        last = int(numbers[-1]) + 1
+        if last < count and last == len(times):
+            places, count = np.arange(last), last
+            notes = (*notes, f"{film.file.name}: is shorter than its timestamps; state i is taken to be of image i")
+        shown = max(last, count) if damaged else max(last, len(numbers)) if last > count else len(numbers)
+        noun, remedy = f"states of episode {episode.number}", "download the data set again, or name another episode"
+        if count > len(times):
+            notes = (*notes, f"{film.file.name}: by timestamps, not all images have {noun}; the others are left out")
+            noun, shown = f"that the timestamps of episode {episode.number} reach", min(shown, count)
+        notes = (*notes, *compare_counts(film.file, shown, count, noun, remedy=remedy))
+        row = np.full(max(last, count), -1)
+        row[places] = np.arange(len(times))
+        usable = row[numbers] >= 0
         frames = tuple(np.flatnonzero(usable).tolist())
         return ChosenFrames(
-            video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video=video, frames=frames,
+            video.path, video.size, (*notes, *video.notes), times[row[numbers[usable]]], video=video, frames=frames,
             pixel_aspect=video.pixel_aspect,
         )  # fmt: skip
 
@@ -180,15 +198,14 @@ class LeRobot(RecordingFormat):
         if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
             return [plain]
         bodies = pose_bodies(feature.names)
-        found = []
+        readings, found = joint_columns(feature.names, bodies), []
         for prefix, columns in bodies.items():
-            body = without_frame(prefix)
-            rest = [column for column in feature.names if _JOINT.search(column) and column not in columns]
-            own = [column for column in rest if len(bodies) == 1 or body in re.split(r"[_.\-/]", column)]
-            joints = tuple((_joint_name(column, body), column) for column in own)
-            poses = recognise_pose(columns)
+            body, poses = without_frame(prefix), recognise_pose(columns)
             if poses.position is None:
                 continue
+            own = [name for name in readings if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
+            joints = tuple((_joint_name(name, body), name) for name in own)
+            columns = tuple(name for name in columns if name not in readings)
             asks = () if poses.rotation else _rotation_asks(self._columns(episode, feature, columns), columns)
             meaning = _meaning(feature.key, columns)
             found.append(replace(plain, kind=POSES, offered=True, body=body or UNNAMED, joints=joints, columns=columns,
@@ -281,8 +298,9 @@ def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np
     return pixels
 
 
-def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return times [R] s of an episode's rows from the first on, the rows of its file in their order, and notes."""
+def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Return times [R] s of an episode's rows from the first on, the rows of its file in their order, the number of
+    each row's image in its film: the one nearest to its timestamp where no two share one, and notes."""
     table = ParquetFile(episode.data).read(["timestamp", "frame_index"], episode.number)
     frames, stamps = table["frame_index"].reshape(-1), table["timestamp"].reshape(-1).astype(np.float64)
     if len(frames) != episode.length:
@@ -294,11 +312,15 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, tup
     frames, stamps = frames[order], stamps[order]
     if not np.array_equal(frames, np.arange(len(frames))):
         raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")
-    steps = np.diff(stamps)
+    rows, steps = np.arange(len(frames)), np.diff(stamps)
     if np.isfinite(stamps).all() and (steps > 0).all():
-        return stamps - stamps[0], order, ()
+        places = np.rint(stamps * data.fps)
+        if (np.diff(places) > 0).all() and places[0] >= 0 and places[-1] < MAX_IMAGES:
+            return stamps - stamps[0], order, places.astype(np.int64), ()
+        note = f"episode {episode.number}: its timestamps name no images; state i is taken to be of image i"
+        return stamps - stamps[0], order, rows, (f"{data.path.name}: {note}",)
     note = f"episode {episode.number}: its timestamps do not increase; taken as {data.fps:g} a second"
-    return frames / data.fps, order, (f"{data.path.name}: {note}",)
+    return frames / data.fps, order, rows, (f"{data.path.name}: {note}",)
 
 
 def _frame_numbers(video: VideoSource) -> np.ndarray:

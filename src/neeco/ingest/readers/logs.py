@@ -83,7 +83,7 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     times = read_times(rows, source, found)
     positions, quats = _poses(rows, source, found)
     drop_stuck(rows, times, np.column_stack([positions, quats]))
-    times, order = in_order(rows, times)
+    times, order = in_order(rows, times, source.rate_hz)
     if np.ptp(quats[order], axis=0).max() == 0 and np.ptp(positions[order], axis=0).max() > 0:
         rows.repairs.append("its rotation never changes: does it hold positions alone?")
     quats, flips = continuous(quats[order])
@@ -179,7 +179,7 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
         impossible = np.abs(np.where(rows.keep, values, 0)) > MAX_ANGLE
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
         rows.drop_wrong(impossible, reason)
-    times, order = in_order(rows, times)
+    times, order = in_order(rows, times, source.rate_hz)
     gaps, gap_notes = find_gaps(table, times)
     notes = (*rows.notes(), *clamped, *gap_notes)
     return ReadingLog(table.path, source.clock, times, values[order], gaps=gaps, notes=notes, image_hz=table.image_hz)

@@ -15,6 +15,9 @@ MAX_LISTED_STATES = 8  # of those that drop rows, in the notes
 MAX_SAME_TIME = 0.5  # share of rows at the time of another: more, and times are too coarse
 STUCK_S, STUCK_SAMPLES = 0.5, 10  # a tracker's noise leaves no pose unchanged for as long
 GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
+RESTART_STEPS = 10.0  # usual steps back in time, beyond which rows are not out of order: time begins anew
+DAY_S = 86400.0  # a clock that shows the time of day begins anew
+COUNTERS = (2.0**32, 2.0**16)  # values at which unsigned counters begin anew
 
 
 class Rows:
@@ -78,6 +81,11 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, found: Recognised
     """Return times [R] in s; rows without one are dropped."""
     table, names, rate = rows.table, source.time or found.time, source.rate_hz
     if names is None and rate is not None:
+        if headers := _headers(table, range(len(table.rows))):
+            raise NeecoError(
+                f"{table.where}: line {headers[0]} repeats the header, and its rows have no times; keep those of one "
+                "run in a file"
+            )
         return np.arange(len(table.rows)) / rate
     if names is None:
         raise NeecoError(
@@ -152,9 +160,11 @@ def drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
             rows.drop(used[first + 1 : last + 1], "the pose of the row before, repeated (a tracker that lost its tool)")
 
 
-def in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left."""
+def in_order(rows: Rows, times: np.ndarray, rate_hz: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left, and where
+    time begins anew. rate_hz: of a column that counts frames."""
     table, usable = rows.table, np.flatnonzero(rows.keep)
+    times = _continued(rows, times, usable, rate_hz)
     order = usable[np.argsort(times[usable], kind="stable")]
     late = usable[1:][times[usable][1:] < np.maximum.accumulate(times[usable])[:-1]]
     doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
@@ -175,6 +185,50 @@ def in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         listed = table.list_rows(table.lines[late])
         rows.repairs.append(f"{counted(len(late), 'row')} out of order in time; sorted ({listed})")
     return times[order], order
+
+
+def restarts(times: np.ndarray) -> tuple[float, list[int]]:
+    """Return the usual step of times [T], and after which of them time begins anew: a step back by far more than it,
+    which no single time out of its place explains."""
+    steps = np.diff(times)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
+    far = np.flatnonzero(steps < -RESTART_STEPS * usual).tolist()
+    held = [back for back in far if (times[max(back - 1, 0) : back] > times[back + 1]).all()]
+    return usual, [back for back in held if (times[back + 2 : back + 3] < times[back]).all()]
+
+
+def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float | None) -> np.ndarray:
+    """Return times [R] that go on where a counter, or the time of day, begins anew. Raises NeecoError where time does
+    for another reason: one step back by far more than a usual step, between rows in order."""
+    table, taken = rows.table, times[usable]
+    usual, places = restarts(taken)
+    units = [1.0, 1e-3, 1e-6, 1e-9, *([] if rate_hz is None else [1 / rate_hz])]
+    periods = [DAY_S, *(count * unit for unit in units for count in COUNTERS)]
+    times = times.copy()
+    for back in places:
+        before, after = float(taken[back]), float(taken[back + 1])
+        tolerance, line = GAP_STEPS * usual, table.lines[usable[back + 1]]
+        wraps = [
+            period
+            for period in periods  # unsigned, or signed
+            for first in (0.0, -period / 2)
+            if abs(after - first) <= tolerance and abs(first + period - before) <= tolerance < period / 10
+        ]
+        if not wraps:
+            headers = _headers(table, range(usable[back] + 1, usable[back + 1]))
+            why = f"line {headers[0]} repeats the header" if headers else "another run, or a clock set back"
+            raise NeecoError(
+                f"{table.where}: {table.record} {line}: time begins anew ({before:.6g} s, then {after:.6g} s): {why}; "
+                "keep the rows of one run in a file"
+            )
+        times[usable[back + 1 :]] += wraps[0]
+        rows.repairs.append(f"its time begins anew after {before:.6g} s ({table.record} {line}); taken to go on")
+    return times
+
+
+def _headers(table: Table, rows: range) -> list[int]:
+    """Return the lines that repeat the header."""
+    return [int(table.lines[row]) for row in rows if tuple(table.rows[row]) == tuple(table.header)]
 
 
 def find_gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -204,6 +205,8 @@ class _Scan:
     pixel_aspect: float = 1.0
     others: tuple[str, ...] = ()  # sizes of the video streams besides the one that is read
     promised: int = 0  # frames the file's header speaks of
+    packets: int = 0  # coded frames that were read
+    end: int | None = None  # of the stream by the file's header, in its time base
     buffered: list[Any] = field(default_factory=list)  # the frames, up to MAX_BUFFERED_BYTES in all
     buffered_bytes: int = 0
 
@@ -236,6 +239,7 @@ class _Scan:
             self.pixel_aspect = 1.0 if abs(aspect - 1) < SQUARE else aspect
             stream.thread_type = self.threads
             self.promised = int(stream.frames or 0)
+            self.packets, self.end = 0, stream.duration and (stream.start_time or 0) + stream.duration
             self.rate = float(stream.average_rate) if stream.average_rate else None
             self.time_base = float(stream.time_base) if stream.time_base else None
             first, last = self._bounds(stream)
@@ -246,6 +250,7 @@ class _Scan:
             while True:
                 try:
                     packet = next(packets)
+                    self.packets += packet.size > 0
                     frames = packet.decode()
                 except StopIteration:
                     return
@@ -306,6 +311,11 @@ class _Scan:
         numbered, own = False, None
         if len(stamps) == len(self.stamps) and self.time_base and len(order) > 0.9 * len(stamps):
             times = (np.array(order, dtype=np.float64) - order[0]) * self.time_base
+            if any(later < stamp for stamp, later in pairwise(stamps)):
+                # AVI and ASF store no times of display: these are of decoding, and frames come in order of display
+                ranked, numbered = sorted(stamps), True
+                order = [place for place, stamp in enumerate(ranked) if place == 0 or stamp > ranked[place - 1]]
+                notes.append(f"{self.path.name}: its frames' times fall; frames are taken in the order they are shown")
             if fps is not None:
                 own = _another_rate(1 / float(np.median(np.diff(times))), fps)
                 times = np.arange(len(order)) / fps
@@ -325,12 +335,22 @@ class _Scan:
             part=self.part, stated_fps=own, pixel_aspect=self.pixel_aspect, buffered=tuple(self.buffered),
         )  # fmt: skip
 
+    def _is_complete(self) -> bool:
+        """Whether frames reach the end that the file states, or those missing are decoded and not shown (edit list)."""
+        if self.packets >= self.promised:
+            return True
+        shown = [stamp for stamp in self.stamps if stamp is not None]
+        if self.end is None or not self.time_base or len(shown) < MIN_IMAGES:
+            return False
+        step = float(np.median(np.diff(sorted(shown))))
+        return max(shown) + 1.5 * step >= self.end
+
     def _notes(self) -> list[str]:
         notes, read = [], len(self.stamps)
         if self.failure or self.corrupt:
             what = f"{self.failure or 'corrupt frames'}; {read} frames could be read, the others are left out"
             notes.append(f"{self.path.name}: is damaged: {what}")
-        elif self.promised > read and self.part is None:
+        elif self.promised > read and self.part is None and not self._is_complete():
             notes.append(f"{self.path.name}: ends early: {read} of {self.promised} frames are there")
         if self.others:
             several = (
@@ -405,5 +425,5 @@ def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[
     falling = np.flatnonzero(np.diff(times) <= 0)
     if len(falling):
         line = table.lines[rows_used[falling[0] + 1]]
-        raise NeecoError(f"{table_path}: line {line}: {column} does not increase; sort the rows")
+        raise NeecoError(f"{table_path}: line {line}: {column} does not increase; keep the rows of one run, in order")
     return files, times

@@ -26,6 +26,8 @@ from neeco.ingest.readers.columns import (
     UNITS,
     PoseColumns,
     RecognisedColumns,
+    joint_columns,
+    pose_bodies,
     recognise_pose,
     recognise_time,
     recognise_value,
@@ -306,6 +308,8 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
     if pose.rotation or "rotation" in pose.unclear:
         found.poses.append((replace(log, meaning=meaning), pose))
+        joints = joint_columns(columns, pose_bodies(columns))
+        found.joints += [(log, when, column, _joint_of(column)) for column in joints]
     elif value and when.time:
         found.joints.append((log, when, value, None))
     elif when.time and len(angles) > 1:
