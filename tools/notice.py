@@ -26,7 +26,6 @@ IMPORTED = (
     "hub",
     "ingest",
     "lerobot",
-    "rerun",
     "ros",
     "triton",
     "urdf",

@@ -222,7 +222,7 @@ def documented(tmp_path_factory: pytest.TempPathFactory) -> DocumentedWorld:
 def prepare(documented: DocumentedWorld, words: list[str], folder: Path) -> None:
     """Make everything that a command reads; what it is to write is left out."""
     verb = "init" if "--init" in words else words[0]
-    writes = {index + 1 for index, word in enumerate(words) if word in ("--output", "--export", "--video", "--rrd")}
+    writes = {index + 1 for index, word in enumerate(words) if word in ("--output", "--export", "--video")}
     if verb in ("ingest", "init"):
         writes -= {index + 1 for index, word in enumerate(words) if word == "--video"}
     if "--resume" in words:
@@ -254,8 +254,6 @@ def serves(words: list[str], folder: Path) -> None:
 def test_a_command_of_the_pages_runs_to_its_end(
     line: str, documented: DocumentedWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if "--rrd" in line:
-        pytest.importorskip("rerun")
     if line.startswith("downstream"):
         pytest.importorskip("transformers")
     if "--help" in line.split():

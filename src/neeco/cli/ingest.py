@@ -52,8 +52,6 @@ class Ingest:
     recording.yaml into it, or next to it."""
     formats: bool = False
     """List the formats that recordings are read from."""
-    rrd: Path | None = None
-    """Write images, poses, joints, what moves and clocks into this file, too, for the rerun viewer."""
     json: JsonTarget = None
     strict: bool = False
     """End with exit status 1 where the verdict is DOUBTFUL."""
@@ -61,7 +59,7 @@ class Ingest:
 
 def run(args: Ingest) -> int:
     """Ingest, convert, or write a template."""
-    from neeco.cli._output import ready_for_json, require_ending, write_numbers
+    from neeco.cli._output import ready_for_json, write_numbers
     from neeco.cli._progress import Bars
     from neeco.ingest.convert import convert_folder
     from neeco.ingest.sources import folder_to_convert
@@ -87,12 +85,10 @@ def run(args: Ingest) -> int:
         print(f"capture: {output}  (next: neeco check {shlex.quote(str(output))})")
         return 0
     recordings = recordings_of(args)
-    if args.rrd is not None:
-        require_ending("--rrd", args.rrd, ".rrd")
     with ready_for_json(args.json):
         with Bars() as bars:
             try:
-                done = ingest_and_report(recordings, output, bars.stage, args.rrd)
+                done = ingest_and_report(recordings, output, bars.stage)
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("nothing was written") from None
         if not write_numbers(args.json, done.as_json()):
@@ -126,7 +122,7 @@ def recordings_of(args: Ingest) -> list[Recording]:
     from neeco.ingest.sources import read_recordings, recording_from_flags
 
     if args.source:
-        keep = ("output", "frames", "rrd", "json", "strict")
+        keep = ("output", "frames", "json", "strict")
         _refuse_others(args, f"{args.source[0]}: says what was recorded", keep)
         return read_recordings(args.source, args.frames)
     if args.video is None:

@@ -17,7 +17,6 @@ from neeco.capture import read_capture
 from neeco.capture.checks import inspect_capture
 from neeco.capture.documents import Problem, errors_only
 from neeco.capture.model import Capture, Frame
-from neeco.errors import NeecoError
 from neeco.files import finite
 from neeco.ingest.assessment import VERDICTS, Assessment, assess_ingest, clock_cost_mm, rms
 from neeco.ingest.frames.views import StageProgress
@@ -30,7 +29,6 @@ from neeco.report import ingest_figures as figures
 from neeco.report.charts import residual_chart
 from neeco.report.coverage import SPLIT_COLORS, degrees_of_freedom, extrapolations, histogram, unvisited
 from neeco.report.page import split_counts, write_page
-from neeco.report.rerun_log import require_rerun, write_rrd
 
 PAGE = "ingest.html"
 
@@ -46,7 +44,6 @@ class Ingested:
     results: dict[str, IngestResult] = field(default_factory=dict)
     verdicts: dict[str, Assessment] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)  # found by `check`
-    rrd: Path | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -78,7 +75,6 @@ class Ingested:
         shown += [f"wrong: {problem}" for problem in errors_only(self.problems)]
         shown.append(f"capture: {self.output}  ({len(self.problems)} remarks by `neeco check`)")
         shown.append(f"page: {', '.join(str(self.output / page_of(tissue)) for tissue in self.results)}")
-        shown += [f"to scrub through: rerun {self.rrd}"] if self.rrd is not None else []
         for tissue, verdict in self.verdicts.items():
             first, *others = verdict.lines()
             of = f"{tissue}: " if tissue else ""
@@ -91,18 +87,9 @@ def page_of(tissue: str) -> str:
     return f"{Path(PAGE).stem}_{file_name(tissue)}.html" if tissue else PAGE
 
 
-def ingest_and_report(
-    recordings: Sequence[Recording], output: Path, progress: StageProgress, rrd: Path | None = None
-) -> Ingested:
-    """Make the capture `output` from recordings, with a page on each tissue in it, and a file `rrd` for rerun.
-
-    Raises NeecoError.
-    """
+def ingest_and_report(recordings: Sequence[Recording], output: Path, progress: StageProgress) -> Ingested:
+    """Make the capture `output` from recordings, with a page on each tissue in it. Raises NeecoError."""
     several = any(recording.tissue for recording in recordings)
-    if rrd is not None:
-        require_rerun()
-        if several:
-            raise NeecoError("--rrd: shows one tissue, and the recordings name theirs; leave it out")
     problems: list[Problem] = []
     verdicts: dict[str, Assessment] = {}
 
@@ -115,15 +102,12 @@ def ingest_and_report(
             own = capture.over(tissue) if tissue else capture
             verdicts[tissue] = assess_ingest(result, own, problems)
             write_ingest_page(result, verdicts[tissue], folder / page_of(tissue), own)
-            if rrd is not None:
-                progress("writing for rerun", 0, 0)
-                write_rrd(result, own, rrd)
 
     if several:
         results = ingest_tissues(recordings, output, progress, complete)
     else:
         results = {"": ingest(recordings, output, progress, lambda result, folder: complete({"": result}, folder))}
-    return Ingested(output, results, verdicts, problems, rrd)
+    return Ingested(output, results, verdicts, problems)
 
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
