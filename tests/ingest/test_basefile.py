@@ -114,3 +114,35 @@ def test_another_file_than_a_registration_ends_in_one_line(tmp_path, text, messa
     (tmp_path / "reg.json").write_text(text)
     with pytest.raises(NeecoError, match=message):
         read_dvrk_registration(tmp_path / "reg.json")
+
+
+QUATERNION = {"qx": -(0.5**0.5), "qy": 0.0, "qz": 0.0, "qw": 0.5**0.5}  # base_from_camera of MILLIMETRES
+PLACE = {"x": -0.05, "y": -0.17, "z": -0.02}
+
+
+@pytest.mark.parametrize("second", [False, True])
+def test_the_yaml_of_easy_handeye_is_inverted(tmp_path, second):
+    stated = {"parameters": {"eye_on_hand": False}, "transformation": PLACE | QUATERNION}
+    if second:
+        rotation = {name[1]: value for name, value in QUATERNION.items()}
+        stated = {"parameters": {"calibration_type": "eye_on_base"}}
+        stated |= {"transform": {"translation": PLACE, "rotation": rotation}}
+    (tmp_path / "eye.yaml").write_text(json.dumps(stated))
+    assert np.allclose(_recording(tmp_path, "eye.yaml")[0].base.matrix, MILLIMETRES)
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ({"parameters": {"eye_on_hand": True}, "transformation": PLACE | QUATERNION}, "eye_on_hand: false"),
+        ({"transformation": PLACE | QUATERNION}, "eye_on_hand: false"),
+        ({"parameters": {"eye_on_hand": False}, "transformation": PLACE}, "qx"),
+        ({"parameters": {"eye_on_hand": False}, "transformation": None}, "is missing"),
+        (None, "expected an object"),
+        (3, "expected an object"),
+    ],
+)
+def test_other_yaml_than_of_easy_handeye_ends_in_one_line(tmp_path, document, message):
+    (tmp_path / "eye.yaml").write_text(json.dumps(document))
+    with pytest.raises(NeecoError, match=message):
+        read_dvrk_registration(tmp_path / "eye.yaml")

@@ -236,3 +236,34 @@ def test_a_pinhole_changes_nothing():
 def test_distortion_that_folds_the_image_is_refused():
     with pytest.raises(NeecoError, match="folds the image over"):
         Lens(300, 300, 160, 120, (-9.0, -40.0, 0.0, 0.0)).pinhole((320, 240))
+
+
+@pytest.mark.parametrize("text", ["null", "3", '"x"', "[]", "[null]", "true"])
+@pytest.mark.parametrize("suffix", [".json", ".yaml"])
+def test_a_file_that_holds_no_object_ends_in_one_line(tmp_path, text, suffix):
+    path = tmp_path / f"lens{suffix}"
+    path.write_text(text)
+    with pytest.raises(NeecoError, match="expected"):
+        read_lens(path)
+
+
+def test_nine_numbers_are_a_camera_matrix(tmp_path):
+    path = tmp_path / "K.txt"
+    path.write_text("383.5 0 155.5\n0 383.5 124\n0 0 1\n")
+    assert read_lens(path) == Lens(383.5, 383.5, 156.0, 124.5, (), None)
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ({"cx": 678.5, "cy": 542.9, "a0": 769.2, "a1": 0, "a2": -8e-4, "a3": 6e-7, "a4": 0}, "omnidirectional"),
+        ({"FocalLength": [1035, 1035], "PrincipalPoint": [597, 520], "ImageSize": [1024, 1280]}, "MATLAB"),
+        ({"width": 1280, "height": 720, "ppx": 640.1, "ppy": 360.2, "fx": 900, "fy": 901}, "RealSense"),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".json", ".yaml"])
+def test_calibrations_of_other_kinds_are_named(tmp_path, document, message, suffix):
+    path = tmp_path / f"lens{suffix}"
+    path.write_text(json.dumps(document))
+    with pytest.raises(NeecoError, match=message):
+        read_lens(path)

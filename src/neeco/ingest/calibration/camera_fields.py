@@ -94,7 +94,16 @@ def read_calibration(path: Path) -> Any:
             raise
     if not isinstance(document, dict) and isinstance(again := _by_opencv(text), dict):
         return again
-    return document
+    return document if isinstance(document, dict) else _matrix_alone(text) or document
+
+
+def _matrix_alone(text: str) -> dict[str, list[float]] | None:
+    """Return the camera of a text of nothing but a matrix: nine numbers by rows, of which the last are 0 0 1."""
+    try:
+        numbers = [float(part) for part in re.split(r"[\s,;\[\]]+", text.strip("[]; \t\r\n"))]
+    except ValueError:
+        return None
+    return {"camera_matrix": numbers} if len(numbers) == 9 and numbers[6:] == [0, 0, 1] else None
 
 
 def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
@@ -103,6 +112,17 @@ def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
     if not isinstance(document, dict):
         return ()
     keys = _plain(document)
+    if {"a0", "a2", "a3"} <= keys.keys() or {"ss", "pol", "mappingcoefficients"} & keys.keys():
+        raise NeecoError(
+            f"{where}: is an omnidirectional model (Scaramuzza's), which is not read; undistort the images"
+        )
+    if "focallength" in keys and "principalpoint" in keys:
+        raise NeecoError(
+            f"{where}: FocalLength: MATLAB's cameraParameters are not read; write camera_matrix (its IntrinsicMatrix "
+            "transposed, principal point less 1 px) and distortion_coefficients"
+        )
+    if {"ppx", "ppy"} <= keys.keys():
+        raise NeecoError(f"{where}: ppx: RealSense's intrinsics are not read; write camera_matrix of fx, fy, ppx, ppy")
     for pair in SIDES:
         sides = [_side(keys, side) for side in pair]
         if all(_has_camera(side) for side in sides):

@@ -48,7 +48,9 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
         return checked_lens("intrinsics", [*source], (), None)
     require_file(source, "a calibration as YAML, XML or JSON")
     document = read_calibration(source)
-    if source.suffix.lower() == ".json" and ("fl_x" in document or not cameras_in(source, document)):
+    if source.suffix.lower() == ".json" and (
+        (isinstance(document, dict) and "fl_x" in document) or not cameras_in(source, document)
+    ):
         return _nerfstudio(source, document)
     return opencv_lens(source, document)
 

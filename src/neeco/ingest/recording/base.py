@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.errors import NeecoError
-from neeco.files import read_text
+from neeco.files import parse_yaml, read_text
 from neeco.geometry.conventions import DVRK_ECM
+from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_of
 from neeco.ingest.recording.sections import Fault, existing_file, join_places, read_section, word
@@ -72,6 +74,36 @@ def same_base(one: StatedBase | None, other: StatedBase | None) -> bool:
     return same and (one.sd_mm, one.sd_deg, one.to_world) == (other.sd_mm, other.sd_deg, other.to_world)
 
 
+def _of_hand_eye(path: Path) -> StatedBase:
+    """Read the YAML that easy_handeye saves, in metres: of a still camera (eye_on_hand: false), base_from_camera.
+    Raises NeecoError."""
+    remedy = "give the YAML of easy_handeye, or write {transform: 4 rows, mm}"
+    node = Node(parse_yaml(path, read_text(path, WHAT), remedy), str(path), "", RaisingReport())
+    node.is_object()  # else it raises
+    parameters, second = node.child("parameters"), node.has("transform")  # of easy_handeye2
+    stated = node.child("transform" if second else "transformation")
+    if not isinstance(stated.value, dict):
+        stated.error("is missing", remedy)
+    if second:
+        still = parameters.child("calibration_type").value == "eye_on_base"
+        places = [stated.child("translation").child(axis) for axis in "xyz"]
+        places += [stated.child("rotation").child(axis) for axis in "xyzw"]
+    else:
+        still = (parameters if parameters.value is not None else node).child("eye_on_hand").value is False
+        places = [stated.child(name) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    if not still:
+        node.error(
+            "does not say `eye_on_hand: false` (`calibration_type: eye_on_base`), so the camera may be on the robot",
+            "calibrate a camera that stands still, or write {transform: 4 rows, mm}",
+        )
+    numbers = [number for place in places if (number := place.number()) is not None]
+    quaternion = np.array(numbers[3:])
+    if not 0.99 < np.linalg.norm(quaternion) < 1.01:
+        stated.error("qx, qy, qz, qw are no unit quaternion", "calibrate again")
+    rotation = Rotation.from_quat(quaternion).as_matrix()
+    return StatedBase(rigid(rotation.T, -rotation.T @ np.array(numbers[:3]) * MM), DVRK_SD_MM, DVRK_SD_DEG)
+
+
 def read_dvrk_registration(path: Path) -> StatedBase:
     """Read the file that `camera_registration.py` of jhu-dvrk/dvrk_camera_registration writes for a still camera, in
     metres. Raises NeecoError for another file.
@@ -79,12 +111,16 @@ def read_dvrk_registration(path: Path) -> StatedBase:
     It is `…-registration-open-cv.json` or, in the dVRK's axes, `…-registration-dVRK.json`: a piece of a system.json
     and no JSON by itself.
     """
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return _of_hand_eye(path)
     content = read_text(path, WHAT).strip()
     whole = content.startswith("{")
     try:
         document = json.loads(content if whole else "{" + content.rstrip(",") + "}")
     except (ValueError, RecursionError) as error:
-        raise NeecoError(f"{path}: is not {WHAT}; give the file …-registration-open-cv.json") from error
+        raise NeecoError(
+            f"{path}: is not {WHAT}; give the file …-registration-open-cv.json, or easy_handeye's YAML"
+        ) from error
     node = Node(document, str(path), "", RaisingReport())
     if isinstance(document, dict) and "measured_cp" in document:
         node.child("measured_cp").error(
@@ -112,7 +148,8 @@ def read_dvrk_registration(path: Path) -> StatedBase:
 
 
 def parse_base(node: Node) -> StatedBase:
-    """Return the base of `camera_from_base`: `unknown`, a file of the dVRK's registration, or a BaseSection."""
+    """Return the base of `camera_from_base`: `unknown`, a file of the dVRK's registration or easy_handeye's, or a
+    BaseSection."""
     if node.value == UNKNOWN:
         return StatedBase()
     if isinstance(node.value, str):
