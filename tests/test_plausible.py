@@ -14,7 +14,15 @@ import neeco
 from neeco.api import Scene
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.plausible import center_fault, focal_fault, joint_fault, mask_fault, size_fault, time_fault
+from neeco.plausible import (
+    center_fault,
+    focal_fault,
+    joint_fault,
+    mask_fault,
+    other_size_fault,
+    size_fault,
+    time_fault,
+)
 from neeco.synthesis.settings import Settings
 
 POSE = pose_of(0.1, 0.2, 0.0, 1.0, 2.0, 60.0)
@@ -150,3 +158,18 @@ def test_the_limits_leave_room_for_what_is_rare_but_right():
         mask_fault(0.3, 0.9),
     ):
         assert fault is not None
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.75, 1.25, 1.5])
+def test_intrinsics_of_another_image_size_are_noticed(factor):
+    for center in ((80, 64), (77, 66)):  # of 160x128 px; lenses are off the middle by a few per cent
+        assert other_size_fault(*center, 160, 128) is None
+        message, remedy = other_size_fault(*(factor * value for value in center), 160, 128)
+        assert "intrinsics of another image size" in message
+        stated = float(remedy.split("scale them by ")[1].split(",")[0])
+        assert stated == pytest.approx(1 / factor, rel=0.05)
+
+
+@pytest.mark.parametrize("center", [(120, 64), (80, 30), (120, 30), (60, 90), (88, 70)])
+def test_a_crop_off_the_middle_is_no_other_image_size(center):
+    assert other_size_fault(*center, 160, 128) is None

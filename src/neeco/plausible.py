@@ -12,6 +12,8 @@ Fault = tuple[str, str]  # what is wrong, what to do
 MAX_SIZE_PX = 65_535  # px along a side of an image
 MIN_FOCAL, MAX_FOCAL = 0.1, 50.0  # focal length of any lens, in lengths of the image's longer side
 MAX_ANAMORPHIC = 2.5  # ratio of the two focal lengths: single fields of interlaced video have 2
+MAX_OFF_MIDDLE = 0.08  # of the sides, distance of a principal point from the middle by a lens's own tolerances
+MAX_MIDDLE_ERROR = 0.03  # of the sides, the same once intrinsics of another image size are scaled
 FULL_TURN = 2 * math.pi  # rad; a joint without stated limits turns no farther
 MAX_SLIDE_MM = 1000.0  # mm; nor slides farther
 LIMIT_TOLERANCE = 1e-3  # rad (mm of sliding joints) by which rounding and noise may exceed a limit
@@ -56,6 +58,18 @@ def center_fault(cx: float, cy: float, width: float, height: float) -> Fault | N
     if 0 < cx < width and 0 < cy < height:  # NaN compares false
         return None
     return f"principal point ({cx:g}, {cy:g}) lies outside the {width:g}x{height:g} image", "give it in pixels of it"
+
+
+def other_size_fault(cx: float, cy: float, width: float, height: float) -> Fault | None:
+    """Check whether one factor brings a principal point far from the middle there: intrinsics of another image size."""
+    scale = cx / width + cy / height  # of the image whose middle it is
+    if abs(scale - 1) <= 2 * MAX_OFF_MIDDLE or abs(cx / width - cy / height) > 2 * MAX_MIDDLE_ERROR * scale:
+        return None
+    message = (
+        f"principal point ({cx:g}, {cy:g}) is the middle of a {width * scale:.0f}x{height * scale:.0f} image, not of "
+        f"this {width:g}x{height:g} one: intrinsics of another image size"
+    )
+    return message, f"scale them by {1 / scale:.3g}, or give this image's (right where images are cropped)"
 
 
 def time_fault(time: float) -> Fault | None:

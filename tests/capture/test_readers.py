@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -266,7 +267,7 @@ def test_camera_models_of_newer_colmap_are_named(folder, tmp_path, binary, model
 
 def test_an_unknown_camera_model_of_colmap_is_newer_and_not_damage(folder, tmp_path):
     write_colmap(folder, tmp_path, True, "OF_TOMORROW")
-    with pytest.raises(NeecoError, match=r"camera model 99 is newer than this version"):
+    with pytest.raises(NeecoError, match=r"camera model 99 is not known; run `colmap image_undistorter`"):
         read_capture(tmp_path)
 
 
@@ -447,3 +448,91 @@ def test_evenly_spaced_items_run_from_the_first_to_the_last(count, most, floor):
     assert chosen == sorted(set(chosen))
     assert chosen[:1] + chosen[-1:] == ([0, count - 1] if count else [])
     assert max(np.diff(chosen), default=1) - min(np.diff(chosen), default=1) <= 1
+
+
+def test_of_several_colmap_models_the_largest_is_read_and_the_rest_noted(folder, tmp_path):
+    write_colmap(folder, tmp_path, binary=False)
+    sparse = tmp_path / "sparse"
+    shutil.copytree(sparse / "0", sparse / "1")
+    lines = (sparse / "0/images.txt").read_text().splitlines(keepends=True)
+    (sparse / "0/images.txt").write_text("".join(lines[:7]))
+    (tmp_path / "images/unregistered.png").write_bytes((tmp_path / "images/000000.png").read_bytes())
+    assert len(read_capture(tmp_path).frames) == 8
+    told = " ".join(str(problem) for problem in check_capture(tmp_path))
+    assert "sparse/1 with 8 images is read; left out: sparse/0 with 3" in told
+    assert "1 of 9 images in images/ have no camera ('unregistered.png')" in told
+
+
+def rename(root: Path, names: list[str]) -> None:
+    """Give the images of a COLMAP folder, in their order, other names."""
+    file = root / "sparse/0/images.txt"
+    text = file.read_text()
+    for index, name in enumerate(names):
+        old = f"{index:06d}.png"
+        (root / "images" / name).parent.mkdir(exist_ok=True)
+        (root / "images" / old).rename(root / "images" / name)
+        text = text.replace(f" 1 {old}", f" {1 + name.startswith('right')} {name}")
+    file.write_text(text)
+
+
+def test_colmap_images_are_in_the_order_of_their_numbers(folder, tmp_path):
+    write_colmap(folder, tmp_path, binary=False)
+    rename(tmp_path, [f"{number}.png" for number in (0, 1, 10, 11, 2, 20, 3, 9)])
+    times = {frame.image_path.stem: frame.state.time for frame in read_capture(tmp_path).frames}
+    assert sorted(times, key=times.__getitem__) == ["0", "1", "2", "3", "9", "10", "11", "20"]
+
+
+@pytest.mark.parametrize("lenses", [1, 2])
+def test_two_cameras_of_a_rig_share_their_instants(folder, tmp_path, lenses):
+    """With one lens, two folders hold one recording after the other."""
+    write_colmap(folder, tmp_path, binary=False)
+    rename(tmp_path, [f"{side}/{number}.png" for side in ("left", "right") for number in (8, 9, 10, 11)])
+    sparse = tmp_path / "sparse/0"
+    with (sparse / "cameras.txt").open("a") as stream:
+        stream.write("2 PINHOLE 32 24 40 41 16 12\n")
+    if lenses == 1:
+        text = (sparse / "images.txt").read_text()
+        (sparse / "images.txt").write_text(text.replace(" 2 right", " 1 right"))
+    frames = read_capture(tmp_path).frames
+    assert [frame.state.time for frame in frames] == ([0, 0, 1, 1, 2, 2, 3, 3] if lenses == 2 else [*range(8)])
+    assert all(one.split == two.split for one, two in zip(frames[::2], frames[1::2], strict=True)) or lenses == 1
+
+
+def test_nerfstudio_frames_without_time_are_in_the_order_of_their_numbers(folder):
+    document = folder.document
+    for frame in document["frames"]:
+        frame.pop("time", None)
+    names = [frame["file_path"] for frame in document["frames"]]
+    document["frames"] = [document["frames"][index] for index in (5, 2, 7, 0, 1, 3, 6, 4)]
+    folder.write(document)
+    frames = read_capture(folder.root).frames
+    assert [frame.image_path.relative_to(folder.root).as_posix() for frame in frames] == names
+    assert [frame.state.time for frame in frames] == [*range(8)]
+
+
+@pytest.mark.parametrize(("number", "model", "count"), [(12, "SIMPLE_DIVISION", 4), (16, "EUCM", 6), (42, "42", 4)])
+def test_newer_colmap_models_are_named(folder, tmp_path, number, model, count):
+    write_colmap(folder, tmp_path, binary=True)
+    camera = struct.pack(f"<QiiQQ{count}d", 1, 1, number, 32, 24, *[20.0] * count)
+    (tmp_path / "sparse/0/cameras.bin").write_bytes(camera)
+    with pytest.raises(NeecoError, match=f"camera model (is )?{model}.*image_undistorter"):
+        read_capture(tmp_path)
+
+
+def test_equidistant_colmap_images_can_be_undistorted(folder, tmp_path):
+    write_colmap(folder, tmp_path, binary=True)
+    camera = struct.pack("<QiiQQ4d", 1, 1, 15, 32, 24, 40.0, 41.0, 16.5, 12.0)
+    (tmp_path / "sparse/0/cameras.bin").write_bytes(camera)
+    with pytest.raises(NeecoError, match=r"FISHEYE: the images are distorted .*: neeco ingest"):
+        read_capture(tmp_path)
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.5])
+def test_cameras_of_another_image_size_are_a_warning(folder, factor):
+    document = folder.document
+    for key in ("fl_x", "fl_y", "cx", "cy"):
+        for place in (document, *document["frames"]):
+            if key in place:
+                place[key] *= factor
+    folder.write(document)
+    assert any("intrinsics of another image size" in problem.message for problem in check_capture(folder.root))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.ingest.recording.base import read_dvrk_registration, read_registration
+from neeco.ingest.recording.base import read_dvrk_registration
 from neeco.ingest.recording.file import read_recording
 
 # rotation about x by a quarter turn, and metres
@@ -116,53 +116,40 @@ def test_another_file_than_a_registration_ends_in_one_line(tmp_path, text, messa
         read_dvrk_registration(tmp_path / "reg.json")
 
 
-EASY = {"x": 0.0162, "y": 0.0571, "z": -0.0879, "qx": 0.5, "qy": -0.5, "qz": 0.5, "qw": 0.5}
+QUATERNION = {"qx": -(0.5**0.5), "qy": 0.0, "qz": 0.0, "qw": 0.5**0.5}  # base_from_camera of MILLIMETRES
+PLACE = {"x": -0.05, "y": -0.17, "z": -0.02}
 
 
-def easy_handeye(path, frame="camera_optical_frame", eye_on_hand=False, ros2=False):
-    """A hand-eye calibration as easy_handeye writes it, or easy_handeye2."""
-    parameters = {"eye_on_hand": eye_on_hand, "robot_base_frame": "psm1_base", "tracking_base_frame": frame}
-    document = {"parameters": parameters, "transformation": EASY}
-    if ros2:
-        kind = "eye_in_hand" if eye_on_hand else "eye_on_base"
-        parameters = {"calibration_type": kind, "tracking_base_frame": frame}
-        rotation = {key[1]: value for key, value in EASY.items() if key.startswith("q")}
-        translation = {key: EASY[key] for key in "xyz"}
-        document = {"parameters": parameters, "transform": {"translation": translation, "rotation": rotation}}
-    path.write_text(json.dumps(document))  # JSON is YAML
-    return path
-
-
-@pytest.mark.parametrize("ros2", [False, True])
-def test_easy_handeye_states_the_inverse_in_metres(tmp_path, ros2):
-    base = read_registration(easy_handeye(tmp_path / "easy.yaml", ros2=ros2))
-    base_from_camera = np.linalg.inv(base.matrix)
-    np.testing.assert_allclose(base_from_camera[:3, 3], [16.2, 57.1, -87.9], atol=1e-9)
-    np.testing.assert_allclose(base_from_camera[:3, 0], [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(base_from_camera[:3, 1], [-1, 0, 0], atol=1e-12)
-    assert (base.sd_mm, base.sd_deg) == (8, 5)
-
-
-@pytest.mark.parametrize("ros2", [False, True])
-def test_a_camera_on_the_hand_and_axes_that_nothing_says_are_refused(tmp_path, ros2):
-    with pytest.raises(NeecoError, match="parameters: the camera was on the robot's hand"):
-        read_registration(easy_handeye(tmp_path / "hand.yaml", eye_on_hand=True, ros2=ros2))
-    with pytest.raises(NeecoError, match="tracking_base_frame: is 'camera_link', and nothing says"):
-        read_registration(easy_handeye(tmp_path / "link.yaml", "camera_link", ros2=ros2))
+@pytest.mark.parametrize("second", [False, True])
+def test_the_yaml_of_easy_handeye_is_inverted(tmp_path, second):
+    stated = {"parameters": {"eye_on_hand": False}, "transformation": PLACE | QUATERNION}
+    if second:
+        rotation = {name[1]: value for name, value in QUATERNION.items()}
+        stated = {"parameters": {"calibration_type": "eye_on_base"}}
+        stated |= {"transform": {"translation": PLACE, "rotation": rotation}}
+    (tmp_path / "eye.yaml").write_text(json.dumps(stated))
+    assert np.allclose(_recording(tmp_path, "eye.yaml")[0].base.matrix, MILLIMETRES)
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("document", "message"),
     [
-        ("null", "is neither a camera registration"),
-        ("[1, 2]", "is neither"),
-        ("camera_matrix: 3", "is neither"),
-        ("transformation: null", "transformation"),
-        ("transformation: {x: 1, y: 2, z: 3, qx: 0, qy: 0, qz: 0, qw: 0}", "no unit quaternion"),
-        ("transform: {translation: 4, rotation: {x: 0, y: 0, z: 0, w: 1}}", "transform"),
+        ({"parameters": {"eye_on_hand": True}, "transformation": PLACE | QUATERNION}, "eye_on_hand: false"),
+        ({"transformation": PLACE | QUATERNION}, "eye_on_hand: false"),
+        ({"parameters": {"eye_on_hand": False}, "transformation": PLACE}, "qx"),
+        ({"parameters": {"eye_on_hand": False}, "transformation": None}, "is missing"),
+        (
+            {
+                "parameters": {"eye_on_hand": False, "tracking_base_frame": "camera_link"},
+                "transformation": PLACE | QUATERNION,
+            },
+            "tracking_base_frame: is 'camera_link', and nothing says",
+        ),
+        (None, "expected an object"),
+        (3, "expected an object"),
     ],
 )
-def test_another_yaml_than_a_hand_eye_calibration_ends_in_one_line(tmp_path, text, message):
-    (tmp_path / "base.yaml").write_text(text)
+def test_other_yaml_than_of_easy_handeye_ends_in_one_line(tmp_path, document, message):
+    (tmp_path / "eye.yaml").write_text(json.dumps(document))
     with pytest.raises(NeecoError, match=message):
-        read_registration(tmp_path / "base.yaml")
+        read_dvrk_registration(tmp_path / "eye.yaml")

@@ -300,3 +300,13 @@ def test_no_bytes_make_reading_raise(world, transforms, name):
                 messages.append(str(error))
     assert messages
     assert all(len(message.splitlines()) == 1 and str(world.folder) in message for message in messages)
+
+
+def test_a_transform_without_to_is_read_and_its_frame_asked_for(tmp_path, world):
+    """As 3D Slicer names them."""
+    poses = world.poses(TIMES - START)
+    path = mha(tmp_path / "slicer.seq.mha", frame_fields(TIMES, {"LinearTransform_3": poses}))
+    (stream,) = format_of(path).streams(path)
+    assert (stream.name, stream.kind, stream.count) == ("LinearTransform_3", POSES, COUNT)
+    assert "LinearTransform_3" in stream.asks[0]
+    assert len(format_of(path).read(path).rows) == COUNT

@@ -457,3 +457,37 @@ def test_a_bag_without_the_right_cameras_camera_info_says_what_to_give(tmp_path:
     assert known is not None
     with pytest.raises(NeecoError, match="holds no /stereo/right/camera_info; give a calibration of both cameras"):
         known.stereo(path, LEFT, "/stereo/right/image_raw")
+
+
+def mcap_of(tmp_path, change):
+    """An MCAP file of poses with other bytes."""
+    with BagWriter(tmp_path, "recording-mcap") as bag:
+        for index in range(5):
+            bag.pose("/psm1", index / 25, (0.01 * index, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0), "PSM1_base")
+    content = bytearray(bag.file.read_bytes())
+    change(content)
+    path = tmp_path / "other.mcap"
+    path.write_bytes(content)
+    return path
+
+
+def without_profile(content):
+    length = int.from_bytes(content[9:17], "little")
+    content[17 : 17 + length] = bytes(4) + (length - 8).to_bytes(4, "little") + b"-" * (length - 8)
+
+
+def of_other_encoding(content):
+    content[:] = content.replace(b"\3\0\0\0cdr", b"\3\0\0\0own").replace(b"ros2msg", b"foreign")
+    content[:] = content.replace(b"Header header", b"\xc9eader header")  # a schema that is no text
+
+
+def test_an_mcap_file_need_not_name_a_profile(tmp_path):
+    path = mcap_of(tmp_path, without_profile)
+    (stream,) = format_of(path).streams(path)
+    assert (stream.name, stream.kind, stream.count) == ("/psm1", POSES, 5)
+
+
+def test_an_mcap_file_of_other_messages_is_called_what_it_is(tmp_path):
+    path = mcap_of(tmp_path, of_other_encoding)
+    with pytest.raises(NeecoError, match=r"/psm1 \(geometry_msgs/PoseStamped\) is written as own, not as cdr"):
+        format_of(path).streams(path)

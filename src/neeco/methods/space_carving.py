@@ -254,7 +254,7 @@ def carved_shape(session: GaussianSession, evidence: Evidence, name: str, genera
     if shape is None:
         raise NeecoError(
             f"instrument {name!r}: nothing in the images moves with its recorded pose; check that its poses are in the "
-            "cameras' world frame and in mm (`neeco check`), or train with --method neeco as published"
+            "cameras' world frame and in mm (`neeco check`), or train with --method nps as published"
         )
     if moves_with_pose(session, evidence, name, shape):
         return shape

@@ -6,8 +6,9 @@ Not by pycolmap, which an installation may lack and which ends in a traceback fo
 from __future__ import annotations
 
 import math
+import os
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import dropwhile
 from pathlib import Path
@@ -17,9 +18,18 @@ import numpy as np
 import torch
 
 from neeco.capture.documents import Node, Problem, ProblemReport, printable
+from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import TEST_EVERY, Frame, PointCloud, State
 from neeco.capture.readers.cameras import opencv_distortion
-from neeco.capture.readers.parsed import NOWHERE, Parsed, inside, missing_file, relative_name
+from neeco.capture.readers.parsed import (
+    NOWHERE,
+    Parsed,
+    inside,
+    instants,
+    missing_file,
+    natural_order,
+    relative_name,
+)
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
@@ -34,6 +44,7 @@ _MODELS = {
     12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4), 16: ("EUCM", 6),
     17: ("EQUIRECTANGULAR", 2),
 }  # fmt: skip
+MAX_MODEL_ID = 100  # that a COLMAP to come may write; more: damaged
 _COEFFICIENTS = {  # in a model's parameters, behind the focal lengths and the principal point
     "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"),
     "OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
@@ -58,21 +69,37 @@ class _Image:
     translation: tuple[float, ...]  # camera_from_world
 
 
-def find_model(root: Path) -> Path | None:
-    """The folder of a capture that holds a COLMAP model, or None."""
-    for folder in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0", root):
-        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return folder
-    return None
+def find_models(root: Path) -> list[Path]:
+    """Return the folders of a capture that hold a COLMAP model, the one with most images first."""
+    parts = [root / "sparse", root / "colmap" / "sparse"]
+    numbered = [entry for part in parts if part.is_dir() for entry in part.iterdir()]
+    folders = [*sorted(numbered, key=lambda folder: natural_order(folder.name)), *parts, root]
+    models = [folder for folder in folders if (folder / f"cameras{_suffix(folder)}").is_file()]
+    return sorted(models, key=lambda model: -_image_count(model)) if len(models) > 1 else models
 
 
-def parse_colmap(model: Path, root: Path, report: ProblemReport, *, as_source: bool = False) -> Parsed:
-    """Read a COLMAP model; problems go to `report`. Lengths are in the model's own unit. as_source: see `Parsed`.
+def _suffix(model: Path) -> str:
+    return ".bin" if (model / "cameras.bin").is_file() else ".txt"
+
+
+def _image_count(model: Path) -> int:
+    """Number of images of a model, 0 of a damaged one."""
+    suffix = _suffix(model)
+    try:
+        return len(_parse(model / f"images{suffix}", _PARSERS[suffix][1]))
+    except NeecoError:
+        return 0
+
+
+def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, as_source: bool = False) -> Parsed:
+    """Read the first of a capture's COLMAP models; problems go to `report`. Lengths are in the model's own unit.
+    as_source: see `Parsed`.
 
     Images are in the capture's `images/`; sorted by name, every 8th is a test frame, and time is the order.
     """
+    model, *others = models
     parsed = Parsed(root, timed=False, as_source=as_source)
-    suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
+    suffix = _suffix(model)
     parse_cameras, parse_images, parse_points = _PARSERS[suffix]
     try:
         cameras = _parse(model / f"cameras{suffix}", parse_cameras)
@@ -84,7 +111,11 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport, *, as_source: b
     file = relative_name(model / f"images{suffix}", root)
     if not images:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
-    for order, image in enumerate(sorted(images, key=lambda item: item.name)):
+    _note_left_out(model, others, images, root, Node(None, file, "", report))
+    images.sort(key=lambda item: natural_order(item.name))
+    orders = instants([image.name for image in images], [image.camera_id for image in images])
+    orders = orders or list(range(len(images)))
+    for order, image in sorted(zip(orders, images, strict=True), key=lambda item: item[0]):
         place = Node(None, file, printable(image.name), report)
         try:
             path = inside(root, root / "images", image.name)
@@ -101,6 +132,21 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport, *, as_source: b
         parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
         parsed.places.append(place)
     return parsed
+
+
+def _note_left_out(model: Path, others: Sequence[Path], images: Sequence[_Image], root: Path, place: Node) -> None:
+    """Warn of other models, and of images in images/ without a camera."""
+    if others:
+        counts = ", ".join(f"{relative_name(other, root)} with {_image_count(other)}" for other in others)
+        message = f"{relative_name(model, root)} with {len(images)} images is read; left out: {counts}"
+        place.warning(message, "to read another, copy it and images/ into a folder of its own")
+    pictures = [file for file in (root / "images").rglob("*") if file.suffix.lower() in EXTENSIONS and file.is_file()]
+    named = {os.path.normpath(image.name) for image in images}
+    absent = sorted(str(file.relative_to(root / "images")) for file in pictures)
+    absent = [name for name in absent if os.path.normpath(name) not in named]
+    if absent:
+        message = f"{len(absent)} of {len(pictures)} images in images/ have no camera ({printable(absent[0])})"
+        place.warning(message, "they are left out")
 
 
 def _parse_points(
@@ -195,11 +241,8 @@ def _cameras_binary(content: bytes) -> dict[int, _Intrinsics]:
     cameras: dict[int, _Intrinsics] = {}
     for _ in range(stream.take("Q")[0]):
         camera_id, model_id, width, height = stream.take("iiQQ")
-        if model_id > max(_MODELS) and not cameras:
-            raise NeecoError(
-                f"camera model {model_id} is newer than this version of neeco; export the model as text, or run "
-                "`colmap image_undistorter` first"
-            )
+        if model_id not in _MODELS and 0 <= model_id < MAX_MODEL_ID:
+            raise NeecoError(f"its camera model {model_id} is not known; run `colmap image_undistorter` first")
         model, count = _MODELS[model_id]
         cameras[camera_id] = _Intrinsics(model, width, height, stream.take(f"{count}d"))
     return cameras

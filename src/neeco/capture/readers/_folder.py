@@ -13,12 +13,14 @@ import torch
 from neeco.capture.documents import Node, ProblemReport, errors_only
 from neeco.capture.model import Capture, Frame, Instrument, State, Tissue, share_lamps
 from neeco.capture.points import PointCloud, points_in_view
-from neeco.capture.readers._colmap import find_model, parse_colmap
+from neeco.capture.readers._colmap import find_models, parse_colmap
 from neeco.capture.readers._transforms import is_blender, load_document, parse_blender, parse_transforms
 from neeco.capture.readers.endonerf import is_endonerf_folder, parse_endonerf
 from neeco.capture.readers.parsed import Parsed, inside
 from neeco.errors import NeecoError
 from neeco.files import require_utf8
+from neeco.geometry.lens import Lens
+from neeco.plausible import other_size_fault
 
 
 def read_capture(path: Path | str, transforms: str = "transforms.json", *, background: float = 1.0) -> Capture:
@@ -122,7 +124,24 @@ def parse_capture(
 ) -> Parsed:
     """Read as much of a capture as can be read; what is wrong with it goes to `report`. as_source: see `Parsed`. Raises
     NeecoError for a path that is not in UTF-8."""
-    path = Path(path)
+    parsed = _parse(Path(path), report, transforms, background, as_source)
+    _warn_of_other_size(parsed)
+    return parsed
+
+
+def _warn_of_other_size(parsed: Parsed) -> None:
+    """Warn of intrinsics of another image size, of the lens or of most cameras."""
+    frames = parsed.with_cameras().frames
+    lenses = [Lens.of(frame.camera) for frame in frames]
+    if parsed.lens is not None:
+        lenses = [parsed.lens]
+    faults = [other_size_fault(lens.cx, lens.cy, *lens.size) for lens in lenses if lens.size is not None]
+    found = [fault for fault in faults if fault is not None]
+    if len(found) > len(faults) / 2:
+        parsed.header("cx, cy" if parsed.lens is None else "lens").warning(*found[0])
+
+
+def _parse(path: Path, report: ProblemReport, transforms: str, background: float, as_source: bool) -> Parsed:
     require_utf8(path)
     if os.path.isfile(path):
         path, transforms = path.parent, path.name
@@ -146,8 +165,8 @@ def parse_capture(
     if blender_files := [file for file in splits if file.is_file()]:
         documents = {file: load_document(file, path, report) for file in blender_files}
         return parse_blender(documents, path, background, as_source=as_source)
-    if (model := find_model(path)) is not None:
-        return parse_colmap(model, path, report, as_source=as_source)
+    if models := find_models(path):
+        return parse_colmap(models, path, report, as_source=as_source)
     if is_endonerf_folder(path):
         return parse_endonerf(path, report)
     message = "no such file, nor transforms_train.json, a COLMAP model or poses_bounds.npy"

@@ -16,10 +16,19 @@ from neeco.capture.model import SCHEMA, TEST_EVERY, Frame, Instrument, State
 from neeco.capture.points import PointCloud, random_points, read_ply
 from neeco.capture.readers._states import all_instruments, declared_instruments, parse_instruments
 from neeco.capture.readers.cameras import CameraFields, parse_lens, placeholder_camera
-from neeco.capture.readers.parsed import NOWHERE, Parsed, ParsedTissue, inside, missing_file, relative_name
+from neeco.capture.readers.parsed import (
+    NOWHERE,
+    Parsed,
+    ParsedTissue,
+    inside,
+    instants,
+    missing_file,
+    relative_name,
+)
 from neeco.errors import NeecoError
 from neeco.files import read_json
 from neeco.geometry.conventions import swap_camera_axes
+from neeco.geometry.lens import Lens
 from neeco.plausible import time_fault
 
 BLENDER_HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there
@@ -48,10 +57,25 @@ def parse_transforms(
     _parse_header(document, parsed)
     _parse_tissues(document, folder, parsed)
     _parse_frames(document, folder, parsed, background)
+    parsed = _by_name(parsed)
     _parse_points(document, folder, parsed)
     parsed.instruments = all_instruments(parsed.frames, declared_instruments(document))
     _warn_of_unread_states(document, parsed)
     return parsed
+
+
+def _by_name(parsed: Parsed) -> Parsed:
+    """Sort frames without times by the numbers in their images' names, which count in the order of recording."""
+    names = [relative_name(frame.image_path, parsed.root) for frame in parsed.frames]
+    ranks = None if parsed.timed else instants(names, [Lens.of(frame.camera) for frame in parsed.frames])
+    if ranks is None:
+        return parsed
+    found = parsed.of_rows(sorted(range(len(ranks)), key=ranks.__getitem__))
+    found.frames = [
+        replace(frame, state=replace(frame.state, time=float(rank)))
+        for frame, rank in zip(found.frames, sorted(ranks), strict=True)
+    ]
+    return found
 
 
 def is_blender(document: Node) -> bool:

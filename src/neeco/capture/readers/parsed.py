@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -64,7 +65,7 @@ class Parsed:
 
     def with_cameras(self) -> Parsed:
         """The same without the frames whose camera is a placeholder."""
-        return self._of_rows([row for row in range(len(self.frames)) if row not in self.without_camera])
+        return self.of_rows([row for row in range(len(self.frames)) if row not in self.without_camera])
 
     def by_tissue(self) -> list[Parsed]:
         """The parts of several tissues that have frames, each with a world of its own; the whole where there is one."""
@@ -73,11 +74,12 @@ class Parsed:
         parts = []
         for tissue in self.tissues:
             rows = [row for row, frame in enumerate(self.frames) if frame.state.tissue == tissue.name]
-            part = replace(self._of_rows(rows), tissues=[], over=tissue.name)
+            part = replace(self.of_rows(rows), tissues=[], over=tissue.name)
             parts += [replace(part, points=tissue.points, points_place=tissue.place)] if rows else []
         return parts
 
-    def _of_rows(self, rows: Sequence[int]) -> Parsed:
+    def of_rows(self, rows: Sequence[int]) -> Parsed:
+        """Return the same with the frames of these rows, in their order."""
         without = {index for index, row in enumerate(rows) if row in self.without_camera}
         frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
         return replace(self, frames=frames, places=places, without_camera=without)
@@ -108,6 +110,31 @@ def inside(root: Path, folder: Path, text: str) -> Path:
     if outside:
         raise NeecoError(f"{printable(text)} leaves the capture's folder; copy the file into it and name it from there")
     return path
+
+
+def natural_order(name: str) -> list[tuple[int, int, str]]:
+    """Key that sorts frame2 before frame10."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
+
+
+def instants(names: Sequence[str], lenses: Sequence[Hashable]) -> list[int] | None:
+    """Rank in time of images by the numbers in their names; None where the names do not count alike.
+
+    The same name in several folders is one instant where no two folders share a lens: cameras of a rig.
+    """
+    parts = [PurePosixPath(name.replace("\\", "/")) for name in names]
+    folders: dict[str, set[Hashable]] = {}
+    for part, lens in zip(parts, lenses, strict=True):
+        folders.setdefault(str(part.parent), set()).add(lens)
+    stems = {part.with_suffix("").name for part in parts}
+    apart = sum(map(len, folders.values())) == len(set(lenses))
+    rig = len(folders) > 1 and apart and len(stems) <= len(names) * 2 / (1 + len(folders))
+    keys = [part.with_suffix("").name if rig else str(part.with_suffix("")) for part in parts]
+    if len({re.sub(r"\d+", "0", key) for key in keys}) > 1:
+        return None
+    ranks = {key: rank for rank, key in enumerate(sorted(set(keys), key=natural_order))}
+    return [ranks[key] for key in keys]
 
 
 def relative_name(file: Path, root: Path) -> str:

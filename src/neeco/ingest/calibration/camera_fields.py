@@ -5,9 +5,9 @@ All of them state what OpenCV does: a principal point that counts from the first
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -73,7 +73,8 @@ def read_calibration(path: Path) -> Any:
     cv2.FileStorage what only OpenCV takes for YAML, as `data:[1, 2]` and `%PATH`. Raises NeecoError.
     """
     if path.suffix.lower() == ".json":
-        return _with_bare_matrix(read_json(path))
+        document = read_json(path)
+        return _matrix_alone(json.dumps(document)) or document if isinstance(document, list) else document
     text = read_text(path, "OpenCV's calibration as YAML or XML")
     if text.lstrip().startswith("<"):
         if "<opencv_storage" not in text:
@@ -96,21 +97,16 @@ def read_calibration(path: Path) -> Any:
             raise
     if not isinstance(document, dict) and isinstance(again := _by_opencv(text), dict):
         return again
-    return _with_bare_matrix(document)
+    return document if isinstance(document, dict) else _matrix_alone(text) or document
 
 
-def _with_bare_matrix(document: Any) -> Any:
-    """Return the document of nine numbers, row by row, that are a camera matrix and nothing else; others as they are.
-    YAML takes lines of numbers for text."""
-    words = re.split(r"[\s,;]+", document.strip()) if isinstance(document, str) else document
-    if not isinstance(words, list) or len(words) not in (3, 9):
-        return document
-    values = [as_float(word) for row in words for word in (row if isinstance(row, list) else [row])]
-    numbers = [] if None in values else values
-    if isinstance(document, str):
-        with suppress(ValueError):
-            numbers = [float(word) for word in words]
-    return {"camera_matrix": numbers} if len(numbers) == 9 and numbers[6:] == [0, 0, 1] else document
+def _matrix_alone(text: str) -> dict[str, list[float]] | None:
+    """Return the camera of a text of nothing but a matrix: nine numbers by rows, of which the last are 0 0 1."""
+    try:
+        numbers = [float(part) for part in re.split(r"[\s,;\[\]]+", text.strip("[]; \t\r\n"))]
+    except ValueError:
+        return None
+    return {"camera_matrix": numbers} if len(numbers) == 9 and numbers[6:] == [0, 0, 1] else None
 
 
 def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
@@ -119,11 +115,17 @@ def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
     if not isinstance(document, dict):
         return ()
     keys = _plain(document)
-    if all(name in keys for name in _OMNIDIRECTIONAL):
+    if {"a0", "a2", "a3"} <= keys.keys() or {"ss", "pol", "mappingcoefficients"} & keys.keys():
         raise NeecoError(
-            f"{where}: a0, a1, a2: an omnidirectional lens (Scaramuzza's polynomial), which is not read; undistort the "
-            "images, or calibrate a pinhole with radial and tangential, or equidistant, distortion"
+            f"{where}: is an omnidirectional model (Scaramuzza's), which is not read; undistort the images"
         )
+    if "focallength" in keys and "principalpoint" in keys:
+        raise NeecoError(
+            f"{where}: FocalLength: MATLAB's cameraParameters are not read; write camera_matrix (its IntrinsicMatrix "
+            "transposed, principal point less 1 px) and distortion_coefficients"
+        )
+    if {"ppx", "ppy"} <= keys.keys():
+        raise NeecoError(f"{where}: ppx: RealSense's intrinsics are not read; write camera_matrix of fx, fy, ppx, ppy")
     for pair in SIDES:
         sides = [_side(keys, side) for side in pair]
         if all(_has_camera(side) for side in sides):

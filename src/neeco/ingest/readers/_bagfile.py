@@ -7,6 +7,7 @@ types that are read have been the same for years, and a bag with other digests i
 from __future__ import annotations
 
 import bz2
+import io
 import re
 import sys
 from collections.abc import Collection, Iterator
@@ -37,6 +38,7 @@ MIB = 2**20
 MAX_CHUNK_BYTES = 256 * MIB  # unpacked; recorders write some MiB
 MAX_METADATA_BYTES = 16 * MIB
 MAX_NAME_LENGTH = 200
+MCAP_HEADER_AT, MCAP_SCHEMA = 17, 3  # byte where the header's content begins, and the opcode of schemas
 METADATA = "metadata.yaml"
 INFORMATION = "rosbag2_bagfile_information"
 _DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
@@ -57,6 +59,38 @@ class Topic:
     type: str
     count: int
     problem: str | None = None
+
+
+class _AnyMcap(io.BufferedReader):
+    """An MCAP file as rosbags takes it: of the profile ros2 (each channel states its own encoding), and
+    without the schemas of other encodings, whose messages are not read."""
+
+    _opcode = 0
+
+    def read(self, size: int | None = -1) -> bytes:
+        start, content = self.tell(), super().read(size)
+        found = content
+        if start == MCAP_HEADER_AT:
+            found = b"\4\0\0\0ros2" + content
+        elif self._opcode == MCAP_SCHEMA and size != 8:  # the length of the record
+            name_end = 6 + int.from_bytes(content[2:6], "little")
+            encoding = content[name_end + 4 :][: int.from_bytes(content[name_end:][:4], "little")]
+            if encoding not in (b"ros2msg", b"ros2idl"):
+                found = content[:name_end] + b"\7\0\0\0ros2msg" + bytes(len(content))
+        self._opcode = content[0] if size == 1 and content else self._opcode
+        return found[: len(content)]
+
+
+class _McapReader(McapReader):
+    """Reader of MCAP files of any profile."""
+
+    def open(self) -> None:
+        self.bio = _AnyMcap(io.FileIO(str(self.path)))
+        try:
+            self._open()
+        except BaseException:
+            self.bio.close()
+            raise
 
 
 class Bag:
@@ -101,11 +135,11 @@ class Bag:
 
     def _problem(self, connection: Any) -> str | None:
         kind = connection.msgtype
+        encoding = "cdr" if self._ros1 else connection.ext.serialization_format
+        if encoding != "cdr" and (kind in self.store.fielddefs or self.path.suffix.lower() == ".mcap"):
+            return f"is written as {plain(encoding) or 'nothing named'}, not as cdr"
         if kind not in self.store.fielddefs:
             return None  # nobody reads it
-        encoding = "cdr" if self._ros1 else connection.ext.serialization_format
-        if encoding != "cdr":
-            return f"is written as {encoding}, not as cdr"
         if connection.digest not in ("", "*", _digest(self._ros1, kind)):
             return f"defines {kind.replace('/msg/', '/')} otherwise than ROS"
         return None
@@ -121,7 +155,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         with _damage_named(path):
             if path.is_dir():
                 _check_metadata(path)
-            kinds = {".bag": Ros1Reader, ".mcap": McapReader, ".db3": Sqlite3Reader}
+            kinds = {".bag": Ros1Reader, ".mcap": _McapReader, ".db3": Sqlite3Reader}
             reader: Any = DirectoryReader(path) if path.is_dir() else kinds[path.suffix.lower()](path)
             reader.open()
             stack.callback(reader.close)

@@ -153,6 +153,9 @@ def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
 
 def _fill(survey: Survey, bag: Bag) -> None:
     kinds: dict[str, str] = {}
+    unread = [f"{plain(topic.name)} ({topic.type}) {topic.problem}" for topic in bag.topics.values() if topic.problem]
+    if unread and len(unread) == len(bag.topics):
+        raise NeecoError(f"{survey.path}: no topic can be read: {', '.join(unread)}; record or convert to ROS 2's cdr")
     for topic in bag.topics.values():
         if topic.type in READ and topic.problem is None:
             kinds[topic.name] = topic.type

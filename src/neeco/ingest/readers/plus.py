@@ -25,6 +25,7 @@ from neeco.ingest.readers import (
     parse_number,
 )
 from neeco.ingest.readers._sequencefile import META, NRRD, FrameSequence, SequenceImages, read_sequence
+from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_of, of_dvrk
 
 TRANSFORM, STATUS, TIME = "Transform", "Status", "Timestamp"
@@ -141,20 +142,22 @@ def _cached(path: Path, size: int, changed: int) -> FrameSequence:
 
 
 def _transforms(sequence: FrameSequence) -> list[str]:
-    names = [name.removesuffix(TRANSFORM) for name in sequence.fields if name.endswith(TRANSFORM)]
-    return sorted(name for name in names if _ENDS.fullmatch(name))
+    return sorted(name.removesuffix(TRANSFORM) for name in sequence.fields if name.endswith(TRANSFORM))
 
 
 def _ends(name: str) -> tuple[str, str]:
-    """Return the ends of a transform: Stylus and Tracker of StylusToTracker."""
+    """Return the ends of a transform: Stylus and Tracker of StylusToTracker; without a "To", as 3D Slicer names
+    transforms (LinearTransform_3), the whole name and nothing."""
     match = _ENDS.fullmatch(name)
-    assert match is not None
-    return match[1], match[2]
+    return (name, "") if match is None else (match[1], match[2])
 
 
 def _meaning(name: str) -> NamedFrame:
     """Return the meaning of the frame that a transform maps to."""
     body, frame = _ends(name)
+    if not frame:
+        why = f"{printable(name)} names no frame (StylusToTracker does)"
+        return NamedFrame(None, why, (BASE, CAMERA))
     return meaning_of(frame, dvrk=of_dvrk(body))
 
 

@@ -24,7 +24,6 @@ BASE_KEY, WORLD_KEY = "camera_from_base", "world_from_base"  # to a still camera
 UNKNOWN = "unknown"
 DVRK_SD_MM, DVRK_SD_DEG = 8.0, 5.0  # accuracy of the dVRK's registration by a marker, by its own README: 5 to 10 mm
 MM = 1000.0  # per m
-EASY_HANDEYE = ("transformation", "transform")  # base_from_camera, m, in its files for ROS 1 and ROS 2
 WHAT = "a camera registration of the dVRK: JSON"
 _AXES = word((*CAMERA_FRAMES,), "is no convention", f"write one of {', '.join(CAMERA_FRAMES)}")
 
@@ -75,6 +74,43 @@ def same_base(one: StatedBase | None, other: StatedBase | None) -> bool:
     return same and (one.sd_mm, one.sd_deg, one.to_world) == (other.sd_mm, other.sd_deg, other.to_world)
 
 
+def _of_hand_eye(path: Path) -> StatedBase:
+    """Read the YAML that easy_handeye saves, in metres: of a still camera (eye_on_hand: false), base_from_camera.
+    Raises NeecoError."""
+    remedy = "give the YAML of easy_handeye, or write {transform: 4 rows, mm}"
+    node = Node(parse_yaml(path, read_text(path, WHAT), remedy), str(path), "", RaisingReport())
+    node.is_object()  # else it raises
+    parameters, second = node.child("parameters"), node.has("transform")  # of easy_handeye2
+    stated = node.child("transform" if second else "transformation")
+    if not isinstance(stated.value, dict):
+        stated.error("is missing", remedy)
+    if second:
+        still = parameters.child("calibration_type").value == "eye_on_base"
+        places = [stated.child("translation").child(axis) for axis in "xyz"]
+        places += [stated.child("rotation").child(axis) for axis in "xyzw"]
+    else:
+        still = (parameters if parameters.value is not None else node).child("eye_on_hand").value is False
+        places = [stated.child(name) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    if not still:
+        node.error(
+            "does not say `eye_on_hand: false` (`calibration_type: eye_on_base`), so the camera may be on the robot",
+            "calibrate a camera that stands still, or write {transform: 4 rows, mm}",
+        )
+    camera = parameters.child("tracking_base_frame") if parameters.has("tracking_base_frame") else None
+    axes = CAMERA if camera is None else meaning_of(str(camera.value)).frame or ""
+    if camera is not None and axes not in CAMERA_FRAMES:
+        camera.error(
+            f"is {printable(camera.value)}, and nothing says in which axes", "write {transform: 4 rows, mm, axes: …}"
+        )
+    numbers = [number for place in places if (number := place.number()) is not None]
+    quaternion = np.array(numbers[3:])
+    if not 0.99 < np.linalg.norm(quaternion) < 1.01:
+        stated.error("qx, qy, qz, qw are no unit quaternion", "calibrate again")
+    rotation = Rotation.from_quat(quaternion).as_matrix()
+    camera_from_base = rigid(rotation.T, -rotation.T @ np.array(numbers[:3]) * MM)
+    return StatedBase(CAMERA_FRAMES[axes].poses_to_opencv(camera_from_base), DVRK_SD_MM, DVRK_SD_DEG)
+
+
 def read_dvrk_registration(path: Path) -> StatedBase:
     """Read the file that `camera_registration.py` of jhu-dvrk/dvrk_camera_registration writes for a still camera, in
     metres. Raises NeecoError for another file.
@@ -82,12 +118,16 @@ def read_dvrk_registration(path: Path) -> StatedBase:
     It is `…-registration-open-cv.json` or, in the dVRK's axes, `…-registration-dVRK.json`: a piece of a system.json
     and no JSON by itself.
     """
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return _of_hand_eye(path)
     content = read_text(path, WHAT).strip()
     whole = content.startswith("{")
     try:
         document = json.loads(content if whole else "{" + content.rstrip(",") + "}")
     except (ValueError, RecursionError) as error:
-        raise NeecoError(f"{path}: is not {WHAT}; give the file …-registration-open-cv.json") from error
+        raise NeecoError(
+            f"{path}: is not {WHAT}; give the file …-registration-open-cv.json, or easy_handeye's YAML"
+        ) from error
     node = Node(document, str(path), "", RaisingReport())
     if isinstance(document, dict) and "measured_cp" in document:
         node.child("measured_cp").error(
@@ -114,54 +154,13 @@ def read_dvrk_registration(path: Path) -> StatedBase:
     return StatedBase(DVRK_ECM.poses_to_opencv(matrix) if turned else matrix, DVRK_SD_MM, DVRK_SD_DEG)
 
 
-def read_registration(path: Path) -> StatedBase:
-    """Read a file that states a base to a still camera: easy_handeye's YAML, or the dVRK's registration. Raises
-    NeecoError for another file."""
-    if path.suffix.lower() not in (".yaml", ".yml", ".calib"):
-        return read_dvrk_registration(path)
-    document = parse_yaml(path, read_text(path, "a hand-eye calibration as YAML"), "save the calibration again")
-    node = Node(document, str(path), "", RaisingReport())
-    if not isinstance(document, dict) or not any(key in document for key in EASY_HANDEYE):
-        node.error(
-            f"is neither {WHAT} nor easy_handeye's YAML, which has `transformation`",
-            "write {transform: 4 rows, mm} of camera_from_base instead",
-        )
-    parameters = node.child("parameters")
-    held = parameters.value if isinstance(parameters.value, dict) else {}
-    if held.get("eye_on_hand") is True or held.get("calibration_type") in ("eye_in_hand", "eye_on_hand"):
-        parameters.error("the camera was on the robot's hand", "give the calibration of a camera that stands beside it")
-    stated = held.get("tracking_base_frame")
-    frame = CAMERA if stated is None else meaning_of(str(stated)).frame or ""
-    if frame not in CAMERA_FRAMES:
-        parameters.child("tracking_base_frame").error(
-            f"is {printable(stated)}, and nothing says in which axes it is",
-            "write {transform: 4 rows of camera_from_base, mm, axes: opencv or ros_body} instead",
-        )
-    transform = node.child(next(key for key in EASY_HANDEYE if key in document))
-    place, turn = (
-        transform.child(key) if isinstance(transform.value, dict) and key in transform.value else transform
-        for key in ("translation", "rotation")
-    )
-    if turn is transform:
-        values = {key: transform.child(key).number() for key in ("x", "y", "z", "qx", "qy", "qz", "qw")}
-    else:
-        values = {key: place.child(key).number() for key in "xyz"}
-        values |= {f"q{key}": turn.child(key).number() for key in "xyzw"}
-    position = MM * np.array([values[key] for key in "xyz"], np.float64)
-    quaternion = np.array([values[f"q{key}"] for key in "xyzw"], np.float64)
-    if not 0.99 < np.linalg.norm(quaternion) < 1.01:
-        turn.error("is no unit quaternion", "save the calibration again")
-    base_from_camera = rigid(Rotation.from_quat(quaternion).as_matrix(), position)
-    camera_from_base = np.linalg.inv(base_from_camera)
-    return StatedBase(CAMERA_FRAMES[frame].poses_to_opencv(camera_from_base), DVRK_SD_MM, DVRK_SD_DEG)
-
-
 def parse_base(node: Node) -> StatedBase:
-    """Return the base of `camera_from_base`: `unknown`, a file (`read_registration`), or a BaseSection."""
+    """Return the base of `camera_from_base`: `unknown`, a file of the dVRK's registration or easy_handeye's, or a
+    BaseSection."""
     if node.value == UNKNOWN:
         return StatedBase()
     if isinstance(node.value, str):
-        return read_registration(existing_file(node))
+        return read_dvrk_registration(existing_file(node))
     if not isinstance(node.value, dict):
         raise Fault(node.field, f"expected `unknown`, a file or {{transform: …}}, found {printable(node.value)}")
     stated = read_section(BaseSection, node)
