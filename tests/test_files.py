@@ -335,3 +335,9 @@ def test_whoever_cannot_write_learns_what_to_do(tmp_path: Path, write: Callable[
         assert message.startswith(f"{path}: cannot write: "), message
         assert f"; {remedy}" in message
     assert {entry.name for entry in tmp_path.iterdir()} == {"file", "folder"}
+
+
+def test_a_video_wrapped_in_dicom_is_called_so(tmp_path):
+    path = tmp_path / "video.dcm"
+    path.write_bytes(bytes(128) + b"DICM" + bytes(400))
+    assert "DICOM" in (placeholder(path) or "")

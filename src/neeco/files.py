@@ -35,13 +35,15 @@ _ANNEX = "is a git-annex pointer, not the file; run `git annex get`"
 _MAC = "is macOS metadata (AppleDouble), not the file; give the file without `._`"
 _PAGE = "is a web page, not the file; download the file again (does it need a login?)"
 _ANSWER = "is a server's error message, not the file; download the file again"
+_DICOM = "is DICOM; take its video out by pydicom: next(generate_frames(dataset.PixelData, number_of_frames=1))"
 _PLACEHOLDERS = (
+    (rb".{128}DICM", _DICOM),
     (rb"version https://(?:git-lfs|hawser)\.github\.com/spec/", _LFS),
     (rb"[./\\][\w./\\-]*annex[/\\]objects[/\\]\S+\s*\Z", _ANNEX),
     (rb"\0\x05\x16[\0\x07]\0", _MAC),
     (_XML + rb"<(?:!doctype\s+html|html[\s>])", _PAGE),
     (_XML + rb"<Error>\s*<Code>|(?:404: Not Found|Entry not found|Access to \S+ \S+ is restricted\b.*)\s*\Z", _ANSWER),
-)  # what clones and downloads leave in a file's place: how it begins, and what to do
+)  # what stands in a file's place, of clones and downloads above all: how it begins, and what to do
 PLACEHOLDERS = [(re.compile(start, re.DOTALL | re.IGNORECASE), problem) for start, problem in _PLACEHOLDERS]
 
 
