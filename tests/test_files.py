@@ -424,3 +424,9 @@ def test_a_pipe_is_no_folder_and_none_is_within_a_folder_of_ours(tmp_path: Path,
     assert stat.S_ISFIFO(os.lstat(tmp_path / "pipe").st_mode)
     with pytest.raises(NeecoError, match="pipe: is a device, pipe or socket, not a file"), own_folder(tmp_path):
         raise AssertionError
+
+
+def test_a_video_wrapped_in_dicom_is_called_so(tmp_path):
+    path = tmp_path / "video.dcm"
+    path.write_bytes(bytes(128) + b"DICM" + bytes(400))
+    assert "DICOM" in (placeholder(path) or "")

@@ -14,7 +14,9 @@ _ANNEX = "is a git-annex pointer, not the file; run `git annex get`"
 _MAC = "is macOS metadata (AppleDouble), not the file; give the file without `._`"
 _PAGE = "is a web page, not the file; download the file again (does it need a login?)"
 _ANSWER = "is a server's error message, not the file; download the file again"
+_DICOM = "is DICOM; take its video out by pydicom: next(generate_frames(dataset.PixelData, number_of_frames=1))"
 _PLACEHOLDERS = (
+    (rb".{128}DICM", _DICOM),
     (rb"version https://(?:git-lfs|hawser)\.github\.com/spec/", _LFS),
     (rb"[./\\][\w./\\-]*annex[/\\]objects[/\\]\S+\s*\Z", _ANNEX),
     (rb"\0\x05\x16[\0\x07]\0", _MAC),

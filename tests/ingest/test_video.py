@@ -222,7 +222,7 @@ def test_one_image_that_is_missing_or_of_another_size_is_left_out_and_shifts_no_
 def test_dicom_is_called_what_it_is(tmp_path):
     path = tmp_path / "v.dcm"
     path.write_bytes(bytes(128) + b"DICM" + bytes(200))
-    with pytest.raises(NeecoError, match=r"v\.dcm: is DICOM; take the video stream out of it first"):
+    with pytest.raises(NeecoError, match=r"v\.dcm: is DICOM; take its video out by pydicom"):
         open_video(path)
 
 

@@ -20,7 +20,6 @@ from neeco.errors import NeecoError, install_hint
 from neeco.files import require_content, visible_entries
 from neeco.ingest.readers import VideoSource, numbers, read_table
 from neeco.ingest.readers.columns import recognise_time, scale_of
-from neeco.placeholders import read_head
 
 FURTHER_FORMATS = {".bmp": "BMP", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}  # opened under these names alone
 IMAGES = (".png", ".jpg", ".jpeg", *FURTHER_FORMATS)
@@ -220,11 +219,6 @@ class _Scan:
         try:
             container = av.open(str(self.path))
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            if read_head(self.path, 132)[128:] == b"DICM":
-                raise NeecoError(
-                    f"{self.path}: is DICOM; take the video stream out of it first, by pydicom: next(pydicom.encaps."
-                    "generate_frames(dataset.PixelData, number_of_frames=1)) is the content of a video file"
-                ) from None
             raise NeecoError(
                 f"{self.path}: cannot be opened as a video ({_reason(error)}); give an intact video file"
             ) from None
