@@ -48,7 +48,8 @@ def read_pycocotools(root: Path) -> str:
     """Filled again, polygons are the masks and parts; ids of parts are those of dataset.json."""
     from pycocotools.coco import COCO
 
-    ids = {item["id"]: f"{item['instrument']}/{item['part']}" for item in document(root / "dataset.json")["ids"][1:]}
+    info = document(root / "dataset.json")
+    ids = {item["id"]: f"{info['classes'][item['instrument']]}/{item['part']}" for item in info["ids"][1:]}
     shares, count = [], 0
     for kind in ("instances", "parts"):
         for file in (root / f"coco/{kind}.json", *sorted((root / "coco/annotations").glob(f"{kind}_*.json"))):

@@ -6,14 +6,17 @@ import importlib.util
 import io
 import json
 import shutil
+import tarfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from ball_world import RADIUS, at, ball_scene, run_of
 from PIL import Image
 from rod_world import CAMERA, FakeRun
 
+from neeco.errors import NeecoError
 from neeco.geometry.projection import project
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
@@ -172,6 +175,53 @@ def test_imagefolder_has_a_line_for_every_image_and_mask(made: Path) -> None:
                 assert mask[y : y + height, x : x + width].any()
             found += 1
     assert found == COUNT
+
+
+@pytest.mark.parametrize(
+    ("names", "classes"),
+    [(("near=grasper",), ["grasper", "far"]), (("near=grasper", "far=grasper"), ["grasper"])],
+)
+def test_every_format_has_the_given_names_of_classes(
+    names: tuple[str, ...], classes: list[str], runs: list[FakeRun], tmp_path: Path
+) -> None:
+    settings = Settings(count=2, tissue_tolerance_mm=2.0, class_names=names)
+    synthesize(runs[0], tmp_path, settings, FORMATS, instrument_runs=runs[1:])  # type: ignore[arg-type]
+    coco = json.loads((tmp_path / "coco/instances.json").read_text())
+    assert [item["name"] for item in coco["categories"]] == classes
+    parts = json.loads((tmp_path / "coco/parts.json").read_text())
+    assert [item["supercategory"] for item in parts["categories"]] == classes
+    for document in (coco, parts):
+        assert {item["category_id"] for item in document["annotations"]} == set(range(1, len(classes) + 1))
+    for variant, ending in (("", ""), ("segment", ""), ("obb", ""), ("parts", "/instrument")):
+        data = yaml.safe_load((tmp_path / "yolo" / variant / "data.yaml").read_text())
+        assert [name.removesuffix(ending) for name in data["names"].values()] == classes
+        rows = (tmp_path / "yolo" / variant / "labels/train/000000.txt").read_text().splitlines()
+        assert {int(row.split()[0]) for row in rows} == set(range(len(classes)))
+        assert len(rows) == 2
+    assert list(json.loads((tmp_path / "bop/objects.json").read_text()).values()) == classes
+    truth = json.loads((tmp_path / "bop/train/000000/scene_gt.json").read_text())
+    assert {item["obj_id"] for item in truth["0"]} == set(range(1, len(classes) + 1))
+    line = json.loads((tmp_path / "imagefolder/train/metadata.jsonl").read_text().splitlines()[0])
+    assert set(line["objects"]["name"]) == set(classes)
+    with tarfile.open(tmp_path / "webdataset/train-000000.tar") as tar:
+        stored = json.load(tar.extractfile("000000.json"))  # type: ignore[arg-type]
+    assert {label["name"] for label in stored["labels"]} == set(classes)
+    assert json.loads((tmp_path / "dataset.json").read_text())["classes"]["near"] == "grasper"
+    assert "--class-names near=grasper" in (tmp_path / "README.md").read_text()
+    assert [item["name"] for item in json.loads((tmp_path / "states.jsonl").read_text().splitlines()[0])["labels"]] == [
+        "near",
+        "far",
+    ]
+
+
+@pytest.mark.parametrize("names", [("nobody=a",), ("near",), ("near=",), ("near=a", "near=b")])
+def test_names_of_classes_that_fit_no_instrument_are_refused(
+    names: tuple[str, ...], runs: list[FakeRun], tmp_path: Path
+) -> None:
+    settings = Settings(count=2, tissue_tolerance_mm=2.0, class_names=names)
+    with pytest.raises(NeecoError, match=r"--class-names: .* expected INSTRUMENT=CLASS, once for each of near, far"):
+        synthesize(runs[0], tmp_path / "set", settings, FORMATS, instrument_runs=runs[1:])  # type: ignore[arg-type]
+    assert not (tmp_path / "set").exists()
 
 
 def test_a_larger_data_set_is_larger_in_every_format_it_was_begun_in(runs: list[FakeRun], tmp_path: Path) -> None:

@@ -27,6 +27,9 @@ class Arguments:
     """Frames trusted less are listed, not written: 0 to 1, about the overlap (IoU) that the image speaks for."""
     formats: Annotated[tuple[str, ...], tyro.conf.arg(help=formats_help())] = DEFAULT_FORMATS
     images: tyro.conf.OmitArgPrefixes[ImageSettings] = AS_RECORDED
+    class_names: tuple[str, ...] = ()
+    """INSTRUMENT=CLASS: names of classes in the data set's formats, which instruments may share. Default: those of the
+    instruments."""
     resume: bool = False
     """Continue a data set begun with the same settings."""
     force: bool = False
@@ -59,6 +62,7 @@ def run(arguments: Arguments) -> int:
                 min_trust=arguments.min_trust,
                 formats=arguments.formats,
                 images=arguments.images,
+                class_names=arguments.class_names,
                 resume=arguments.resume,
                 on_progress=advance,
             )

@@ -23,11 +23,11 @@ from neeco.fitting.alignment import STATE_ERRORS, AlignConfig, AlignedFrame, ali
 from neeco.geometry.distortion import field_pinhole
 from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
-from neeco.labels.labellers import CompositedLabels
+from neeco.labels.labellers import CompositedLabels, instruments_of
 from neeco.raster.resampling import of_rendered_size, resampled
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
-from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings
+from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings, parse_class_names
 from neeco.synthesis.writers.folder import Record, encoded_sample, skipped_sample
 
 if TYPE_CHECKING:
@@ -62,6 +62,7 @@ def annotate_capture(
     min_trust: float = MIN_TRUST,
     formats: Sequence[str] = DEFAULT_FORMATS,
     images: ImageSettings = AS_RECORDED,
+    class_names: Sequence[str] = (),
     resume: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Annotated:
@@ -89,7 +90,7 @@ def annotate_capture(
     check_formats(formats, images)
     cameras = DrawnCameras.of(images, scene.recorded, (frame.camera for frame in capture.frames))
     first = capture.frames[0].camera
-    settings |= images.image_identity(first.width, first.height)
+    settings |= images.image_identity(first.width, first.height) | {"class_names": list(class_names) or None}
     output = Path(output)
     info = description(run, settings)
     begun = check_output(output, info, resume)
@@ -101,6 +102,7 @@ def annotate_capture(
         scene=scene,
         labeller=labeller,
         formats=formats,
+        class_names=parse_class_names(class_names, instruments_of(labeller.names)),
     )
     with folder.being_written() as records:
         typical = typical_errors(scene, labeller, trained_on)

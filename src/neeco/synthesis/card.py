@@ -97,6 +97,11 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
         "size_categories": [next((name for name, limit in SIZES.items() if info["images"] < limit), "n>10M")],
         "configs": [config],
     }
+
+    def named(instrument: str) -> str:
+        name = info["classes"].get(instrument, instrument)
+        return instrument if name == instrument else f"{instrument}: {name}"
+
     text = TEXT.format(
         front=yaml.safe_dump(front, sort_keys=False),
         mark=MARK,
@@ -104,7 +109,9 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
         how=RECORDED if annotated else SYNTHETIC,
         images=info["images"],
         splits=", ".join(f"{count} {split}" for split, count in info["splits"].items()),
-        classes="\n".join(f"| {item['id']} | {item.get('instrument', '')} | {item['part']} |" for item in info["ids"]),
+        classes="\n".join(
+            f"| {item['id']} | {named(item.get('instrument', ''))} | {item['part']} |" for item in info["ids"]
+        ),
         keypoints=", ".join(info["keypoints"]) or "none",
         mm_per_count=info["depth"]["mm_per_count"],
         formats="\n".join(f"- {formats[name]}" for name in info["formats"]),
@@ -133,5 +140,7 @@ def _command(info: Mapping[str, Any]) -> str:
             words += [] if value == field.default else [flag if value else f"--no-{flag[2:]}"]
         elif value != field.default or field.name == "seed":
             words += [flag, *(value if isinstance(value, list) else ["FILE"] if isinstance(value, dict) else [value])]
+    if "annotates" in settings and settings.get("class_names"):
+        words += ["--class-names", *settings["class_names"]]
     formats = ["--formats", *info["formats"]] if info["formats"] else []
     return shlex.join(map(str, ["neeco", *words, *formats, "--output", "DATASET"]))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,7 @@ from neeco.errors import NeecoError
 from neeco.files import own_folder, read_begun, require_same, sync_disk, write_json
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.drawing import EDGE_WIDTH
-from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels
+from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels, instruments_of
 from neeco.registry import plugins
 from neeco.synthesis.backgrounds import ImageFolder
 from neeco.synthesis.camera_effects import read_effects
@@ -38,7 +38,7 @@ from neeco.synthesis.generator import (
 from neeco.synthesis.parallel import draw_in_workers
 from neeco.synthesis.preview import write_preview
 from neeco.synthesis.samplers import N_SIMILAR, states_fingerprint
-from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names
+from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names, parse_class_names
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import (
     DEPTH_MM_PER_COUNT,
@@ -139,6 +139,7 @@ def synthesize(
         scene=generator.scene,
         labeller=generator.labeller,
         formats=formats,
+        class_names=parse_class_names(settings.class_names, instruments_of(generator.labeller.names)),
     )
     with folder.being_written() as records:
         if records:
@@ -225,6 +226,7 @@ class DataSetFolder:
     scene: GaussianScene
     labeller: Labeller
     formats: Sequence[str]
+    class_names: Mapping[str, str]  # by instrument, where they differ
 
     @contextlib.contextmanager
     def being_written(self) -> Iterator[dict[int, Record]]:
@@ -253,6 +255,12 @@ class DataSetFolder:
     def _stored(self) -> dict[int, Record]:
         return {k: record for k in range(self.count) if (record := load_record(self.output, k)) is not None}
 
+    def _with_classes(self, record: Record) -> Record:
+        """The record with its labels named by class, and their instruments as `instrument`."""
+        names = ((label, label["name"]) for label in record["labels"])
+        labels = [label | {"name": self.class_names.get(name, name), "instrument": name} for label, name in names]
+        return record | {"labels": labels}
+
     def _write_indexes(self, records: list[Record], complete: bool) -> None:
         """(Re)write everything that is about the whole data set, from the records."""
         output, names, images = self.output, self.labeller.names, with_image(records)
@@ -263,8 +271,8 @@ class DataSetFolder:
         formats = [name for name in formats if name in self.formats or (output / name).is_dir()]
         written = WrittenImages(
             root=output,
-            records=images,
-            part_names=names,
+            records=[self._with_classes(record) for record in images],
+            part_names=tuple(dict.fromkeys((self.class_names.get(owner, owner), part) for owner, part in names)),
             keypoint_names=keypoints,
             bones=self.scene.skeleton(),
             scene=self.scene,
@@ -281,6 +289,7 @@ class DataSetFolder:
             "splits": dict(Counter(record["split"] for record in images)),
             "formats": formats,
             "ids": part_ids(names),
+            "classes": {name: self.class_names.get(name, name) for name in instruments_of(names)},
             "keypoints": list(keypoints),
             "depth": {"mm_per_count": DEPTH_MM_PER_COUNT, "none": 0},
             "delta_thresholds": None if thresholds is None else asdict(thresholds),

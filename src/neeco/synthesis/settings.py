@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import entry_points
 from typing import Any, Literal, get_args
@@ -106,6 +107,18 @@ class ImageSettings(SizeSettings):
         }
 
 
+def parse_class_names(words: Sequence[str], instruments: Sequence[str]) -> dict[str, str]:
+    """Parse `PSM1=needle_driver` as {"PSM1": "needle_driver"}. Raises NeecoError for others than `instruments`."""
+    names: dict[str, str] = {}
+    for word in words:
+        instrument, _, name = word.partition("=")
+        if not (name and name.isprintable()) or instrument not in instruments or instrument in names:
+            known = ", ".join(instruments)
+            raise NeecoError(f"--class-names: {word!r}: expected INSTRUMENT=CLASS, once for each of {known}")
+        names[instrument] = name
+    return names
+
+
 def format_names() -> tuple[str, ...]:
     """Return the names that `--formats` takes: ours, then those of installed packages. Loads none of them."""
     return tuple(dict.fromkeys((*FORMATS, *sorted(point.name for point in entry_points(group=WRITERS)))))
@@ -134,6 +147,9 @@ class Settings(ImageSettings):
     """How far `extrapolate` goes, as a share of the recorded range at either end."""
     views: Views = "recorded"
     """Cameras: of a recorded frame with a similar state, near such ones, or from there in orbit about the tissue."""
+    class_names: tuple[str, ...] = ()
+    """INSTRUMENT=CLASS: names of classes in the data set's formats, which instruments may share. Default: those of the
+    instruments."""
     labels: LabelWay = "composited"
     """composited: from compositing, occlusion-correct. threshold: the paper's, from Gaussians that move."""
     label_threshold: float | None = None
@@ -213,6 +229,7 @@ class Settings(ImageSettings):
             del values[field.name]
         if not self.states.startswith(PATH_PREFIX):
             del values["count"]
+        values["class_names"] = list(self.class_names) or None
         if self.delta_thresholds is not None:
             values["delta_thresholds"] = list(self.delta_thresholds)
         return values

@@ -92,10 +92,10 @@ def _masks(images: WrittenImages, folder: Path, record: Record) -> list[dict[str
     extended = extended_silhouettes(images.scene, labeller, State(given, record["time"], record.get("tissue")), camera)
     infos = []
     for place, label in enumerate(record["labels"]):
-        ids = [k for k, (owner, _) in enumerate(labeller.names, 1) if owner == label["name"]]
+        ids = [k for k, (owner, _) in enumerate(labeller.names, 1) if owner == label["instrument"]]
         visible = np.isin(parts, ids)
         mask = visible | (bits >> place & 1 > 0)
-        whole = extended[label["name"]]
+        whole = extended[label["instrument"]]
         whole[height : 2 * height, width : 2 * width] = mask
         for kind, pixels in (("mask", mask), ("mask_visib", visible)):
             path = folder / kind / f"{name}_{place:06d}.png"
