@@ -383,7 +383,7 @@ def test_the_verb_says_what_labels_few_frames_give(folder, capsys):
 def test_a_capture_is_parsed_once_to_be_checked_and_handed_on(folder, monkeypatch):
     parsed = []
     real = json.loads
-    monkeypatch.setattr(json, "loads", lambda text: parsed.append(text) or real(text))
+    monkeypatch.setattr(json, "loads", lambda text, **words: parsed.append(text) or real(text, **words))
     assert len(read_checked(folder.root).frames) == 8
     assert len(parsed) == 1
 

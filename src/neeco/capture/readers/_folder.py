@@ -124,6 +124,9 @@ def parse_capture(
     NeecoError for a path that is not in UTF-8."""
     path = Path(path)
     require_utf8(path)
+    if os.path.isfile(path) and path.suffix.lower() != ".json":
+        report.error(str(path), "", "is no capture", "give the folder of one, or a transforms file (JSON) in it")
+        return Parsed(path.parent)
     if os.path.isfile(path):
         path, transforms = path.parent, path.name
     if not os.path.isdir(path):
