@@ -30,6 +30,15 @@ class NeecoError(Exception):
 
     command_line: str | None = None  # the message as the command line words it, where that differs
 
+    def __init__(self, message: str = "") -> None:
+        super().__init__(visible(message))
+
+
+def visible(text: str) -> str:
+    """Return text in one line without control characters, which could move a terminal's cursor: files may hold any."""
+    line = " ".join(text.split())
+    return line if line.isprintable() else "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line)
+
 
 def install_hint(extra: str) -> str:
     """Return the command that installs an extra of neeco ("view"). No package index has neeco yet."""

@@ -23,6 +23,7 @@ from neeco.locks import LOCK, LOCKING, TEMPORARY, begin_file, locked, remove_aba
 from neeco.placeholders import placeholder
 
 LOCK_WAIT_S = 20.0  # for a person who clicks, while another process writes
+FOLLOW_LINKS = "NEECO_FOLLOW_LINKS"  # environment variable
 MAX_VALUES = 1_000_000  # in a YAML file, aliases written out
 MAX_BYTES = 2**30  # of a file that is read whole
 HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
@@ -250,6 +251,11 @@ def require_utf8(path: Path | str) -> None:
         raise NeecoError(f"{os.fsencode(name)!r}: the name is not in UTF-8; rename the file or folder")
 
 
+def follows_links() -> bool:
+    """Return whether links in a capture may lead out of it (`--follow-links`): workers inherit the environment."""
+    return os.environ.get(FOLLOW_LINKS, "") not in ("", "0")
+
+
 def require_inside(file: Path, folder: Path) -> Path:
     """`file`, whose path goes through `folder`. Raises NeecoError when a link on the way leads out of that, or in a
     circle."""
@@ -323,19 +329,45 @@ def read_json(path: Path) -> Any:
     """Parse a JSON file. Raises NeecoError naming the file (and the line) when absent, unreadable or malformed."""
     text = read_text(Path(path), "JSON")
     try:
-        value = json.loads(text)
+        value = json.loads(text, object_pairs_hook=distinct_keys)
         # halves of characters, as of names that are not in UTF-8: no other file could hold them
         if "\\ud" in text.lower() and (half := HALVES.search(json.dumps(value, ensure_ascii=False))):
             raise NeecoError(f"{path}: holds {half[0]!r}, half a character; write its names and the files' in UTF-8")
         return value
     except json.JSONDecodeError as error:
         raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}; mend or write it anew") from None
+    except RepeatedKeyError as error:
+        raise NeecoError(f"{path}: {error}") from None
     except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels
         raise NeecoError(f"{path}: not usable JSON: a number or the nesting is too large; write it anew") from None
 
 
+class RepeatedKeyError(ValueError):
+    """An object of a JSON file holds a key twice, so that it is unknown which value is meant."""
+
+
+def distinct_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object of its pairs, as `object_pairs_hook`. Raises RepeatedKeyError."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in found if names.count(name) > 1)
+        raise RepeatedKeyError(f"{twice!r} is given twice in one object; keep one of them")
+    return found
+
+
 class YamlLoader(yaml.SafeLoader):
-    """YAML in which -.5, 1e-3 and 1.5e3 are numbers, as in YAML 1.2; PyYAML, which reads 1.1, takes them for text."""
+    """YAML in which -.5, 1e-3 and 1.5e3 are numbers, as in YAML 1.2 (PyYAML, which reads 1.1, takes them for text), and
+    a key given twice is an error: the first would be lost without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                problem = f"{key.value!r} is given twice; keep one of them"
+                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+            seen.add(str(key.value))
+        return super().construct_mapping(node, deep)
 
 
 class FastYamlLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]

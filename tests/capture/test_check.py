@@ -16,6 +16,7 @@ from PIL import Image
 
 from neeco.capture import check_capture, errors_only, read_capture
 from neeco.capture.checks import read_checked
+from neeco.capture.checks.inspection import expected_labels
 from neeco.capture.points import read_ply, write_ply
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.cli import check as check_verb
@@ -372,10 +373,13 @@ def test_the_verb_prints_and_returns_a_status(folder, capsys):
     assert report["summary"]["splits"] == {"train": 7, "test": 1}
 
 
-def test_the_verb_says_what_labels_few_frames_give(folder, capsys):
-    check_verb.run(check_verb.Arguments(folder.root))
-    told = capsys.readouterr().out
-    assert re.search(r"labels to expect: with exact states, \d+ training frames gave IoU 0\.\d\d on seen", told)
+def test_the_labels_of_few_frames_are_told_where_any_were_measured(folder, capsys):
+    assert expected_labels(9) is None
+    assert expected_labels(60) is None
+    assert re.search(r"10 training frames gave IoU 0\.\d\d on seen", expected_labels(14) or "")
+    assert re.search(r"15 training frames gave IoU 0\.\d\d on seen", expected_labels(15) or "")
+    check_verb.run(check_verb.Arguments(folder.root))  # 7 training frames
+    assert "labels to expect" not in capsys.readouterr().out
     check_verb.run(check_verb.Arguments(SAMPLE))  # 72 training frames
     assert "labels to expect" not in capsys.readouterr().out
 
@@ -383,7 +387,7 @@ def test_the_verb_says_what_labels_few_frames_give(folder, capsys):
 def test_a_capture_is_parsed_once_to_be_checked_and_handed_on(folder, monkeypatch):
     parsed = []
     real = json.loads
-    monkeypatch.setattr(json, "loads", lambda text: parsed.append(text) or real(text))
+    monkeypatch.setattr(json, "loads", lambda text, **words: parsed.append(text) or real(text, **words))
     assert len(read_checked(folder.root).frames) == 8
     assert len(parsed) == 1
 

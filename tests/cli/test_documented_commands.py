@@ -64,6 +64,7 @@ synthesize RUN --output SET --count 2 --labels composited --formats webdataset b
 synthesize RUN --output SET --count 2 --states states.jsonl
 synthesize RUN --output SET --count 2 --states path:path.jsonl
 synthesize RUN --output SET --count 2 --states grid
+synthesize RUN --output SET --count 2 --class-names maryland=needle_driver
 synthesize RUN --output dataset --count 8 --resume
 annotate RUN --output LABELLED --lens
 annotate RUN --capture OTHER --output LABELLED

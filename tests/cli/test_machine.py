@@ -140,7 +140,7 @@ def test_memory_is_named_where_a_reader_took_it_for_a_damaged_file(monkeypatch: 
     assert memory_failure(NeecoError("scene.safetensors: damaged scene; train again")) is None
     assert memory_failure(RuntimeError("shapes differ")) is None
 
-    def full(path: Path) -> None:
+    def full(path: Path, **options: object) -> None:
         raise MemoryError
 
     monkeypatch.setattr(Image, "open", full)

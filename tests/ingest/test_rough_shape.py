@@ -51,6 +51,20 @@ def test_poses_logged_late_fit_what_moves_at_another_lag(late: float) -> None:
     assert lag == pytest.approx(late, abs=0.1)
 
 
+def test_agreement_with_a_flat_top_contradicts_no_clock() -> None:
+    """A wide instrument agrees with what moves about as well 0.1 s earlier and later: its clock is right."""
+    times = np.arange(2.0, 12.0, 0.25)
+
+    def poses_at(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = np.tile(np.eye(4), (len(times), 1, 1))
+        found[:, :3, 3] = np.stack([20 * np.sin(2 * times), 14 * np.cos(1.3 * times**1.2), 100 + times], 1)
+        return found, times < 30
+
+    early, late = (moving_at(poses_at(times + side * 0.11)[0][:, :3, 3]) for side in (-1, 1))
+    evidence = np.maximum(early, 0.9 * late)
+    assert best_lag(evidence, lambda lag: poses_at(times + lag), PINHOLE, 4.0) == 0.0
+
+
 def test_motion_that_follows_no_pose_gives_no_shape() -> None:
     evidence = np.random.default_rng(0).uniform(0, 0.2, (len(ROWS), 48 // STEP_PX, 64 // STEP_PX))
     assert carve_shape(evidence, poses(), PINHOLE) is None

@@ -11,7 +11,7 @@ from typing import Any, Literal, NoReturn
 
 import numpy as np
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, visible
 from neeco.geometry.rotations import rigid_fault
 
 MIN_CONDENSED = 3  # problems similar to another one, from which they are counted instead of listed
@@ -33,7 +33,7 @@ class Problem:
 
     def __str__(self) -> str:
         place = f"{self.file}: {self.field}" if self.field else self.file
-        return f"{place}: {self.message}" + (f"; {self.remedy}" if self.remedy else "")
+        return visible(f"{place}: {self.message}" + (f"; {self.remedy}" if self.remedy else ""))
 
 
 def errors_only(problems: list[Problem]) -> list[Problem]:
@@ -82,7 +82,7 @@ class RaisingReport(ProblemReport):
 
     def error(self, file: str, field: str, message: str, remedy: str = "") -> NoReturn:
         problem = Problem("error", file, field, message, remedy)
-        raise NeecoError(" ".join(str(problem).split()))
+        raise NeecoError(str(problem))
 
 
 def printable(value: Any, limit: int = 60) -> str:

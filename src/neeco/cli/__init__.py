@@ -20,8 +20,8 @@ from dataclasses import make_dataclass
 from typing import Any, get_type_hints
 
 from neeco import __version__
-from neeco.errors import NeecoError, memory_failure, nearest
-from neeco.files import require_utf8
+from neeco.errors import NeecoError, memory_failure, nearest, visible
+from neeco.files import FOLLOW_LINKS, require_utf8
 
 VERBS = {
     "demo": "The whole main job on the bundled sample capture, in five minutes.",
@@ -44,7 +44,8 @@ VERBS = {
 
 DESCRIPTION = """Labelled images of surgical instruments in states nobody recorded.
 
-neeco VERB --help: the options of a verb.
+neeco VERB --help, neeco help VERB: the options of a verb.
+neeco VERB … --follow-links: also read files of a capture that are links to files outside of its folder.
 neeco --version: the version.
 neeco --tyro-print-completion bash|zsh|tcsh: completion for a shell, to be sourced (bash, tcsh) or saved as _neeco in a
 folder of fpath (zsh)."""
@@ -64,7 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = _with_target(list(sys.argv[1:] if arguments is None else arguments))
     _prepare_streams()
-    terminate = None
+    terminate, before = None, os.environ.get(FOLLOW_LINKS)
+    if "--follow-links" in words[1:]:
+        words.remove("--follow-links")
+        os.environ[FOLLOW_LINKS] = "1"
     if threading.current_thread() is threading.main_thread():
         # SIGTERM ends as Ctrl-C does: tidily
         terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -84,6 +88,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     finally:
         _discard_unwritable()
+        if before is None:
+            os.environ.pop(FOLLOW_LINKS, None)
+        else:
+            os.environ[FOLLOW_LINKS] = before
         if terminate is not None:
             signal.signal(signal.SIGTERM, terminate)
 
@@ -98,7 +106,7 @@ def _status(words: list[str]) -> int:
         raise
     except KeyboardInterrupt as interrupt:
         message = " ".join(map(str, interrupt.args)) or "run the same command again"
-        print(f"\nneeco: interrupted: {message}", file=sys.stderr)
+        print(f"\nneeco: interrupted: {visible(message)}", file=sys.stderr)
         return INTERRUPTED
     except Exception as error:
         if failure := memory_failure(error):
@@ -148,50 +156,39 @@ def _discard_unwritable() -> None:
 
 
 def _print_error(message: str) -> None:
-    print(f"neeco: error: {_printable(' '.join(message.split()))}", file=sys.stderr)
-
-
-def _printable(text: str) -> str:
-    """Text in which nothing moves a terminal's cursor or changes its colours, as names in damaged files may."""
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+    print(f"neeco: error: {visible(message)}", file=sys.stderr)
 
 
 def _dispatch(words: list[str]) -> int:
     if words == ["--version"]:
         print(f"neeco {__version__}")
         return 0
+    if words[:1] == ["help"]:
+        words = [*words[1:2], "--help"]
     import tyro
 
-    if words and words[0] not in VERBS and not words[0].startswith("-"):
-        meant = nearest(words[0], VERBS)
+    config = (tyro.conf.FlagCreatePairsOff,)
+    if not words or words[0].startswith("-"):
+        complete = bool(words) and words[0] in COMPLETION
+        choices = {name: _verb([name])[1] if complete else _named_only(name, line) for name, line in VERBS.items()}
+        tyro.extras.subcommand_cli_from_dict(choices, prog="neeco", description=DESCRIPTION, args=words, config=config)
+        raise SystemExit(USAGE)
+    if words[0] not in VERBS:
+        meant = nearest(words[0], [*VERBS, "help"])
         hint = "" if meant is None else f"did you mean {meant}? "
         _print_error(f"{words[0]}: no such verb; {hint}`neeco --help` lists all")
         raise SystemExit(USAGE)
-    run, arguments = _verb(words) if words and words[0] in VERBS else (None, None)
-    complete = bool(words) and words[0] in COMPLETION
-    choices: dict[str, Callable[..., Any]] = {
-        name: arguments
-        if arguments is not None and name == words[0]
-        else (_verb([name])[1] if complete else _named_only(name, line))
-        for name, line in VERBS.items()
-    }
-
-    def parse(shown: bool) -> Any:
-        config = (tyro.conf.FlagCreatePairsOff,)
-        return tyro.extras.subcommand_cli_from_dict(
-            choices, prog="neeco", description=DESCRIPTION, args=words, config=config, console_outputs=shown
-        )
+    run, arguments = _verb(words)
+    from neeco.cli._output import number_values
 
     try:
-        parsed = parse(shown=arguments is None or _asks_for_help(words))
+        parsed = tyro.cli(arguments, prog=f"neeco {words[0]}", args=words[1:], config=config, registry=number_values())
     except SystemExit as end:
-        if end.code and arguments is not None:
+        if end.code:
             _misspelt_options(words, arguments)
-            parse(shown=True)
-        if not end.code and words[:1] == ["train"]:
+        elif words[0] == "train":
             importlib.import_module(f"{__name__}.train").explain(words)
         raise
-    assert run is not None, "tyro leaves through SystemExit when no verb was given"
     with contextlib.suppress(FileNotFoundError):  # the current folder was removed: absolute paths may do
         for word in (os.getcwd(), *words):
             require_utf8(word)
@@ -205,30 +202,24 @@ def _dispatch(words: list[str]) -> int:
 
 def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     """Print a warning as one line on the error stream."""
-    print(f"neeco: warning: {_printable(' '.join(str(message).split()))}", file=sys.stderr)
+    print(f"neeco: warning: {visible(str(message))}", file=sys.stderr)
 
 
 def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any]]:
     """The first word's `run` and the dataclass of its arguments, which is what `run` takes."""
     module = importlib.import_module(f"{__name__}.{words[0].replace('-', '_')}")
     arguments = next(iter(get_type_hints(module.run).values()))
-    if _asks_for_help(words):
-        from neeco.cli._output import state_defaults
+    from neeco.cli._output import state_defaults
 
-        state_defaults(arguments)
+    state_defaults(arguments)
     return module.run, arguments
 
 
-def _asks_for_help(words: Sequence[str]) -> bool:
-    return not {"-h", "--help"}.isdisjoint(words)
-
-
 def _misspelt_options(words: Sequence[str], arguments: Callable[..., Any]) -> None:
-    """Print a line for every option that a verb does not have and that is nearly one, before tyro's list of what is
-    missing, which does not connect the two. That list then shows values as `--help` does."""
-    from neeco.cli._output import option_names, state_defaults
+    """Print a line for every option that a verb does not have and that is nearly one, behind tyro's list of what is
+    missing, which does not connect the two."""
+    from neeco.cli._output import option_names
 
-    state_defaults(arguments)
     known = [*option_names(arguments), "--help"]
     for word in words:
         option = word.partition("=")[0]

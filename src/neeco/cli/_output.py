@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import types
 import typing
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -17,10 +18,11 @@ from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from neeco.errors import NeecoError
 from neeco.files import finite, new_folder, require_replaceable, write_json
-from neeco.settings import described, field_texts, value_words
+from neeco.settings import WORDS, described, field_texts, value_words
 
 if TYPE_CHECKING:
     from neeco.studies.tables import ResultTable
@@ -204,6 +206,41 @@ def option_names(kind: Any) -> list[str]:
             name = next(filter(None, (getattr(marker, "name", None) for marker in markers)), field.name)
             names.append(f"--{'no-' if field.default is True else ''}{name.replace('_', '-')}")
     return names
+
+
+def number_values() -> ConstructorRegistry:
+    """Return tyro's rules for options that are numbers, or None where they are left out: one sentence on a word that is
+    none."""
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        arms = typing.get_args(info.type) if isinstance(info.type, types.UnionType) else (info.type,)
+        kind, *others = [arm for arm in arms if arm is not type(None)] or [type(None)]
+        items = typing.get_args(kind) if typing.get_origin(kind) is tuple else (kind,)
+        if others or not items or not {*items} <= {int, float}:
+            return None
+
+        def read(words: list[str]) -> Any:
+            if type(None) in arms and {*words} == {"None"}:
+                return None
+            values = []
+            for item, word in zip(items, words, strict=True):
+                try:
+                    values.append(item(word))
+                except ValueError:
+                    raise ValueError(f"{word!r} is not {WORDS[item]}") from None
+            return values[0] if kind in items else tuple(values)
+
+        return PrimitiveConstructorSpec(
+            nargs=len(items),
+            metavar=value_words(kind),
+            instance_from_str=read,
+            is_instance=lambda value: True,
+            str_from_instance=lambda value: list(map(str, value if isinstance(value, tuple) else [value])),
+        )
+
+    return registry
 
 
 def print_settings(title: str, kind: type[Any], note: str) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from rich.progress import BarColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from neeco.cli._output import whole_lines
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, visible
 from neeco.raster.devices import device_failure
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class Bars:
                 self._print(_line(task))
 
     def _print(self, line: str, style: str = "") -> None:
-        self.bar.console.print(line, style=style, markup=False, highlight=False, soft_wrap=True)
+        self.bar.console.print(visible(line), style=style, markup=False, highlight=False, soft_wrap=True)
 
 
 def _line(task: Task) -> str:

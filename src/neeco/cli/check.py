@@ -56,7 +56,7 @@ def _print(problems: list[Problem], errors: int, summary: CaptureSummary) -> Non
         console.print(f"{counted(errors, 'error')}, {counted(warnings, 'warning')}")
     else:
         console.print(Text("no problems found", "bold green"))
-    for line in _summary_lines(summary):
+    for line in _summary_lines(summary) if summary.splits else []:
         console.print(Text(line))
 
 

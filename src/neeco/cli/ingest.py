@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from neeco.cli._output import JsonTarget, whole_lines
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, visible
 
 if TYPE_CHECKING:
     from neeco.ingest.recording.model import Recording
@@ -81,7 +81,7 @@ def run(args: Ingest) -> int:
     if (folder := folder_to_convert(args.source)) is not None:
         _refuse_others(args, f"{folder}: a folder in another format", keep=("output",))
         for sentence in convert_folder(folder, output):
-            print(f"note: {sentence}")
+            print(f"note: {visible(sentence)}")
         print(f"capture: {output}  (next: neeco check {shlex.quote(str(output))})")
         return 0
     recordings = recordings_of(args)
@@ -92,7 +92,7 @@ def run(args: Ingest) -> int:
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("nothing was written") from None
         if not write_numbers(args.json, done.as_json()):
-            print("\n".join(done.lines()))
+            print(*map(visible, done.lines()), sep="\n")
     return 1 if args.strict and done.verdict == "doubtful" else 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from neeco.capture.model import PointCloud
 from neeco.errors import NeecoError
+from neeco.geometry.lens import Lens
 from neeco.ingest.cameras.sfm import StructureFromMotion
 from neeco.ingest.foreground.masks import passing_masks
 from neeco.ingest.foreground.residual_flow import ResidualFlow
@@ -105,6 +107,8 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         data, shaft = find_in_video(data, data.video_instrument, placed, masks, tissue)
         placed, points = _in_mm(sfm, views, registration, shaft.axes.scale * distance)
     data = data.with_assumed_clocks()
+    if registration is not None and evidence:
+        _compare_motion(data, placed, shapes, evidence, flow.pinhole)
     states, usable = data.states_at(views.times)
     return World(
         data=data, images=images, views=placed, states=states, usable=usable, tissue=_reliable(data, sfm, points),
@@ -170,17 +174,10 @@ def _carve_instruments(
     camera_from_world = np.linalg.inv(views.world_from_camera)
     on_instruments, shapes = np.zeros(len(sfm.observations), dtype=bool), {}
     for name in data.parts[0].poses:
-
-        def before_cameras(lag: float, chosen: np.ndarray = rows, of: str = name) -> tuple[np.ndarray, np.ndarray]:
-            poses, known = data.instrument_poses(of, views.times[chosen], lag)
-            return camera_from_world[chosen] @ np.where(known[:, None, None], poses, np.eye(4)), known
-
-        camera_from_instrument, valid = before_cameras(0.0, np.arange(len(views.times)))
+        poses, valid = data.instrument_poses(name, views.times)
+        camera_from_instrument = camera_from_world @ np.where(valid[:, None, None], poses, np.eye(4))
         usable = valid[rows]
         shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], flow.pinhole)
-        note_motion_contradiction(
-            data, name, shape is not None, best_lag(evidence, before_cameras, flow.pinhole, longest_lag(data))
-        )
         if shape is None:
             continue
         shapes[name] = shape
@@ -190,3 +187,23 @@ def _carve_instruments(
                 camera=flow.pinhole.camera(views.world_from_camera[row]),
             )  # fmt: skip
     return on_instruments, shapes, dict(zip(views.frames[rows].tolist(), evidence, strict=True))
+
+
+def _compare_motion(
+    data: Episodes, views: Views, shapes: Mapping[str, RoughShape], evidence: Mapping[int, np.ndarray], pinhole: Lens
+) -> None:
+    """Note instruments that do not move in the images as their poses do, by the capture's own clocks and cameras.
+
+    evidence: by video frame where [h, w] pixels moved.
+    """
+    rows = np.flatnonzero(np.isin(views.frames, list(evidence)))
+    moved = np.stack([evidence[frame] for frame in views.frames[rows].tolist()])
+    camera_from_world = np.linalg.inv(views.world_from_camera[rows])
+    for name in data.parts[0].poses:
+
+        def before_cameras(lag: float, of: str = name) -> tuple[np.ndarray, np.ndarray]:
+            poses, known = data.instrument_poses(of, views.times[rows], lag)
+            return camera_from_world @ np.where(known[:, None, None], poses, np.eye(4)), known
+
+        lag = best_lag(moved, before_cameras, pinhole, longest_lag(data))
+        note_motion_contradiction(data, name, name in shapes, lag)

@@ -141,14 +141,15 @@ LABEL_IOU = {10: (0.91, 0.82), 15: (0.94, 0.88), 60: (0.97, 0.93)}
 
 
 def expected_labels(frames: int) -> str | None:
-    """Return one line on what labels so many training frames gave, and a larger number; None where no more are needed.
+    """Return one line on what labels so many training frames gave, and a larger number; None where no more are needed,
+    and where fewer than were ever measured are there.
 
-    The numbers are those of the nearest measured count that is not larger, or of the smallest.
+    The numbers are those of the nearest measured count that is not larger.
     """
     counts = sorted(LABEL_IOU)
-    if not 0 < frames < counts[-1]:
+    if not counts[0] <= frames < counts[-1]:
         return None
-    index = max(0, sum(count <= frames for count in counts) - 1)
+    index = sum(count <= frames for count in counts) - 1
     gave = [
         f"{count} training frames gave IoU {LABEL_IOU[count][0]:.2f} on seen and {LABEL_IOU[count][1]:.2f} on unseen "
         "states"

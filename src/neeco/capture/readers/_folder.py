@@ -143,6 +143,9 @@ def _warn_of_other_size(parsed: Parsed) -> None:
 
 def _parse(path: Path, report: ProblemReport, transforms: str, background: float, as_source: bool) -> Parsed:
     require_utf8(path)
+    if os.path.isfile(path) and path.suffix.lower() != ".json":
+        report.error(str(path), "", "is no capture", "give the folder of one, or a transforms file (JSON) in it")
+        return Parsed(path.parent)
     if os.path.isfile(path):
         path, transforms = path.parent, path.name
     if not os.path.isdir(path):

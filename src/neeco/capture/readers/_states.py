@@ -19,7 +19,7 @@ from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.capture.model import BaseUncertainty, Frame, FromVideo, Instrument, InstrumentState, State, Uncertainty
 from neeco.capture.readers.kinematics import parse_kinematics
 from neeco.errors import NeecoError
-from neeco.files import read_text
+from neeco.files import RepeatedKeyError, distinct_keys, read_text
 from neeco.geometry.conventions import swap_camera_axes
 
 Limits = tuple[float, float] | None
@@ -213,7 +213,9 @@ def _joint_nodes(item: Node) -> dict[str, Node] | None:
 
 def _parse_line(text: str, where: str, instruments: Sequence[Instrument], tissues: Sequence[str]) -> StateLine:
     try:
-        value = json.loads(text)
+        value = json.loads(text, object_pairs_hook=distinct_keys)
+    except RepeatedKeyError as error:
+        raise NeecoError(f"{where}: {error}") from None
     except (ValueError, RecursionError) as error:  # RecursionError, ValueError: endless nesting and numbers
         reason = error.msg if isinstance(error, json.JSONDecodeError) else "a number or the nesting is too large"
         raise NeecoError(f"{where}: not valid JSON: {reason}; give one JSON object per line") from None

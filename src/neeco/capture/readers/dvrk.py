@@ -13,7 +13,7 @@ import numpy as np
 from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.capture.kinematics import REVOLUTE, Array, KinematicTree, Link
 from neeco.errors import NeecoError
-from neeco.files import read_text
+from neeco.files import distinct_keys, read_text
 
 READINGS = ("wrist_pitch", "wrist_yaw", "jaw")  # what drives the joints beyond the roll
 MM = 1000.0  # per m
@@ -66,7 +66,7 @@ def read_dvrk_tool(path: Path | str, readings: Mapping[str, str] | None = None) 
 def _json_with_comments(path: Path) -> object:
     text = _STRING_OR_COMMENT.sub(lambda match: match[1] or " ", read_text(path, WHAT))
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=distinct_keys)
     except (ValueError, RecursionError) as error:
         raise NeecoError(f"{path}: not readable as {WHAT} ({error}); correct it") from None
 

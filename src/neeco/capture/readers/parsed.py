@@ -15,6 +15,7 @@ from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, Instrument, InstrumentState
 from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
+from neeco.files import follows_links
 from neeco.geometry.lens import Lens
 from neeco.placeholders import placeholder
 from neeco.plausible import Fault
@@ -97,6 +98,7 @@ def inside(root: Path, folder: Path, text: str) -> Path:
     """The path `text`, taken relative to `folder`, which must lie inside `root` also after following symbolic links.
 
     Raises NeecoError (without naming the field: the caller does) when it is absolute, leads out or is no path at all.
+    A link in the folder may lead out of it where the user says so (`follows_links`).
     """
     if os.path.isabs(text) or PureWindowsPath(text).is_absolute():
         raise NeecoError(f"{printable(text)} is absolute; give a path relative to the capture's folder")
@@ -107,6 +109,13 @@ def inside(root: Path, folder: Path, text: str) -> Path:
         raise NeecoError(f"{printable(text)} is not a usable path; repair it") from None
     if path.is_symlink() and (problem := placeholder(path)):
         raise NeecoError(f"{printable(text)} {problem}")
+    if outside and path.is_relative_to(os.path.normpath(root)):
+        if follows_links():
+            return path
+        raise NeecoError(
+            f"{printable(text)} is a link, or lies in one, that leaves the capture's folder; copy there what it "
+            "leads to, or add --follow-links where you trust it"
+        )
     if outside:
         raise NeecoError(f"{printable(text)} leaves the capture's folder; copy the file into it and name it from there")
     return path

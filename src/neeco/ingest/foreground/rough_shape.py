@@ -26,7 +26,7 @@ MIN_RELATIVE = 0.85  # of the best point's evidence, for a point to belong to th
 LAG_CELLS, LAG_STEP_S, MAX_LAG_S = 16, 0.1, 60.0  # of the grid for lags, per side; lags that are tried
 MIN_KNOWN = 0.5  # share of the frames that need a pose at a lag
 LAG_GAIN = 1.1  # ratio of agreement to that at 0 and at all other lags
-LAG_PEAK, LAG_LOBE_S = 0.95, 0.5  # share of the best agreement, and s about its lag, of the weighted mean
+LAG_PEAK, LAG_LOBE_S = 0.8, 0.5  # share of the best agreement, and s about its lag, of the weighted mean
 MARGIN_PX = 6  # about its projection
 NEAREST_MM = 1e-3  # in front of the camera
 
@@ -59,7 +59,7 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
 
 def best_lag(evidence: np.ndarray, poses_at: PosesAt, pinhole: Lens, longest: float) -> float:
     """Lag s within +-longest (at most MAX_LAG_S) at which poses explain motion clearly better than at 0 and at all
-    others, else 0.
+    others, else 0. Lags below LAG_STEP_S are not resolved, as agreement has a flat top: they are 0, too.
 
     evidence [R, h, w] as for `carve_shape`; poses_at(lag): camera_from_instrument [R, 4, 4] mm that the log has `lag` s
     later than its clock says, and bool [R] where it has one.
@@ -78,7 +78,8 @@ def best_lag(evidence: np.ndarray, poses_at: PosesAt, pinhole: Lens, longest: fl
     if best < MIN_AGREEMENT or best < LAG_GAIN * max(float(scores[count]), rival):
         return 0.0
     weights = np.clip(scores - LAG_PEAK * best, 0, None) * lobe
-    return float((weights * lags).sum() / weights.sum())
+    lag = float((weights * lags).sum() / weights.sum())
+    return lag if abs(lag) > LAG_STEP_S else 0.0
 
 
 def _agreement(

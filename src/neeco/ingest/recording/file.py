@@ -38,7 +38,6 @@ from neeco.ingest.recording.model import (
 from neeco.ingest.recording.sections import (
     MAX_NUMBER,
     Fault,
-    RecordingLoader,
     columns,
     existing_file,
     faults_in,
@@ -62,7 +61,7 @@ def read_recording(path: Path) -> Recording:
     path = Path(path)
     advice = "`neeco ingest --init` writes one by looking at the files"
     content = read_text(path, "a recording as YAML", f"no such file; {advice}")
-    document = parse_yaml(path, content, "repair it", RecordingLoader)
+    document = parse_yaml(path, content, "repair it")
     if document is None:
         raise NeecoError(f"{path}: the file is empty; {advice}")
     with faults_in(path):

@@ -17,13 +17,11 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 import cattrs
-import yaml
 from cattrs.errors import AttributeValidationNote, BaseValidationError
 from cattrs.gen import make_dict_structure_fn, override
 
 from neeco.capture.documents import Node, ProblemReport, printable
 from neeco.errors import NeecoError, nearest
-from neeco.files import YamlLoader
 
 T = TypeVar("T")
 Parser = Callable[[Node], Any]
@@ -49,7 +47,7 @@ def faults_in(file: Path) -> Iterator[None]:
     try:
         yield
     except Fault as fault:
-        raise NeecoError(" ".join(f"{join_places(str(file), fault.field, join=': ')}: {fault}".split())) from None
+        raise NeecoError(f"{join_places(str(file), fault.field, join=': ')}: {fault}") from None
 
 
 def node_of(value: Any, file: Path, field: str = "") -> Node:
@@ -169,19 +167,6 @@ def ranges(node: Node) -> tuple[tuple[int, int], ...]:
 def join_places(*places: str, join: str = ".") -> str:
     """Return one place: `instruments[0].poses` of `instruments` and `[0].poses`."""
     return join.join(place for place in places if place).replace(".[", "[")
-
-
-class RecordingLoader(YamlLoader):
-    """YAML in which a key given twice is an error: the first would be lost without a word."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                problem = f"{printable(key.value)} is given twice; keep one of them"
-                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
-            seen.add(str(key.value))
-        return super().construct_mapping(node, deep)
 
 
 _PARSERS: dict[type[Any], Parser] = {

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, visible
 from neeco.files import read_json, require_content
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers import IMAGES as IMAGE_STREAMS
@@ -111,8 +111,7 @@ class _FolderFiles:
 
     def leave_out(self, what: str, why: str = "", images: bool = False) -> None:
         """List something as not used. why: what is wrong with it, where anything is; images: may they be in it?"""
-        line = " ".join((f"{what}: {why}" if why else what).split())
-        line = "".join(sign if sign.isprintable() else "?" for sign in line)
+        line = visible(f"{what}: {why}" if why else what)
         self.others.append(line)
         self.problems += [line] if why else []
         self.image_problems += [line] if why and images else []
