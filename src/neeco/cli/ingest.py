@@ -93,6 +93,11 @@ def run(args: Ingest) -> int:
                 raise KeyboardInterrupt("nothing was written") from None
         if not write_numbers(args.json, done.as_json()):
             print(*map(visible, done.lines()), sep="\n")
+            if done.verdict != "doubtful":
+                name = shlex.quote(str(output))
+                print(
+                    f"next: neeco train {name} --output runs/{shlex.quote(output.name)}; look at it: neeco view {name}"
+                )
     return 1 if args.strict and done.verdict == "doubtful" else 0
 
 
