@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bz2
-import json
 import shutil
 import struct
 import sys
@@ -26,7 +25,7 @@ from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
-from neeco.ingest.recording.template import open_questions, write_template
+from neeco.ingest.recording.template import write_template
 from neeco.ingest.sources import recording_from_flags
 from neeco.ingest.timing.reading import read_episodes
 
@@ -470,32 +469,3 @@ def test_what_the_right_camera_took_later_shows_the_state_of_that_moment(tmp_pat
         for taken in (state, of_left):
             place = taken.instruments["bar"].pose[:3, 3].numpy()
             assert np.abs(place - theatre.place(taken.time)).max() < 0.05
-
-
-def test_a_template_ends_with_the_questions_that_it_leaves_open(tmp_path):
-    path = tmp_path / "recording.yaml"
-    text = "video: a.bag\ninstruments:\n  - name: PSM1\n    # kinematics:\n    # camera_from_base: unknown\n"
-    text += "    # units: {length: mm}   # nothing says them: correct, and remove the #\n# sync: {em: 0.0}\n"
-    assert [line.partition(": ")[0] for line in open_questions(text, path)] == [
-        f"  {place}. {path}:{number}" for place, number in ((1, 3), (2, 4), (3, 5), (4, 6))
-    ]
-
-
-@pytest.mark.parametrize("links", [False, True])
-def test_an_unknown_base_of_a_wrist_without_links_is_refused_before_any_work(tmp_path, links):
-    for name in ("video.mp4", "psm.csv", "joints.csv"):
-        (tmp_path / name).touch()
-    joints = {name: {"file": "joints.csv", "columns": {"value": name}} for name in ("wrist_pitch", "jaw")}
-    tree = {"pose_of": "shaft", "links": [{"name": "shaft"}]}
-    tree["links"].append(
-        {"name": "wrist", "parent": "shaft", "type": "revolute", "axis": [0, 1, 0], "value": {"wrist_pitch": 1}}
-    )
-    instrument = {"name": "PSM1", "poses": {"file": "psm.csv"}, "joints": joints, "camera_from_base": "unknown"}
-    document = {"video": "video.mp4", "instruments": [instrument | ({"kinematics": tree} if links else {})]}
-    path = tmp_path / "recording.yaml"
-    path.write_text(json.dumps(document))
-    if links:
-        assert read_recording(path).instruments[0].base.matrix is None
-        return
-    with pytest.raises(NeecoError, match=r"instruments: PSM1: kinematics: is missing: camera_from_base is unknown"):
-        read_recording(path)

@@ -19,7 +19,6 @@ from neeco.ingest.readers import columns as named
 from neeco.ingest.readers import format_of
 from neeco.ingest.readers.columns import FORMS, TRACKER_CLOCK, VIDEO_CLOCK, JointColumns, PoseColumns, Units
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, FRAMES
-from neeco.ingest.readers.rosbag import DVRK_WRIST
 from neeco.ingest.recording.base import BASE_KEY, WORLD_KEY, StatedBase, parse_base, parse_world_base
 from neeco.ingest.recording.model import (
     MAX_EPISODES,
@@ -262,14 +261,6 @@ class InstrumentSection(BasesSection):
             base = None
         else:
             base = self.base or base
-        bent = [joint for joint in DVRK_WRIST[:2] if joint in joints]
-        if base is not None and base.matrix is None and bent and self.kinematics is None:
-            raise Fault(
-                f"instruments: {self.name}: kinematics",
-                f"is missing: {base.key} is unknown, and the base of a wrist that bends ({', '.join(bent)}) is found "
-                "by its links alone; state them ({dvrk_tool: FILE.json}, {urdf: FILE} or links), or the base as far as "
-                "it is known (transform, sd_mm, sd_deg)",
-            )
         return InstrumentLogs(
             self.name, poses=poses, joints=joints, kinematics=self.kinematics, base=base, from_video=self.from_video,
             roll=roll,

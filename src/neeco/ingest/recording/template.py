@@ -117,33 +117,6 @@ class _FolderFiles:
         self.image_problems += [line] if why and images else []
 
 
-OPEN = (
-    (
-        r"# camera_from_base: unknown",
-        "remove the # of one of the lines camera_from_base above, or of this one; else poses are not registered to the "
-        "camera, and nothing can be trained",
-    ),
-    (
-        r"# kinematics:",
-        "state the wrist's links here, or {dvrk_tool: FILE.json}; unknown bases need them, and jaws are labelled far "
-        "better with them",
-    ),
-    (r"- name: (.+)", r"\1 is what labels call this instrument (its class); write another name if you want one"),
-    (r"(frame: .*|rate_hz: .*|.*\bcorrect it\b.*|.*nothing says them.*|.* is a guess.*)", r"\1"),
-)  # lines of a template that leave something to the user, and what to do
-
-
-def open_questions(text: str, path: Path) -> list[str]:
-    """Return what a template leaves to the user: the place of each line, and what to write there."""
-    found = []
-    for number, line in enumerate(text.splitlines(), 1):
-        for pattern, what in OPEN:
-            if match := re.fullmatch(pattern, line.strip()):
-                found.append(f"{path}:{number}: {match.expand(what)}")
-                break
-    return [f"  {place}. {question}" for place, question in enumerate(found, 1)]
-
-
 def write_template(
     source: Path, report: Callable[[str], None] = lambda problem: None, stands_still: StandsStill | None = None
 ) -> str:
