@@ -12,7 +12,8 @@ from scene_worlds import pose_of
 
 from neeco.capture.images import write_image, write_labels
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
-from neeco.capture.writer import write_capture
+from neeco.capture.readers import read_capture
+from neeco.capture.writer import fingerprint, write_capture
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.methods.kinematic.articulation import LINK_LOGITS
@@ -99,7 +100,8 @@ def write_recorded_images(scene: DrawableScene, root: Path, masks: bool = True) 
 def write_run(scene: DrawableScene, path: Path, capture: Path, finished: bool = True) -> Path:
     """A run folder of `scene`; `finished`: with the scene in it."""
     path.mkdir(parents=True, exist_ok=True)
-    write_config(path, capture, TrainConfig(method=scene.method), "0" * 64)
+    digest = fingerprint(read_capture(capture)) if (capture / "transforms.json").is_file() else "0" * 64
+    write_config(path, capture, TrainConfig(method=scene.method), digest)
     if finished:
         trained = [k for k, split in enumerate(scene.recorded.splits) if split == "train"]
         kept = scene.recorded

@@ -104,13 +104,19 @@ def test_a_run_of_another_version_is_refused_by_file_and_field(capture: Path, tm
         with pytest.raises(NeecoError, match=r"config.yaml: schema is 'neeco-run/9', this version reads 'neeco-run/1'"):
             opened()
 
+    def with_line(line: str) -> str:
+        """The settings with this line in place of that of its key."""
+        key = line.partition(":")[0]
+        kept = [other for other in config.splitlines() if other.partition(":")[0] != key]
+        return "\n".join([*kept, line, ""])
+
     for line in ("capture: [1]", "seed: x", "transforms: {}"):
-        (run / "config.yaml").write_text(config + line + "\n")  # the last one holds
+        (run / "config.yaml").write_text(with_line(line))
         with pytest.raises(NeecoError, match=rf"config.yaml: {line.partition(':')[0]}: is not as neeco writes it"):
             load_run(run)
 
     for line in ("minutes: -0.0", "iterations: 0", "batch_size: 0", "seed: -1"):
-        (run / "config.yaml").write_text(config + line + "\n")
+        (run / "config.yaml").write_text(with_line(line))
         with pytest.raises(
             NeecoError, match=rf"config.yaml: --{line.partition(':')[0].replace('_', '-')}: .*; train again"
         ):

@@ -377,6 +377,8 @@ ODD_SCENES: dict[str, Callable[[dict[str, Any], dict[str, torch.Tensor]], Any]] 
     "limits of words": lambda header, _: header["instruments"][0].update(joints={"jaw_angle": ["a", "b"]}),
     "limits beyond all": lambda header, _: header["instruments"][0].update(joints={"jaw_angle": [-1e308, 1e308]}),
     "instruments without poses": lambda header, _: header.update(instruments=header["instruments"] * 1000),
+    "Gaussians beyond all": lambda _, tensors: tensors["canonical.means"].fill_(1e30),
+    "endless Gaussians": lambda _, tensors: tensors["canonical.log_scales"].fill_(1e38),
     "Gaussians at NaN": lambda _, tensors: tensors["canonical.means"].fill_(NAN),
     "doubles": lambda _, tensors: tensors.update({"canonical.means": tensors["canonical.means"].double()}),
     "cameras that are none": lambda _, tensors: tensors["recorded.cameras"].zero_(),
@@ -402,9 +404,9 @@ def test_a_scene_that_cannot_be_is_refused_in_one_short_line(
     [
         lambda header, _: header["recorded"][0].update(name="x" * 10**6),
         lambda header, _: header.update(diagnostics={"<img src=x onerror=alert(1)>": "<img src=x onerror=alert(1)>"}),
-        lambda _, tensors: tensors["canonical.log_scales"].fill_(1e38),
+        lambda _, tensors: tensors["canonical.log_scales"].fill_(1e9),
         lambda _, tensors: tensors["canonical.quats"].zero_(),
-        lambda _, tensors: tensors["canonical.means"].fill_(1e30),
+        lambda _, tensors: tensors["canonical.means"].fill_(1e9),
     ],
 )
 def test_an_odd_scene_is_still_served(made_run: Path, serve: Serve, tmp_path: Path, change: Callable[..., Any]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -62,9 +61,6 @@ def run(args: Arguments) -> int:
     begun = begun_config(args.output) if args.resume else None
     config = training_config(args.method, flags, args.set, begun)
     device = device_of(args.device)
-    where = "a GPU" if device.type == "cuda" else "the CPU (no CUDA device is used)"
-    watch = f"watch it, once a checkpoint is there: neeco view {shlex.quote(str(args.output))}"
-    print(f"training on {where}; the time left is estimated while it learns; {watch}", file=sys.stderr)
     path = train_with_progress(args.capture, args.output, config, device, resume=args.resume)
     print(f"finished: {path}  (next: neeco evaluate {shlex.quote(str(path))})")
     return 0

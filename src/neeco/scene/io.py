@@ -36,7 +36,7 @@ ADDED = {"shadow_offsets", "shadow_strengths", "shadow_width", "middle", "closed
 ADDED_SINCE = {"base_corrections", "anchors", "weights", "lengths"}  # that files of SCHEMA may lack: zero
 MAX_REASON = 200  # characters of an error's message
 MAX_PIXELS = 2**26  # of a recorded image
-MAX_NUMBER = 1e9  # mm, rad, s or px: larger numbers are damage
+MAX_NUMBER = 1e10  # mm, rad, s (of Unix time, too) or px: larger numbers are damage
 # what stands for unknown in a tensor of that name: not every shaft has a known end
 UNKNOWN = {"wrist_start": -math.inf, "radius": math.inf, "closed": math.nan, "tips": math.nan}
 # errors that reading a damaged file raises; endless nesting is a RuntimeError

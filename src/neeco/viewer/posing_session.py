@@ -37,7 +37,8 @@ class PosingSession:
     def __init__(self, root: Path) -> None:
         """root: a capture, or a run of one, whose scene then appears as a ghost. Raises NeecoError for a capture that
         cannot be posed, or whose answers cannot be read."""
-        run = load_run(root) if (root / RUN_FILE).exists() else None
+        # posing changes the capture's states, so that a run of it is always of an earlier one
+        run = load_run(root, force=True) if (root / RUN_FILE).exists() else None
         self.scene = None if run is None else run.scene
         self.posed = PosedCapture(root if run is None else run.capture().root)
         root = self.posed.root
