@@ -171,9 +171,7 @@ def _dispatch(words: list[str]) -> int:
     if not words or words[0].startswith("-"):
         complete = bool(words) and words[0] in COMPLETION
         choices = {name: _verb([name])[1] if complete else _named_only(name, line) for name, line in VERBS.items()}
-        tyro.extras.subcommand_cli_from_dict(
-            choices, prog="neeco", description=DESCRIPTION, args=words, config=config
-        )
+        tyro.extras.subcommand_cli_from_dict(choices, prog="neeco", description=DESCRIPTION, args=words, config=config)
         raise SystemExit(USAGE)
     if words[0] not in VERBS:
         meant = nearest(words[0], [*VERBS, "help"])
@@ -184,9 +182,7 @@ def _dispatch(words: list[str]) -> int:
     from neeco.cli._output import number_values
 
     try:
-        parsed = tyro.cli(
-            arguments, prog=f"neeco {words[0]}", args=words[1:], config=config, registry=number_values()
-        )
+        parsed = tyro.cli(arguments, prog=f"neeco {words[0]}", args=words[1:], config=config, registry=number_values())
     except SystemExit as end:
         if end.code:
             _misspelt_options(words, arguments)
