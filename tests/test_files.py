@@ -335,3 +335,16 @@ def test_whoever_cannot_write_learns_what_to_do(tmp_path: Path, write: Callable[
         assert message.startswith(f"{path}: cannot write: "), message
         assert f"; {remedy}" in message
     assert {entry.name for entry in tmp_path.iterdir()} == {"file", "folder"}
+
+
+def test_a_key_given_twice_is_refused_in_json_and_yaml(tmp_path):
+    file = tmp_path / "a.json"
+    file.write_text('{"frames": [], "lens": {"fl_x": 1, "fl_x": 2}}')
+    with pytest.raises(NeecoError, match="'fl_x' is given twice"):
+        read_json(file)
+    with pytest.raises(NeecoError, match="'fl_x' is given twice"):
+        parse_yaml(file, "lens: {fl_x: 1, fl_x: 2}", "repair it")
+
+
+def test_what_a_file_holds_moves_no_terminals_cursor():
+    assert str(NeecoError("a\x1b[2Jb\nc")) == "a\\x1b[2Jb c"

@@ -376,6 +376,10 @@ def test_the_verb_says_what_labels_few_frames_give(folder, capsys):
     check_verb.run(check_verb.Arguments(folder.root))
     told = capsys.readouterr().out
     assert re.search(r"labels to expect: with exact states, \d+ training frames gave IoU 0\.\d\d on seen", told)
+    for frame in range(1, 8):
+        folder.edit(_frame(frame, "split", "test"))
+    assert check_verb.run(check_verb.Arguments(folder.root)) == 1
+    assert "labels to expect" not in capsys.readouterr().out
     check_verb.run(check_verb.Arguments(SAMPLE))  # 72 training frames
     assert "labels to expect" not in capsys.readouterr().out
 
@@ -558,3 +562,12 @@ def test_one_time_for_all_frames_is_a_warning_where_states_differ(folder):
     for index in range(8):
         folder.edit(_frame(index, "time", 0.0))
     assert_found(folder, "frames", "every frame has the time 0, though states differ", "warning")
+
+
+def test_links_are_followed_where_the_user_says_so(folder, tmp_path, capsys):
+    (folder.root / "images/000001.png").rename(tmp_path / "outside.png")
+    (folder.root / "images/000001.png").symlink_to(tmp_path / "outside.png")
+    assert main(["check", str(folder.root)]) == 1
+    assert "is a link" in capsys.readouterr().out
+    assert main(["check", str(folder.root), "--follow-links"]) == 0
+    assert main(["check", str(folder.root)]) == 1

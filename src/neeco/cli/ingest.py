@@ -97,6 +97,8 @@ def run(args: Ingest) -> int:
                 raise KeyboardInterrupt("nothing was written") from None
         if not write_numbers(args.json, done.as_json()):
             print(*map(visible, done.lines()), sep="\n")
+            verb, rest = ("check", "") if done.verdict == "doubtful" else ("train", " --output RUN")
+            print(f"next: neeco {verb} {shlex.quote(str(output))}{rest}")
     return 1 if args.strict and done.verdict == "doubtful" else 0
 
 
