@@ -430,3 +430,16 @@ def test_a_video_wrapped_in_dicom_is_called_so(tmp_path):
     path = tmp_path / "video.dcm"
     path.write_bytes(bytes(128) + b"DICM" + bytes(400))
     assert "DICOM" in (placeholder(path) or "")
+
+
+def test_a_key_given_twice_is_refused_in_json_and_yaml(tmp_path):
+    file = tmp_path / "a.json"
+    file.write_text('{"frames": [], "lens": {"fl_x": 1, "fl_x": 2}}')
+    with pytest.raises(NeecoError, match="'fl_x' is given twice"):
+        read_json(file)
+    with pytest.raises(NeecoError, match="'fl_x' is given twice"):
+        parse_yaml(file, "lens: {fl_x: 1, fl_x: 2}", "repair it")
+
+
+def test_what_a_file_holds_moves_no_terminals_cursor():
+    assert str(NeecoError("a\x1b[2Jb\nc")) == "a\\x1b[2Jb c"

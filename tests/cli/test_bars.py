@@ -56,3 +56,10 @@ def test_jobs_that_all_ended_have_said_so_and_leave_no_last_line(capsys):
         bars.job(JobEvent(index=0, total=1, job=job, stage="training", share=0.5))
         bars.job(JobEvent(index=0, total=1, job=job, stage="done", result={"iterations": 3}))
     assert capsys.readouterr().err == "1/1 kinematic, seed 0: done: 3 iterations (1 of 1 ended)\n"
+
+
+def test_work_of_some_length_ends_with_its_total_time(capsys, monkeypatch):
+    monkeypatch.setattr(_progress, "MIN_SHOWN_S", 0.0)
+    with Bars() as bars:
+        bars.stage("reading", 1, 1)
+    assert capsys.readouterr().err.splitlines()[-1] == "total: 0:00:00"

@@ -245,3 +245,35 @@ def raising(error: BaseException):
         raise error
 
     return call
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["train", "x", "--output", "y", "--minutes", "abc"], "'abc' is not a number"),
+        (["synthesize", "x", "--output", "y", "--count", "1.5"], "'1.5' is not a whole number"),
+        (["ingest", "--intrinsics", "1", "2", "a", "3"], "'a' is not a number"),
+        (["train", "x", "--output", "y", "--bogus"], "neeco train --help"),
+    ],
+)
+def test_usage_errors_are_about_the_word_and_name_the_verbs_help(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(words)
+    assert left.value.code == 2
+    printed = capsys.readouterr().err
+    assert told in printed
+    assert f"neeco {words[0]} --help" in printed
+    assert "NoneType" not in printed
+
+
+def test_help_is_a_verb_and_a_file_is_no_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["help"], ["help", "train"]):
+        with pytest.raises(SystemExit) as left:
+            cli.main(words)
+        assert left.value.code == 0
+    capsys.readouterr()
+    (tmp_path / "README.md").write_text("# read me")
+    assert cli.main(["check", str(tmp_path / "README.md")]) == 1
+    assert "is no capture" in capsys.readouterr().out

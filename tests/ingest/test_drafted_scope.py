@@ -12,6 +12,7 @@ from bag_world import BagWriter
 from ingest.still_world import BASELINE, FOCAL, HEIGHT, WIDTH, Theatre
 
 from neeco.cli import main
+from neeco.errors import NeecoError
 from neeco.ingest.cameras.still_scene import video_stands_still
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import Recording
@@ -112,6 +113,21 @@ def test_the_forms_of_a_base_and_the_links_count_once_their_marks_are_removed(tm
         assert list(instrument.joints) == ["wrist_pitch", "wrist_yaw", "jaw"]
 
 
+def test_what_is_still_open_is_asked_by_line_and_refused_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, text = drafted(write_bag(tmp_path))
+    asked = re.findall(r"^(\d)\. .*recording\.yaml:(\d+): ", capsys.readouterr().out, re.MULTILINE)
+    assert [number for number, _ in asked] == ["1", "2", "3"]
+    for (_, line), start in zip(asked, ("- name:", "# kinematics:", "# camera_from_base:"), strict=True):
+        assert text.splitlines()[int(line) - 1].strip().startswith(start)
+    unknown = text.replace("    # camera_from_base: unknown", "    camera_from_base: unknown")
+    for content, missing in ((text, "camera_from_base: missing"), (unknown, "kinematics: missing")):
+        (tmp_path / "recording.yaml").write_text(content)
+        with pytest.raises(NeecoError, match=missing):
+            read_episodes([read_recording(tmp_path / "recording.yaml")])
+
+
 def test_limits_are_proposed_by_the_readings(tmp_path: Path) -> None:
     text = drafted(write_bag(tmp_path))[1]
     assert "# limits: [-0.5, 0.5]   # how far it goes; its readings are -0.50 to 0.42" in text
@@ -119,7 +135,7 @@ def test_limits_are_proposed_by_the_readings(tmp_path: Path) -> None:
 
 def test_a_calibration_of_another_scope_than_the_bags_own_is_doubted(tmp_path: Path) -> None:
     path = write_bag(tmp_path)
-    _, text = drafted(path)
+    text = drafted(path)[1].replace("    # camera_from_base: {tr", "    camera_from_base: {tr")
     for focal, doubted in ((FOCAL, False), (1.1 * FOCAL, True)):
         with BagWriter(tmp_path, "other.bag") as bag:
             for side, baseline in (("left", 0.0), ("right", 0.008)):

@@ -133,6 +133,6 @@ def test_a_scene_that_diverged_behind_a_finite_image_ends_the_run(capture: Path,
         if session.iteration == 60:
             session.scene.canonical.log_scales.data[3] = float("nan")
 
-    with pytest.raises(NeecoError, match="diverged: canonical.log_scales contains NaN, .* after 60 iterations"):
+    with pytest.raises(NeecoError, match=r"diverged: canonical\.log_scales contains NaN, .* after 60 iterations"):
         train(capture, tmp_path / "run", config_of("3dgs"), watch=watch)
     assert not (tmp_path / "run" / "scene.safetensors").exists()

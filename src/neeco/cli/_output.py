@@ -216,7 +216,7 @@ def number_values() -> ConstructorRegistry:
     @registry.primitive_rule
     def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
         arms = typing.get_args(info.type) if isinstance(info.type, types.UnionType) else (info.type,)
-        kind, *others = [arm for arm in arms if arm is not type(None)] or [type(None)]
+        kind, *others = [arm for arm in arms if arm is not type(None)] or arms
         items = typing.get_args(kind) if typing.get_origin(kind) is tuple else (kind,)
         if others or not items or not {*items} <= {int, float}:
             return None

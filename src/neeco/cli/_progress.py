@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import shlex
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,6 +47,7 @@ class Bars:
         self.bar = Progress(*columns, console=console)
         self.tasks: dict[str, TaskID] = {}
         self.stages: list[TaskID] = []
+        self.began = time.monotonic()
         self.ended: set[int] = set()
         self.left = threading.Event()
         self.lines = threading.Thread(target=self._print_lines, daemon=True)
@@ -62,6 +65,9 @@ class Bars:
                 shown = [task for task in self.bar.tasks if task.visible]  # none where all were jobs that ended
                 for task in [task for task in shown[:-1] if (task.elapsed or 0) >= MIN_SHOWN_S] + shown[-1:]:
                     self._print(_line(task))
+        passed = time.monotonic() - self.began
+        if kind is None and self.tasks and passed >= MIN_SHOWN_S:
+            self._print(f"total: {_duration(passed)}")
 
     def stage(self, what: str, done: int, total: int | None) -> None:
         """Show that `done` of `total` are done; those of the stages before are, then."""
@@ -129,7 +135,7 @@ class Bars:
 
 def _line(task: Task) -> str:
     """State what is done, how far it is, and how long it still takes at the speed so far."""
-    passed = task.elapsed or 0.0
+    passed = task.finished_time or task.elapsed or 0.0
     words = [f"{task.percentage:.0f} %"] if task.total else []
     words += [task.fields["text"]] if task.fields["text"] else []
     words += [f"{_duration(passed)} passed"]
@@ -174,8 +180,20 @@ def train_with_progress(
     """`train` with a bar that shows PSNR, Gaussians and time left. Returns the run's folder."""
     from neeco.training.train import train
 
-    how = f"go on with: neeco train {shlex.quote(str(capture))} --output {shlex.quote(str(output))} --resume"
+    run = shlex.quote(str(output))
+    how = f"go on with: neeco train {shlex.quote(str(capture))} --output {run} --resume"
+    started: list[int] = []  # the iteration of the first row
+
+    def show(row: ProgressRow) -> None:
+        if not row.note and not started:
+            started.append(row.iteration)
+            slow = "; a CUDA device would be used if there were one" if device.type == "cpu" else ""
+            took = row.seconds / row.progress if row.progress > 0 else 0.0
+            forecast = f"takes about {_duration(took)} in all, estimated anew as it goes on" if took else "begins"
+            bars.training(replace(row, note=f"training on {device.type} {forecast}{slow}; watch it: neeco view {run}"))
+        bars.training(row)
+
     with Bars() as bars, resumable(how, output / "config.yaml"):
-        path = train(capture, output, config, device=device, resume=resume, progress=bars.training)
+        path = train(capture, output, config, device=device, resume=resume, progress=show)
         bars.end("training")
     return path

@@ -93,11 +93,8 @@ def run(args: Ingest) -> int:
                 raise KeyboardInterrupt("nothing was written") from None
         if not write_numbers(args.json, done.as_json()):
             print(*map(visible, done.lines()), sep="\n")
-            if done.verdict != "doubtful":
-                name = shlex.quote(str(output))
-                print(
-                    f"next: neeco train {name} --output runs/{shlex.quote(output.name)}; look at it: neeco view {name}"
-                )
+            verb, rest = ("check", "") if done.verdict == "doubtful" else ("train", " --output RUN")
+            print(f"next: neeco {verb} {shlex.quote(str(output))}{rest}")
     return 1 if args.strict and done.verdict == "doubtful" else 0
 
 

@@ -29,6 +29,7 @@ from neeco.ingest.registration.clocks import find_instrument_clocks
 from neeco.ingest.registration.find_bases import check_reference_frames, find_bases
 from neeco.ingest.shaft.video_instruments import find_in_video
 from neeco.ingest.timing.episodes import Episodes
+from neeco.ingest.timing.reading import require_lens
 from neeco.ingest.world import (
     NAME_TISSUES,
     World,
@@ -64,11 +65,7 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
 
     folder: for temporary files. Raises NeecoError for an unknown lens.
     """
-    if images.lens is None:
-        raise NeecoError(
-            f"{data.recording.path}: intrinsics: missing; images of a scope that stands still do not determine its "
-            "lens; give fl_x, fl_y, cx, cy or a calibration"
-        )
+    require_lens(data.recording, images.lens)
     if data.parts[0].scope is not None:
         data.notes.add("the scope stands still: the laparoscope's log adds nothing to its images, and is ignored")
     check_reference_frames(data, moving=False)

@@ -18,7 +18,7 @@ from neeco.ingest.cameras.still_scene import video_stands_still
 from neeco.ingest.readers import IMAGES, VideoSource, format_of
 from neeco.ingest.readers.choices import AXES, OpenPoses, Reading, axis_directions, largest_step, open_poses, shaft_of
 from neeco.ingest.readers.columns import BASE
-from neeco.ingest.recording.template import holds_streams, write_template
+from neeco.ingest.recording.template import holds_streams, open_questions, write_template
 from neeco.ingest.sources import RECORDING
 from neeco.report.charts import page_style
 
@@ -40,13 +40,16 @@ def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
     path = (source.parent if holds_streams(source) else source) / RECORDING
     if path.exists():
         raise NeecoError(f"{path}: already exists; edit it, or move it away first")
-    write_text(path, write_template(source, lambda problem: report(f"left out: {problem}"), video_stands_still))
+    draft = write_template(source, lambda problem: report(f"left out: {problem}"), video_stands_still)
+    write_text(path, draft)
     lines, picture = [], path.with_name(CHOICES)
     try:
         if holds_streams(source) and write_choice_picture(source, picture):
             lines.append(f"wrote {picture}: what its poses would be under each choice that the file leaves open")
     except NeecoError as error:  # recording.yaml, which names the choices, is written all the same
         lines.append(f"no picture of the choices that the file leaves open: {error}")
+    questions = [f"{n}. {path}:{line}: {words}" for n, (line, words) in enumerate(open_questions(draft), 1)]
+    lines += ["still open:", *questions] if questions else []
     return [*lines, f"wrote {path}: look through it, then: neeco ingest {path} --output CAPTURE"]
 
 

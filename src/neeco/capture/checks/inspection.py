@@ -12,7 +12,7 @@ import numpy as np
 
 from neeco.capture.checks import colors, motion_evidence
 from neeco.capture.checks.colors import check_colors
-from neeco.capture.checks.frames import check_frames, check_image_files
+from neeco.capture.checks.frames import MIN_TRAIN_FRAMES, check_frames, check_image_files
 from neeco.capture.checks.motion import check_motion
 from neeco.capture.checks.pictures import Pictures, Size
 from neeco.capture.checks.placement import check_placement
@@ -142,14 +142,14 @@ LABEL_IOU = {10: (0.91, 0.82), 15: (0.94, 0.88), 60: (0.97, 0.93)}
 
 def expected_labels(frames: int) -> str | None:
     """Return one line on what labels so many training frames gave, and a larger number; None where no more are needed,
-    and where fewer than were ever measured are there.
+    and where they are too few to train on.
 
-    The numbers are those of the nearest measured count that is not larger.
+    The numbers are those of the nearest measured count that is not larger, or of the smallest.
     """
     counts = sorted(LABEL_IOU)
-    if not counts[0] <= frames < counts[-1]:
+    if not MIN_TRAIN_FRAMES <= frames < counts[-1]:
         return None
-    index = sum(count <= frames for count in counts) - 1
+    index = max(0, sum(count <= frames for count in counts) - 1)
     gave = [
         f"{count} training frames gave IoU {LABEL_IOU[count][0]:.2f} on seen and {LABEL_IOU[count][1]:.2f} on unseen "
         "states"

@@ -59,7 +59,7 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
 
 def best_lag(evidence: np.ndarray, poses_at: PosesAt, pinhole: Lens, longest: float) -> float:
     """Lag s within +-longest (at most MAX_LAG_S) at which poses explain motion clearly better than at 0 and at all
-    others, else 0. Lags below LAG_STEP_S are not resolved, as agreement has a flat top: they are 0, too.
+    others, else 0.
 
     evidence [R, h, w] as for `carve_shape`; poses_at(lag): camera_from_instrument [R, 4, 4] mm that the log has `lag` s
     later than its clock says, and bool [R] where it has one.
@@ -72,7 +72,14 @@ def best_lag(evidence: np.ndarray, poses_at: PosesAt, pinhole: Lens, longest: fl
         if known.sum() >= MIN_KNOWN * len(evidence):
             _, _, share, enough = _agreement(evidence[known], poses[known], pinhole, LAG_CELLS)
             scores[index] = np.quantile(share[enough], 0.99) if enough.any() else 0.0
-    best = float(scores.max())
+    return lag_of(scores)
+
+
+def lag_of(scores: np.ndarray) -> float:
+    """Return the lag s that agreements at 2 N + 1 lags, LAG_STEP_S apart about 0, show. Those up to LAG_STEP_S are not
+    resolved, as agreement has a flat top: they are 0."""
+    count = len(scores) // 2
+    lags, best = LAG_STEP_S * np.arange(-count, count + 1), float(scores.max())
     lobe = np.abs(lags - lags[scores.argmax()]) < LAG_LOBE_S
     rival = float(scores[~lobe].max(initial=0.0))  # motion that repeats fits at several lags
     if best < MIN_AGREEMENT or best < LAG_GAIN * max(float(scores[count]), rival):

@@ -182,6 +182,27 @@ def write_template(
     )
 
 
+# Lines of a draft that leave something open: what marks the first of them, and what to write there
+_QUESTIONS = (
+    (r"^  - name: ", "what is the instrument called in labels? Correct its name"),
+    (r"^ +# kinematics: \{dvrk_tool", "which tool is it? Remove the # and give its file, or write out its links below"),
+    (r"^ +# camera_from_base: \{transform", "how does the robot's base stand to the camera? Remove the # of one line"),
+    (r"a guess: correct it", "at which rate were these taken? Correct the number"),
+    (r"# units: .*nothing says them", "in which units? Correct them and remove the #"),
+    (r"is not clear: ", "which columns hold it? Name them"),
+    (r"^ +# +(?:frame|quaternion\w*|rotation\w*|euler\w*): ", "what do its poses mean? Correct it, remove the #"),
+)
+
+
+def open_questions(draft: str) -> list[tuple[int, str]]:
+    """Return the lines of a drafted recording.yaml, from 1, that only the one who recorded can answer, and what to
+    write there."""
+    found = []
+    for number, line in enumerate(draft.splitlines(), 1):
+        found += [(number, words) for marks, words in _QUESTIONS if re.search(marks, line)][:1]
+    return found
+
+
 def holds_streams(source: Path) -> bool:
     """Return whether the path is a recording in itself (a bag, a data set's folder), not a folder of its files."""
     return source.is_file() or format_of(source) is not None

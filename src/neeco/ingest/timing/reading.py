@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neeco.errors import NeecoError
+from neeco.geometry.lens import Lens
 from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_lengths, format_of
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording.compatibility import check_recordings, episode_names, refusal
-from neeco.ingest.recording.model import Recording
+from neeco.ingest.recording.model import STILL, Recording
 from neeco.ingest.timing.clock_search import GIVEN, MAX_LENGTH_S, ClockOffset
 from neeco.ingest.timing.episodes import PAUSE_S, Episode, Episodes, Notes, assumed_clock
 
@@ -65,6 +66,7 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
     rolls = {item.name: read_reading_log(item.roll) for item in items if item.roll is not None}
     scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
     _check_bases(recording, scope, poses)
+    require_answers(recording, poses)
     video = recording.source.open()
     logs: list[PoseLog | ReadingLog] = [*poses.values(), *([scope] if scope else [])]
     logs += [log for held in joints.values() for log in held.values()] + [*rolls.values()]
@@ -130,6 +132,36 @@ def _check_bases(recording: Recording, scope: PoseLog | None, poses: Mapping[str
                 f"{log.stated_in}; where these are one frame write `frame: base` for both, else state how they stand "
                 "(world_from_base)"
             )
+
+
+def require_answers(recording: Recording, poses: Mapping[str, PoseLog]) -> None:
+    """Raise NeecoError for what a later stage needs and nothing states, before any of the work that takes minutes."""
+    for item in recording.instruments:
+        place, base = f"{recording.path}: instruments: {item.name}", item.base
+        log = poses.get(item.name)
+        in_base = log is not None and log.frame == BASE and log.stated_in is not None
+        if recording.camera == STILL and in_base and base is None:
+            raise NeecoError(
+                f"{place}: camera_from_base: missing; its poses are stated in a robot's base, and nothing says how "
+                "that stands to the camera: give {transform: 4x4, sd_mm: 8, sd_deg: 5} roughly measured, a file of the "
+                "dVRK's registration, or unknown (with kinematics)"
+            )
+        if base is not None and base.matrix is None and item.kinematics is None and len(item.joints) > 1:
+            raise NeecoError(
+                f"{place}: kinematics: missing; a wrist that bends does not show an unknown base: give its "
+                f"links ({{dvrk_tool: TOOL.json}}, urdf or links), or {base.key} as roughly measured (sd_mm, sd_deg)"
+            )
+    if recording.camera == STILL:
+        require_lens(recording, recording.read_lens()[0])
+
+
+def require_lens(recording: Recording, lens: Lens | None) -> None:
+    """Raise NeecoError for a scope that stands still without a lens."""
+    if lens is None:
+        raise NeecoError(
+            f"{recording.path}: intrinsics: missing; images of a scope that stands still do not determine its "
+            "lens; give fl_x, fl_y, cx, cy or a calibration"
+        )
 
 
 def _check_video(recording: Recording, video: VideoSource) -> None:
