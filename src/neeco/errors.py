@@ -36,7 +36,7 @@ class NeecoError(Exception):
 
 def visible(text: str) -> str:
     """Return text in one line without control characters, which could move a terminal's cursor: files may hold any."""
-    line = " ".join(text.split())
+    line = re.sub(r"\s*[^\S ]\s*", " ", text)  # line breaks and tabs, with the spaces around
     return line if line.isprintable() else "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line)
 
 

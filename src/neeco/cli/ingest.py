@@ -93,8 +93,8 @@ def run(args: Ingest) -> int:
                 raise KeyboardInterrupt("nothing was written") from None
         if not write_numbers(args.json, done.as_json()):
             print(*map(visible, done.lines()), sep="\n")
-            verb, rest = ("check", "") if done.verdict == "doubtful" else ("train", " --output RUN")
-            print(f"next: neeco {verb} {shlex.quote(str(output))}{rest}")
+            if done.verdict != "doubtful":  # whose last line says not to train
+                print(f"next: neeco train {shlex.quote(str(output))} --output RUN")
     return 1 if args.strict and done.verdict == "doubtful" else 0
 
 
