@@ -210,7 +210,8 @@ class Frame:
     split: str  # train, test, unseen, or any other name
     mask_path: Path | None = None  # black pixels are ignored by the loss
     background: float = 1.0  # colour behind transparent pixels: 0 black, 1 white
-    stored_size: tuple[int, int] | None = None  # (width, height) of the files, pixels; None: that of the camera
+    # px, width and height of the files; None: those of the camera
+    stored_size: tuple[int, int] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image_path", Path(self.image_path))

@@ -30,7 +30,7 @@ COLUMNS = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Evaluate:
     """Score a run: images, masks, parts, speed; writes evaluation.json and report.html into it."""
 
