@@ -32,10 +32,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from neeco.capture import read_capture
+from neeco.capture.checks.truth import REFERENCE_FOLDER
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import Frame
 from neeco.capture.readers import read_dvrk_tool
-from neeco.evaluation.mask_folders import REFERENCE_FOLDER
 
 WRIST = {"wrist_pitch": "wrist_pitch_rad", "wrist_yaw": "wrist_yaw_rad"}
 REGISTERED = "transforms_registered.json"

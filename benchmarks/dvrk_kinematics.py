@@ -16,8 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from neeco.capture import read_capture, write_capture
+from neeco.capture.checks.truth import REFERENCE_FOLDER
 from neeco.capture.readers import read_dvrk_tool
-from neeco.evaluation.mask_folders import REFERENCE_FOLDER
 
 JAW_LIMITS = (0.0, 1.2)  # rad
 

@@ -70,6 +70,9 @@ annotate RUN --output LABELLED --lens
 annotate RUN --capture OTHER --output LABELLED
 track RUN FOOTAGE --output TRACKED --start first --min-trust 0.1
 evaluate RUN --json
+evaluate RUN --force
+annotate RUN --output LABELLED --force
+synthesize RUN --output SET --count 2 --force
 check CAPTURE --json
 check CAPTURE --json FILE.json
 view RUN --export FILE.html --sh 1

@@ -6,8 +6,8 @@ import io
 
 from rich.console import Console
 
+from neeco.capture.checks.truth import USUAL_NAMES
 from neeco.cli.evaluate import COLUMNS, evaluation_table
-from neeco.evaluation.mask_folders import USUAL_NAMES
 from neeco.evaluation.mask_metrics import part_scores
 
 

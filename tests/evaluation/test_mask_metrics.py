@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
+from neeco.capture.checks.truth import USUAL_NAMES
 from neeco.errors import NeecoError
-from neeco.evaluation.mask_folders import USUAL_NAMES, truth_file
+from neeco.evaluation.mask_folders import truth_file
 from neeco.evaluation.mask_metrics import PartTally, dice, iou, mean_of, pairs_of, to_truth_ids
 from neeco.labels.labellers import composited_parts
 from neeco.raster.types import Rendering

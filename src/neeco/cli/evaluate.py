@@ -85,6 +85,8 @@ def evaluation_table(evaluation: dict[str, Any]) -> Table:
     table = Table("poses", *(Column(f"{kind}\n{split}", justify="right") for kind, split in scored))
     for title, key, form in COLUMNS:
         values = [evaluation[kind][split][key] for kind, split in scored]
+        if all(value is None for value in values):  # a note says why
+            continue
         table.add_row(title, *("-" if value is None else form.format(value) for value in values))
     for part in dict.fromkeys(part for kind, split in scored for part in evaluation[kind][split]["part_iou"]):
         values = [evaluation[kind][split]["part_iou"][part] for kind, split in scored]

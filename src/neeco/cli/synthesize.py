@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, counted
 from neeco.settings import Device
 from neeco.synthesis.settings import DEFAULT_FORMATS, Settings, formats_help
 
@@ -76,7 +76,7 @@ def run(arguments: Arguments) -> int:
         print(f"the scope stood still: views are {VIEWS_OF_STILL[settings.views]}")
     print(f"{made.images} images in {made.output} ({made.made_now} rendered now); look at preview.png")
     for reason, times in made.refused.items():
-        print(f"refused {times} states: instrument {reason}")
+        print(f"refused {counted(times, 'state')}: instrument {reason}")
     if made.skipped:
         print(f"skipped given states {made.skipped}: refused from every view tried")
     if arguments.push_to_hub is not None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from neeco.capture.checks.truth import SHADOW_FOLDER
 from neeco.capture.images import read_mask
 from neeco.capture.model import Capture, Frame, State
 from neeco.errors import NeecoError
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from neeco.scene import DrawableScene
     from neeco.training.run import TrainedRun
 
-SHADOW_FOLDER = "truth/shadow"
 MISSING_LIGHT = 0.15  # share of the tissue's light, from which a pixel is in shadow
 MIN_AREA = 1e-3  # of the image: a smaller shadow has no score
 

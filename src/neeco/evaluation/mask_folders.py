@@ -13,17 +13,14 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
+from neeco.capture.checks.truth import MASK_FOLDERS, REFERENCE_FOLDER, USUAL_NAMES, stated_names
 from neeco.capture.images import open_image, read_labels, read_mask
 from neeco.capture.model import Capture, Frame
 from neeco.capture.readers import read_capture
 from neeco.errors import NeecoError
-from neeco.files import read_json, require_inside, visible_entries
+from neeco.files import require_inside, visible_entries
 
 PARTS_SUFFIX, MASK_SUFFIX = "_parts", "_mask"  # of files that `neeco render` writes
-PARTS_FILE = "parts.json"  # names of the ids of masks in a folder
-USUAL_NAMES: Mapping[int, str] = {1: "shaft", 2: "wrist", 3: "jaw_left", 4: "jaw_right"}  # in folders without one
-REFERENCE_FOLDER = "reference_masks"
-MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)  # of a capture, in order of preference
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,7 @@ def truth_file(root: Path, name: str) -> Path | None:
 def truth_names(root: Path) -> Mapping[int, str]:
     """Return parts by id in the truth of the capture in `root`, as its parts.json states, else the usual ones. Raises
     NeecoError."""
-    return _stated_names(root / MASK_FOLDERS[0]) or USUAL_NAMES
+    return stated_names(root / MASK_FOLDERS[0]) or USUAL_NAMES
 
 
 def load_reference(capture: Capture, frame: Frame) -> ReferenceMask | None:
@@ -144,7 +141,7 @@ def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str
     if suffix == MASK_SUFFIX and classes is None:
         _check_ids(files, {255}, "0 and 255", option)
         return Masks(path, files, None)
-    names = classes if classes is not None else _stated_names(path)
+    names = classes if classes is not None else stated_names(path)
     if names is None:
         return _guessed(path, files, suffix == "", option)
     _check_ids(files, set(names), ", ".join(f"{number} {part}" for number, part in names.items()), option)
@@ -201,19 +198,6 @@ def _palette_ids(image: Image.Image, ids: np.ndarray) -> np.ndarray:
     colours = palette[used]
     black_and_white = np.isin(colours, (0, 255)).all() and (colours == colours[:, :1]).all()
     return palette[ids][..., 0] if black_and_white else ids
-
-
-def _stated_names(path: Path) -> dict[int, str] | None:
-    """Return the names of ids in the folder's `parts.json`, or None without one."""
-    file = path / PARTS_FILE
-    if not file.is_file():
-        return None
-    stated = read_json(file)
-    try:
-        return {int(entry["id"]): str(entry["part"]) for entry in stated["ids"] if entry["id"]}
-    except (KeyError, TypeError, ValueError):
-        expected = 'expected [{"id": 1, "part": "shaft"}, …]'
-        raise NeecoError(f"{file}: ids: {expected}; correct it or give --classes") from None
 
 
 def _found_ids(file: Path) -> set[int]:

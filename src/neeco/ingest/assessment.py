@@ -140,7 +140,8 @@ def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -
 
 
 def _sentence(text: str) -> str:
-    return text[0].upper() + text[1:] + ("" if text.endswith((".", "?")) else ".")
+    begun = text if "." in text.partition(":")[0] else text[0].upper() + text[1:]  # a file's name stays
+    return begun + ("" if text.endswith((".", "?")) else ".")
 
 
 def _rolls_known(capture: Capture) -> bool:

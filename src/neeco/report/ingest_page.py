@@ -17,6 +17,7 @@ from neeco.capture import read_capture
 from neeco.capture.checks import inspect_capture
 from neeco.capture.documents import Problem, errors_only
 from neeco.capture.model import Capture, Frame
+from neeco.errors import counted
 from neeco.files import finite
 from neeco.ingest.assessment import VERDICTS, Assessment, assess_ingest, clock_cost_mm, rms
 from neeco.ingest.frames.views import StageProgress
@@ -73,7 +74,7 @@ class Ingested:
             shown += [f"tissue {tissue}:"] if tissue else []
             shown += result.lines()
         shown += [f"wrong: {problem}" for problem in errors_only(self.problems)]
-        shown.append(f"capture: {self.output}  ({len(self.problems)} remarks by `neeco check`)")
+        shown.append(f"capture: {self.output}  ({counted(len(self.problems), 'remark')} by `neeco check`)")
         shown.append(f"page: {', '.join(str(self.output / page_of(tissue)) for tissue in self.results)}")
         for tissue, verdict in self.verdicts.items():
             first, *others = verdict.lines()

@@ -190,7 +190,7 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
         if numbers["mask_iou"] is not None:
             tiles.append((f"{numbers['mask_iou']:.3f}", f"mask IoU, {split}, {KIND_NAMES[labelled]}"))
     doubts = evaluation.get("doubts", ())
-    tiles.append(("doubtful" if doubts else "no doubt", "labels, by what training measured"))
+    tiles.append(("doubtful" if doubts else "no doubt", "about labels, by what training measured"))
     first = next(iter(evaluation["given"].values()), None)
     if first is not None:
         tiles.append((f"{first['fps']:.1f}", "posed images rendered per second"))

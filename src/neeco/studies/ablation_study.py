@@ -17,11 +17,11 @@ import torch
 
 from neeco import __version__
 from neeco.capture.checks import read_checked
+from neeco.capture.checks.truth import MASK_FOLDERS
 from neeco.capture.model import Capture, Frame, InstrumentState, State, evenly_spaced
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import held_out_splits
-from neeco.evaluation.mask_folders import MASK_FOLDERS
 from neeco.files import own_folder, read_begun, read_json, require_same, write_atomically, write_json
 from neeco.geometry.rotations import rotation_from_vector
 from neeco.raster.devices import device_of

@@ -9,10 +9,11 @@ from typing import Any
 import torch
 
 from neeco.capture import Capture
+from neeco.capture.checks.truth import PARTS_FILE
 from neeco.capture.images import write_labels
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.mask_folders import PARTS_FILE, PARTS_SUFFIX, load_reference, open_masks, truth_file
+from neeco.evaluation.mask_folders import PARTS_SUFFIX, load_reference, open_masks, truth_file
 from neeco.evaluation.mask_metrics import iou, mean_of
 from neeco.evaluation.mask_scores import score_masks
 from neeco.files import write_json

@@ -124,8 +124,6 @@ def train(
         for problem in contradicted:
             log.note(f"warning: {problem}")
         log.note(_size_note(frames, config))
-        where = "a GPU" if device.type == "cuda" else "the CPU; a CUDA device would be used if there were one"
-        log.note(f"learning on {where}; watch it, once a checkpoint is there: neeco view {shlex.quote(str(output))}")
         with deferred_interrupts() as stop:
             _run(session, output, config, log, stop, go_on)
         try:

@@ -17,6 +17,7 @@ from neeco.capture.checks.motion import check_motion
 from neeco.capture.checks.pictures import Pictures, Size
 from neeco.capture.checks.placement import check_placement
 from neeco.capture.checks.states import check_states
+from neeco.capture.checks.truth import check_truth
 from neeco.capture.documents import Problem, ProblemReport, condensed, errors_only, key_name
 from neeco.capture.model import Capture
 from neeco.capture.readers import capture_of, parse_capture
@@ -64,7 +65,7 @@ def read_checked(
     report: receives the contradictions between states and images, which take seconds to find. Raises NeecoError with
     the first error that `check_capture` finds.
     """
-    checked = inspect_capture(path, transforms, motion=report is not None)
+    checked = inspect_capture(path, transforms, motion=report is not None, truth=False)
     ProblemReport(checked.problems).raise_first(path)
     for problem in checked.problems:
         if report is not None and problem.contradicted:
@@ -73,9 +74,11 @@ def read_checked(
     return checked.capture
 
 
-def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, motion: bool = True) -> Checked:
+def inspect_capture(
+    path: Path | str, transforms: str = "transforms.json", *, motion: bool = True, truth: bool = True
+) -> Checked:
     """Read and check a capture. motion: also compare cameras and states with the images, which takes seconds and finds
-    warnings only."""
+    warnings only; truth: also open the masks that evaluation compares with."""
     report = ProblemReport()
     parsed = parse_capture(path, report, transforms)
     if not parsed.frames and not errors_only(report.problems):
@@ -86,6 +89,8 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
         check_frames(parsed)
         check_image_files(parsed, pictures, _compared(parts) if motion else {})
         check_states(parsed)
+        if truth:
+            check_truth(parsed, report)
         verdicts = [check_placement(part, pictures) for part in parts]
         if motion and not errors_only(report.problems):
             for part, known in zip(parts, verdicts, strict=True):

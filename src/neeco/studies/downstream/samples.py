@@ -13,10 +13,11 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 import cv2
 import numpy as np
 
+from neeco.capture.checks.truth import PARTS_FILE
 from neeco.capture.images import image_files, image_size, open_image, read_image_bytes, read_labels
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth, truth_file, truth_names
+from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, truth_file, truth_names
 from neeco.evaluation.mask_metrics import pairs_of
 from neeco.files import read_bytes, read_json, read_text, require_inside
 

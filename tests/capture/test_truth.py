@@ -1,0 +1,81 @@
+"""`check` opens the truth that evaluation reads: wrong kind, size, ids and names are warnings, no errors."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from neeco.capture.checks import check_capture, read_checked
+
+SAMPLE = Path(__file__).resolve().parents[2] / "samples" / "liver-mini"
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    root = tmp_path / "capture"
+    shutil.copytree(SAMPLE, root)
+    return root
+
+
+def told_of(root: Path) -> list[str]:
+    before = {str(problem) for problem in check_capture(SAMPLE)}
+    found = [problem for problem in check_capture(root) if str(problem) not in before]
+    assert all(problem.severity == "warning" for problem in found)
+    read_checked(root)  # it can be trained on
+    return [str(problem) for problem in found]
+
+
+def masks(root: Path) -> list[Path]:
+    return sorted((root / "truth" / "masks").glob("*.png"))
+
+
+def test_a_right_truth_is_not_told_of(root: Path) -> None:
+    assert len(masks(root)) > 2
+    assert told_of(root) == []
+
+
+@pytest.mark.parametrize(
+    ("pixels", "told"),
+    [
+        (np.zeros((192, 240, 3), np.uint8), "expected an 8-bit image of part ids, found mode RGB; save it as grey PNG"),
+        (np.zeros((96, 120), np.uint8), "120x96"),
+        (np.full((192, 240), 9, np.uint8), "id 9 is not among 1 shaft, 2 wrist"),
+    ],
+)
+def test_a_mask_of_another_kind_size_or_with_unknown_ids_is_named(pixels: np.ndarray, told: str, root: Path) -> None:
+    file = masks(root)[0]
+    Image.fromarray(pixels).save(file)
+    (line,) = told_of(root)
+    assert line.startswith(f"truth/masks/{file.name}: ")
+    assert told in line
+
+
+def test_files_that_evaluation_would_pass_over_are_named(root: Path) -> None:
+    file = masks(root)[0]
+    Image.open(file).convert("L").save(file.with_suffix(".jpg"))
+    os.rename(file, file.with_name("unknown.png"))
+    jpeg, unknown = sorted(told_of(root))
+    assert "is not read: masks are PNG files" in jpeg
+    assert "unknown.png: no frame has an image of this name" in unknown
+
+
+def test_a_damaged_file_and_a_wrong_list_of_parts_are_named(root: Path) -> None:
+    file = masks(root)[0]
+    file.write_bytes(file.read_bytes()[:40])
+    (root / "truth" / "masks" / "parts.json").write_text(json.dumps({"ids": [3]}))
+    lines = told_of(root)
+    assert any(line.startswith(f"truth/masks/{file.name}: ") for line in lines)
+    assert any(line.startswith("truth/masks/parts.json: ids: expected") for line in lines)
+
+
+def test_a_reference_mask_of_zeros_and_ones_is_named(root: Path) -> None:
+    (root / "reference_masks").mkdir()
+    Image.fromarray(np.eye(192, 240, dtype=np.uint8)).save(root / "reference_masks" / masks(root)[0].name)
+    (line,) = told_of(root)
+    assert "its largest value is 1, which reads as black; write 255 instead" in line
