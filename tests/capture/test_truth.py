@@ -65,6 +65,14 @@ def test_files_that_evaluation_would_pass_over_are_named(root: Path) -> None:
     assert "unknown.png: no frame has an image of this name" in unknown
 
 
+def test_further_files_about_a_frame_that_has_its_mask_are_not_told_of(root: Path) -> None:
+    file = masks(root)[0]
+    shutil.copy(file, file.with_name(f"{file.stem}_label.png"))
+    assert told_of(root) == []
+    file.unlink()
+    assert len(told_of(root)) == 1, "without its mask the name is wrong"
+
+
 def test_a_damaged_file_and_a_wrong_list_of_parts_are_named(root: Path) -> None:
     file = masks(root)[0]
     file.write_bytes(file.read_bytes()[:40])

@@ -139,6 +139,12 @@ def test_footage_over_another_tissue_in_another_world_is_tracked(
     run = load_run(tmp_path / "out" / "run")
     assert run.scene.recorded.names == tuple(frame.name for frame in other_footage.frames)
     assert len(run.capture().frames) == COUNT
+    trusts = sorted(rec["trust"]["value"] for rec in tracked.records)
+    output, stricter = tmp_path / "out", trusts[1]  # which leaves out the least trusted frame
+    again = track_footage(tracked_run, other_footage, output, tissue="footage", min_trust=stricter, resume=True)
+    run = load_run(output / "run")
+    assert 0 < again.written < COUNT
+    assert run.scene.recorded.names == tuple(frame.name for frame in run.capture().frames)
 
 
 @pytest.mark.slow

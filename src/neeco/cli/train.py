@@ -60,8 +60,7 @@ def run(args: Arguments) -> int:
     flags = {name: getattr(args, name) for name in FLAGS if name != "method"}
     begun = begun_config(args.output) if args.resume else None
     config = training_config(args.method, flags, args.set, begun)
-    device = device_of(args.device)
-    path = train_with_progress(args.capture, args.output, config, device, resume=args.resume)
+    path = train_with_progress(args.capture, args.output, config, device_of(args.device), resume=args.resume)
     print(f"finished: {path}  (next: neeco evaluate {shlex.quote(str(path))})")
     return 0
 

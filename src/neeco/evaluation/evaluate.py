@@ -145,9 +145,9 @@ def evaluate_run(
 
     Returns {"given": {split: numbers}, "aligned": the same when `align`, "notes": [why a number is null], "labels":
     {how masks were made and compared}, "doubts": [reasons to doubt the labels], "per_frame": {kind: {split: [row]}}},
-    and of several tissues "by_tissue": {kind:
-    {split: {tissue: means}}}. None is "not known", never zero; psnr* in dB. networks: of `find_lpips`. The caller sets
-    the number of torch threads (`open_run`). Raises NeecoError for unknown splits and unreadable frames.
+    and of several tissues "by_tissue": {kind: {split: {tissue: means}}}. None is "not known", never zero; psnr* in dB.
+    networks: of `find_lpips`. The caller sets the number of torch threads (`open_run`). Raises NeecoError for unknown
+    splits and unreadable frames.
     """
     scene = run.scene
     capture = scene.recorded.completed(capture, scene.instruments)

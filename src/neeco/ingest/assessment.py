@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -140,7 +141,7 @@ def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -
 
 
 def _sentence(text: str) -> str:
-    begun = text if "." in text.partition(":")[0] else text[0].upper() + text[1:]  # a file's name stays
+    begun = text if re.match(r"\S+\.\w+:", text) else text[0].upper() + text[1:]  # a file's name stays
     return begun + ("" if text.endswith((".", "?")) else ".")
 
 

@@ -169,7 +169,7 @@ def track_footage(
             write_tracked(trusted, output, scene, trained_on)
         elif stored.get("complete"):
             info = stored  # its capture stays
-        if tissue == "footage" and not stored.get("complete"):
+        if tissue == "footage" and (trusted.frames or not stored.get("complete")):
             _write_run(output, run, scene)
         write_json(output / INFO, info)
         if (output / STEPS).exists():

@@ -43,9 +43,11 @@ def check_truth(parsed: Parsed, report: ProblemReport) -> None:
             known = (folder == MASK_FOLDERS[0] and stated_names(root / folder)) or USUAL_NAMES
         except NeecoError as error:
             report.warning(f"{folder}/{PARTS_FILE}", "", str(error).rpartition(f"{PARTS_FILE}: ")[2])
-        for file in visible_entries(root / folder) if (root / folder).is_dir() else []:
+        files = visible_entries(root / folder) if (root / folder).is_dir() else []
+        read = tuple(f"{file.stem}_" for file in files if file.stem in names)
+        for file in files:
             place = f"{folder}/{file.name}"
-            if file.name == PARTS_FILE:
+            if file.name == PARTS_FILE or file.stem.startswith(read):  # 000003_label.png beside 000003.png
                 continue
             if file.suffix != ".png":
                 report.warning(place, "", "is not read: masks are PNG files", "save it as NAME_OF_THE_IMAGE.png")

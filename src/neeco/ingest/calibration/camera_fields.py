@@ -36,7 +36,6 @@ _INTRINSICS = ("intrinsics", "projectionparameters")  # four numbers, or by name
 _FOCAL = (("fx", "fy", "cx", "cy"), ("mu", "mv", "u0", "v0"))
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_COEFFICIENTS = (("k1", "k2", "k3", "k4"), ("k2", "k3", "k4", "k5"))  # of OpenCV, and with mu, mv, u0, v0
-_OMNIDIRECTIONAL = ("a0", "a1", "a2", "cx", "cy")  # and the affine c, d, e
 _SIZES = (("imagewidth", "imageheight"), ("width", "height"), ("w", "h"), ("cols", "rows"))
 _SIZE_LISTS = ("resolution", "imagesize", "size")  # width, height
 _MODELS = ("distortionmodel", "cameramodel", "modeltype", "type", "model")

@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from neeco.capture.images import FORMATS, open_image
+from neeco.capture.readers.parsed import natural_order
 from neeco.errors import NeecoError, install_hint
 from neeco.files import require_content, visible_entries
 from neeco.ingest.readers import VideoSource, numbers, read_table
@@ -60,7 +61,10 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     if not folder.is_dir():
         raise NeecoError(f"{folder}: {'is a file; give a folder of images' if folder.exists() else 'no such folder'}")
     folder = folder if folder.name else folder.resolve()  # "." says nothing in a message
-    files = sorted((file for file in visible_entries(folder) if file.suffix.lower() in IMAGES), key=_natural_order)
+    files = sorted(
+        (file for file in visible_entries(folder) if file.suffix.lower() in IMAGES),
+        key=lambda file: natural_order(file.name),
+    )
     if len(files) < MIN_IMAGES:
         raise NeecoError(f"{folder}: holds {len(files)} images; expected frames as {', '.join(IMAGES[:3])} files")
     notes: list[str] = []
@@ -377,12 +381,6 @@ def _rgb(frame: Any) -> np.ndarray:
 def _reason(error: BaseException) -> str:
     text = getattr(error, "strerror", None) or str(error)
     return " ".join(str(text).split())[:100] or type(error).__name__
-
-
-def _natural_order(file: Path) -> list[tuple[int, int, str]]:
-    """Sorts frame2 before frame10."""
-    parts = re.split(r"(\d+)", file.name.lower())
-    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
 
 
 def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[str]) -> tuple[list[Path], np.ndarray]:
