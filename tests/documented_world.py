@@ -65,7 +65,7 @@ class DocumentedWorld:
         return self.once("other-run", make)
 
     def dataset(self) -> Path:
-        words = ("--count", 6, "--min-share", 0, "--max-unobserved", 1, "--no-tissue-check")
+        words = ("--count", 6, "--min-share", 0, "--max-unobserved", 1, "--no-tissue-check", "--force")
         return self.once("dataset", lambda path: neeco_does("synthesize", self.run(), "--output", path, *words))
 
     def tracked(self) -> Path:
