@@ -58,7 +58,7 @@ class Settings:
     base_error: tuple[float, float] | None = None  # mm and degrees that recording/ is off about a robot's base
     stereo: bool = False  # right/: the images of a second camera beside it
     plates: bool = False  # plates/: training frames without the instrument
-    processor: str | None = None  # of another endoscope: one of PROCESSORS
+    processor: str | Processor | None = None  # of another endoscope: one of PROCESSORS, or its numbers
     workers: int = 1
 
     @property
@@ -90,7 +90,9 @@ class Settings:
     @property
     def developing(self) -> Processor:
         """The processor of the images."""
-        return Processor() if self.processor is None else PROCESSORS[self.processor]
+        if isinstance(self.processor, str):
+            return PROCESSORS[self.processor]
+        return self.processor or Processor()
 
     def modes(self, spec: SceneSpec) -> tuple[Mode, ...]:
         """How the tissue moves."""

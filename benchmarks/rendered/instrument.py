@@ -16,6 +16,7 @@ from torch import Tensor
 SHAFT, WRIST, FIRST_JAW, SECOND_JAW = 1, 2, 3, 4  # what `trace` calls the parts; the truth's ids may swap the jaws
 SHAFT_LENGTH = 320.0
 ITERATIONS = 60
+RING_EVERY, RING_WIDTH, RING_COLOR = 12.0, 1.6, 0.75  # mm from one painted ring to the next; linear grey
 TOUCH = 0.004  # mm; a ray this near has met the surface
 
 
@@ -75,6 +76,7 @@ class Design:
     shares: tuple[float, float]
     materials: tuple[Material, Material, Material]
     mirrors: bool = False  # metal that shows its surroundings instead of a haze of tissue
+    rings: bool = False  # bright rings painted around the shaft, as depth marks
 
     wrist_joints: ClassVar[tuple[str, ...]] = ()  # readings beside the jaws'
 
@@ -223,6 +225,13 @@ def normals(design: Design, opening: float, points: Tensor, parts: Tensor) -> Te
     for corner in corners:
         slope += corner * design.distances(points + 0.02 * corner, opening).gather(1, column)
     return torch.where((parts == SHAFT)[:, None], around, F.normalize(slope, dim=-1))
+
+
+def painted(design: Design, points: Tensor, parts: Tensor) -> Tensor:
+    """Which points [M, 3] on the given parts [M] a painted ring covers."""
+    if not design.rings:
+        return torch.zeros_like(parts, dtype=torch.bool)
+    return (parts == SHAFT) & (torch.remainder(points[:, 2], RING_EVERY) < RING_WIDTH)
 
 
 def grain(design: Design, opening: float, points: Tensor, parts: Tensor) -> Tensor:

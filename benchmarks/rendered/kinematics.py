@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.kinematics import PRISMATIC, REVOLUTE, KinematicTree, Link
+from neeco.capture.kinematics import FIXED, PRISMATIC, REVOLUTE, KinematicTree, Link
 from rendered.hinge import JAW_LEFT, JAW_RIGHT, truth_ids
 from rendered.motion import Array
 from rendered.scenes import SceneSpec
@@ -24,31 +25,44 @@ def true_kinematics(spec: SceneSpec) -> KinematicTree:
     """The links in the true sensor frame, mm, with the encoders' offsets taken out: what a perfect search would find.
     Link frames are parallel to the sensor's where the wrist is straight and the jaws are closed."""
     design, encoders = spec.design, spec.encoders
-    assert isinstance(design, WristedDesign | SlidingDesign)
-    assert encoders is not None
     sensor_from_mechanical = np.linalg.inv(spec.mount.mechanical_from_sensor())
     rotation, shift = sensor_from_mechanical[:3, :3], sensor_from_mechanical[:3, 3]
+    if not isinstance(design, WristedDesign | SlidingDesign):
+        hinge = rotation @ np.array([0.0, 0.0, design.hinge]) + shift
+        return KinematicTree((Link("shaft"), Link("wrist", "shaft"), *_jaws(spec, rotation, hinge)))
+    assert encoders is not None
     first, *others = design.wrist_joints
     slides = isinstance(design, SlidingDesign)
     start = 0.0 if slides else design.pitch_at
     kind, axis = (PRISMATIC, rotation[:, 2]) if slides else (REVOLUTE, rotation[:, 1])
     origin = _shift(rotation @ np.array([0.0, 0.0, start]) + shift)
     links = [Link("shaft"), Link("wrist", "shaft", kind, origin, axis, {first: 1.0}, offset=-encoders.offsets[0])]
-    hinge = _shift(rotation @ np.array([0.0, 0.0, design.hinge - start]))
-    for part, sense, share in zip(truth_ids(spec), (-1, 1), design.shares, strict=True):
+    hinge = rotation @ np.array([0.0, 0.0, design.hinge - start])
+    return KinematicTree((*links, *_jaws(spec, rotation, hinge, others, -sum(encoders.offsets[1:]))))
+
+
+def _jaws(
+    spec: SceneSpec, rotation: Array, hinge: Array, others: Sequence[str] = (), offset: float = 0.0
+) -> list[Link]:
+    """Both jaws, of the link "wrist", about a hinge [3] in its frame; others: readings that turn both as well, less
+    their offset."""
+    found = []
+    for part, sense, share in zip(truth_ids(spec), (-1, 1), spec.design.shares, strict=True):
+        if not (others or share):
+            found.append(Link(JAW_NAMES[part], "wrist", origin=_shift(hinge)))
+            continue
         gain = sense * share * spec.joint.sign  # per reading of the jaw
-        offset = -gain * spec.joint.zero - sum(encoders.offsets[1:])
         value = dict.fromkeys(others, 1.0) | {"jaw_angle": gain}
-        links.append(Link(JAW_NAMES[part], "wrist", REVOLUTE, hinge, rotation[:, 0], value, offset=offset))
-    return KinematicTree(tuple(links))
+        own = offset - gain * spec.joint.zero
+        found.append(Link(JAW_NAMES[part], "wrist", REVOLUTE, _shift(hinge), rotation[:, 0], value, offset=own))
+    return found
 
 
 def stated_kinematics(spec: SceneSpec, *, exact: bool = False) -> KinematicTree:
     """The links as a drawing of the instrument and a ruler on its sensor give them: axes turned by AXIS_ERROR and
     pivots shifted by PIVOT_ERROR mm, each some way of its own, unless `exact`, and encoders thought to be without an
     offset."""
-    assert spec.encoders is not None
-    without = replace(spec.encoders, offsets=(0.0,) * len(spec.encoders.offsets))
+    without = spec.encoders and replace(spec.encoders, offsets=(0.0,) * len(spec.encoders.offsets))
     right = true_kinematics(replace(spec, encoders=without))
     if exact:
         return right
@@ -56,7 +70,7 @@ def stated_kinematics(spec: SceneSpec, *, exact: bool = False) -> KinematicTree:
     errors: dict[str, tuple[Array, Array]] = {}  # by parent: the links that it carries share an axis
     links = []
     for link in right.links:
-        if link.parent is None:
+        if link.type == FIXED:
             links.append(link)
             continue
         if link.parent not in errors:

@@ -242,15 +242,17 @@ def _shade_instrument(place: Place, view: View, points: Tensor, parts: Tensor) -
     local = points @ transform[:3, :3].T + transform[:3, 3]
     normal = tools.normals(place.design, view.opening, local, parts) @ transform[:3, :3]
     tone = 1 + 0.16 * tools.grain(place.design, view.opening, local, parts)[:, None]
-    return light_instrument(place, points, normal, parts, tone)
+    return light_instrument(place, points, normal, parts, tone, ring=tools.painted(place.design, local, parts))
 
 
 def light_instrument(
-    place: Place, points: Tensor, normal: Tensor, parts: Tensor, tone: Tensor, spread: float | Tensor = 0.0
-) -> Tensor:
+    place: Place, points: Tensor, normal: Tensor, parts: Tensor, tone: Tensor, spread: float | Tensor = 0.0,
+    ring: Tensor | None = None,
+) -> Tensor:  # fmt: skip
     """Colour [M, 3] of the instrument at points [M, 3] with unit normals [M, 3], camera frame, on the given parts [M].
 
-    tone [M, 1] multiplies the material's colour; spread [M, 1]: variance of the slopes within a pixel.
+    tone [M, 1] multiplies the material's colour; spread [M, 1]: variance of the slopes within a pixel; ring bool [M]:
+    painted over.
     """
     towards_eye = F.normalize(-points, dim=-1)
     shaft, wrist, jaw = (_rows(material) for material in place.design.materials)
@@ -258,6 +260,8 @@ def light_instrument(
     rows = torch.where(is_shaft, shaft, torch.where(is_wrist, wrist, jaw))
     base, diffuse_share, shine, sharpness = rows[:, :3], rows[:, 3:4], rows[:, 4:5], rows[:, 5:6]
     base = base * tone
+    if ring is not None:
+        base = torch.where(ring[:, None], torch.full_like(base, tools.RING_COLOR), base)
     if isinstance(spread, Tensor):
         shine, sharpness = widened(shine, sharpness, spread)
     mirrored = 2 * (normal * towards_eye).sum(-1, keepdim=True) * normal - towards_eye

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -199,15 +200,16 @@ def stomach(seed: int, resolution: int = 2400) -> Tissue:
     return finish(height, albedo, 0.76 + 0.15 * value_noise(size, 22, generator), relief)
 
 
-def cloth(seed: int, resolution: int = 2400) -> Tissue:
-    """Surgical drapes on a bench: a blue-green cloth in soft creases, partly under a white one; both woven, not wet."""
+def cloth(seed: int, resolution: int = 2400, drape: bool = True) -> Tissue:
+    """Surgical drapes on a bench: a blue-green cloth in soft creases, partly under a white one (`drape`); both woven,
+    not wet."""
     generator = torch.Generator().manual_seed(seed)
     rows, size = max(64, resolution // 3), resolution
     creases = ridges(rows, 3, 0.12, generator) + 0.6 * ridges(rows, 6, 0.10, generator)
     border = 5 * value_noise(size, 4, generator)
     axis = torch.linspace(-HALF_SIZE, HALF_SIZE, size)
     y, x = torch.meshgrid(axis, axis, indexing="ij")
-    white = torch.sigmoid((0.8 * x + 0.6 * y + border - 30) * 4)
+    white = torch.sigmoid((0.8 * x + 0.6 * y + border - 30) * 4) if drape else torch.zeros_like(x)
     lift = F.interpolate(white[None, None], size=(rows, rows), mode="area")[0, 0]
     waves = 2.2 * value_noise(rows, 6, generator) + 0.7 * value_noise(rows, 16, generator)
     height = waves + blur(5 * creases + 1.5 * lift, 1.5 * (rows - 1) / (2 * HALF_SIZE))
@@ -224,7 +226,12 @@ def cloth(seed: int, resolution: int = 2400) -> Tissue:
     return finish(height, albedo, torch.full((size, size), 0.12), 0.05 * weave)
 
 
-ORGANS: dict[str, Callable[[int, int], Tissue]] = {"bowel": bowel, "stomach": stomach, "cloth": cloth}
+ORGANS: dict[str, Callable[[int, int], Tissue]] = {
+    "bowel": bowel,
+    "stomach": stomach,
+    "cloth": cloth,
+    "sheet": partial(cloth, drape=False),
+}
 
 
 def _color(red: float, green: float, blue: float) -> Tensor:

@@ -71,7 +71,7 @@ def write_recording(spec: SceneSpec, path: Path, settings: Settings, report: Rep
         write_json(path / "truth" / "breathing.json", breathing.describe(modes, spec.world_from_scene().tolist()))
     if exposure:
         write_json(path / "truth" / "exposure.json", exposure.describe([shot.number for shot in shots]))
-    capture, quality = _recorded(world, trajectory, sampler, path, settings.lens, generator)
+    capture, quality = recorded(world, trajectory, sampler, path, settings.lens, generator)
     if settings.optics:
         capture = _behind_optics(capture, Optics.of(settings.lens), path)
     quality["smallest clearance mm"] = clearance(place, settings, spec, shots)
@@ -103,7 +103,7 @@ def _cpu_seconds() -> float:
     return sum(os.times()[:4])
 
 
-def _recorded(
+def recorded(
     world: World, trajectory: Trajectory, sampler: PointSampler, path: Path, lens: Lens, generator: np.random.Generator
 ) -> tuple[Capture, dict[str, float]]:
     """The capture as instruments recorded it, with its errors against the truth."""

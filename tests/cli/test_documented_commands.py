@@ -10,6 +10,7 @@ import re
 import shlex
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -188,6 +189,8 @@ def smaller(line: str) -> str:
         line += " --min-share 0 --max-unobserved 1"
     if verb == "synthesize" and "--no-tissue-check" not in words and "--tissue-tolerance-mm" not in words:
         line += " --no-tissue-check"
+    if verb == "track" and "--min-trust" not in words:
+        line += " --min-trust 0"
     if verb in ("synthesize", "annotate") and "--force" not in words:
         line += " --force"  # a run of 40 iterations is no good one
     return line
@@ -246,7 +249,9 @@ def prepare(documented: DocumentedWorld, words: list[str], folder: Path) -> None
 
 def serves(words: list[str], folder: Path) -> None:
     """Run a server until it has said its address, then end it as Ctrl-C does."""
-    command = [sys.executable, "-u", "-m", "neeco", *words, "--no-browser", "--port", "0"]
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    command = [sys.executable, "-u", "-m", "neeco", *words, "--no-browser", "--port", str(port)]
     with subprocess.Popen(command, cwd=folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as server:
         assert server.stdout is not None
         said = ""

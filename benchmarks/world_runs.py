@@ -1,0 +1,250 @@
+"""Trains and evaluates builds of neeco on drawn worlds: one job a build and world, each in processes of its own.
+
+A build is a commit, or "." for this checkout, optionally less one mechanism: "COMMIT:without-NAME" (`WITHOUT`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from rendered.draws import SIZES, draw_world
+from rendered.world_capture import write_world
+
+from neeco.errors import NeecoError
+from neeco.files import read_json, write_json
+
+ROOT = Path(__file__).resolve().parents[1]
+METHOD = "import neeco.methods.kinematic.deformation as m; "
+SEARCH = "import neeco.methods.kinematic.discovery as m; "
+PASSES = "import neeco.methods.kinematic.state_passes as m; "
+NOTHING = "lambda *_: None"
+# mechanisms that can be switched off: by a statement before the command, or by options of `train`
+WITHOUT: dict[str, str | tuple[str, ...]] = {
+    "silhouettes": f"{METHOD}m.observe_silhouettes = {NOTHING}",
+    "interiors": f"{METHOD}m.fade_interior_tissue = {NOTHING}",
+    "states-before-training": f"{SEARCH}m.register_states = {NOTHING}",
+    "pose-registration": f"{SEARCH}m.correct_poses = {NOTHING}",
+    "state-fits": f"{METHOD}m.fit_states = {NOTHING}",
+    "contradictions": PASSES
+    + "; ".join(
+        f"m.{name} = {NOTHING}"
+        for name in ("refit_outliers", "judge_again", "judge_held_back", "hold_back", "leave_out_unexplained")
+    ),
+    "judging-again": f"{PASSES}m.judge_again = {NOTHING}",
+    "held-back": f"{PASSES}m.hold_back = m.judge_held_back = {NOTHING}",
+    "carving-again": f"{PASSES}m.carve_again = {NOTHING}",
+    "wrists-placed": f"{METHOD}m.place_wrists = {NOTHING}",
+    "wrists-again": ("--set", "deformation.refine_wrists=false"),
+    "shadow": ("--set", "deformation.shadow=false"),
+    "breathing": ("--set", "deformation.breathing=false"),
+    "label-sharpness": ("--set", "deformation.label_sharpness=0"),
+    "part-sharpness": ("--set", "deformation.part_sharpness=0"),
+    "spun-shaft": ("--set", "deformation.shaft_roll=0"),
+    "opacity-penalty": ("--set", "deformation.opacity_penalty=0"),
+    "extrapolated-tissue": ("--set", "deformation.extrapolate_tissue=false"),
+    "corrected-axes": ("--set", "deformation.stated_axes=false"),
+    "corrected-readings": ("--set", "deformation.stated_readings=false"),
+    "frame-poses": ("--set", "refine.frame_poses=false"),
+    "frame-joints": ("--set", "refine.frame_joints=false"),
+}
+START = "import sys; from neeco.cli import main; sys.exit(main())"
+LAST_LINES = 12
+ERRORS_OVER_SD = re.compile(r"(, wrong states)? \((\d+) frames\): .*; / sd (\S+) (\S+) (\S+)")
+
+
+@dataclass(frozen=True)
+class Build:
+    """A checkout with its kernels, and what is left out of it."""
+
+    title: str
+    checkout: Path
+    without: str = ""
+
+    def words(self, verb: str, *words: str) -> list[str]:
+        """A command line of this build."""
+        left_out = WITHOUT.get(self.without, ())
+        if isinstance(left_out, str):
+            return [sys.executable, "-c", f"{left_out}\n{START}", verb, *words]
+        return [sys.executable, "-c", START, verb, *words, *(left_out if verb == "train" else ())]
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """One thread each: jobs run side by side."""
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        return {**os.environ, **threads, "PYTHONPATH": str(self.checkout / "src")}
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A command that has ended: exit status, what it said, processor seconds and peak memory (GiB)."""
+
+    status: int
+    said: str
+    seconds: float
+    gib: float
+
+
+def builds_of(names: Sequence[str], work: Path) -> list[Build]:
+    """The builds of these names; commits are checked out below `work`. Raises NeecoError for unknown ones."""
+    found = []
+    for name in names:
+        commit, _, without = name.partition(":")
+        without = without.removeprefix("without-")
+        if without and without not in WITHOUT:
+            raise NeecoError(f"{name}: {without} cannot be left out; one of {', '.join(WITHOUT)} can")
+        found.append(Build(name, ROOT if commit == "." else _checked_out(commit, work / "builds"), without))
+    return found
+
+
+def _checked_out(commit: str, folder: Path) -> Path:
+    """The checkout of a commit, its kernels built once."""
+    said = subprocess.run(["git", "rev-parse", "--short=10", f"{commit}^{{commit}}"], cwd=ROOT, capture_output=True)
+    if said.returncode:
+        raise NeecoError(f"--commits: {commit} is no commit of this repository")
+    path = folder / said.stdout.decode().strip()
+    if not (path / "src" / "neeco").exists():
+        path.mkdir(parents=True)
+        archive = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True, check=True)
+        subprocess.run(["tar", "-x"], cwd=path, input=archive.stdout, check=True)
+    if not list((path / "src" / "neeco").glob("_native*")):
+        with tempfile.TemporaryDirectory() as scratch:
+            options = ["--quiet", "--no-deps", "--no-build-isolation", "--target", scratch]
+            subprocess.run([sys.executable, "-m", "pip", "install", *options, str(path)], check=True)
+            (kernels,) = Path(scratch).glob("neeco/_native*")
+            shutil.copy(kernels, path / "src" / "neeco")
+    return path
+
+
+def run_all(
+    builds: Sequence[Build], seeds: Sequence[int], work: Path, options: Sequence[str], workers: int, *, quick: bool
+) -> None:
+    """Run what is not there yet, every build on one world after the other; says each result as it comes."""
+    jobs = [(build, seed) for seed in seeds for build in builds if not result_path(work, build.title, seed).exists()]
+    began = time.monotonic()
+    with ProcessPoolExecutor(workers) as pool:
+        drawn = {}
+        for seed in dict.fromkeys(seed for _, seed in jobs):
+            drawn[seed] = pool.submit(_drawn, seed, work, quick)
+        for seed, future in drawn.items():
+            if (fault := future.result()) is not None:
+                print(f"world {seed}: {fault}", flush=True)
+        jobs = [(build, seed) for build, seed in jobs if (capture_path(work, seed) / "world.json").exists()]
+        running = {pool.submit(_run, build, seed, work, tuple(options)): (build, seed) for build, seed in jobs}
+        for count, future in enumerate(as_completed(running), 1):
+            build, seed = running[future]
+            result, passed = future.result(), time.monotonic() - began
+            left = passed / count * (len(jobs) - count)
+            score = "refused" if result["iou"] is None else f"IoU {result['iou']:.3f}"
+            print(f"{count} of {len(jobs)}, {left / 60:.0f} min left: world {seed}, {build.title}: {score}", flush=True)
+
+
+def result_path(work: Path, title: str, seed: int) -> Path:
+    """Where the result of a job lies."""
+    return work / "results" / title.replace(":", "-") / f"{seed}.json"
+
+
+def run_path(work: Path, title: str, seed: int) -> Path:
+    """The run folder of a job."""
+    return work / "runs" / title.replace(":", "-") / str(seed)
+
+
+def capture_path(work: Path, seed: int) -> Path:
+    """Where a world lies."""
+    return work / "worlds" / str(seed)
+
+
+def _drawn(seed: int, work: Path, quick: bool) -> str | None:
+    """Draw a world where it is absent; return why it cannot be drawn."""
+    torch.set_num_threads(1)
+    path = capture_path(work, seed)
+    if (path / "world.json").exists():
+        return None
+    shutil.rmtree(path, ignore_errors=True)
+    try:
+        world = draw_world(seed)
+        write_world(replace(world, size=SIZES[0], scale=1.0) if quick else world, path)
+    except NeecoError as error:
+        return str(error)
+    return None
+
+
+def _run(build: Build, seed: int, work: Path, options: tuple[str, ...]) -> dict[str, Any]:
+    """One job; writes and returns its result."""
+    capture, run = capture_path(work, seed), run_path(work, build.title, seed)
+    world = read_json(capture / "world.json")
+    shutil.rmtree(run, ignore_errors=True)
+    checked = _command(build, "check", str(capture), "--json", "-")
+    scale = () if world["scale"] == 1.0 else ("--scale", str(world["scale"]))
+    trained = _command(build, "train", str(capture), "--output", str(run), *scale, *options)
+    result: dict[str, Any] = {
+        "seed": seed,
+        "build": build.title,
+        "world": world,
+        "check": [problem["message"] for problem in json.loads(checked.said)["problems"]] if checked.said else [],
+        "status": trained.status,
+        "warnings": [line for line in trained.said.splitlines() if "warning:" in line],
+        "said": trained.said.splitlines()[-LAST_LINES:],
+        "train_seconds": trained.seconds,
+        "gib": trained.gib,
+        "iou": None,
+        "doubts": [],
+    }
+    if trained.status == 0:
+        result |= _evaluated(build, run)
+    write_json(result_path(work, build.title, seed), result)
+    return result
+
+
+def _evaluated(build: Build, run: Path) -> dict[str, Any]:
+    """Scores, doubts and errors over stated deviations of a run."""
+    ended = _command(build, "evaluate", str(run), "--align")
+    if ended.status:
+        return {"status": ended.status, "said": ended.said.splitlines()[-LAST_LINES:]}
+    evaluation = read_json(run / "evaluation.json")
+    aligned, given = evaluation["aligned"], evaluation["given"]
+    keys = ("mask_iou", "mask_precision", "shaft_recall", "psnr", "psnr_instrument")
+    scores = {kind: {split: {key: rows[key] for key in keys} for split, rows in splits.items()}
+              for kind, splits in (("aligned", aligned), ("given", given))}  # fmt: skip
+    ious = [rows["mask_iou"] for rows in aligned.values()]
+    recalls = [rows["shaft_recall"] for rows in aligned.values() if rows["shaft_recall"] is not None]
+    found: dict[str, Any] = {
+        "iou": sum(ious) / len(ious),
+        "recall": min(recalls) if recalls else None,
+        "scores": scores,
+        "doubts": evaluation.get("doubts", []),
+        "evaluate_seconds": ended.seconds,
+    }
+    script = str(build.checkout / "benchmarks" / "state_scores.py")
+    states = subprocess.run(
+        [sys.executable, script, str(run)], env=build.environment, capture_output=True, text=True
+    ).stdout
+    for wrong, count, *values in ERRORS_OVER_SD.findall(states):
+        key = "over_sd_wrong" if wrong else "over_sd"
+        found[key] = {"frames": int(count), "turn_shift_joints": [float(value) for value in values]}
+    return found
+
+
+def _command(build: Build, verb: str, *words: str) -> Ended:
+    """Run one command of a build. What it says on stderr follows what it says on stdout."""
+    with tempfile.TemporaryFile("w+") as said, tempfile.TemporaryFile("w+") as noted:
+        child = subprocess.Popen(build.words(verb, *words), env=build.environment, stdout=said, stderr=noted)
+        _, status, used = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        text = ""
+        for file in (said, noted):
+            file.seek(0)
+            text += "" if file is noted and verb == "check" else file.read()
+    return Ended(child.returncode, text, used.ru_utime + used.ru_stime, used.ru_maxrss / 2**20)
