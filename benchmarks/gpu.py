@@ -6,7 +6,8 @@
 Method `kinematic`, random Gaussians on a closed surface, a fifth of them the instrument's: `frame` poses and renders
 them, `step` does, takes the photometric loss and its gradients and one step of Adam; `draw` and `draw+backward`
 do the rasteriser's part alone, on the same posed tensors for all backends. Backends take turns, call by call; numbers
-are medians of the time from an idle device to an idle device, after three calls to warm up. Stages are timed by CUDA
+are medians of the time from an idle device to an idle device, after three calls to warm up. gsplat (pip install gsplat;
+the stated numbers are of 1.5.3) takes part where it is installed. Stages are timed by CUDA
 events in calls of their own, and held against peaks measured in the same run (`stages.MODEL`). FOLDER gets gpu.md and
 gpu.json, after every part.
 
