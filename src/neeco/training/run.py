@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -70,9 +70,9 @@ class TrainedRun:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons to doubt the labels, by what training measured: too few iterations, joints that were not found."""
+        """Reasons to doubt the labels, by what training measured: too few iterations, else joints not found."""
         recorded, noted = len(self.scene.recorded.names), getattr(self.scene, "diagnostics", {})
-        usual = replace(method_defaults(self.config["method"]), iterations=None).for_frames(recorded).length
+        usual = method_defaults(self.config["method"]).usual_length(recorded)
         if usual.is_short(done := noted.get("iterations", usual.iterations)):
             return (f"training ended after {done:,} iterations, usual are {usual.iterations:,}",)
         joints = noted.get("joints", {}).items()
