@@ -77,6 +77,12 @@ def test_without_truth_the_mask_numbers_are_null_and_a_note_says_so(world, tmp_p
     assert any("no frame has a true or reference mask" in note for note in evaluation["notes"])
 
 
+def test_what_holds_of_several_splits_is_noted_once(world, tmp_path):
+    evaluation = evaluated(make_run(world, tmp_path, truth=False), ["train", "test"])
+    (note,) = [note for note in evaluation["notes"] if "no frame has a true or reference mask" in note]
+    assert note.startswith("train, test: psnr_instrument, mask_iou, part_iou: null")
+
+
 def test_reference_masks_of_some_frames_are_used_and_counted(world, tmp_path):
     run = make_run(world, tmp_path, ("train", "test", "test"), truth=False)
     mask = torch.zeros(world.HEIGHT, world.WIDTH, dtype=torch.uint8)

@@ -259,7 +259,8 @@ def test_a_run_killed_before_its_first_whole_file_begins_again(capture: Path, tm
     assert hidden_files(run) == []
 
 
-def test_where_nothing_was_begun_nothing_is_resumed(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_where_nothing_was_begun_nothing_is_resumed(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "runs" / "none"
     assert main(["train", str(capture), "--output", str(output), "--resume"]) == 1

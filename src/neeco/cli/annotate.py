@@ -67,5 +67,10 @@ def run(arguments: Arguments) -> int:
                 on_progress=advance,
             )
         page = write_annotated_page(annotated.output, annotated.records, annotated.capture, arguments.min_trust)
-    print(f"{annotated.written} of {len(annotated.records)} frames in {annotated.output}; worst first: {page}")
+    written, total = annotated.written, len(annotated.records)
+    print(f"{written} of {total} frames in {annotated.output}")
+    if written < total:
+        print(f"{total - written} trusted less than {arguments.min_trust:g}: left out")
+    print("numbered anew; field frame of states.jsonl has the capture's name")
+    print(f"labels, worst first: {page}")
     return 0

@@ -217,8 +217,8 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
             session.seconds, last = session.seconds + now - last, now
             if session.phase != phase:
                 phase = session.phase
-                why = "enough of the run is over" if session.forced else "PSNR is high enough and the loss falls"
-                log.note(f"phase {phase} of the schedule begins at iteration {session.iteration}: {why}")
+                why = "enough of the run is over" if session.forced else "PSNR is high enough"
+                log.note(f"iteration {session.iteration}: details are learned from now on, phase {phase} ({why})")
             session.between_steps(before)
             if due(config.log_interval, iteration, session.iteration):
                 log.row(session)
