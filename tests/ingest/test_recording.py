@@ -14,7 +14,7 @@ from neeco.ingest.readers.columns import Units
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import IngestSettings, Splits
-from neeco.ingest.recording.template import write_template
+from neeco.ingest.recording.template import open_questions, write_template
 from neeco.ingest.sources import recording_from_flags
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
@@ -94,6 +94,27 @@ def test_init_writes_what_the_flags_say(folder):
                 read_reading_log(mine.joints[joint]).values, read_reading_log(theirs.joints[joint]).values
             )
     assert recording.laparoscope.path.name == "camera.csv"
+
+
+def test_init_asks_for_the_lens_and_the_clock_that_no_file_states(folder):
+    def asked() -> list[str]:
+        draft = write_template(folder)
+        return [draft.splitlines()[line - 1] for line, _ in open_questions(draft)]
+
+    lens = folder / "lens.json"
+    lens.write_text(json.dumps({"fl_x": 290, "fl_y": 290, "cx": 160, "cy": 128, "w": 320, "h": 256}))
+    assert not any("intrinsics" in line or "sync" in line for line in asked())
+    lens.unlink()
+    (folder / "logs/sync.json").unlink()
+    (folder / "capture").mkdir()
+    document = {"fl_x": 1, "frames": [], "clocks": {"em": {"offset_s": 0.1, "sd_s": 0.001}}}  # as `ingest` writes it
+    (folder / "capture/transforms.json").write_text(json.dumps(document))
+    assert [line for line in asked() if "intrinsics" in line or "sync" in line] == [
+        "# intrinsics: [290, 290, 160, 128]   # no calibration was found",
+        "# sync: {jaw_angle: 0.0}   # a clock of its own",
+    ]
+    (folder / "recording.yaml").write_text(write_template(folder).replace("# sync: {jaw", "sync: {jaw"))
+    assert read_recording(folder / "recording.yaml").sync == {"jaw_angle": 0.0}
 
 
 def test_init_asks_for_what_no_header_says(world):

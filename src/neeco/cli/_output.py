@@ -180,6 +180,10 @@ def state_defaults(kind: Any) -> None:
         if dataclasses.is_dataclass(bare):
             state_defaults(bare)  # type: ignore[arg-type]
             continue
+        if tyro.conf.Positional in markers and not any(getattr(marker, "metavar", None) for marker in markers):
+            name = field.name.upper()
+            hint = Annotated[hint, tyro.conf.arg(metavar=f"[{name} ...]" if typing.get_origin(bare) is tuple else name)]
+            kind.__annotations__[field.name] = hint
         required = field.default is dataclasses.MISSING and typing.get_origin(bare) is tuple
         empty = required or field.default in (None, ())
         if empty and field.name in texts and tyro.conf.UseAppendAction not in markers:

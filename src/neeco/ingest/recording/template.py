@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from neeco.capture.documents import as_float
 from neeco.errors import NeecoError, visible
 from neeco.files import read_json, require_content
 from neeco.ingest.calibration.lens import read_lens
@@ -39,6 +40,7 @@ from neeco.ingest.readers.ndi import tool_columns, tool_names
 from neeco.ingest.readers.rosbag import DVRK_WRIST
 from neeco.ingest.readers.video import IMAGES
 from neeco.ingest.recording.drafted_scope import FoundFrames, StandsStill, draft_scope
+from neeco.ingest.recording.file import stated_offsets
 from neeco.placeholders import placeholder
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts", ".wmv", ".mxf")
@@ -159,6 +161,8 @@ def write_template(
     own = scopes[0][0].stream if scopes else None
     scope = draft_scope(frames, found.lenses, None if own is None else found.travels.get(own.name), stands_still)
     guess = "" if found.videos else "   # the rate is a guess: correct it"
+    instruments = _instruments(found, poses, scope.still or not scopes)
+    joints = [joint for instrument in instruments for joint in instrument["joints"]]
     environment = Environment(
         loader=PackageLoader("neeco.ingest.recording", ""),
         undefined=StrictUndefined,
@@ -171,11 +175,14 @@ def write_template(
         frames=[f"{frames[0].line}{guess}", *(item.line for item in frames[1:] if item.line != scope.right)],
         camera=scope,
         lenses=found.lenses,
-        instruments=_instruments(found, poses, scope.still or not scopes),
+        instruments=instruments,
         scope=_pose_lines(*scopes[0]) if scopes else None,
         scope_hints=scopes[0][0].hints if scopes else (),
         other_scopes=[", ".join(log.lines()) for log, _ in scopes[1:]],
         sync=next(iter(found.syncs), None),
+        own_clocks=[
+            name for name, lines in joints if not any(line.startswith(("clock:", "stream:")) for line in lines)
+        ],
         shares_clock=any(log.stream is not None and log.file == frames[0].name for log, _ in found.poses),
         others=found.others[:MAX_OTHERS],
         episodes=found.episodes,
@@ -189,6 +196,8 @@ _QUESTIONS = (
     (r"^ +# camera_from_base: \{transform", "how does the robot's base stand to the camera? Remove the # of one line"),
     (r"a guess: correct it", "at which rate were these taken? Correct the number"),
     (r"# units: .*nothing says them", "in which units? Correct them and remove the #"),
+    (r"^# intrinsics: .*no calibration was found", "which lens? Remove the # and give a calibration's file or numbers"),
+    (r"^# sync: .*a clock of its own", "by how many seconds is this log ahead of the video? Correct it, remove the #"),
     (r"is not clear: ", "which columns hold it? Name them"),
     (r"^ +# +(?:frame|quaternion\w*|rotation\w*|euler\w*): ", "what do its poses mean? Correct it, remove the #"),
 )
@@ -343,7 +352,8 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
 def _is_sync(file: Path) -> bool:
     with suppress(NeecoError):
         document = read_json(file)
-        return isinstance(document, dict) and any(key == "clocks" or key.endswith("_minus_video_s") for key in document)
+        offsets = stated_offsets(document) if isinstance(document, dict) else {}
+        return bool(offsets) and None not in map(as_float, offsets.values())  # a capture's "clocks" hold more
     return False
 
 
