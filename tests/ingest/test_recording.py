@@ -103,18 +103,19 @@ def test_init_asks_for_the_lens_and_the_clock_that_no_file_states(folder):
 
     lens = folder / "lens.json"
     lens.write_text(json.dumps({"fl_x": 290, "fl_y": 290, "cx": 160, "cy": 128, "w": 320, "h": 256}))
-    assert not any("intrinsics" in line or "sync" in line for line in asked())
+    assert not any("intrinsics" in line or "clock" in line for line in asked())
     lens.unlink()
     (folder / "logs/sync.json").unlink()
     (folder / "capture").mkdir()
     document = {"fl_x": 1, "frames": [], "clocks": {"em": {"offset_s": 0.1, "sd_s": 0.001}}}  # as `ingest` writes it
     (folder / "capture/transforms.json").write_text(json.dumps(document))
-    assert [line for line in asked() if "intrinsics" in line or "sync" in line] == [
+    assert [line.strip() for line in asked() if "intrinsics" in line or "clock" in line] == [
         "# intrinsics: [290, 290, 160, 128]   # no calibration was found",
-        "# sync: {jaw_angle: 0.0}   # a clock of its own",
+        "# clock: em   # left out, it is its own, whose offset nothing states",
     ]
-    (folder / "recording.yaml").write_text(write_template(folder).replace("# sync: {jaw", "sync: {jaw"))
-    assert read_recording(folder / "recording.yaml").sync == {"jaw_angle": 0.0}
+    (folder / "recording.yaml").write_text(write_template(folder).replace("# clock: em ", "clock: em "))
+    [instrument] = read_recording(folder / "recording.yaml").instruments
+    assert instrument.joints["jaw_angle"].clock == "em"
 
 
 def test_init_asks_for_what_no_header_says(world):

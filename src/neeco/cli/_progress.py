@@ -159,27 +159,21 @@ def counting(title: str, total: int | None = None) -> Iterator[Callable[..., Non
 
 
 @contextmanager
-def resumable(how: str, begun: Path | None = None) -> Iterator[None]:
-    """Report `how` to resume where Ctrl-C, a failing GPU or too little memory ends the block, once folder `begun` holds
-    anything.
+def resumable(begun: Path, how: str = "it is kept; run the same command again with --resume") -> Iterator[None]:
+    """Report `how` to resume where Ctrl-C, a failing GPU or too little memory ends the block, once `begun` has files.
 
     Ctrl-C's own message goes first where it has one. Raises KeyboardInterrupt and NeecoError.
     """
     try:
         yield
     except (KeyboardInterrupt, Exception) as error:
-        if begun is not None and is_vacant(begun):
+        if is_vacant(begun):
             raise
         if isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt(*(error.args or (how,))) from None
         if failure := device_failure(error):
             raise NeecoError(f"{failure}; {how}") from error
         raise
-
-
-def _forecast(before: ProgressRow, row: ProgressRow) -> float:
-    """Return how many seconds a run takes in all at the speed between two rows."""
-    return row.seconds + (1 - row.progress) * (row.seconds - before.seconds) / (row.progress - before.progress)
 
 
 def train_with_progress(
@@ -197,13 +191,13 @@ def train_with_progress(
             timed.append(row)
             slow = "; a CUDA device would be used if there were one" if device.type == "cpu" else ""
             bars.training(replace(row, note=f"training on {device.type} begins{slow}; watch it: neeco view {run}"))
-        elif not row.note and len(timed) == 1 and row.progress - timed[0].progress >= MIN_TIMED_SHARE:
+        elif not row.note and len(timed) == 1 and (done := row.progress - timed[0].progress) >= MIN_TIMED_SHARE:
+            took = row.seconds + (1 - row.progress) * (row.seconds - timed[0].seconds) / done
+            bars.training(replace(row, note=f"training takes about {_duration(took)} in all at this speed"))
             timed.append(row)
-            took = f"{_duration(_forecast(*timed))} in all at this speed, estimated anew as it goes on"
-            bars.training(replace(row, note=f"training takes about {took}"))
         bars.training(row)
 
-    with Bars() as bars, resumable(how, output):
+    with Bars() as bars, resumable(output, how):
         path = train(capture, output, config, device=device, resume=resume, progress=show)
         bars.end("training")
     return path

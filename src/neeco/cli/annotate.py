@@ -51,10 +51,7 @@ def run(arguments: Arguments) -> int:
     with open_gaussian_run(arguments.run, "annotate", device, force=arguments.force) as trained:
         trained.require_trusted("annotate")
         capture = None if arguments.capture is None else read_checked(arguments.capture)
-        with (
-            counting("annotate") as advance,
-            resumable("what was done is kept; run the same command again with --resume", arguments.output),
-        ):
+        with counting("annotate") as advance, resumable(arguments.output):
             annotated = annotate_capture(
                 trained,
                 arguments.output,
@@ -67,10 +64,9 @@ def run(arguments: Arguments) -> int:
                 on_progress=advance,
             )
         page = write_annotated_page(annotated.output, annotated.records, annotated.capture, arguments.min_trust)
-    written, total = annotated.written, len(annotated.records)
-    print(f"{written} of {total} frames in {annotated.output}")
-    if written < total:
-        print(f"{total - written} trusted less than {arguments.min_trust:g}: left out")
+    count, left = len(annotated.records), len(annotated.records) - annotated.written
+    out = f"; {left} trusted less than {arguments.min_trust:g}: left out" if left else ""
+    print(f"{annotated.written} of {count} frames in {annotated.output}{out}")
     print("numbered anew; field frame of states.jsonl has the capture's name")
     print(f"labels, worst first: {page}")
     return 0

@@ -56,10 +56,7 @@ def run(arguments: Arguments) -> int:
         check_hub(arguments.push_to_hub)
     settings = arguments.settings
     tissue, instruments = _runs(arguments)
-    with (
-        Bars() as bars,
-        resumable("what was rendered is kept; run the same command again with --resume", arguments.output),
-    ):
+    with Bars() as bars, resumable(arguments.output):
         made = synthesize(
             tissue,
             arguments.output,

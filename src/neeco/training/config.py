@@ -126,10 +126,6 @@ class TrainConfig:
         share = min(1.0, frames / max(1, method_class(self.method).enough_frames))
         return replace(self, iterations=round(ITERATIONS * (1 + 2 * share) / 3))
 
-    def usual_length(self, frames: int) -> RunLength:
-        """Return the length of a run of so many training frames where nobody sets another."""
-        return replace(self, iterations=None, minutes=None).for_frames(frames).length
-
 
 def method_defaults(method: str) -> TrainConfig:
     """Return the config that a method starts from: the paper's, with the method's changes. Raises NeecoError for an

@@ -414,15 +414,10 @@ def _sync(
     with faults_in(file):
         if isinstance(document.get("clocks"), dict):
             return _offsets(node_of(document["clocks"], file, "clocks"), clocks)
-        if not (stated := stated_offsets(document)):
+        stated = {key: value for key, value in document.items() if key.endswith(_OFFSET_SUFFIX)}
+        if not stated:
             raise Fault("clocks", 'missing; give offsets, as in {"clocks": {"em": 0.038}}')
         return _offsets(node_of(stated, file), clocks)
-
-
-def stated_offsets(document: dict[str, Any]) -> dict[str, Any]:
-    """Return what a JSON file of clock offsets holds of them, by clock."""
-    named = {key: value for key, value in document.items() if key.endswith(_OFFSET_SUFFIX)}
-    return document["clocks"] if isinstance(document.get("clocks"), dict) else named
 
 
 def _offsets(node: Node, clocks: tuple[str, ...]) -> tuple[dict[str, float], tuple[str, ...]]:

@@ -40,7 +40,6 @@ from neeco.ingest.readers.ndi import tool_columns, tool_names
 from neeco.ingest.readers.rosbag import DVRK_WRIST
 from neeco.ingest.readers.video import IMAGES
 from neeco.ingest.recording.drafted_scope import FoundFrames, StandsStill, draft_scope
-from neeco.ingest.recording.file import stated_offsets
 from neeco.placeholders import placeholder
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts", ".wmv", ".mxf")
@@ -161,8 +160,6 @@ def write_template(
     own = scopes[0][0].stream if scopes else None
     scope = draft_scope(frames, found.lenses, None if own is None else found.travels.get(own.name), stands_still)
     guess = "" if found.videos else "   # the rate is a guess: correct it"
-    instruments = _instruments(found, poses, scope.still or not scopes)
-    joints = [joint for instrument in instruments for joint in instrument["joints"]]
     environment = Environment(
         loader=PackageLoader("neeco.ingest.recording", ""),
         undefined=StrictUndefined,
@@ -175,14 +172,11 @@ def write_template(
         frames=[f"{frames[0].line}{guess}", *(item.line for item in frames[1:] if item.line != scope.right)],
         camera=scope,
         lenses=found.lenses,
-        instruments=instruments,
+        instruments=_instruments(found, poses, scope.still or not scopes),
         scope=_pose_lines(*scopes[0]) if scopes else None,
         scope_hints=scopes[0][0].hints if scopes else (),
         other_scopes=[", ".join(log.lines()) for log, _ in scopes[1:]],
         sync=next(iter(found.syncs), None),
-        own_clocks=[
-            name for name, lines in joints if not any(line.startswith(("clock:", "stream:")) for line in lines)
-        ],
         shares_clock=any(log.stream is not None and log.file == frames[0].name for log, _ in found.poses),
         others=found.others[:MAX_OTHERS],
         episodes=found.episodes,
@@ -197,7 +191,7 @@ _QUESTIONS = (
     (r"a guess: correct it", "at which rate were these taken? Correct the number"),
     (r"# units: .*nothing says them", "in which units? Correct them and remove the #"),
     (r"^# intrinsics: .*no calibration was found", "which lens? Remove the # and give a calibration's file or numbers"),
-    (r"^# sync: .*a clock of its own", "by how many seconds is this log ahead of the video? Correct it, remove the #"),
+    (r"^ +# clock: .*its own", "is it the clock of the poses? Remove the #; else give its offset in sync, below"),
     (r"is not clear: ", "which columns hold it? Name them"),
     (r"^ +# +(?:frame|quaternion\w*|rotation\w*|euler\w*): ", "what do its poses mean? Correct it, remove the #"),
 )
@@ -351,9 +345,9 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
 
 def _is_sync(file: Path) -> bool:
     with suppress(NeecoError):
-        document = read_json(file)
-        offsets = stated_offsets(document) if isinstance(document, dict) else {}
-        return bool(offsets) and None not in map(as_float, offsets.values())  # a capture's "clocks" hold more
+        held = document if isinstance(document := read_json(file), dict) else {}
+        offsets = held.get("clocks") or {key: held[key] for key in held if key.endswith("_minus_video_s")}
+        return isinstance(offsets, dict) and bool(offsets) and None not in map(as_float, offsets.values())
     return False
 
 
@@ -423,7 +417,8 @@ def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value:
     time = [f"  time: {_list(when.time)}"] if when.time and log.stream is None else []
     # a table of several joints is a robot's, as its poses are
     clock = ["clock: em   # that of the poses: correct it where another computer logged it"]
-    lines = [*log.lines(), *(clock if named and log.stream is None else []), "columns:", *time]
+    own = [] if found.syncs else ["# clock: em   # left out, it is its own, whose offset nothing states"]
+    lines = [*log.lines(), *([] if log.stream else clock if named else own), "columns:", *time]
     lines.append(f"  value: {_scalar(value)}")
     stem = log.stem.lower()
     tables = [name for name, header in found.calibrations if value in header]

@@ -114,7 +114,7 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
     explained = 1 - given / middle if middle > 0 else 0.0
     explains = bool(explained > MIN_JOINT_EXPLAINED and math.isfinite(explained))
     warning = scene.diagnostics.get("doubted_readings", {}).get(f"{instrument.name}.{name}")
-    usual = session.config.usual_length(len(session.views.frames))
+    usual = replace(session.config, iterations=None).for_frames(len(session.views.frames)).length
     if short := usual.is_short(session.iteration):
         verdict = f"not judged: {session.iteration:,} iterations are too few, usual are {usual.iterations:,}"
     elif warning is not None:
