@@ -417,9 +417,8 @@ def read_begun(
 ) -> dict[str, Any] | None:
     """Return what file `name` in folder `output` says of the `work` (a noun) begun there; None for a vacant folder.
 
-    resume: whether the user wants to continue it; None: continue it where it was begun. read: reads it from the folder;
-    None: the file is JSON. Raises NeecoError where `output` may not be written to: it is no folder, is vacant (with
-    `resume`) or not empty (without), or holds something else.
+    resume: continue it; None: where it was begun. read: reads it from the folder; None: the file is JSON. Raises
+    NeecoError where `output` is no folder, vacant (with `resume`) or not empty (without), or holds something else.
     """
     file = output / name
     if output.exists() and not output.is_dir():

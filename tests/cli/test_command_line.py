@@ -306,3 +306,27 @@ def test_a_folder_of_another_kind_is_called_what_it_is(
     printed = capsys.readouterr()
     wanted = "a run folder" if verb == "evaluate" else "the folder of a capture"
     assert f"{given}: {told.format(wanted)}" in (printed.err if verb == "evaluate" else printed.out)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["synthesize", "run", "--output", "set", "--count", "3", "--class-names"],
+        ["annotate", "run", "--formats", "--output", "set"],
+        ["evaluate", "run", "--splits", "--align"],
+        ["train", "capture", "--joints", "--output", "run"],
+    ],
+)
+def test_an_option_of_several_values_without_one_is_refused(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    option = next(word for word in words if word in ("--class-names", "--formats", "--splits", "--joints"))
+    assert cli.main(words) == 1
+    assert capsys.readouterr().err == f"neeco: error: {option}: no value follows; give one or more, or leave it out\n"
+
+
+@pytest.mark.parametrize("words", [["evaluate", "run"], ["score-masks", "drawn", "true"], ["check", "capture"]])
+def test_numbers_go_to_no_file_without_the_ending_json(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*words, "--json=ev"]) == 1
+    told = "--json: ev has no ending; name a file that ends in .json, or none, to print the numbers"
+    assert capsys.readouterr().err == f"neeco: error: {told}\n"

@@ -31,6 +31,7 @@ def test_a_scene_scored_on_its_own_drawings_is_nearly_perfect(world, tmp_path):
     run = make_run(world, tmp_path)
     seen = []
     evaluation = evaluated(run, progress=lambda *event: seen.append(event))
+    assert all(done == total for done, total in {what: count for what, *count in seen}.values())  # the last of each
     numbers = evaluation["given"]["test"]
     assert set(evaluation["given"]) == {"test", "unseen"}
     assert numbers["psnr"] > 45  # 8 bit rounding

@@ -355,3 +355,23 @@ def test_two_instruments_with_one_joint_name_have_two_clocks(world, folder):
     text = "video: video.mp4\ninstruments:\n"
     text += "".join(f"  - name: {name}\n    joints: {{jaw: logs/jaw.csv}}\n" for name in ("left", "right"))
     assert read_recording(world.text(text, "recording.yaml")).clocks == ("left.jaw", "right.jaw")
+
+
+def test_a_fault_of_a_flag_is_told_by_its_flag(folder):
+    (folder / "empty").mkdir()
+    with pytest.raises(NeecoError, match=r"--video: .*empty: holds no images; give a folder of frames"):
+        recording_from_flags(folder / "empty")
+    (folder / "frames").mkdir()
+    Image.new("RGB", (8, 8)).save(folder / "frames" / "1.png")
+    with pytest.raises(NeecoError, match=r"--video: .*frames: when were the images taken\? Give --fps"):
+        recording_from_flags(folder / "frames")
+    joint = ("jaw_angle", folder / "logs/jaw_calibration.csv", folder / "logs/jaw.csv")
+    with pytest.raises(
+        NeecoError, match=r"--joint jaw_angle: .*calibration\.csv has no times, .*jaw\.csv has; give the"
+    ):
+        flags(folder, joints=[joint])
+    with pytest.raises(NeecoError, match=r"^--intrinsics: fl_x, fl_y: must be two positive focal lengths in pixels"):
+        flags(folder, intrinsics=(-290, 290, 160, 128)).read_lens()
+    with pytest.raises(NeecoError) as told:
+        flags(folder, intrinsics=None, calibration=folder / "logs/jaw.csv").read_lens()
+    assert str(told.value).count("jaw.csv") == 1

@@ -199,8 +199,8 @@ def test_files_are_numbered_anew_and_the_card_and_the_command_say_so(
     assert main(["annotate", "run", "--output", str(tmp_path / "set")]) == 0
     assert capsys.readouterr().out.splitlines() == [
         f"7 of 8 frames in {tmp_path / 'set'}; 1 trusted less than 0.8: left out",
-        "numbered anew; field frame of states.jsonl has the capture's name",
-        f"labels, worst first: {tmp_path / 'set' / 'annotate.html'}",
+        "numbered anew; field frame of states.jsonl has the capture's name; worst first: "
+        f"{tmp_path / 'set' / 'annotate.html'}",
     ]
 
 

@@ -160,10 +160,8 @@ def counting(title: str, total: int | None = None) -> Iterator[Callable[..., Non
 
 @contextmanager
 def resumable(begun: Path, how: str = "it is kept; run the same command again with --resume") -> Iterator[None]:
-    """Report `how` to resume where Ctrl-C, a failing GPU or too little memory ends the block, once `begun` has files.
-
-    Ctrl-C's own message goes first where it has one. Raises KeyboardInterrupt and NeecoError.
-    """
+    """Report `how` to resume where Ctrl-C, whose own message goes first, a failing GPU or too little memory ends the
+    block, once folder `begun` has files. Raises KeyboardInterrupt and NeecoError."""
     try:
         yield
     except (KeyboardInterrupt, Exception) as error:

@@ -67,6 +67,5 @@ def run(arguments: Arguments) -> int:
     count, left = len(annotated.records), len(annotated.records) - annotated.written
     out = f"; {left} trusted less than {arguments.min_trust:g}: left out" if left else ""
     print(f"{annotated.written} of {count} frames in {annotated.output}{out}")
-    print("numbered anew; field frame of states.jsonl has the capture's name")
-    print(f"labels, worst first: {page}")
+    print(f"numbered anew; field frame of states.jsonl has the capture's name; worst first: {page}")
     return 0

@@ -166,10 +166,9 @@ def evaluate_run(
     for split in splits:
         frames = capture.split(split)
         tallies = {kind: _Tally(PartTally(names)) for kind in kinds}
-        for index, frame in enumerate(frames):
-            report(split, index, len(frames))
+        for done, frame in enumerate(frames, 1):
             _score_frame(context, frame, tallies)
-        report(split, len(frames), len(frames))
+            report(split, done, len(frames))
         fps, count = _speed(scene, frames)
         for kind, tally in tallies.items():
             numbers, pair_assignment[kind][split] = _summary(scene, tally)

@@ -146,8 +146,7 @@ def read_config(path: Path) -> dict[str, Any]:
         if not entry.is_dir():  # folders that their owner has linked there are no part of the run
             require_inside(entry, path)
     if not os.path.lexists(file):
-        content = "the config.yaml that `neeco train` writes"
-        raise NeecoError(f"{path}: {'; '.join(misplaced(path, 'a run folder', content))}")
+        raise NeecoError(f"{path}: {'; '.join(misplaced(path, 'a run folder', 'config.yaml, by `neeco train`'))}")
     config = parse_yaml(file, read_text(file, "the settings of a run as YAML"), "train again")
     if not isinstance(config, dict) or config.get("schema") != SCHEMA:
         found = config.get("schema") if isinstance(config, dict) else None

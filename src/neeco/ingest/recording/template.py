@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from neeco.capture.documents import as_float
 from neeco.errors import NeecoError, visible
 from neeco.files import read_json, require_content
 from neeco.ingest.calibration.lens import read_lens
@@ -347,7 +346,7 @@ def _is_sync(file: Path) -> bool:
     with suppress(NeecoError):
         held = document if isinstance(document := read_json(file), dict) else {}
         offsets = held.get("clocks") or {key: held[key] for key in held if key.endswith("_minus_video_s")}
-        return isinstance(offsets, dict) and bool(offsets) and None not in map(as_float, offsets.values())
+        return isinstance(offsets, dict) and bool(offsets) and {*map(type, offsets.values())} <= {int, float}
     return False
 
 
