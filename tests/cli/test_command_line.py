@@ -277,3 +277,56 @@ def test_help_is_a_verb_and_a_file_is_no_capture(tmp_path: Path, capsys: pytest.
     (tmp_path / "README.md").write_text("# read me")
     assert cli.main(["check", str(tmp_path / "README.md")]) == 1
     assert "is no capture" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "check"])
+@pytest.mark.parametrize(
+    ("holds", "told"),
+    [
+        ("recording.yaml", "is a recording, not {}; `neeco ingest` makes a capture of it"),
+        ("config.yaml", "is a run, not {}; its config.yaml names its capture"),
+        ("transforms.json", "is a capture, not {}; `neeco train` makes a run of it"),
+        ("jaw.csv", "is not {}; one holds "),
+        ("a pipe", "is a device, pipe or socket; give {}"),
+        ("nothing", "no such "),
+    ],
+)
+def test_a_folder_of_another_kind_is_called_what_it_is(
+    verb: str, holds: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if (verb, holds) in (("evaluate", "config.yaml"), ("check", "transforms.json")):
+        return  # what is asked for
+    given = tmp_path / "raw"
+    if holds == "a pipe":
+        os.mkfifo(given)
+    elif holds != "nothing":
+        given.mkdir()
+        (given / holds).write_text("{}")
+    assert cli.main([verb, str(given)]) == 1
+    printed = capsys.readouterr()
+    wanted = "a run folder" if verb == "evaluate" else "the folder of a capture"
+    assert f"{given}: {told.format(wanted)}" in (printed.err if verb == "evaluate" else printed.out)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["synthesize", "run", "--output", "set", "--count", "3", "--class-names"],
+        ["annotate", "run", "--formats", "--output", "set"],
+        ["evaluate", "run", "--splits", "--align"],
+        ["train", "capture", "--joints", "--output", "run"],
+    ],
+)
+def test_an_option_of_several_values_without_one_is_refused(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    option = next(word for word in words if word in ("--class-names", "--formats", "--splits", "--joints"))
+    assert cli.main(words) == 1
+    assert capsys.readouterr().err == f"neeco: error: {option}: no value follows; give one or more, or leave it out\n"
+
+
+@pytest.mark.parametrize("words", [["evaluate", "run"], ["score-masks", "drawn", "true"], ["check", "capture"]])
+def test_numbers_go_to_no_file_without_the_ending_json(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*words, "--json=ev"]) == 1
+    told = "--json: ev has no ending; name a file that ends in .json, or none, to print the numbers"
+    assert capsys.readouterr().err == f"neeco: error: {told}\n"

@@ -16,7 +16,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import make_dataclass
+from dataclasses import is_dataclass, make_dataclass
 from typing import Any, get_type_hints
 
 from neeco import __version__
@@ -192,6 +192,10 @@ def _dispatch(words: list[str]) -> int:
     from neeco.raster.native import keep_freed_memory
 
     keep_freed_memory()
+    groups = (parsed, *filter(is_dataclass, vars(parsed).values()))
+    for word in (word for word in words if word.startswith("--")):
+        if any(vars(group).get(word[2:].replace("-", "_")) == () for group in groups):
+            raise NeecoError(f"{word}: no value follows; give one or more, or leave it out")
     with readable_failures():
         return run(parsed)
 

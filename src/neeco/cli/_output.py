@@ -156,9 +156,10 @@ def ready_for_json(path: Path | None) -> Iterator[None]:
     Raises NeecoError for a folder, a name of another format, or a file whose folder cannot be written to.
     """
     file = None if path == STANDARD_OUTPUT else path
-    if file is not None and file.is_dir():
-        raise NeecoError(f"--json: {file} is a folder; name a file")
     if file is not None:
+        if file.is_dir() or not file.suffix:  # more likely a word that is not of --json
+            problem = "is a folder" if file.is_dir() else "has no ending"
+            raise NeecoError(f"--json: {file} {problem}; name a file that ends in .json, or none, to print the numbers")
         require_ending("--json", file, ".json")
         require_replaceable(file)
     with nullcontext() if file is None else new_folder(file.parent):
@@ -180,6 +181,9 @@ def state_defaults(kind: Any) -> None:
         if dataclasses.is_dataclass(bare):
             state_defaults(bare)  # type: ignore[arg-type]
             continue
+        if tyro.conf.Positional in markers and not any(getattr(marker, "metavar", None) for marker in markers):
+            name = f"[{field.name} ...]" if typing.get_origin(bare) is tuple else field.name
+            kind.__annotations__[field.name] = hint = Annotated[hint, tyro.conf.arg(metavar=name.upper())]
         required = field.default is dataclasses.MISSING and typing.get_origin(bare) is tuple
         empty = required or field.default in (None, ())
         if empty and field.name in texts and tyro.conf.UseAppendAction not in markers:

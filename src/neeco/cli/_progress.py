@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, Task, TaskID, TextColumn, TimeEla
 
 from neeco.cli._output import whole_lines
 from neeco.errors import NeecoError, visible
+from neeco.files import is_vacant
 from neeco.raster.devices import device_failure
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 LINE_INTERVAL_S = 30.0  # between two lines about the same work, where no terminal shows bars
 WIDE = 100  # characters of a terminal on which bars are long
 MIN_SHOWN_S = 1.0  # what took less has no last line
+MIN_TIMED_SHARE = 0.002  # of a run, between the two rows that its first forecast compares: progress is rounded
 EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
 
 
@@ -157,15 +159,13 @@ def counting(title: str, total: int | None = None) -> Iterator[Callable[..., Non
 
 
 @contextmanager
-def resumable(how: str, begun: Path | None = None) -> Iterator[None]:
-    """Report `how` to resume where Ctrl-C, a failing GPU or too little memory ends the block, once `begun` exists.
-
-    Ctrl-C's own message goes first where it has one. Raises KeyboardInterrupt and NeecoError.
-    """
+def resumable(begun: Path, how: str = "it is kept; run the same command again with --resume") -> Iterator[None]:
+    """Report `how` to resume where Ctrl-C, whose own message goes first, a failing GPU or too little memory ends the
+    block, once folder `begun` has files. Raises KeyboardInterrupt and NeecoError."""
     try:
         yield
     except (KeyboardInterrupt, Exception) as error:
-        if begun is not None and not begun.exists():
+        if is_vacant(begun):
             raise
         if isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt(*(error.args or (how,))) from None
@@ -182,18 +182,20 @@ def train_with_progress(
 
     run = shlex.quote(str(output))
     how = f"go on with: neeco train {shlex.quote(str(capture))} --output {run} --resume"
-    started: list[int] = []  # the iteration of the first row
+    timed: list[ProgressRow] = []  # two: what passed before the first of them says nothing of the speed
 
     def show(row: ProgressRow) -> None:
-        if not row.note and not started:
-            started.append(row.iteration)
+        if not row.note and not timed:
+            timed.append(row)
             slow = "; a CUDA device would be used if there were one" if device.type == "cpu" else ""
-            took = row.seconds / row.progress if row.progress > 0 else 0.0
-            forecast = f"takes about {_duration(took)} in all, estimated anew as it goes on" if took else "begins"
-            bars.training(replace(row, note=f"training on {device.type} {forecast}{slow}; watch it: neeco view {run}"))
+            bars.training(replace(row, note=f"training on {device.type} begins{slow}; watch it: neeco view {run}"))
+        elif not row.note and len(timed) == 1 and (done := row.progress - timed[0].progress) >= MIN_TIMED_SHARE:
+            took = row.seconds + (1 - row.progress) * (row.seconds - timed[0].seconds) / done
+            bars.training(replace(row, note=f"training takes about {_duration(took)} in all at this speed"))
+            timed.append(row)
         bars.training(row)
 
-    with Bars() as bars, resumable(how, output / "config.yaml"):
+    with Bars() as bars, resumable(output, how):
         path = train(capture, output, config, device=device, resume=resume, progress=show)
         bars.end("training")
     return path

@@ -10,7 +10,9 @@ from typing import Any
 from neeco.errors import NeecoError
 from neeco.files import write_text
 from neeco.ingest.cameras.still_scene import video_stands_still
-from neeco.ingest.readers import format_of
+from neeco.ingest.readers import format_of, read_table
+from neeco.ingest.readers.columns import recognise_time
+from neeco.ingest.readers.video import IMAGES
 from neeco.ingest.recording.file import RecordingSection, read_recording
 from neeco.ingest.recording.model import MAX_SHAFT_MM, MIN_FRAMES, Recording
 from neeco.ingest.recording.sections import faults_in, node_of, read_section
@@ -82,6 +84,10 @@ def recording_from_flags(
     for option, file in given:
         if file is not None and not Path(file).exists():
             raise NeecoError(f"{option}: {file}: no such file; correct the path")
+    for joint, log, table in joints:
+        timed = [recognise_time(read_table(Path(file)).header).time for file in (log, table) if file is not None]
+        if timed[0] is None and timed[-1] is not None:
+            raise NeecoError(f"--joint {joint}: {log} has no times, {table} has; give the log first, its table second")
     names = [joint for joint, *_ in joints]
     twice = next((joint for joint in names if names.count(joint) > 1), None)
     if twice is not None:
@@ -101,6 +107,10 @@ def recording_from_flags(
         raise NeecoError(f"--intrinsics: takes FX FY CX CY, not {len(intrinsics)} numbers")
     video = Path(video)
     is_folder = video.is_dir() and format_of(video) is None
+    if is_folder and fps is None:
+        images = any(entry.suffix.lower() in IMAGES for entry in video.iterdir())
+        problem = "when were the images taken? Give --fps" if images else "holds no images; give a folder of frames"
+        raise NeecoError(f"--video: {video}: {problem}")
     tool = {
         "name": "instrument",
         "poses": _plain(instrument),

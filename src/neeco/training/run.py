@@ -31,6 +31,7 @@ from neeco.files import (
     require_utf8,
     write_text,
 )
+from neeco.placeholders import misplaced
 from neeco.scene.drawable import DrawableScene
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import DAMAGED, load_scene, pack_scene, require_numbers, save_tensors, unpack_scene
@@ -70,7 +71,7 @@ class TrainedRun:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons to doubt the labels, by what training measured: too few iterations, joints that were not found."""
+        """Reasons to doubt the labels, by what training measured: too few iterations, else joints not found."""
         recorded, noted = len(self.scene.recorded.names), getattr(self.scene, "diagnostics", {})
         usual = replace(method_defaults(self.config["method"]), iterations=None).for_frames(recorded).length
         if usual.is_short(done := noted.get("iterations", usual.iterations)):
@@ -139,13 +140,13 @@ def read_config(path: Path) -> dict[str, Any]:
     path = Path(path)
     require_utf8(path)
     file = path / CONFIG_FILE
-    if not path.is_dir():
-        raise NeecoError(f"{path}: no such run folder; make one with `neeco train`")
+    if not path.exists():
+        raise NeecoError(f"{path}: no such run folder; correct the path, or make one with `neeco train`")
     for entry in path.glob("*"):
         if not entry.is_dir():  # folders that their owner has linked there are no part of the run
             require_inside(entry, path)
     if not os.path.lexists(file):
-        raise NeecoError(f"{path}: not a run folder (config.yaml is missing); make one with `neeco train`")
+        raise NeecoError(f"{path}: {'; '.join(misplaced(path, 'a run folder', 'config.yaml, by `neeco train`'))}")
     config = parse_yaml(file, read_text(file, "the settings of a run as YAML"), "train again")
     if not isinstance(config, dict) or config.get("schema") != SCHEMA:
         found = config.get("schema") if isinstance(config, dict) else None

@@ -339,8 +339,8 @@ class GaussianSession(GaussianTraining):
         for part, item in found.items():
             if item.applied:
                 self.report(
-                    f"{part}: errors depend on the state ({item.explained:.0%} of their variance is predicted for "
-                    "stretches left out): new states are corrected, too"
+                    f"{part}: similar recorded states have similar errors ({item.explained:.0%} of their variance is "
+                    "predicted from other frames), so new states are corrected, too"
                 )
 
     def finish(self) -> None:

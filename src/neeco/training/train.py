@@ -73,7 +73,7 @@ def train(
     *,
     capture: Capture | None = None,
     device: torch.device = CPU,
-    resume: bool = False,
+    resume: bool | None = False,
     progress: ShowRow | None = None,
     watch: Watch | None = None,
     clock: Callable[[], float] = time.monotonic,
@@ -82,14 +82,14 @@ def train(
 
     Writes config.yaml, metrics.jsonl and checkpoint/ while running, and scene.safetensors at the end. capture: what
     `read_checked` returned for the path, where it was read already. resume: continue an interrupted run under the
-    settings it was begun with, which `config` must not contradict, on the same kind of device. clock: seconds that
-    `minutes` counts (time.process_time: CPU time), without those of `watch`. The same seed gives the same scene on a
-    CPU, interrupted or not, unless `minutes` is set.
+    settings it was begun with, which `config` must not contradict, on the same kind of device; None: where one was
+    begun. clock: seconds that `minutes` counts (time.process_time: CPU time), without those of `watch`. The same seed
+    gives the same scene on a CPU, interrupted or not, unless `minutes` is set.
 
     SIGINT or SIGTERM ends the run between two steps with a checkpoint, a second one at once; the message of
     KeyboardInterrupt says how to resume. A failure before the first step leaves no run folder behind. Raises NeecoError
-    for a capture that `neeco check` refuses, a non-empty `output` without `resume`, other settings or another capture
-    than the run was begun with, or a loss that is not finite.
+    for a capture that `neeco check` refuses, an `output` that is not empty without `resume` or vacant with it, other
+    settings or another capture than the run was begun with, or a loss that is not finite.
     """
     capture_path, output = Path(capture_path), Path(output)
     if (stored := read_begun(output, CONFIG_FILE, resume, "a run", read_config)) is not None:
@@ -101,7 +101,7 @@ def train(
     config = replace(config, deformation=method_class(config.method).resolved(config.deformation))
     contradicted: list[str] = []
     if capture is None:
-        capture = read_checked(capture_path, config.transforms, None if resume else contradicted.append)
+        capture = read_checked(capture_path, config.transforms, None if stored else contradicted.append)
     digest = fingerprint(capture)
     if stored is not None:
         require_same_capture(output, capture.root, digest)
@@ -115,7 +115,7 @@ def train(
     with own_folder(output), method_class(config.method).torch_threads(), _stating_memory(frames, config):
         try:
             views = TrainingViews.read(frames, config.scale).to(device)
-            session = _begin(capture, views, output if resume else None, config, log)
+            session = _begin(capture, views, output if stored else None, config, log)
             log.truncate(session.iteration)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("before the first step; run the same command again") from None
@@ -217,8 +217,8 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
             session.seconds, last = session.seconds + now - last, now
             if session.phase != phase:
                 phase = session.phase
-                why = "enough of the run is over" if session.forced else "PSNR is high enough and the loss falls"
-                log.note(f"phase {phase} of the schedule begins at iteration {session.iteration}: {why}")
+                why = "enough of the run is over" if session.forced else "PSNR is high enough"
+                log.note(f"iteration {session.iteration}: details are learned from now on, phase {phase} ({why})")
             session.between_steps(before)
             if due(config.log_interval, iteration, session.iteration):
                 log.row(session)

@@ -189,6 +189,8 @@ _QUESTIONS = (
     (r"^ +# camera_from_base: \{transform", "how does the robot's base stand to the camera? Remove the # of one line"),
     (r"a guess: correct it", "at which rate were these taken? Correct the number"),
     (r"# units: .*nothing says them", "in which units? Correct them and remove the #"),
+    (r"^# intrinsics: .*no calibration was found", "which lens? Remove the # and give a calibration's file or numbers"),
+    (r"^ +# clock: .*its own", "is it the clock of the poses? Remove the #; else give its offset in sync, below"),
     (r"is not clear: ", "which columns hold it? Name them"),
     (r"^ +# +(?:frame|quaternion\w*|rotation\w*|euler\w*): ", "what do its poses mean? Correct it, remove the #"),
 )
@@ -342,8 +344,9 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
 
 def _is_sync(file: Path) -> bool:
     with suppress(NeecoError):
-        document = read_json(file)
-        return isinstance(document, dict) and any(key == "clocks" or key.endswith("_minus_video_s") for key in document)
+        held = document if isinstance(document := read_json(file), dict) else {}
+        offsets = held.get("clocks") or {key: held[key] for key in held if key.endswith("_minus_video_s")}
+        return isinstance(offsets, dict) and bool(offsets) and {*map(type, offsets.values())} <= {int, float}
     return False
 
 
@@ -413,7 +416,8 @@ def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value:
     time = [f"  time: {_list(when.time)}"] if when.time and log.stream is None else []
     # a table of several joints is a robot's, as its poses are
     clock = ["clock: em   # that of the poses: correct it where another computer logged it"]
-    lines = [*log.lines(), *(clock if named and log.stream is None else []), "columns:", *time]
+    own = [] if found.syncs else ["# clock: em   # left out, it is its own, whose offset nothing states"]
+    lines = [*log.lines(), *([] if log.stream else clock if named else own), "columns:", *time]
     lines.append(f"  value: {_scalar(value)}")
     stem = log.stem.lower()
     tables = [name for name, header in found.calibrations if value in header]
