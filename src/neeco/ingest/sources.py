@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 from neeco.errors import NeecoError
 from neeco.ingest.readers import format_of
+from neeco.ingest.readers.video import VIDEOS
 from neeco.ingest.recording.file import RecordingSection, read_recording
 from neeco.ingest.recording.model import MAX_SHAFT_MM, MIN_FRAMES, Recording
 from neeco.ingest.recording.sections import faults_in, node_of, read_section
@@ -20,6 +22,8 @@ def folder_to_convert(sources: Sequence[Path]) -> Path | None:
     """Return the folder that holds cameras in another format; None where the sources are files of recordings. Raises
     NeecoError for what is neither."""
     for source in sources:
+        if source.suffix.lower() in VIDEOS:
+            raise NeecoError(f"{source}: is a video; give it as --video {shlex.quote(str(source))}")
         if (known := format_of(source)) is not None and source.exists():
             raise NeecoError(
                 f"{source}: is in a recording's format ({known.format}) but does not state the meaning of its streams; "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from neeco.ingest.cameras.still_scene import video_stands_still
 from neeco.ingest.readers import IMAGES, VideoSource, format_of
 from neeco.ingest.readers.choices import AXES, OpenPoses, Reading, axis_directions, largest_step, open_poses, shaft_of
 from neeco.ingest.readers.columns import BASE
-from neeco.ingest.recording.template import holds_streams, open_questions, write_template
+from neeco.ingest.recording.template import write_template
 from neeco.ingest.sources import RECORDING
 from neeco.report.charts import page_style
 
@@ -29,6 +30,16 @@ COLORS = ("#d62728", "#2ca02c", "#1f77b4")  # x, y, z
 N_LINES = 24  # along a shaft
 MAX_ROWS = 10  # of choices
 CHOICES = "recording_choices.png"
+# Lines of a draft that leave something open: what marks the first of them, and what to write there
+_QUESTIONS = (
+    (r"^  - name: ", "what is the instrument called in labels? Correct its name"),
+    (r"^ +# kinematics: \{dvrk_tool", "which tool is it? Remove the # and give its file, or write out its links below"),
+    (r"^ +# camera_from_base: \{transform", "how does the robot's base stand to the camera? Remove the # of one line"),
+    (r"a guess: correct it", "at which rate were these taken? Correct the number"),
+    (r"# units: .*nothing says them", "in which units? Correct them and remove the #"),
+    (r"is not clear: ", "which columns hold it? Name them"),
+    (r"^ +# +(?:frame|quaternion\w*|rotation\w*|euler\w*): ", "what do its poses mean? Correct it, remove the #"),
+)
 
 
 def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
@@ -37,19 +48,24 @@ def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
 
     Raises NeecoError where a recording.yaml exists, and where there are no images.
     """
-    path = (source.parent if holds_streams(source) else source) / RECORDING
+    whole = source.is_file() or format_of(source) is not None  # a recording in itself: a bag, a data set's folder
+    path = (source.parent if whole else source) / RECORDING
     if path.exists():
         raise NeecoError(f"{path}: already exists; edit it, or move it away first")
     draft = write_template(source, lambda problem: report(f"left out: {problem}"), video_stands_still)
     write_text(path, draft)
     lines, picture = [], path.with_name(CHOICES)
     try:
-        if holds_streams(source) and write_choice_picture(source, picture):
+        if whole and write_choice_picture(source, picture):
             lines.append(f"wrote {picture}: what its poses would be under each choice that the file leaves open")
     except NeecoError as error:  # recording.yaml, which names the choices, is written all the same
         lines.append(f"no picture of the choices that the file leaves open: {error}")
-    questions = [f"{n}. {path}:{line}: {words}" for n, (line, words) in enumerate(open_questions(draft), 1)]
-    lines += ["still open:", *questions] if questions else []
+    marked = [
+        f"{path}:{number}: {words}"
+        for number, line in enumerate(draft.splitlines(), 1)
+        for words in [words for marks, words in _QUESTIONS if re.search(marks, line)][:1]
+    ]
+    lines += ["still open:", *(f"{n}. {question}" for n, question in enumerate(marked, 1))] if marked else []
     return [*lines, f"wrote {path}: look through it, then: neeco ingest {path} --output CAPTURE"]
 
 

@@ -24,6 +24,7 @@ from neeco.ingest.readers.columns import recognise_time, scale_of
 
 FURTHER_FORMATS = {".bmp": "BMP", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}  # opened under these names alone
 IMAGES = (".png", ".jpg", ".jpeg", *FURTHER_FORMATS)
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts", ".wmv", ".mxf")
 MIN_IMAGES = 2
 SQUARE = 0.005  # by which a square pixel's width and height may differ: 1 px of 200
 MAX_RATE = 1000.0  # frames a second, beyond which a file's own number is no rate
