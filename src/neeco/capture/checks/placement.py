@@ -18,7 +18,7 @@ from neeco.capture.checks.motion import POSES, MotionVerdict, judge_motion
 from neeco.capture.checks.motion_evidence import MotionEvidence
 from neeco.capture.checks.pictures import Pictures
 from neeco.capture.documents import Node, errors_only, printable
-from neeco.capture.model import Instrument, InstrumentState
+from neeco.capture.model import HOW_TO_REGISTER, Instrument, InstrumentState
 from neeco.capture.points import sampled
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.lines import across_projectors
@@ -160,9 +160,7 @@ def _check_instruments(parsed: Parsed, extent: _Extent | None, pictures: Picture
     verdicts: dict[str, MotionVerdict] = {}
     if not parsed.registered and parsed.instruments:
         message = "instrument poses are 'unregistered': in a tracker's or robot's own frame, not the cameras' world"
-        remedy = (
-            "where an instrument is in the images must be learned, and cannot be checked here; register it if you can"
-        )
+        remedy = f"where an instrument is in the images cannot be checked; {HOW_TO_REGISTER}"
         parsed.header("instrument_frame").warning(message, remedy)
     cameras = CameraArrays.of([frame.camera for frame in parsed.frames])
     for instrument in parsed.instruments:
