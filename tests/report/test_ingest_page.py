@@ -277,11 +277,13 @@ def test_a_reason_is_stated_once_with_what_is_usual(tmp_path, overlap, advice):
     assert page.partition('class="tiles"')[0].count(f"utline of psm1 and what moves overlap by {overlap:.2f}") == 1
 
 
-def test_a_page_counts_the_images_of_both_eyes(tmp_path):
+def test_a_page_counts_the_images_of_both_cameras(tmp_path):
     times = np.array([frame.state.time for frame in read_capture(SAMPLE).frames])
     one_less = made(SAMPLE, selected=np.arange(95), selected_times=times[:95], registration=None)
     write_ingest_page(one_less, tmp_path / "page.html")
-    assert "seen by both eyes: 96 images (72 train, 12 test, 12 unseen)" in (tmp_path / "page.html").read_text()
+    page = (tmp_path / "page.html").read_text()
+    assert "96 images, 1 of them by the second camera (72 train, 12 test, 12 unseen)" in page
+    assert "eyes" not in page
 
 
 @pytest.mark.parametrize(("tracked", "level", "limit"), [(False, "good", "2"), (True, "careful", "1")])

@@ -140,7 +140,7 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
         capture=capture,
         verdict=verdict,
         splits=split_counts(capture),
-        eyes=2 if len(capture.frames) > len(result.selected) else 1,  # a stereo partner's frames are training frames
+        second=len(capture.frames) - len(result.selected),  # images of a stereo partner, which are training frames
         in_view=[
             (item.name, figures.in_view(capture, item.name)) for item in capture.instruments if capture.registered
         ],

@@ -47,7 +47,7 @@ IMAGE_SCORES = (
     Score("psnr_covered", "PSNR covered", "{:.2f}", "PSNR without the tissue that no training frame saw."),
     Score("covered_fraction", "covered", "{:.1%}", "How much of the visible tissue at least one training frame saw."),
     Score("fps", "FPS", "{:.1f}", "Posed images rendered per second on the machine that evaluated."),
-    Score("num_gaussians", "Gaussians", "{:,}", "Gaussians used by one rendering."),
+    Score("num_gaussians", "Gaussians", "{:,}", "Gaussians of the finished scene; finishing adds some, as of shafts."),
     Score("frames", "frames", "{}", "How many frames were scored."),
 )  # fmt: skip
 LABEL_SCORES = (
@@ -61,7 +61,7 @@ KINDS = {
     "given": "As given: rendered at the poses the capture states, tracker errors included",
     "aligned": "Aligned: instrument and camera pose fitted to each recorded image first, the scene unchanged",
 }
-KIND_NAMES = {"given": "as given", "aligned": "aligned"}
+KIND_NAMES = {"given": "in the recorded poses", "aligned": "in poses fitted to each image"}
 
 
 def write_report(
@@ -185,17 +185,19 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
     tiles = []
     for split, numbers in evaluation["given"].items():
         if numbers["psnr"] is not None:
-            tiles.append((f"{numbers['psnr']:.1f} dB", f"PSNR, {split}, as given"))
+            what = f"PSNR, {split} frames: similarity to the recorded (30 is close, 20 rough)"
+            tiles.append((f"{numbers['psnr']:.1f} dB", what))
     for split, numbers in evaluation[labelled].items():
         if numbers["mask_iou"] is not None:
-            tiles.append((f"{numbers['mask_iou']:.3f}", f"mask IoU, {split}, {KIND_NAMES[labelled]}"))
+            what = f"overlap of labels and true masks (IoU; 1 is perfect), {split} frames {KIND_NAMES[labelled]}"
+            tiles.append((f"{numbers['mask_iou']:.3f}", what))
     doubts = evaluation.get("doubts", ())
-    tiles.append(("doubtful" if doubts else "no doubt", "about labels, by what training measured"))
+    tiles.append(("doubtful" if doubts else "no doubt", "trust in the labels, by what training measured (see Notes)"))
     first = next(iter(evaluation["given"].values()), None)
     if first is not None:
-        tiles.append((f"{first['fps']:.1f}", "posed images rendered per second"))
+        tiles.append((f"{first['fps']:.1f}", "images rendered per second, each of another state"))
         if first["num_gaussians"] is not None:
-            tiles.append((f"{first['num_gaussians']:,}", "Gaussians"))
+            tiles.append((f"{first['num_gaussians']:,}", "Gaussians (coloured blobs) that make up the scene"))
     return tiles
 
 
