@@ -169,8 +169,12 @@ def _dispatch(words: list[str]) -> int:
 
     config = (tyro.conf.FlagCreatePairsOff,)
     if words and words[0] in ("-h", "--help", *COMPLETION):
-        complete = words[0] in COMPLETION
-        choices = {name: _verb([name])[1] if complete else _named_only(name, line) for name, line in VERBS.items()}
+        choices = {  # stand-ins in the overview, for which no verb is imported
+            name: _verb([name])[1]
+            if words[0] in COMPLETION
+            else make_dataclass(name.replace("-", "_"), [], namespace={"__doc__": line})
+            for name, line in VERBS.items()
+        }
         tyro.extras.subcommand_cli_from_dict(choices, prog="neeco", description=DESCRIPTION, args=words, config=config)
         raise SystemExit(USAGE)
     if not words or words[0] not in VERBS:
@@ -218,8 +222,3 @@ def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any
 
     state_defaults(arguments)
     return module.run, arguments
-
-
-def _named_only(name: str, line: str) -> Callable[..., Any]:
-    """Return a stand-in for a verb in the overview, which is not imported."""
-    return make_dataclass(name.replace("-", "_"), [], namespace={"__doc__": line})

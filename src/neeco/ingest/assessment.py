@@ -118,7 +118,8 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
         for name, clock in result.clocks.items()
         if not np.isfinite(clock.sd)
     ]
-    if result.in_video and not _rolls_known(capture):
+    deviations = [state.uncertainty for frame in capture.frames for state in frame.state.instruments.values()]
+    if result.in_video and any(item is not None and item.rotation_deg[2] >= UNKNOWN_DEG for item in deviations):
         words = "The instrument's roll is not known: log it, or pose frames by hand, before training."
         evidence.append(_Evidence.of(words, severe=False))
     others = [problem for problem in problems if problem not in grave]
@@ -151,12 +152,6 @@ def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -
 def _sentence(text: str) -> str:
     begun = text if re.match(r"\S+\.\w+:", text) else text[0].upper() + text[1:]  # a file's name stays
     return begun + ("" if text.endswith((".", "?")) else ".")
-
-
-def _rolls_known(capture: Capture) -> bool:
-    """Return whether every state's roll has a standard deviation below UNKNOWN_DEG."""
-    deviations = [state.uncertainty for frame in capture.frames for state in frame.state.instruments.values()]
-    return all(item is None or item.rotation_deg[2] < UNKNOWN_DEG for item in deviations)
 
 
 def _lower(sentence: str) -> str:

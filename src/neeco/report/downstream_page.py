@@ -79,15 +79,22 @@ def write_downstream_report(output: Path, experiment: Experiment, capture: Captu
         write_text(output / "data" / name, text)
     models = " and ".join(model["name"] for model in experiment["models"])
     from_scratch = not any(model["weights"] for model in experiment["models"])
+    scored = {split: row["frames"] for job in experiment["jobs"] for split, row in job["splits"].items() if row}
+    counts = [f"{scored.get(split, len(capture.split(split)))} frames of {split}" for split in experiment["splits"]]
     intro = (
         f"{models} trained{' from scratch' if from_scratch else ''} on recorded frames that somebody labelled, on "
-        f"synthetic images, and on both, always in as many steps; tested on {_tested(experiment, capture)}, recorded, "
+        f"synthetic images, and on both, always in as many steps; tested on {', '.join(counts)}, recorded, "
         "which no training saw."
     )
     failed = failed_jobs(experiment)
     notes = [note for note in experiment["notes"] if not note.startswith("failed: ")]  # which stand apart
     lists = [Section(title=title, notes=lines) for title, lines in (("What failed", failed), ("Notes", notes)) if lines]
-    made = Section(title="How it was made", facts=_facts(experiment, capture), listings=_set_listings(experiment))
+    listings = [
+        (f"set {entry['name']}: how it was made", json.dumps(entry["made_by"], indent=1, ensure_ascii=False))
+        for entry in experiment["sets"]
+        if entry["made_by"]
+    ]
+    made = Section(title="How it was made", facts=_facts(experiment, capture), listings=listings)
     return write_page(
         output / REPORT_FILE,
         "study.html",
@@ -295,13 +302,6 @@ def _trainings(experiment: Experiment) -> list[Section]:
     return [Section(title="Training", text=text, head=head, rows=rows)]
 
 
-def _tested(experiment: Experiment, capture: Capture) -> str:
-    """`12 frames of test and 8 frames of unseen`."""
-    scored = {split: row["frames"] for job in experiment["jobs"] for split, row in job["splits"].items() if row}
-    counts = [f"{scored.get(split, len(capture.split(split)))} frames of {split}" for split in experiment["splits"]]
-    return ", ".join(counts)
-
-
 def _facts(experiment: Experiment, capture: Capture) -> list[tuple[str, str]]:
     machine, given = experiment["machine"], experiment["teaching"]
     labels = given["labels"] or "the capture's truth"
@@ -327,11 +327,3 @@ def _set_words(entry: Row) -> str:
         return f"{images}; how they were made is not known: it has no dataset.json"
     scene = f", synthesized from {made['scene']}" if made["scene"] else ""
     return f"{images}{scene}; dataset.json sha256 {entry['sha256'][:12]}"
-
-
-def _set_listings(experiment: Experiment) -> list[tuple[str, str]]:
-    return [
-        (f"set {entry['name']}: how it was made", json.dumps(entry["made_by"], indent=1, ensure_ascii=False))
-        for entry in experiment["sets"]
-        if entry["made_by"]
-    ]

@@ -200,7 +200,9 @@ def _check_instrument(
     outside = "every image" if not visible.any() else f"{len(visible) - int(visible.sum())} of {len(visible)} images"
     fault, verdict = None, None
     if visible.mean() < MIN_VISIBLE:
-        evidence = _motion_evidence(parsed, instrument, pictures)
+        everywhere = all(instrument.name in frame.state.instruments for frame in parsed.frames)
+        clean = not errors_only(parsed.places[0].report.problems)
+        evidence = MotionEvidence.of(parsed, pictures) if everywhere and clean else None
         if evidence is None:
             fault = _instrument_fault(cameras, poses, float(visible.mean()))
         else:  # the images decide where they can
@@ -245,13 +247,6 @@ def _check_instrument(
             remedy = "a tracker drop-out or unit slip? repair the pose or drop the frame"
             places[index].child("pose").warning(message, remedy)
     return verdict
-
-
-def _motion_evidence(parsed: Parsed, instrument: Instrument, pictures: Pictures) -> MotionEvidence | None:
-    """The motion in the images, where they can be read and every frame has the instrument."""
-    everywhere = all(instrument.name in frame.state.instruments for frame in parsed.frames)
-    clean = not errors_only(parsed.places[0].report.problems)
-    return MotionEvidence.of(parsed, pictures) if everywhere and clean else None
 
 
 def _visible_body_point(cameras: CameraArrays, poses: np.ndarray) -> tuple[np.ndarray, float]:

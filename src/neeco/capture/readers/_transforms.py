@@ -81,11 +81,8 @@ def _by_name(parsed: Parsed) -> Parsed:
 def is_blender(document: Node) -> bool:
     """Return True if a transforms file has the field of view for intrinsics and no states, as Blender writes."""
     value = document.value
-    return "camera_angle_x" in value and "fl_x" not in value and not _lists_states(document)
-
-
-def _lists_states(document: Node) -> bool:
-    return "instruments" in document.value or any("instruments" in frame for frame in _frame_objects(document))
+    states = "instruments" in value or any("instruments" in frame for frame in _frame_objects(document))
+    return "camera_angle_x" in value and "fl_x" not in value and not states
 
 
 def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0, *, as_source: bool = False) -> Parsed:

@@ -78,7 +78,8 @@ def find_rotations(values: np.ndarray) -> list[tuple[int, str]]:
     while place <= values.shape[1] - 4:
         four = values[:, place : place + 4]
         nine = values[:, place : place + 9]
-        if nine.shape[1] == 9 and _are_rotations(nine.reshape(-1, 3, 3)):
+        matrices = nine.reshape(-1, 3, 3) if nine.shape[1] == 9 else np.zeros((1, 3, 3))
+        if rotation_error(matrices).max() < UNIT_TOLERANCE and (np.linalg.det(matrices) > 0).all():
             found.append((place, ROTATION_MATRIX))
             place += 9
         elif np.abs(np.linalg.norm(four, axis=1) - 1).max() < UNIT_TOLERANCE and (np.ptp(four, axis=0) > 0).sum() > 1:
@@ -182,7 +183,3 @@ def _ways(values: np.ndarray, columns: Sequence[str], rotation: tuple[str, ...] 
         held = tuple(columns[place : place + 4])
         return [(way, held, way, None) for way in (QUATERNION_WXYZ, QUATERNION_XYZW)]
     return []
-
-
-def _are_rotations(matrices: np.ndarray) -> bool:
-    return bool(rotation_error(matrices).max() < UNIT_TOLERANCE and (np.linalg.det(matrices) > 0).all())

@@ -149,9 +149,9 @@ def write_template(
     for problem in found.problems:
         report(problem)
     frames = [
-        FoundFrames(
-            _frames_line(log), log.file, found.folder / log.file, None if log.stream is None else log.stream.name
-        )
+        FoundFrames(f"video: {_scalar(log.file)}", log.file, found.folder / log.file)
+        if log.stream is None
+        else FoundFrames(f"video: {{{', '.join(log.lines())}}}", log.file, found.folder / log.file, log.stream.name)
         for log in found.videos
     ]
     frames += [
@@ -312,10 +312,6 @@ def _summary(found: _FolderFiles, log: _Log, table: Table, columns: Sequence[str
 def _without_place(message: str, path: Path, name: str) -> str:
     """A message without the file and the stream that it begins with."""
     return message.removeprefix(f"{path}: ").removeprefix(f"{name}: ").replace(str(path), path.name)
-
-
-def _frames_line(log: _Log) -> str:
-    return f"video: {_scalar(log.file)}" if log.stream is None else f"video: {{{', '.join(log.lines())}}}"
 
 
 def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
