@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup, escape
-from matplotlib.axes import Axes
 
 from neeco.capture.model import Capture
 from neeco.errors import counted
@@ -262,20 +261,17 @@ def difference_chart(experiment: Experiment, model: Row, split: str) -> Markup:
             reference = f" − {row['against']}" if key in ("sets", "use") else ""
             name = (title_of(row["condition"], row["real"]) + reference)[:45]
             color = {HELPS: "good", HURTS: "bad"}.get(verdict(row), "soft")
-            _draw_interval(axes, y, row, reach, PALETTE[color])
+            shade = PALETTE[color]
+            axes.plot([0, 0], [y - 0.5, y + 0.5], color=PALETTE["edge"], linewidth=1)
+            if row["low"] is not None:
+                low, high = np.clip([row["low"], row["high"]], -reach, reach)
+                axes.plot([low, high], [y, y], color=shade, linewidth=2)
+                axes.plot(low, y, color=shade, marker="|" if low == row["low"] else "<", markersize=7)
+                axes.plot(high, y, color=shade, marker="|" if high == row["high"] else ">", markersize=7)
+            axes.plot(row["difference"], y, color=shade, marker="o", markersize=6)
         place = axes.get_yaxis_transform()
         axes.annotate(name, (0, y), (-290, 0), place, "offset points", va="center", color=PALETTE[color])
     return inline_svg(axes, f"differences of {model['name']} on {split}")
-
-
-def _draw_interval(axes: Axes, y: float, row: Row, reach: float, color: str) -> None:
-    axes.plot([0, 0], [y - 0.5, y + 0.5], color=PALETTE["edge"], linewidth=1)
-    if row["low"] is not None:
-        low, high = np.clip([row["low"], row["high"]], -reach, reach)
-        axes.plot([low, high], [y, y], color=color, linewidth=2)
-        axes.plot(low, y, color=color, marker="|" if low == row["low"] else "<", markersize=7)
-        axes.plot(high, y, color=color, marker="|" if high == row["high"] else ">", markersize=7)
-    axes.plot(row["difference"], y, color=color, marker="o", markersize=6)
 
 
 def _trainings(experiment: Experiment) -> list[Section]:

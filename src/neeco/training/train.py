@@ -134,7 +134,13 @@ def train(
             _run(session, output, config, log, stop, go_on)
         try:
             log.note("finishing: labels, shaft, diagnostics")
-            _check_finite(session)
+            try:
+                require_numbers(pack_scene(session.scene)[0])
+            except ValueError as error:
+                raise NeecoError(
+                    f"training: the scene diverged: {error} after {session.iteration} iterations; "
+                    "train anew with another --seed or a milder schedule"
+                ) from None
             session.finish()
             if states := session.training_states():
                 write_json(output / STATES_FILE, {"schema": "neeco-states/1", "frames": states})
@@ -247,17 +253,6 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
         save_checkpoint(session, output)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"at iteration {session.iteration}; {go_on}") from None
-
-
-def _check_finite(session: Session) -> None:
-    """Raise NeecoError when a learned number is not finite, or too large to be read again."""
-    try:
-        require_numbers(pack_scene(session.scene)[0])
-    except ValueError as error:
-        raise NeecoError(
-            f"training: the scene diverged: {error} after {session.iteration} iterations; "
-            "train anew with another --seed or a milder schedule"
-        ) from None
 
 
 @contextmanager

@@ -186,7 +186,10 @@ def _parse_frames(
         name = splits.of(node, index)
         pose = node.child("transform_matrix").rigid()
         mask_path = _file(node.child("mask_path"), folder, parsed.root) if node.has("mask_path") else None
-        time = _time(node) if node.has("time") else float(index)
+        time = node.child("time").number() if node.has("time") else float(index)
+        if time is not None and (fault := time_fault(time)) is not None:
+            node.child("time").error(*fault)
+            time = None
         timed += node.has("time")
         instruments, tissue = parse_instruments(node), _tissue_of(node, parsed)
         if image_path is None:
@@ -209,14 +212,6 @@ def _parse_frames(
         parsed.timed = False
         for order, frame in enumerate(parsed.frames):
             parsed.frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
-
-
-def _time(frame: Node) -> float | None:
-    time = frame.child("time").number()
-    fault = None if time is None else time_fault(time)
-    if fault is not None:
-        frame.child("time").error(*fault)
-    return None if fault is not None else time
 
 
 def _parse_tissues(document: Node, folder: Path, parsed: Parsed) -> None:
