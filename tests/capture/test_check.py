@@ -252,6 +252,8 @@ def test_unregistered_instruments_are_a_warning_and_not_located(folder):
     folder.edit(_head("instrument_frame", "unregistered"))
     assert problems(folder) == []
     assert_found(folder, "instrument_frame", "unregistered", "warning")
+    (said,) = [problem for problem in problems(folder, "warning") if problem.field == "instrument_frame"]
+    assert "in recording.yaml state camera_from_base" in said.remedy
 
 
 def test_damaged_images_are_errors(folder):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -172,11 +173,61 @@ def test_version_is_the_package_version(capsys: pytest.CaptureFixture[str]) -> N
     assert capsys.readouterr().out == f"neeco {__version__}\n"
 
 
-@pytest.mark.parametrize("words", [[], ["synthesise"], *([verb, "--no-such-option"] for verb in cli.VERBS)])
-def test_wrong_usage_exits_2(words: list[str]) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        [], ["synthesise"], ["--bogus"], ["train"], ["synthesize", "run"], ["train", "one", "two", "--output", "run"],
+        ["view", "run", "--export"], ["ingest", "--intrinsics", "1", "2"],
+        ["synthesize", "run", "--output", "set", "--count", "4", "--views", "orb"],
+        *([verb, "--no-such-option"] for verb in cli.VERBS),
+    ],
+)  # fmt: skip
+def test_wrong_usage_is_one_line_and_exits_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
         cli.main(words)
     assert left.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("neeco: error: ")
+    assert re.search(r"`neeco( [a-z-]+)? --help`|did you mean", line)
+    assert "│" not in line
+    assert "(required)" not in line
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["view", "run", "--export"], "--export page.html"),
+        (["ingest", "--intrinsics", "1", "2"], "FX FY CX CY"),
+        (["train", "capture"], "missing --output PATH: Run folder to write"),
+    ],
+)
+def test_what_an_option_needs_is_said_where_it_is_missing(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(words)
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ([], "no source"),
+        (["left.mp4"], "--video left.mp4"),
+        (["my left.AVI", "--output", "made"], "--video 'my left.AVI'"),
+        (["--init", "nope.bag"], "nope.bag: no such file"),
+        (["--init", "nope"], "nope: no such file"),
+        (["--video", "left.mp4"], "--output: "),
+    ],
+)
+def test_ingest_asks_for_the_source_that_it_lacks(
+    words: list[str], told: str, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["ingest", *words]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert told in line
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("verb", cli.VERBS)

@@ -14,8 +14,8 @@ from neeco.ingest.readers.columns import Units
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import IngestSettings, Splits
-from neeco.ingest.recording.template import open_questions, write_template
-from neeco.ingest.sources import recording_from_flags
+from neeco.ingest.recording.template import write_template
+from neeco.ingest.sources import open_questions, recording_from_flags
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 

@@ -12,7 +12,8 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.progress import BarColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from neeco.cli._output import whole_lines
 from neeco.errors import NeecoError, visible
@@ -44,7 +45,7 @@ class Bars:
             BarColumn(bar_width=20 if console.width >= WIDE else 5),
             TextColumn("{task.fields[text]}"),
             TimeElapsedColumn(),
-            TimeRemainingColumn(),
+            _TimeLeft(),
         )
         self.bar = Progress(*columns, console=console)
         self.tasks: dict[str, TaskID] = {}
@@ -79,7 +80,7 @@ class Bars:
             for before in self.stages:
                 self._complete(before)
             self.stages.append(task)
-        self.bar.update(task, completed=done, total=total or None, text=f"{done}/{total}" if total else "")
+        self._update(task, done, f"{done}/{total}" if total else "", total=total or None)
 
     def training(self, row: ProgressRow) -> None:
         """Progress of `train`."""
@@ -87,9 +88,11 @@ class Bars:
         if row.note:
             self._print(row.note, style="dim")
             return
+        if not self._found(task).completed:  # preparation counts, and the time before an interruption
+            self._found(task).start_time = self.bar.get_time() - row.seconds
         size = f", {row.num_gaussians} Gaussians" if row.num_gaussians else ""
         text = f"iteration {row.iteration}, PSNR {row.psnr:.1f} dB{size}"
-        self.bar.update(task, completed=row.progress, text=text)
+        self._update(task, row.progress, text, row.seconds_left)
 
     def end(self, title: str) -> None:
         """Complete the bar of `title`, if there is one."""
@@ -110,7 +113,7 @@ class Bars:
         share = news.share * (1 - EVALUATION_SHARE)
         if news.stage == "evaluating":
             share = 1 - EVALUATION_SHARE * (1 - news.share)
-        self.bar.update(task, completed=share, text=f"{news.stage} {news.text}".rstrip())
+        self._update(task, share, f"{news.stage} {news.text}".rstrip())
 
     def _task(self, title: str, total: float | None = 1.0) -> TaskID:
         if self.bar.console.is_terminal:
@@ -118,12 +121,23 @@ class Bars:
         elif not self.tasks:
             self.lines.start()
         if title not in self.tasks:
-            self.tasks[title] = self.bar.add_task(title, total=total, text="")
+            self.tasks[title] = self.bar.add_task(title, total=total, text="", ends=None)
         return self.tasks[title]
 
+    def _found(self, task: TaskID) -> Task:
+        return next(one for one in self.bar.tasks if one.id == task)
+
+    def _update(
+        self, task: TaskID, done: float, text: str, left: float | None = None, *, total: float | None = 1.0
+    ) -> None:
+        """Note progress, and when all is done: in `left` s, by default at the speed so far."""
+        if left is None and total and done:
+            left = (self._found(task).elapsed or 0.0) * (total / done - 1)
+        ends = None if left is None else self.bar.get_time() + left
+        self.bar.update(task, completed=done, total=total, text=text, ends=ends)
+
     def _complete(self, task: TaskID) -> None:
-        found = next(one for one in self.bar.tasks if one.id == task)
-        total = found.total or 1.0
+        total = self._found(task).total or 1.0
         self.bar.update(task, completed=total, total=total)
 
     def _print_lines(self) -> None:
@@ -135,14 +149,29 @@ class Bars:
         self.bar.console.print(visible(line), style=style, markup=False, highlight=False, soft_wrap=True)
 
 
+class _TimeLeft(ProgressColumn):
+    """Time that a task still takes, counted down between two reports of its progress."""
+
+    max_refresh = 0.5
+
+    def render(self, task: Task) -> Text:
+        left = _seconds_left(task)
+        return Text("" if left is None else f"{_duration(left)} left", style="progress.remaining")
+
+
+def _seconds_left(task: Task) -> float | None:
+    ends = task.fields["ends"]
+    return None if ends is None or task.finished else max(0.0, ends - task.get_time())
+
+
 def _line(task: Task) -> str:
     """State what is done, how far it is, and how long it still takes at the speed so far."""
     passed = task.finished_time or task.elapsed or 0.0
     words = [f"{task.percentage:.0f} %"] if task.total else []
     words += [task.fields["text"]] if task.fields["text"] else []
     words += [f"{_duration(passed)} passed"]
-    if task.total and 0 < task.completed < task.total:
-        words += [f"about {_duration(passed * (task.total / task.completed - 1))} left"]
+    if (left := _seconds_left(task)) is not None:
+        words += [f"about {_duration(left)} left"]
     return f"{task.description}: {', '.join(words)}"
 
 
@@ -178,21 +207,20 @@ def train_with_progress(
     capture: Path, output: Path, config: TrainConfig, device: torch.device, *, resume: bool = False
 ) -> Path:
     """`train` with a bar that shows PSNR, Gaussians and time left. Returns the run's folder."""
+    from neeco.training.run import resume_command
     from neeco.training.train import train
 
-    run = shlex.quote(str(output))
-    how = f"go on with: neeco train {shlex.quote(str(capture))} --output {run} --resume"
-    timed: list[ProgressRow] = []  # two: what passed before the first of them says nothing of the speed
+    run, how = shlex.quote(str(output)), f"go on with: {resume_command(capture, output)}"
+    started: list[int] = []  # the iteration of the first row
 
     def show(row: ProgressRow) -> None:
-        if not row.note and not timed:
-            timed.append(row)
+        if not row.note and not started:
+            started.append(row.iteration)
             slow = "; a CUDA device would be used if there were one" if device.type == "cpu" else ""
-            bars.training(replace(row, note=f"training on {device.type} begins{slow}; watch it: neeco view {run}"))
-        elif not row.note and len(timed) == 1 and (done := row.progress - timed[0].progress) >= MIN_TIMED_SHARE:
-            took = row.seconds + (1 - row.progress) * (row.seconds - timed[0].seconds) / done
-            bars.training(replace(row, note=f"training takes about {_duration(took)} in all at this speed"))
-            timed.append(row)
+            left = row.seconds_left
+            whole = "begins" if left is None else f"takes about {_duration(row.seconds + left)} in all"
+            forecast = f"{whole}, estimated anew as it goes on"
+            bars.training(replace(row, note=f"training on {device.type} {forecast}{slow}; watch it: neeco view {run}"))
         bars.training(row)
 
     with Bars() as bars, resumable(output, how):

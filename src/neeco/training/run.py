@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -112,9 +113,15 @@ def load_run(path: Path, device: torch.device | None = None, *, force: bool = Fa
     path = Path(path)
     config = read_config(path)
     if not (path / SCENE_FILE).is_file():
-        raise NeecoError(f"{path}: training has not finished here; continue it with `neeco train … --resume`")
+        command = resume_command(config["capture"], path)
+        raise NeecoError(f"{path}: training has not finished here; go on with: `{command}`")
     scene = load_scene(path / SCENE_FILE)
     return TrainedRun(path, scene if device is None else scene.to(device), config, force)
+
+
+def resume_command(capture: Path | str, run: Path) -> str:
+    """Return the command that continues the training of a run."""
+    return f"neeco train {shlex.quote(str(capture))} --output {shlex.quote(str(run))} --resume"
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 import signal
 import threading
 import time
@@ -37,6 +36,7 @@ from neeco.training.run import (
     reporting_damage,
     require_same_capture,
     restore_session,
+    resume_command,
     save_checkpoint,
     stored_config,
     write_config,
@@ -59,7 +59,13 @@ class ProgressRow:
     phase: int = 1
     seconds: float = 0.0
     progress: float = 0.0  # in [0, 1]
+    prepared: float = 0.0  # of the seconds, those before the first iteration
     note: str = ""  # a line for the user
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Time until the end at the speed so far; None before there is progress."""
+        return (self.seconds - self.prepared) * (1 / self.progress - 1) if self.progress > 0 else None
 
 
 ShowRow = Callable[[ProgressRow], None]
@@ -111,7 +117,7 @@ def train(
     frames = _training_frames(capture, capture_path, config)
     config = config.for_frames(len(frames))
     log = _Log(output / "metrics.jsonl", progress, watch, clock)
-    go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
+    go_on = f"go on with: {resume_command(capture_path, output)}"
     with own_folder(output), method_class(config.method).torch_threads(), _stating_memory(frames, config):
         try:
             views = TrainingViews.read(frames, config.scale).to(device)
@@ -128,11 +134,18 @@ def train(
             _run(session, output, config, log, stop, go_on)
         try:
             log.note("finishing: labels, shaft, diagnostics")
-            _check_finite(session)
+            try:
+                require_numbers(pack_scene(session.scene)[0])
+            except ValueError as error:
+                raise NeecoError(
+                    f"training: the scene diverged: {error} after {session.iteration} iterations; "
+                    "train anew with another --seed or a milder schedule"
+                ) from None
             session.finish()
             if states := session.training_states():
                 write_json(output / STATES_FILE, {"schema": "neeco-states/1", "frames": states})
             save_scene(session.scene, output / SCENE_FILE)
+            log.finished(session)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"while finishing; {go_on}") from None
     return output
@@ -242,17 +255,6 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
         raise KeyboardInterrupt(f"at iteration {session.iteration}; {go_on}") from None
 
 
-def _check_finite(session: Session) -> None:
-    """Raise NeecoError when a learned number is not finite, or too large to be read again."""
-    try:
-        require_numbers(pack_scene(session.scene)[0])
-    except ValueError as error:
-        raise NeecoError(
-            f"training: the scene diverged: {error} after {session.iteration} iterations; "
-            "train anew with another --seed or a milder schedule"
-        ) from None
-
-
 @contextmanager
 def deferred_interrupts() -> Iterator[threading.Event]:
     """Turn the first SIGINT or SIGTERM in the block into an event; a second raises KeyboardInterrupt.
@@ -303,8 +305,9 @@ class _Log:
             phase=session.phase,
             seconds=round(session.seconds, 2),
             progress=round(session.progress, 4),
+            prepared=session.prepared,
         )
-        entry = {key: value for key, value in vars(self.last).items() if key != "note"}
+        entry = {key: value for key, value in vars(self.last).items() if key not in ("prepared", "note")}
         try:
             with self.path.open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(entry, allow_nan=False) + "\n")
@@ -312,6 +315,11 @@ class _Log:
             raise cannot_write(self.path, error) from error
         if self.progress:
             self.progress(self.last)
+
+    def finished(self, session: Session) -> None:
+        """Show the scene's final number of Gaussians."""
+        if self.progress and self.last.iteration:
+            self.progress(replace(self.last, num_gaussians=session.scene.num_gaussians, progress=1.0))
 
     def note(self, text: str) -> None:
         if self.progress:

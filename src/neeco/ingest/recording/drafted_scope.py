@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,7 +68,8 @@ def draft_scope(
     still, camera = False, "# camera: still          # or moving"
     looked = None
     if stands_still is not None and (left.stream is not None or stereo):
-        looked = _looked(left, stands_still)
+        with suppress(NeecoError):
+            looked = stands_still(left.open())
     if looked is False:
         camera += "; in frames spread over the recording, the background does not keep its place"
     elif looked and travel_mm is not None and travel_mm > MAX_TRAVEL_MM:
@@ -84,13 +86,6 @@ def draft_scope(
     return DraftedScope(
         camera=camera, stereo=line, right=right, lens=_lens_remark(left, still), still=still,
     )  # fmt: skip
-
-
-def _looked(frames: FoundFrames, stands_still: StandsStill) -> bool | None:
-    try:
-        return stands_still(frames.open())
-    except NeecoError:
-        return None
 
 
 def _second_camera(
