@@ -7,14 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from neeco.cli import _progress
 from neeco.cli._progress import Bars, counting
 from neeco.errors import NeecoError
-from neeco.scene.training_session import RunLength
 from neeco.studies.study import JobEvent
-from neeco.training.config import TrainConfig
 from neeco.training.train import ProgressRow
 
 
@@ -90,27 +87,3 @@ def test_work_of_some_length_ends_with_its_total_time(capsys, monkeypatch):
     with Bars() as bars:
         bars.stage("reading", 1, 1)
     assert capsys.readouterr().err.splitlines()[-1] == "total: 0:00:00"
-
-
-@pytest.mark.parametrize("minutes", [None, 1.0])
-def test_a_run_is_forecast_by_its_speed_after_preparation(minutes, capsys, monkeypatch, tmp_path):
-    length, prepared, second_per_iteration = RunLength(6000, minutes), 100.0, 0.05
-
-    def trained(*_, progress, **__):
-        for iteration in (50, 100, 150):
-            seconds = prepared + second_per_iteration * iteration
-            progress(
-                ProgressRow(
-                    iteration=iteration,
-                    seconds=seconds,
-                    progress=round(length.progress(iteration, seconds, prepared), 4),
-                )
-            )
-
-    monkeypatch.setattr("neeco.training.train.train", trained)
-    _progress.train_with_progress(tmp_path, tmp_path / "run", TrainConfig(), torch.device("cpu"))
-    told = capsys.readouterr().err
-    assert "training on cpu begins; a CUDA device would be used if there were one; watch it: neeco view" in told
-    (forecast,) = re.findall(r"training takes about 0:0(\d):(\d\d) in all", told)
-    took = 60 * int(forecast[0]) + int(forecast[1])
-    assert abs(took - (prepared + (60 if minutes else 300))) < 3

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 LINE_INTERVAL_S = 30.0  # between two lines about the same work, where no terminal shows bars
 WIDE = 100  # characters of a terminal on which bars are long
 MIN_SHOWN_S = 1.0  # what took less has no last line
-MIN_TIMED_SHARE = 0.002  # of a run, between the two rows that its first forecast compares: progress is rounded
 EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
 
 
