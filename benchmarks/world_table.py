@@ -60,8 +60,8 @@ def summary_of(results: Sequence[Result]) -> Summary:
     right = [result for result in results if is_right(result)]
     stated = [result["over_sd"]["turn_shift_joints"] for result in results if "over_sd" in result]
     over = np.array(stated or [[None] * 3], float)  # None: without joints
-    with np.errstate(invalid="ignore"):
-        rms = np.sqrt(np.nanmean(np.where(np.isfinite(over), over, np.nan) ** 2, 0))
+    squares = np.where(np.isfinite(over), over, 0) ** 2
+    rms = np.sqrt(squares.sum(0) / np.maximum(np.isfinite(over).sum(0), 1e-9))
     return Summary(
         median=float(np.median(ious)),
         worst_tenth=float(ious[: max(1, round(len(ious) / 10))].mean()),

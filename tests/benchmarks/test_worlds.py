@@ -1,0 +1,74 @@
+"""Random worlds: a seed is a world, all that is drawn occurs, and a table counts what users would see."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+
+from rendered.draws import BACKGROUNDS, FINISHES, JAWS, KINDS, LINKS, SCOPES, SIZES, STATES, TRAIN_FRAMES, draw_world
+from rendered.world_capture import write_world
+from world_table import interval, summary_of, table_of
+
+from neeco.capture import read_capture
+from neeco.capture.checks import check_capture
+from neeco.errors import NeecoError
+
+
+def test_a_seed_is_a_world() -> None:
+    assert draw_world(5) == draw_world(5)
+    assert draw_world(5) != draw_world(6)
+
+
+def test_all_that_can_be_drawn_is_drawn() -> None:
+    worlds = [draw_world(seed) for seed in range(400)]
+    for name, values in (
+        ("background", BACKGROUNDS), ("finish", FINISHES), ("jaws", JAWS), ("kind", KINDS), ("links", LINKS),
+        ("scope", SCOPES), ("size", SIZES), ("states", STATES), ("frames", TRAIN_FRAMES),
+    ):  # fmt: skip
+        assert {getattr(world, name) for world in worlds} == set(values), name
+    assert {world.scale for world in worlds} == {1.0, 0.75, 0.5}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 9])  # of a still scope, of a stereo scope
+def test_a_world_is_written_as_a_capture_with_truth(seed: int, tmp_path: Path) -> None:
+    torch.set_num_threads(1)
+    world = draw_world(seed)
+    write_world(world, tmp_path)
+    capture = read_capture(tmp_path)
+    eyes = 2 if world.scope == "stereo" else 1
+    assert len(capture.split("train")) == world.frames * eyes
+    assert not [problem for problem in check_capture(tmp_path) if problem.severity == "error"]
+    for frame in capture.split("test"):
+        assert (tmp_path / "truth" / "masks" / f"{frame.name}.png").is_file()
+    with pytest.raises(NeecoError, match="already holds a capture"):
+        write_world(world, tmp_path)
+
+
+def result(seed: int, iou: float | None, *, doubts: tuple[str, ...] = (), recall: float | None = 1.0) -> dict[str, Any]:
+    told = {"doubts": list(doubts), "said": [], "status": int(iou is None)}
+    return {"seed": seed, "iou": iou, "recall": recall, "train_seconds": 1.0, "gib": 1.0, **told}
+
+
+def test_a_table_counts_failures_silence_and_false_alarms() -> None:
+    results = [
+        result(0, 0.95), result(1, 0.96, doubts=("few",)), result(2, 0.5), result(3, 0.6, doubts=("few",)),
+        result(4, None), result(5, 0.97, recall=0.8),
+    ]  # fmt: skip
+    own = summary_of(results)
+    assert (own.failures, own.silent, own.refused, own.alarms, own.right) == (4, 2, 1, 1, 2)
+    assert own.worst_tenth == 0.0  # one that was refused gives no labels
+    other = [{**entry, "iou": (entry["iou"] or 0) + 0.01} for entry in results]
+    assert "+0.010 [+0.010, +0.010]" in table_of({"a": results, "b": other})
+
+
+def test_an_interval_holds_the_mean() -> None:
+    low, high = interval(np.random.default_rng(0).normal(0.1, 0.05, 40))
+    assert low < 0.1 < high
