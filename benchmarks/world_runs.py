@@ -1,6 +1,7 @@
 """Trains and evaluates builds of neeco on drawn worlds: one job a build and world, each in processes of its own.
 
-A build is a commit, or "." for this checkout, optionally less one mechanism: "COMMIT:without-NAME" (`WITHOUT`).
+A build is a commit, "." for this checkout or the folder of another, optionally less one mechanism:
+"COMMIT:without-NAME" (`WITHOUT`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import time
 from collections.abc import Sequence
@@ -77,14 +79,20 @@ class Build:
         """A command line of this build."""
         left_out = WITHOUT.get(self.without, ())
         if isinstance(left_out, str):
-            return [sys.executable, "-c", f"{left_out}\n{START}", verb, *words]
-        return [sys.executable, "-c", START, verb, *words, *(left_out if verb == "train" else ())]
+            return [*self.python, "-c", f"{left_out}\n{START}", verb, *words]
+        return [*self.python, "-c", START, verb, *words, *(left_out if verb == "train" else ())]
+
+    @property
+    def python(self) -> list[str]:
+        """The interpreter; of other checkouts than this one without what an editable installation puts before them."""
+        return [sys.executable] if self.checkout == ROOT else [sys.executable, "-S"]
 
     @property
     def environment(self) -> dict[str, str]:
         """One thread each: jobs run side by side."""
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        return {**os.environ, **threads, "PYTHONPATH": str(self.checkout / "src")}
+        paths = os.pathsep.join([str(self.checkout / "src"), sysconfig.get_path("purelib")])
+        return {**os.environ, **threads, "PYTHONPATH": paths}
 
 
 @dataclass(frozen=True)
@@ -113,7 +121,9 @@ def _checked_out(commit: str, folder: Path) -> Path:
     """The checkout of a commit, its kernels built once."""
     said = subprocess.run(["git", "rev-parse", "--short=10", f"{commit}^{{commit}}"], cwd=ROOT, capture_output=True)
     if said.returncode:
-        raise NeecoError(f"--commits: {commit} is no commit of this repository")
+        if (Path(commit) / "src" / "neeco").is_dir():
+            return Path(commit).resolve()
+        raise NeecoError(f"--commits: {commit} is no commit of this repository, and no checkout")
     path = folder / said.stdout.decode().strip()
     if not (path / "src" / "neeco").exists():
         path.mkdir(parents=True)
@@ -153,12 +163,16 @@ def run_all(
 
 def result_path(work: Path, title: str, seed: int) -> Path:
     """Where the result of a job lies."""
-    return work / "results" / title.replace(":", "-") / f"{seed}.json"
+    return work / "results" / _name(title) / f"{seed}.json"
 
 
 def run_path(work: Path, title: str, seed: int) -> Path:
     """The run folder of a job."""
-    return work / "runs" / title.replace(":", "-") / str(seed)
+    return work / "runs" / _name(title) / str(seed)
+
+
+def _name(title: str) -> str:
+    return re.sub(r"[^\w.-]+", "-", title).strip("-")
 
 
 def capture_path(work: Path, seed: int) -> Path:
@@ -229,7 +243,7 @@ def _evaluated(build: Build, run: Path) -> dict[str, Any]:
     }
     script = str(build.checkout / "benchmarks" / "state_scores.py")
     states = subprocess.run(
-        [sys.executable, script, str(run)], env=build.environment, capture_output=True, text=True
+        [*build.python, script, str(run)], env=build.environment, capture_output=True, text=True
     ).stdout
     for wrong, count, *values in ERRORS_OVER_SD.findall(states):
         key = "over_sd_wrong" if wrong else "over_sd"

@@ -9,7 +9,8 @@
 from which distribution is in `rendered/draws.py`. 6 to 25 s of CPU time.
 
 `run` trains and evaluates each build on the same worlds (S, S + 1, …) in turns and can be stopped and called again. A
-build is a commit, "." (this checkout), or either with ":without-NAME" (a mechanism left out; `--help` lists them). It
+build is a commit, "." (this checkout), the folder of another, or any with ":without-NAME" (a mechanism left out;
+`--help` lists them). It
 writes DIR/table.md: per build the label IoU with aligned poses (mean of the splits test and unseen; median, and mean of
 the worst tenth of the worlds; a refused run counts 0), failures (IoU below .80 or recall on shafts below .90), silent
 ones (neither refused nor called doubtful), false alarms (doubts about runs of IoU above .90), paired differences of IoU

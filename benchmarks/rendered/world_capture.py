@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,6 +39,7 @@ TEST, BEYOND = 8, 8  # frames of the splits test and unseen
 LEAST_SHARE, MOST_SHARE = 0.02, 0.30  # of the image that the instrument covers, mean over training frames
 THUMBNAIL = 48  # px of width, to measure it
 RAISE_MM, RAISES = 4.0, 12  # where the instrument touches the tissue it is held higher
+RIGHT = "right_"  # begins the names of the right camera's images
 BASE_MM, BASE_RAD = 3.0, math.radians(1.2)  # of a robot's base, times the world's scale of errors
 
 
@@ -61,7 +63,10 @@ def write_world(world: World, path: Path, workers: int = 1) -> Capture:
     for shot, rendered in zip(shots, render_all(renderer, shots), strict=True):
         sampler.take(shot.moment, rendered.drawing, rendered.pixels, world.lens)
     true = TrueWorld(spec, shots)
-    write_json(path / "truth" / "transforms.json", truth_document(true, world.lens))
+    truth = truth_document(true, world.lens)
+    if stereo:
+        _truth_of_both_eyes(truth)
+    write_json(path / "truth" / "transforms.json", truth)
     capture, _ = recorded(true, trajectory, sampler, path, world.lens, generator)
     capture = _as_stated(world, spec, capture)
     capture, wrong = _with_state_errors(world, capture)
@@ -194,8 +199,19 @@ def _both_eyes(capture: Capture, shots: list[Shot], path: Path) -> Capture:
     for frame in capture.split("train"):
         world_from_right = frame.camera.world_from_camera.double() @ torch.linalg.inv(right_from_left)
         camera = replace(frame.camera, world_from_camera=world_from_right.to(frame.camera.world_from_camera.dtype))
-        frames.append(replace(frame, image_path=path / right_name(by_image[frame.image_path]), camera=camera))
+        shown = path / right_name(by_image[frame.image_path])
+        own = shown.with_name(f"{RIGHT}{shown.name}")  # frames go by the stems of their images
+        shown.rename(own)
+        frames.append(replace(frame, image_path=own, camera=camera))
     return replace(capture, frames=tuple(frames))
+
+
+def _truth_of_both_eyes(document: dict[str, Any]) -> None:
+    """Add the states of the right camera's training frames, in the frame of the left one, which is the world."""
+    for frame in list(document["frames"]):
+        if frame["split"] == "train":
+            name = f"../right/{RIGHT}{Path(frame['file_path']).name}"
+            document["frames"].append({**frame, "file_path": name})
 
 
 def _with(frame: Frame, name: str, state: InstrumentState) -> Frame:

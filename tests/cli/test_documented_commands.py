@@ -127,6 +127,7 @@ SMALLER = (
     (r"deformation\.(coarse_samples|fine_samples|width|warp_width)=\d+", r"deformation.\1=8"),
     (r"deformation\.(depth|warp_depth)=\d+", r"deformation.\1=2"),
     (r"published_steps=20000", "published_steps=40"),
+    (r"--min-trust \S+", "--min-trust 0"),  # of a run of 150 iterations
 )
 TRAINING = {"train": "--iterations 40", "demo": "--minutes 0.05"}  # `refine` trains as its run was
 SMALL_STUDY = {"--folds": 1, "--steps": 1, "--size": 48, "--batch": 2, "--num-real": 2, "--device": "cpu"}
