@@ -20,6 +20,7 @@ from torch import Tensor
 from neeco import __version__
 from neeco.capture import Capture, fingerprint, read_capture
 from neeco.errors import NeecoError
+from neeco.evidence.label_quality import LABEL_QUALITY, LabelQuality
 from neeco.files import (
     YamlDumper,
     parse_yaml,
@@ -70,13 +71,17 @@ class TrainedRun:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons to doubt the labels, by what training measured: too few iterations, joints that were not found."""
+        """Reasons to doubt the labels, by what training measured: too few iterations, labels that leave out what the
+        images show of the instrument or take in tissue, joints that were not found."""
         recorded, noted = len(self.scene.recorded.names), getattr(self.scene, "diagnostics", {})
         usual = replace(method_defaults(self.config["method"]), iterations=None).for_frames(recorded).length
         if usual.is_short(done := noted.get("iterations", usual.iterations)):
             return (f"training ended after {done:,} iterations, usual are {usual.iterations:,}",)
+        known = noted.get(LABEL_QUALITY)
+        doubt = None if known is None else LabelQuality(known["recall"], known["precision"]).doubt
         joints = noted.get("joints", {}).items()
-        return tuple(f"joint {name}: {joint['verdict']}" for name, joint in joints if joint.get("found") is False)
+        lost = (f"joint {name}: {joint['verdict']}" for name, joint in joints if joint.get("found") is False)
+        return (*([doubt] if doubt else []), *lost)
 
     def require_trusted(self, verb: str) -> None:
         """Raise NeecoError where the labels that `verb` is to write are doubtful, unless `force`."""

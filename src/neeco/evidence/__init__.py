@@ -1,0 +1,1 @@
+"""What is instrument in an image, by what the learned tissue does not explain."""

@@ -1,0 +1,148 @@
+"""How likely each pixel of an image shows an instrument, given the tissue of a scene: the foreground.
+
+The scene's tissue, rendered without instruments, is each image's background. A shadow dims it by one factor, so that a
+pixel is described by the factor that fits best (`shade`) and by what that leaves, as a share of the brightness
+(`residual`). Two densities of these two are learned from the images themselves: of tissue, where no instrument is near,
+any shade of a shadow being as likely; of the instruments, well inside of where they are rendered. Their ratio tells
+which of the two a pixel shows, and says nothing where both are alike: a black shaft is no shadow of dark cloth where
+its residuals differ from those of cloth, and undetermined where they do not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter, uniform_filter
+from torch import Tensor
+
+from neeco.capture.model import State
+from neeco.geometry.camera import Camera
+from neeco.raster import rasterize
+from neeco.scene.gaussian_scene import GaussianScene
+
+
+@dataclass(frozen=True)
+class ForegroundSettings:
+    """How pixels are compared, and when they tell anything."""
+
+    window_px: int = 3  # over which residuals are averaged
+    dark: float = 0.03  # added to the brightness [0, 1] that residuals are shares of: the camera's noise in the dark
+    shadow: tuple[float, float] = (0.45, 1.05)  # range of shades of tissue; darker than any shadow is an instrument
+    residuals: tuple[float, float, int] = (-6.0, 1.0, 28)  # range of their logarithms, and bins
+    shades: tuple[float, float, int] = (0.0, 1.5, 15)  # range, and bins
+    smoothing: float = 1.0  # bins, standard deviation
+    floor: float = 0.02  # share of a uniform density in each: what was not sampled is not impossible
+    # ratios of the densities up to which a pixel tells nothing and from which on it tells all: of an instrument's to
+    # the tissue's, and of the tissue's to an instrument's
+    instrument: tuple[float, float] = (3.0, 20.0)
+    tissue: tuple[float, float] = (5.0, 30.0)
+    far: float = 0.04  # of the images' width from a rendered instrument: tissue without one
+    inside_px: int = 2  # from the outline of a rendered instrument: certainly one
+    least_pixels: int = 200  # of each kind, below which nothing is said
+    noise_quantile: float = 0.98  # of the tissue's residuals: its noise
+
+
+SETTINGS = ForegroundSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """An image beside a scene's tissue: shade and residual [H, W], the label [H, W] in [0, 1] as rendered, and which
+    pixels count, bool [H, W]."""
+
+    shade: np.ndarray
+    residual: np.ndarray
+    label: np.ndarray
+    usable: np.ndarray
+
+    @staticmethod
+    @torch.no_grad()
+    def of(
+        scene: GaussianScene, state: State, camera: Camera, image: Tensor, mask: Tensor | None,
+        settings: ForegroundSettings = SETTINGS,
+    ) -> Comparison:  # fmt: skip
+        """Compare an image [H, W, 3] in [0, 1] of a `camera` with the scene in `state`."""
+        posed, instruments = scene.at(state), scene.canonical.of_instruments
+        channels = rasterize(posed, camera, channels=instruments.float()[:, None]).channels
+        assert channels is not None
+        tissue = rasterize(posed.select(~instruments), camera).color.clamp(0, 1).cpu().numpy()
+        shown, window = image.cpu().numpy(), settings.window_px
+        over, under = (uniform_filter((other * tissue).sum(-1), window) for other in (shown, tissue))
+        shade = over / np.maximum(under, 1e-6)
+        likely = np.clip(shade, *settings.shadow)
+        off = np.abs(shown - likely[..., None] * tissue).mean(-1)
+        brightness = settings.dark + uniform_filter(likely * tissue.mean(-1), window)
+        label = channels[..., 0].cpu().numpy()
+        usable = np.ones(label.shape, bool) if mask is None else mask.cpu().numpy()
+        return Comparison(shade, uniform_filter(off, window) / brightness, label, usable)
+
+    def near(self, share: float) -> np.ndarray:
+        """bool [H, W]: pixels within `share` of the width of where an instrument may be rendered."""
+        reach = 2 * math.ceil(share * self.label.shape[1]) + 1
+        return cv2.dilate((self.label > 0.1).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+
+    def inside(self, margin_px: int) -> np.ndarray:
+        """bool [H, W]: pixels so far inside of a rendered instrument."""
+        reach = 2 * margin_px + 1
+        return cv2.erode((self.label > 0.7).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Foreground:
+    """Tells instruments from tissue: the logarithm of the ratio of both densities [R, S] by bins of log residual and
+    shade; `noise`: the residual that nearly all of the tissue is below."""
+
+    ratio: np.ndarray
+    noise: float
+    settings: ForegroundSettings = SETTINGS
+
+    @staticmethod
+    def learned(views: Sequence[Comparison], settings: ForegroundSettings = SETTINGS) -> Foreground | None:
+        """Learn both densities from views; None where there is too little of either."""
+        far = [view.usable & ~view.near(settings.far) for view in views]
+        inside = [view.usable & view.inside(settings.inside_px) for view in views]
+        if min(sum(int(mask.sum()) for mask in masks) for masks in (far, inside)) < settings.least_pixels:
+            return None
+        of_tissue = np.concatenate([view.residual[mask] for view, mask in zip(views, far, strict=True)])
+        residuals = np.concatenate([view.residual[mask] for view, mask in zip(views, inside, strict=True)])
+        shades = np.concatenate([view.shade[mask] for view, mask in zip(views, inside, strict=True)])
+        n_residuals, n_shades = settings.residuals[2], settings.shades[2]
+        row, column = _bins(residuals, shades, settings)
+        instrument = np.bincount(row * n_shades + column, minlength=n_residuals * n_shades).reshape(n_residuals, -1)
+        row = _bins(of_tissue, np.ones_like(of_tissue), settings)[0]
+        middles = np.linspace(*settings.shades[:2], 2 * n_shades + 1)[1::2]
+        shadow = (middles > settings.shadow[0]) & (middles < settings.shadow[1])
+        tissue = np.bincount(row, minlength=n_residuals)[:, None] * shadow
+        instrument, tissue = (_density(counts.astype(float), settings) for counts in (instrument, tissue))
+        noise = float(np.quantile(of_tissue, settings.noise_quantile))
+        return Foreground(np.log(instrument / tissue), noise, settings)
+
+    def certainty(self, view: Comparison, near: float) -> np.ndarray:
+        """Of every pixel of a view [H, W]: 1 certainly an instrument, -1 certainly tissue, 0 not known. No instrument
+        shows farther than `near` (share of the width) from a rendered one."""
+        log_ratio = self.ratio[_bins(view.residual, view.shade, self.settings)]
+        instrument, tissue = (
+            np.clip((sign * log_ratio - math.log(least)) / math.log(most / least), 0, 1)
+            for sign, (least, most) in ((1, self.settings.instrument), (-1, self.settings.tissue))
+        )
+        return np.asarray(np.where(view.usable, np.where(view.near(near), instrument, 0) - tissue, 0))
+
+
+def _bins(residuals: np.ndarray, shades: np.ndarray, settings: ForegroundSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of residuals and shades [...] in the densities."""
+    found = []
+    for values, (low, high, count) in (
+        (np.log(np.maximum(residuals, 1e-6)), settings.residuals), (shades, settings.shades)
+    ):  # fmt: skip
+        found.append(((values - low) / (high - low) * count).astype(int).clip(0, count - 1))
+    return found[0], found[1]
+
+
+def _density(counts: np.ndarray, settings: ForegroundSettings) -> np.ndarray:
+    smooth: np.ndarray = gaussian_filter(counts, settings.smoothing, mode="nearest")
+    return (1 - settings.floor) * smooth / smooth.sum() + settings.floor / smooth.size
