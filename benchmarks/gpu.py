@@ -6,7 +6,8 @@
 Method `kinematic`, random Gaussians on a closed surface, a fifth of them the instrument's: `frame` poses and renders
 them, `step` does, takes the photometric loss and its gradients and one step of Adam; `draw` and `draw+backward`
 do the rasteriser's part alone, on the same posed tensors for all backends. Backends take turns, call by call; numbers
-are medians of the time from an idle device to an idle device, after three calls to warm up. Stages are timed by CUDA
+are medians of the time from an idle device to an idle device, after three calls to warm up. gsplat (pip install gsplat;
+the stated numbers are of 1.5.3) takes part where it is installed. Stages are timed by CUDA
 events in calls of their own, and held against peaks measured in the same run (`stages.MODEL`). FOLDER gets gpu.md and
 gpu.json, after every part.
 
@@ -31,6 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from gsplat_peer import rasterize_gsplat
 from raster import make_surface
 from stages import MODEL, Stages, peaks
 from torch import Tensor
@@ -40,7 +42,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.files import write_json, write_text
 from neeco.methods.kinematic.articulation import LINK_LOGITS
-from neeco.raster import Camera, Gaussians, rasterize
+from neeco.raster import Camera, Gaussians, Rendering, rasterize
 from neeco.raster.devices import device_of, readable_failures
 from neeco.raster.losses import photometric_loss
 from neeco.raster.native import synchronise
@@ -57,6 +59,7 @@ from neeco.training.run import open_run
 
 WORKLOADS = ("25000,320x256", "300000,960x540", "1000000,1920x1080")
 KINDS = ("draw", "frame", "draw+backward", "step")
+GSPLAT = "gsplat"  # a peer, no backend of neeco
 WARM_UP = 3  # calls of each kind and backend
 GRASPER = Instrument("grasper", {"jaw_angle": (0.0, 1.2)})
 STATE = State({"grasper": InstrumentState(torch.eye(4, dtype=torch.float64), {"jaw_angle": 0.4})})
@@ -109,8 +112,15 @@ def backends_on(device: torch.device) -> list[Backend]:
     if device.type == "cpu":
         found.insert(0, Backend("cpu", "cpu"))
     elif importlib.util.find_spec("gsplat") is not None:
-        found.append(Backend("gsplat", "cuda"))
+        found.append(Backend("gsplat", GSPLAT))
     return found
+
+
+def render(gaussians: Gaussians, camera: Camera, word: str) -> Rendering:
+    """`rasterize` by a backend of neeco or by gsplat."""
+    if word == GSPLAT:
+        return rasterize_gsplat(gaussians, camera, background=gaussians.background)
+    return rasterize(gaussians, camera, backend=word)
 
 
 def surface_scene(gaussians: Gaussians, camera: Camera) -> GaussianScene:
@@ -159,14 +169,14 @@ class Case:
 
     @torch.no_grad()
     def draw(self, word: str) -> Tensor:
-        return rasterize(self.posed, self.camera, backend=word).color
+        return render(self.posed, self.camera, word).color
 
     @torch.no_grad()
     def frame(self, word: str) -> Tensor:
-        return rasterize(self.scene.at(STATE), self.camera, backend=word).color
+        return render(self.scene.at(STATE), self.camera, word).color
 
     def gradients(self, word: str) -> None:
-        drawn = rasterize(replace(self.posed, **self.leaves), self.camera, backend=word)
+        drawn = render(replace(self.posed, **self.leaves), self.camera, word)
         torch.autograd.backward(drawn.color, self.weights)
         for leaf in self.leaves.values():
             leaf.grad = None
@@ -174,7 +184,7 @@ class Case:
     def step(self, word: str) -> None:
         for tensor in self.learned:
             tensor.requires_grad_(True)
-        drawn = rasterize(self.scene.at(STATE), self.camera, backend=word)
+        drawn = render(self.scene.at(STATE), self.camera, word)
         photometric_loss(drawn.color, self.target, ssim_weight=0.2).backward()
         for tensor, moments in zip(self.learned, self.moments, strict=True):
             if tensor.grad is not None:

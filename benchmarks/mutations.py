@@ -250,7 +250,7 @@ CASES: dict[str, Case] = {
             "--output",
             "out",
             "--conditions",
-            pick.choice(("a", "b", "a+soft")),
+            pick.choice(("a", "b", "a+strong")),
         ],
         0.5,
         ("capture", "set", "annotated"),

@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=30)
     arguments = parser.parse_args()
     options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with ViewerServer([arguments.run]) as viewer, sync_playwright() as driver:
+    with ViewerServer(arguments.run) as viewer, sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=options)
         for width, height in PAGES:
             found = delays(browser, viewer.address, width, height, arguments.times)

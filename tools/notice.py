@@ -21,7 +21,6 @@ PART = "Part 2. What is installed beside neeco, none of it passed on with it"
 IMPORTED = (
     "neeco",
     "cluster",
-    "cuda",
     "downstream",
     "hub",
     "ingest",
@@ -41,7 +40,6 @@ ALLOWED = re.compile(
 # where the package says nothing that can be read by a machine, and where it was read instead
 FOUND = {
     "cuda-toolkit": "NVIDIA's, an empty package that names others",  # its description on PyPI
-    "gsplat": "Apache-2.0",  # LICENSE in its wheel
     "usd-core": "Apache-2.0",  # LICENSE.txt: TOST-1.0, which is Apache-2.0 but for the paragraph on trademarks
     "apsw": "MIT",  # LICENSE: any licence that the OSI approves
 }

@@ -36,7 +36,6 @@ TASKS_PER_WORKER = 2  # submitted to a cluster, so that no worker waits for the 
 
 # (what all tasks share, a task, threads that it may use) -> its result; pickled, so it is a function of a module
 TaskFunction = Callable[[Any, Any, int], Any]
-Events = Generator["TaskEvent", None, None]
 Outcome = Literal["done", "failed", "died"]
 Stage = Literal["started", "done", "failed", "died", "abandoned"]
 

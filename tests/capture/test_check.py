@@ -361,7 +361,7 @@ def test_the_verb_prints_and_returns_a_status(folder, capsys):
     assert check_verb.run(check_verb.Arguments(SAMPLE)) == 0
     assert "no problems found" in capsys.readouterr().out
     folder.edit(_joint(5, 2.0))
-    assert main(["check", "--json", str(folder.root)]) == 1
+    assert main(["check", str(folder.root), "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
     assert main(["check", str(folder.root), "--json", str(folder.root / "problems.json")]) == 1
     assert json.loads((folder.root / "problems.json").read_text()) == report

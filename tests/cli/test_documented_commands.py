@@ -86,7 +86,7 @@ ingest --formats
 score-masks PREDICTED TRUTH --classes shaft=1 wrist=2 jaws=3 jaws=4 --truth-classes shaft=1 wrist=2 jaws=3 jaws=4
 downstream CAPTURE --sets few=dataset:2 many=dataset:4 --frame-selection spread --steps 1 --batch 2 --output OUT
 downstream CAPTURE --sets few=dataset:2 --frame-selection first --classes parts --output OUT --workers 1
-downstream CAPTURE --sets few=dataset:2 --match-colors FRAMES --backgrounds PLATES --output OUT
+downstream CAPTURE --sets few=dataset:2 --backgrounds PLATES --output OUT
 ablate CAPTURE --output DIR --tables shadow --iterations 40 --seed 2 --workers 2
 """
 # Options of `neeco` that no test can run to the end here: what they need.

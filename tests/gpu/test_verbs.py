@@ -18,7 +18,7 @@ from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.viewer.controls import Controls
-from neeco.viewer.runs import ViewedRuns
+from neeco.viewer.runs import ViewedRun
 from neeco.viewer.views import IMAGE, render_run, scored, views_of
 
 slowly = pytest.mark.parametrize("word", SLOW_ON_CPU, indirect=True)
@@ -151,12 +151,12 @@ def test_export_and_the_page_as_a_file(verb: Call, run: str) -> None:
 
 
 def test_the_viewer_draws_every_view(run: str, device: torch.device) -> None:
-    here, there = (ViewedRuns([Path(run)], where) for where in (torch.device("cpu"), device))
-    loaded = there.loaded[0]
+    here, there = (ViewedRun(Path(run), where) for where in (torch.device("cpu"), device))
+    loaded = there.loaded
     assert loaded.scene.center.device.type == device.type
     camera, controls = loaded.recorded.cameras[2], Controls(2.0)
     for view in views_of(loaded.scene, bool(loaded.frames)):
-        drawn, expected = (render_run(runs, 0, controls, camera, view) for runs in (there, here))
+        drawn, expected = (render_run(viewed, controls, camera, view) for viewed in (there, here))
         difference = np.abs(drawn.picture.pixels.astype(float) - expected.picture.pixels)
         assert (difference > 2).mean() < 0.01, view
     score = scored(drawn).score
@@ -168,13 +168,13 @@ def test_the_viewer_says_that_a_gpu_failed_and_goes_on(run: str, monkeypatch: py
     def full(*words: object, **named: object) -> None:
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB.")
 
-    runs = ViewedRuns([Path(run)])
-    camera, controls = runs.loaded[0].recorded.cameras[2], Controls(2.0)
+    viewed = ViewedRun(Path(run))
+    camera, controls = viewed.loaded.recorded.cameras[2], Controls(2.0)
     with monkeypatch.context() as patch:
         patch.setattr(GaussianScene, "at", full)
         with pytest.raises(NeecoError, match=r"2\.50 GiB more were asked for"):
-            render_run(runs, 0, controls, camera, IMAGE)
-    assert render_run(runs, 0, controls, camera, IMAGE).picture.pixels.any()
+            render_run(viewed, controls, camera, IMAGE)
+    assert render_run(viewed, controls, camera, IMAGE).picture.pixels.any()
 
 
 @slowly

@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from neeco.cli.ingest import Ingest, run
 from neeco.errors import NeecoError
 from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.columns import CAMERA as CAMERA_FRAME
 from neeco.ingest.readers.columns import PoseColumns, Units
+from neeco.ingest.readers.lerobot import find_rotations
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.recording.compatibility import separate
 from neeco.ingest.recording.file import read_recording
@@ -265,6 +267,28 @@ def test_the_first_episode_that_is_there_is_offered(tmp_path):
     for file in path.glob("*/**/*episode_000000*"):
         file.unlink()
     assert f'stream: "episode 1/{CAMERA}"' in write_template(path)
+
+
+def test_rotations_are_found_by_their_numbers():
+    turns = Rotation.from_euler("ZYX", np.linspace((0, 0, 0.4), (3, 0.5, 0.1), 40))
+    places = np.linspace((0.1, 0.2, 0.3), (0.2, 0.1, 0.4), 40)
+    quats, matrices = turns.as_quat().astype(np.float32), turns.as_matrix().reshape(-1, 9).astype(np.float32)
+    found = find_rotations(np.column_stack([places, quats, places]))
+    assert found == [(3, "quaternion_wxyz")]  # of either order
+    found = find_rotations(np.column_stack([places, matrices, quats]))
+    assert found == [(3, "rotation_matrix"), (12, "quaternion_wxyz")]
+    assert find_rotations(np.column_stack([places, places])) == []
+    assert find_rotations(np.tile([1.0, 0, 0, 0], (9, 1))) == []  # four numbers that stand still
+    mirrored = matrices * np.array([1, 1, -1] * 3)
+    assert find_rotations(mirrored.astype(np.float32)) == []
+
+
+def test_init_asks_what_a_data_set_leaves_open_in_words_beside_it(nameless, tmp_path, capsys):
+    path = Path(shutil.copytree(nameless, tmp_path / "set"))
+    assert run(Ingest(source=(path,), init=True)) == 0
+    assert {*tmp_path.iterdir()} == {path, tmp_path / "recording.yaml"}
+    questions = capsys.readouterr().out.partition("still open:")[2]
+    assert questions.count("what do its poses mean?") == 2  # its quaternion's order and its frame
 
 
 def test_a_template_asks_what_a_nameless_vector_may_be(nameless):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import pytest
 import torch
 
@@ -22,13 +20,15 @@ class Cards:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.capability, self.built = (8, 9), ["sm_75", "sm_80", "sm_90a", "compute_120"]
-        self.gsplat = True
+        self.triton_lacks: str | None = None
+        self.started: list[str] = []  # devices on which Triton was started
         monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
         monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
         monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "Some Card")
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: self.capability)
         monkeypatch.setattr(torch.cuda, "get_arch_list", lambda: self.built)
-        monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if self.gsplat else None)
+        monkeypatch.setattr(devices, "missing", lambda device: self.triton_lacks)
+        monkeypatch.setattr(devices, "require_triton", lambda device: self.started.append(str(device)))
 
 
 @pytest.fixture
@@ -98,16 +98,14 @@ def test_a_card_that_pytorch_has_no_kernels_for_is_refused(
         assert device_of("auto").type == "cpu"
 
 
-def test_without_gsplat_triton_must_start_there_before_any_work(cards: Cards, monkeypatch) -> None:
-    cards.gsplat = False
-    asked: list[str] = []
-    monkeypatch.setattr(devices, "require_triton", lambda device: asked.append(str(device)))
+def test_triton_must_start_there_before_any_work(cards: Cards) -> None:
+    cards.triton_lacks = "package triton is missing"
     assert "package triton is missing" in refused("cuda")
     assert device_of("cuda", drawing=False).type == "cuda"
-    assert asked == []
-    monkeypatch.setattr(devices, "missing", lambda device: None)
+    assert cards.started == []
+    cards.triton_lacks = None
     assert device_of("cuda:1") == torch.device("cuda:1")
-    assert asked == ["cuda:1"]
+    assert cards.started == ["cuda:1"]
 
 
 def test_full_memory_says_how_much_was_asked_for_and_what_to_do() -> None:

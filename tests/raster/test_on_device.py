@@ -64,7 +64,7 @@ def test_kernels_are_launched_for_float32_on_cuda_devices_alone(monkeypatch: pyt
     ready.require_triton.cache_clear()
     ready.starts_on.cache_clear()
     try:
-        assert not ready.starts_on(CUDA)  # gsplat's users need no Triton
+        assert not ready.starts_on(CUDA)
     finally:
         ready.require_triton.cache_clear()
         ready.starts_on.cache_clear()

@@ -259,8 +259,8 @@ def test_unknown_and_missing_backends_are_named() -> None:
     with pytest.raises(NeecoError, match="unknown"):
         rasterize(gaussians, camera, backend="metal")
     if not torch.cuda.is_available():
-        with pytest.raises(NeecoError, match=r"\.\[cuda\]"):
-            rasterize(gaussians, camera, backend="cuda")
+        with pytest.raises(NeecoError, match="backend: triton: "):
+            rasterize(gaussians, camera, backend="triton")
 
 
 def test_an_instruction_set_that_is_not_there_is_refused() -> None:
@@ -330,14 +330,13 @@ def test_the_reference_draws_the_same_on_cuda() -> None:
     [
         ("cpu", "nps"),
         pytest.param("triton", "triton", marks=ON_A_GPU),
-        pytest.param("cuda", "gsplat", marks=ON_A_GPU),
     ],
 )
 @pytest.mark.parametrize(("sh_count", "channels"), [(1, 0), (16, 3)])
 def test_image_and_gradients_are_the_references_on_the_backends_device(
     backend: str, package: str, sh_count: int, channels: int
 ) -> None:
-    """That of the camera's pose too. Less exactly than above: gsplat computes its own way."""
+    """That of the camera's pose too."""
     pytest.importorskip(package)
     scene = make_scene(150, sh_count, channels)
     decided = decided_pixels(scene)

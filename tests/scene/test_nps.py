@@ -250,3 +250,23 @@ def test_networks_start_in_bfloat16_where_that_is_fast(method: str) -> None:
         assert method_class(method).resolved(config.deformation, begun).half is half
         assert method_class(method).resolved(begun) is begun
     assert not method_settings(method, {}).half  # of a run that does not say: an older one
+
+
+def test_what_does_not_move_does_not_shift_the_labels() -> None:
+    """Otsu's threshold is found among the Gaussians that move; zeros would pull it below the slightly moving ones."""
+
+    class Moves(NPS):
+        def deltas(self, canonical, state):
+            deltas = super().deltas(canonical, state)
+            share = torch.full((len(canonical), 1), 1e-3)
+            share[:20], share[40:] = 0.0, 1.0
+            deltas.means.copy_(share * state.instruments["grasper"].pose[:3, 3].float())
+            return deltas
+
+    network = Moves((GRASPER,), NPSSettings(depth=2, width=8))
+    canonical = random_canonical(torch.Generator().manual_seed(0))
+    states = [grasper_state(pose_of(0, 0, 0, 5.0 * k, 0, 0)) for k in range(5)]
+    network.fit_ranges(states, canonical.means)
+    labels = network.label_channels(mark_moving(network, canonical, states))[:, 0]
+    assert not labels[:40].any()
+    assert bool(labels[40:].all())

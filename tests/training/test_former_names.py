@@ -49,3 +49,12 @@ def test_a_stored_setting_that_is_none_any_more_is_read_and_not_taken_anew(tmp_p
     assert stored_config(tmp_path, stored) == config
     with pytest.raises(NeecoError, match="label_shares"):
         training_config("kinematic", {}, ["deformation.label_shares=false"])
+
+
+def test_a_stored_setting_that_was_removed_is_read_where_it_was_off_and_refused_where_it_was_on(tmp_path: Path) -> None:
+    config = training_config("nps", {}, [])
+    stored = config_to_dict(config)
+    off, on = ({"gate_mm": mm, "carried_places": mm is not None} for mm in (None, 20.0))
+    assert stored_config(tmp_path, stored | {"deformation": stored["deformation"] | off}) == config
+    with pytest.raises(NeecoError, match="carried_places"):
+        stored_config(tmp_path, stored | {"deformation": stored["deformation"] | on})

@@ -91,7 +91,7 @@ def test_a_wrong_setting_is_refused_by_name(assignment: str, named: str) -> None
         ("half", 1, "1 is not true or false"),
         ("depth", True, "True is not a whole number"),
         ("width", 2.5, "2.5 is not a whole number"),
-        ("gate_mm", "far", "'far' is not a number"),
+        ("rate", "far", "'far' is not a number"),
         ("speed", 1, "has no such field"),
     ],
 )
@@ -103,8 +103,8 @@ def test_a_field_of_a_deformation_is_refused_by_name_when_it_does_not_fit(
 
 
 def test_numbers_of_a_deformation_may_be_whole_and_absent_ones_none() -> None:
-    assert method_settings("nps", {"gate_mm": 20, "depth": 2}).gate_mm == 20
-    drafts = method_settings("nps", {"gate_mm": None, "state": "rotation_jaw"})
+    assert method_settings("nps", {"rate": 1, "depth": 2}).rate == 1
+    drafts = method_settings("nps", {"half": None, "state": "rotation_jaw"})
     assert drafts.state == "rotation_jaw"
 
 

@@ -26,8 +26,8 @@ def serve() -> Iterator[Callable[..., ViewerServer]]:
     """Starts servers, which end with the test."""
     started: list[ViewerServer] = []
 
-    def start(*runs: Path, **options: Any) -> ViewerServer:
-        viewer = ViewerServer(runs, **options)
+    def start(run: Path, **options: Any) -> ViewerServer:
+        viewer = ViewerServer(run, **options)
         started.append(viewer)
         return viewer
 

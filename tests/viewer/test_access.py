@@ -155,7 +155,7 @@ def test_names_of_a_run_stay_text(tmp_path: Path) -> None:
     run = write_run(scene, tmp_path / "<script>run", write_recorded_images(scene, tmp_path / "capture"))
     picture = Picture(np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6)))
     part = RunPicture(loaded=WatchedRun(run).loaded, picture=picture, frame=2.0, exact=True, trouble=HOSTILE)
-    html = status_html([part], 0.1, (6, 4), HOSTILE)
+    html = status_html(part, 0.1, HOSTILE)
     assert "<script" not in html
     assert "<img" not in html
     assert "<b>0" not in html

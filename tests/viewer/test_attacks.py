@@ -47,7 +47,7 @@ CAMERA = {
 @pytest.fixture(scope="module")
 def shared(made_run: Path) -> Iterator[ViewerServer]:
     """One server for all tests that leave it as it is."""
-    viewer = ViewerServer([made_run])
+    viewer = ViewerServer(made_run)
     yield viewer
     viewer.stop()
 
@@ -392,7 +392,7 @@ def test_a_scene_that_cannot_be_is_refused_in_one_short_line(
 ) -> None:
     run = rewritten(made_run, tmp_path, change)
     with pytest.raises(NeecoError) as refused:
-        ViewerServer([run])
+        ViewerServer(run)
     said = str(refused.value)
     assert said.startswith(str(run / "scene.safetensors"))
     assert "\n" not in said

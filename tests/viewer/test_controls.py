@@ -9,7 +9,7 @@ import pytest
 import torch
 from scene_worlds import GRASPER, make_nerf, make_scene, pose_of
 from scipy.spatial.transform import Rotation
-from viewer_world import FRAMES, LIMITS, grasper_scene
+from viewer_world import LIMITS, grasper_scene
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.viewer.controls import (
@@ -17,7 +17,6 @@ from neeco.viewer.controls import (
     InstrumentControls,
     Shaft,
     controlled_state,
-    corresponding_frame,
     interpolated_state,
     shafts_of,
     slider_ranges,
@@ -181,10 +180,3 @@ def test_a_joint_that_never_moved_still_has_a_range() -> None:
     still = (two_states()[0],) * 3
     span = slider_ranges((Instrument(NAME, {"jaw_angle": None}),), still)[NAME, "jaw_angle"]
     assert span.lower < 0.2 < span.upper
-
-
-def test_recordings_of_one_length_go_frame_by_frame_others_by_their_share() -> None:
-    assert corresponding_frame(3.5, FRAMES, FRAMES) == 3.5
-    assert corresponding_frame(2.5, 6, 11) == pytest.approx(5.0)
-    assert corresponding_frame(2.0, 5, 4) == 2.0  # 1.5, and a frame has a frame beside it
-    assert corresponding_frame(0.0, 1, 7) == 0.0

@@ -299,8 +299,6 @@ def test_answers_to_two_servers_on_one_capture_are_all_kept(made: PosingWorld, t
     assert [path.name for path in root.iterdir() if path.name.startswith(".")] == []
 
 
-def test_one_capture_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["view", str(tmp_path), str(tmp_path), "--annotate"]) == 1
-    assert "give one capture" in capsys.readouterr().err
+def test_posing_and_export_exclude_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["view", str(tmp_path), "--annotate", "--export", str(tmp_path / "page.html")]) == 1
     assert "give one of the two" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from neeco.scene.io import save_scene
 from neeco.training.config import TrainConfig
 from neeco.training.run import checkpoint_path
 from neeco.training.train import train
-from neeco.viewer.runs import SCENE_FILE, ViewedRuns, WatchedRun, score_frame
+from neeco.viewer.runs import SCENE_FILE, ViewedRun, WatchedRun, score_frame
 
 
 @pytest.fixture
@@ -142,25 +142,17 @@ def test_every_method_can_be_looked_at(method: str, tmp_path: Path) -> None:
     with torch.no_grad():
         capture = write_recorded_images(scene, tmp_path / "capture")
         run = write_run(scene, tmp_path / "run", capture)
-    runs = ViewedRuns([run])
-    assert len(runs.loaded[0].frames) == len(scene.recorded.names)
-    assert runs.unit > 0
-
-
-def test_two_runs_are_of_one_capture(run: Path, tmp_path: Path) -> None:
-    scene = grasper_scene()
-    elsewhere = write_run(scene, tmp_path / "elsewhere", write_recorded_images(scene, tmp_path / "other-capture"))
-    with pytest.raises(NeecoError, match=r"view: .*elsewhere: was trained on .*other-capture, .*compare runs of one"):
-        ViewedRuns([run, elsewhere])
-    assert len(ViewedRuns([run, run]).loaded) == 2
+    viewed = ViewedRun(run)
+    assert len(viewed.loaded.frames) == len(scene.recorded.names)
+    assert viewed.unit > 0
 
 
 def test_what_is_known_of_frames_is_found_out_anew_for_a_changed_run(run: Path) -> None:
-    runs = ViewedRuns([run])
-    before = score_frame(runs.loaded[0], 2)
-    assert before is score_frame(runs.loaded[0], 2)
+    viewed = ViewedRun(run)
+    before = score_frame(viewed.loaded, 2)
+    assert before is score_frame(viewed.loaded, 2)
     save_scene(brighter(grasper_scene()), run / SCENE_FILE)
     later(run / SCENE_FILE)
-    assert runs.refresh()
-    assert score_frame(runs.loaded[0], 2).psnr < before.psnr - 10
-    assert runs.timelines[0].known()[0].size == 0
+    assert viewed.refresh()
+    assert score_frame(viewed.loaded, 2).psnr < before.psnr - 10
+    assert viewed.timeline.known()[0].size == 0

@@ -146,7 +146,7 @@ def test_a_server_that_the_guard_does_not_see_is_not_left_running(
 
     monkeypatch.setattr("viser.ViserServer", Other)
     with pytest.raises(NeecoError, match="opens its port in a way that is not known"):
-        ViewerServer([made_run])
+        ViewerServer(made_run)
     assert len(stopped) == 1
 
 
@@ -159,11 +159,8 @@ def test_without_viser_it_says_what_to_install(made_run: Path, monkeypatch: pyte
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ([], "no run given"),
-        (["RUN", "RUN", "RUN"], "3 runs given"),
         (["nowhere"], "nowhere: no such run folder"),
         (["RUN", "--port", "70000"], "--port: 70000"),
-        (["RUN", "RUN", "--export", "x.html"], "--export: 2 runs given"),
         (["RUN", "--export", "x.html", "--sh", "4"], "--sh: 4"),
     ],
 )

@@ -26,8 +26,6 @@ from neeco.viewer.views import (
     difference,
     dimmed,
     picture,
-    side_by_side,
-    split,
     views_of,
 )
 
@@ -142,20 +140,6 @@ def test_a_field_shows_image_and_depth() -> None:
     scene = make_nerf()
     for view in views_of(scene, False):
         assert picture(scene, scene.recorded.states[0], scene.recorded.cameras[0], view).pixels.shape == (6, 8, 3)
-
-
-def test_side_by_side_each_keeps_its_width() -> None:
-    both = side_by_side([plain((10, 0, 0), note="a"), plain((20, 0, 0), note="b")])
-    assert both.pixels[0, :, 0].tolist() == [10] * 7 + [255] * 2 + [20] * 7
-    assert both.depth[0].tolist() == [10.0] * 8 + [20.0] * 8
-    assert both.note == "a; b"
-
-
-@pytest.mark.parametrize(("share", "left"), [(0.0, 0), (0.5, 4), (1.0, 8)])
-def test_a_split_picture_shows_each_on_its_side(share: float, left: int) -> None:
-    both = split(plain((10, 0, 0)), plain((20, 0, 0)), share)
-    assert both.depth[0].tolist() == [10.0] * left + [20.0] * (8 - left)
-    assert both.pixels.shape == (6, 8, 3)
 
 
 def test_what_cannot_be_compared_is_darker() -> None:

@@ -122,13 +122,9 @@ def _status(words: list[str]) -> int:
 
 
 def _with_target(words: list[str]) -> list[str]:
-    """Words in which every `--json` that no file follows is followed by `-`, standard output. Before version 0.3, no
-    file followed that of `check` and `ingest`, but captures and recordings might."""
-    bare = words[:1] in (["check"], ["ingest"])
+    """Words in which every `--json` that no file follows is followed by `-`, standard output."""
     for at in reversed([at for at, word in enumerate(words) if word == "--json"]):
-        following = words[at + 1] if at + 1 < len(words) else "--"
-        read = not following.endswith(".json") or os.path.basename(following).startswith("transforms")
-        if following.startswith("--") or (bare and following != "-" and read):
+        if at + 1 == len(words) or words[at + 1].startswith("--"):
             words.insert(at + 1, "-")
     return words
 

@@ -23,11 +23,9 @@ class Downstream:
 
     Each model is trained from scratch in every condition, with as many steps, on the same labelled frames of a fold;
     tests are frames of the other splits, and of other captures. Conditions are sums of words: `real`, names of sets,
-    `paste` (the labelled instruments over other backgrounds), `match` (labelled frames in another recording's colours),
-    `strong` (augmentation of everything), `permuted` (sets with labels of other images, a control), and when what is
-    learned: `finetune`, `balanced`, `pool` or `blend`; for the edges of synthetic labels `hard`, `soft` or `ignore`.
-    The same command continues interrupted work; with more models, sets, conditions or folds it adds them. Needs the
-    extra `downstream`.
+    `paste` (the labelled instruments over other backgrounds), `strong` (augmentation of everything), `permuted` (sets
+    with labels of other images, a control). The same command continues interrupted work; with more models, sets,
+    conditions or folds it adds them. Needs the extra `downstream`.
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
@@ -48,8 +46,6 @@ class Downstream:
     """Training data. Default: real, real+strong, real+paste, SET, SET+strong, SET+real, SET+real+permuted."""
     backgrounds: Path | None = None
     """Folder of images without an instrument to paste over. Default: the labelled frames, instruments filled in."""
-    match_colors: Path | None = None
-    """Folder of unlabelled frames of the other recording, with instruments or without, for the word match."""
     labels: Path | None = None
     """Folder of masks named as the frames, for the recorded training frames. Default: the capture's truth."""
     classes: Literal["instrument", "parts"] = "instrument"

@@ -62,8 +62,7 @@ def run(args: Ingest) -> int:
     from neeco.cli._output import ready_for_json, write_numbers
     from neeco.cli._progress import Bars
     from neeco.ingest.convert import convert_folder
-    from neeco.ingest.sources import folder_to_convert
-    from neeco.report.choice_picture import write_draft
+    from neeco.ingest.sources import folder_to_convert, write_draft
     from neeco.report.ingest_page import ingest_and_report
 
     if args.formats:

@@ -22,14 +22,13 @@ POLL_S = 0.5  # between two looks for Ctrl-C
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Show a run in a web browser: any state, any view, what is made up and what is wrong. Two runs side by side; one
-    that is still trained, too; or a capture before training. With --export, write one file that shows a run without a
-    server. With --annotate, set roll and joints of an instrument found in a video by hand, in the frames that help
-    most."""
+    """Show a run in a web browser: any state, any view, what is made up and what is wrong; one that is still trained,
+    too; or a capture before training. With --export, write one file that shows a run without a server. With
+    --annotate, set roll and joints of an instrument found in a video by hand, in the frames that help most."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [OTHER]"), tyro.conf.Positional]
-    """Run folders that `neeco train` wrote or is writing: one, or two to compare; or one capture. With --annotate: a
-    capture, or a run of one, whose scene then shows as a ghost."""
+    source: Annotated[Path, tyro.conf.arg(metavar="RUN|CAPTURE"), tyro.conf.Positional]
+    """Run folder that `neeco train` wrote or is writing; or a capture. With --annotate: a capture, or a run of one,
+    whose scene then shows as a ghost."""
     port: int = 8080
     """Port to listen on; the next free one where it is taken."""
     host: str = "127.0.0.1"
@@ -39,7 +38,7 @@ class Arguments:
     annotate: bool = False
     """Pose frames of the capture given by hand; answers go to hand_posed.yaml in it, and its states are solved anew."""
     export: Path | None = None
-    """Write this HTML file instead, of the one run given."""
+    """Write this HTML file instead."""
     size: tyro.conf.OmitArgPrefixes[SizeSettings] = RECORDED_SIZE
     sh: int = 3
     """Degree of the spherical harmonics that an exported file keeps, 0 to 3; lower is smaller."""
@@ -52,8 +51,6 @@ def run(arguments: Arguments) -> int:
     """Export, or serve until Ctrl-C."""
     from neeco.raster.devices import device_of
 
-    if not arguments.runs:
-        raise NeecoError("view: no run given; give one, or two to compare")
     if arguments.annotate:
         return _annotate(arguments)
     if arguments.export is not None:
@@ -61,21 +58,18 @@ def run(arguments: Arguments) -> int:
             raise NeecoError("--size, --scale: an exported page renders at the size of its window; leave them out")
         return _export(arguments, arguments.export)
     arguments.size.check()
-    captures = [path for path in arguments.runs if is_capture(path)]
-    if captures:
-        if len(arguments.runs) > 1:
-            raise NeecoError(f"view: {captures[0]}: a capture, no run; give it alone, or two runs to compare")
+    if is_capture(arguments.source):
         from neeco.viewer.recording import RecordingServer
 
-        with RecordingServer(captures[0], arguments.host, arguments.port) as recording:
+        with RecordingServer(arguments.source, arguments.host, arguments.port) as recording:
             return _serve(recording.address, arguments)
     from neeco.viewer.server import ViewerServer
 
     device = device_of(arguments.device)
     with ViewerServer(
-        arguments.runs, arguments.host, arguments.port, device, arguments.size, arguments.tissue
+        arguments.source, arguments.host, arguments.port, device, arguments.size, arguments.tissue
     ) as viewer:
-        if len(shown := viewer.runs.loaded[0].tissues) > 1:
+        if len(shown := viewer.run.loaded.tissues) > 1:
             print(f"the run has several tissues ({', '.join(shown)}); --tissue chooses which is shown")
         return _serve(viewer.address, arguments)
 
@@ -120,11 +114,9 @@ def _opened(address: str) -> Iterator[None]:
 def _annotate(arguments: Arguments) -> int:
     from neeco.viewer.posing_server import PosingServer
 
-    if len(arguments.runs) != 1:
-        raise NeecoError(f"--annotate: {len(arguments.runs)} folders given; give one capture, or a run of one")
     if arguments.export is not None:
         raise NeecoError("--annotate, --export: give one of the two")
-    with PosingServer(arguments.runs[0], arguments.host, arguments.port) as server:
+    with PosingServer(arguments.source, arguments.host, arguments.port) as server:
         return _serve(server.address, arguments)
 
 
@@ -133,8 +125,6 @@ def _export(arguments: Arguments, output: Path) -> int:
     from neeco.raster.devices import device_of
     from neeco.viewer.export import export_page
 
-    if len(arguments.runs) != 1:
-        raise NeecoError(f"--export: {len(arguments.runs)} runs given; a file shows one")
     require_ending("--export", output, ".html", ".htm")
-    print(export_page(arguments.runs[0], output, arguments.sh, device_of(arguments.device), arguments.tissue))
+    print(export_page(arguments.source, output, arguments.sh, device_of(arguments.device), arguments.tissue))
     return 0

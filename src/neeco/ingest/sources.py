@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from neeco.errors import NeecoError
+from neeco.files import write_text
+from neeco.ingest.cameras.still_scene import video_stands_still
 from neeco.ingest.readers import format_of
 from neeco.ingest.recording.file import RecordingSection, read_recording
 from neeco.ingest.recording.model import MAX_SHAFT_MM, MIN_FRAMES, Recording
 from neeco.ingest.recording.sections import faults_in, node_of, read_section
+from neeco.ingest.recording.template import holds_streams, open_questions, write_template
 
 RECORDING = "recording.yaml"
+
+
+def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
+    """Write a recording.yaml for what lies at `source`, into the folder or next to the file. Return lines on what was
+    written; `report` is called with what is left out.
+
+    Raises NeecoError where a recording.yaml exists, and where there are no images.
+    """
+    path = (source.parent if holds_streams(source) else source) / RECORDING
+    if path.exists():
+        raise NeecoError(f"{path}: already exists; edit it, or move it away first")
+    draft = write_template(source, lambda problem: report(f"left out: {problem}"), video_stands_still)
+    write_text(path, draft)
+    questions = [f"{n}. {path}:{line}: {words}" for n, (line, words) in enumerate(open_questions(draft), 1)]
+    lines = ["still open:", *questions] if questions else []
+    return [*lines, f"wrote {path}: look through it, then: neeco ingest {path} --output CAPTURE"]
 
 
 def folder_to_convert(sources: Sequence[Path]) -> Path | None:

@@ -13,103 +13,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
 from neeco.methods.networks import HALF_BY_DEFAULT, check_warm_up, encode, half_resolved, octave_weights, robust_bounds
-from neeco.methods.space_carving import CarvingSettings, carve, moves_with_pose
-from neeco.methods.tissue_fit import carve_seeds, tissue_evidence
-from neeco.raster.devices import CachedPredicate, bfloat16_products, tf32_products
+from neeco.methods.space_carving import CarvingSettings
+from neeco.methods.tissue_fit import carve_seeds
+from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
 from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Perturbation, Posed, floored_decay, state_of
 from neeco.scene.training_session import GaussianTraining
-from neeco.training.session import GaussianSession, gaussian_session
-
-N_CELLS = 64  # per side of a swept volume
-MIN_SHARE_INSIDE = 0.01  # of the Gaussians in a bounded volume: with fewer the network cannot form an instrument
-
-
-class SweptVolume(nn.Module):
-    """All of space until `cover` is called, then the volume within `margin_mm` of its points."""
-
-    low: Tensor  # [3] mm, world frame: corner of the grid
-    cell: Tensor  # [3] mm; 0 while nothing is covered
-    occupied: Tensor  # [N_CELLS, N_CELLS, N_CELLS] bool
-
-    def __init__(self, margin_mm: float) -> None:
-        super().__init__()
-        self.margin_mm = margin_mm
-        self.register_buffer("low", torch.zeros(3))
-        self.register_buffer("cell", torch.zeros(3))
-        self.register_buffer("occupied", torch.zeros(N_CELLS, N_CELLS, N_CELLS, dtype=torch.bool))
-        self._covered = CachedPredicate(lambda cell: cell.any())
-
-    @property
-    def bounded(self) -> bool:
-        """Whether `cover` was called."""
-        return self._covered(self.cell)
-
-    def cover(self, points: Tensor) -> None:
-        """Set the volume to the cells whose centre lies within the margin of a cell that contains one of `points` [P,
-        3] mm."""
-        margin = self.margin_mm
-        low = points.min(0).values - margin
-        size = (points.max(0).values + margin - low).clamp_min(1e-3)
-        self.low.copy_(low)
-        self.cell.copy_(size / N_CELLS)
-        index = ((points - self.low) / self.cell).long().clamp(0, N_CELLS - 1)
-        holds = np.zeros((N_CELLS,) * 3, bool)
-        holds[tuple(index.T.cpu().numpy())] = True
-        distance = distance_transform_edt(~holds, sampling=self.cell.tolist())
-        self.occupied.copy_(torch.from_numpy(distance <= margin))
-
-    def contains(self, points: Tensor) -> Tensor:
-        """[N] bool for points [N, 3] mm, world frame."""
-        if not self.bounded:
-            return torch.ones(len(points), dtype=torch.bool, device=points.device)
-        index = ((points - self.low) / self.cell).floor().long()
-        inside = ((index >= 0) & (index < N_CELLS)).all(1)
-        x, y, z = index.clamp(0, N_CELLS - 1).unbind(1)
-        return inside & self.occupied[x, y, z]
-
-
-def bound_volume(session: GaussianSession, volume: SweptVolume) -> None:
-    """Bound `volume`, outside which the paper's network is not evaluated, by what the carved instruments sweep in the
-    training frames.
-
-    Where carving cannot be trusted the volume stays unbounded: slow, but never wrong. Raises NeecoError when hardly any
-    Gaussian lies inside: the network moves tissue onto the instrument, so the volume has to reach the tissue.
-    """
-    scene, views, report = session.scene, session.views, session.report
-    report("searching for the instruments, to bound where the network is evaluated")
-    evidence = tissue_evidence(scene, views, session.config)
-    generator = torch.Generator().manual_seed(session.config.seed)
-    shapes = []
-    for instrument in scene.instruments:
-        shape = carve(evidence, instrument.name, generator, session.config.deformation.carving)
-        if shape is None or not moves_with_pose(session, evidence, instrument.name, shape):
-            report(f"warning: {instrument.name}: its shape cannot be carved; the network is evaluated everywhere")
-            return
-        shapes.append(shape)
-    swept = []
-    for instrument, shape in zip(scene.instruments, shapes, strict=True):
-        recorded = [frame.state.instruments[instrument.name].pose.float() for frame in views.frames]
-        poses = torch.stack(recorded).to(shape.seeds)  # [F, 4, 4]
-        swept.append((shape.seeds @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3))
-    volume.cover(torch.cat(swept).to(scene.canonical.means))
-    inside = volume.contains(scene.canonical.means)
-    if int(inside.sum()) < MIN_SHARE_INSIDE * len(inside):
-        raise NeecoError(
-            f"deformation.gate_mm: only {int(inside.sum())} of {len(inside)} Gaussians lie within {volume.margin_mm} "
-            "mm of the instruments' path; give a greater distance"
-        )
-    report(f"the network is evaluated on {int(inside.sum())} of {len(inside)} Gaussians")
-
+from neeco.training.session import gaussian_session
 
 # Units of the head's output. With unit features the first Adam step moves every output by about width * rate = 0.2;
 # without these units the first steps would move Gaussians across the scene.
@@ -140,18 +57,13 @@ class NPSSettings:
     # share of the training over which the network is off; without it the first steps, whose gradients all ask to fill a
     # half-empty image, may move the Gaussians out of sight for good
     warm_up: float = 0.075
-    # Gaussians farther than this from all that the instruments were recorded to sweep stay canonical without being
-    # evaluated; None: off, as published
-    gate_mm: float | None = None
     rate: float = 8e-4  # learning rate at the start
     anneal: float = 0.0  # not in the paper: share of the training over which the octaves open, coarse to fine
-    # not in the paper: the network is also given how far each Gaussian would be carried with each instrument
-    carried_places: bool = False
     seeds: bool = False  # not in the paper: Gaussians begin on the carved instruments, too
     # not in the paper: each Gaussian learns its share of each instrument's recorded motion, by which what the network
     # deformed is carried, and which is its label
     membership: bool = False
-    # of the search for instruments, for `gate_mm` and `seeds`
+    # of the search for instruments, for `seeds`
     carving: CarvingSettings = field(default_factory=CarvingSettings)
 
     def __post_init__(self) -> None:
@@ -162,14 +74,10 @@ class NPSSettings:
             )
         if not 0 <= self.anneal <= 1:
             raise NeecoError(f"deformation.anneal: {self.anneal} is not a share of the training in [0, 1]")
-        if self.gate_mm is not None and not self.gate_mm > 0:
-            raise NeecoError(
-                f"deformation.gate_mm: {self.gate_mm} is not a positive distance in mm; leave it out for no gate"
-            )
 
 
 class NPS(LabelledByMotion):
-    """The network F; `gate`, where there is one, is the volume within which it is evaluated."""
+    """The network F."""
 
     method = "nps"
     former_names = ("neeco",)
@@ -209,20 +117,19 @@ class NPS(LabelledByMotion):
         super().__init__(instruments, settings)
         sizes: NPSSettings = self.settings
         depth, width, self.warm_up = sizes.depth, sizes.width, sizes.warm_up
-        self.gate = None if sizes.gate_mm is None else SweptVolume(sizes.gate_mm)
         size = self.state_size()
         self.register_buffer("state_center", torch.zeros(size))
         self.register_buffer("state_halfwidth", torch.ones(size))
         self.register_buffer("mean_center", torch.zeros(3))
         self.register_buffer("mean_halfwidth", torch.ones(()))
         self.register_buffer("first_quats", torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(max(len(instruments), 1), 1))
-        if sizes.carried_places or sizes.seeds or sizes.membership:
+        if sizes.seeds or sizes.membership:
             self.register_buffer("rest", torch.eye(4).repeat(len(instruments), 1, 1))
         if sizes.anneal > 0:
             self.register_buffer("opened", torch.zeros(()))
         if sizes.membership:
             self.label_names = tuple((instrument.name, "instrument") for instrument in instruments)
-        mean_inputs = 3 * (2 * sizes.L_mean + sizes.identity + sizes.carried_places * len(instruments))
+        mean_inputs = 3 * (2 * sizes.L_mean + sizes.identity)
         state_inputs = size * (2 * sizes.L_state + sizes.identity)
         # gamma(mu) and gamma(p) enter through separate weights of one linear layer: the state's share is computed once
         self.skip = depth // 2 if depth >= 8 else -1
@@ -281,11 +188,8 @@ class NPS(LabelledByMotion):
         return {MEMBER_LOGITS: canonical.means.new_full((len(canonical), len(self.instruments)), -INITIAL_LOGIT)}
 
     def begin(self, training: GaussianTraining) -> None:
-        session = gaussian_session(training)
-        if self.gate is not None:
-            with session.searching():
-                bound_volume(session, self.gate)
         if self.settings.seeds:
+            session = gaussian_session(training)
             with session.searching():
                 found = carve_seeds(session)
             session.scene.canonical = self._with_seeds(session.scene.canonical, found)
@@ -331,9 +235,7 @@ class NPS(LabelledByMotion):
         if not self.instruments or self.warming_up:
             deformed = Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
         else:
-            given = canonical.means.detach()
-            places = self._carried_places(given, state) if self.settings.carried_places else None
-            change = self._change(given, self._encoded_state(state, perturbation.state_noise), places)
+            change = self.network(canonical.means.detach(), self._encoded_state(state, perturbation.state_noise))
             means = canonical.means + change[:, :3] * (MEAN_UNIT * self.mean_halfwidth)
             quats = nn.functional.normalize(canonical.quats, dim=-1) + SHAPE_UNIT * change[:, 3:7]
             deformed = Posed(means, quats, (canonical.log_scales + SHAPE_UNIT * change[:, 7:]).exp())
@@ -357,12 +259,6 @@ class NPS(LabelledByMotion):
         ]
         return Posed(blended[0], blended[1], deformed.scales, nn.functional.normalize(blended[2], dim=-1).detach())
 
-    def _carried_places(self, means: Tensor, state: State) -> Tensor:
-        """[N, 3 I] how far means [N, 3] would be carried with each instrument, in the points' half extent."""
-        carried = self._motions(state)
-        moved = means @ carried[:, :3, :3].transpose(1, 2) + carried[:, None, :3, 3] - means  # [I, N, 3]
-        return moved.movedim(0, 1).flatten(1) / self.mean_halfwidth
-
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
         """The learned membership [N, I], or the moving Gaussians."""
         return members(canonical)[:, 1:] if self.settings.membership else super().label_channels(canonical)
@@ -383,24 +279,12 @@ class NPS(LabelledByMotion):
             encoded = encoded * octave_weights(self.opened * octaves, octaves).repeat(2 * values.shape[-1])
         return torch.cat([encoded, values], -1) if self.settings.identity else encoded
 
-    def _change(self, means: Tensor, encoded_state: Tensor, places: Tensor | None) -> Tensor:
-        """The network's output [N, 10]; zero for means [N, 3] outside the gate."""
-        if self.gate is None or not self.gate.bounded:
-            return self.network(means, encoded_state, places)
-        near = torch.nonzero(self.gate.contains(means))[:, 0]
-        evaluated = self.network(means[near], encoded_state, None if places is None else places[near])
-        return evaluated.new_zeros(len(means), evaluated.shape[1]).index_copy(0, near, evaluated)
-
-    def network(self, means: Tensor, encoded_state: Tensor, places: Tensor | None = None) -> Tensor:
-        """F: means [N, 3] mm and gamma(p) [E] to [N, 10] (mean, quaternion, log scale; units above). `places`: further
-        inputs of each Gaussian."""
+    def network(self, means: Tensor, encoded_state: Tensor) -> Tensor:
+        """F: means [N, 3] mm and gamma(p) [E] to [N, 10] (mean, quaternion, log scale; units above)."""
         chunk = self.settings.chunk
         if not torch.is_grad_enabled() and means.shape[0] > chunk:
-            parts = means.split(chunk)
-            more = [None] * len(parts) if places is None else places.split(chunk)
-            return torch.cat([self.network(part, encoded_state, p) for part, p in zip(parts, more, strict=True)])
+            return torch.cat([self.network(part, encoded_state) for part in means.split(chunk)])
         encoded = self._encode((means - self.mean_center) / self.mean_halfwidth, self.settings.L_mean)
-        encoded = encoded if places is None else torch.cat([encoded, places], -1)
         state = encoded_state[None]
         with tf32_products(means.device):
             # one row, and what tells states apart: in float32, as low octaves alone have no place in eight bits

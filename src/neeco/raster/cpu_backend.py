@@ -55,7 +55,7 @@ def last_statistics() -> dict[str, float]:
 
 def _prepared(tensor: Tensor) -> Tensor:
     if tensor.device.type != "cpu":
-        raise NeecoError(f"backend: cpu: tensors are on {tensor.device}; move them or use backend='cuda'")
+        raise NeecoError(f"backend: cpu: tensors are on {tensor.device}; move them or use backend='triton'")
     return tensor.to(torch.float32).contiguous()
 
 

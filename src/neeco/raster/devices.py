@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -16,15 +15,10 @@ from neeco.errors import NeecoError, memory_failure
 from neeco.raster.triton.ready import missing, require_triton
 
 
-def cuda_backend() -> str:
-    """Return the default backend for CUDA devices: "cuda" (gsplat) if it is installed, else "triton"."""
-    return "cuda" if importlib.util.find_spec("gsplat") is not None else "triton"
-
-
 def device_of(word: str, drawing: bool = True) -> torch.device:
     """Return the device of `--device`: cpu, cuda, cuda:N, or auto: a CUDA device where there is one, else the CPU.
 
-    drawing: it renders, which on CUDA needs triton or gsplat; else PyTorch is sufficient. `auto` skips a card that
+    drawing: it renders, which on CUDA needs triton; else PyTorch is sufficient. `auto` skips a card that
     PyTorch or Triton cannot use, with a warning.
 
     Raises NeecoError for another word, or a device that is not there or cannot be used.
@@ -40,14 +34,13 @@ def device_of(word: str, drawing: bool = True) -> torch.device:
     if int(number or 0) >= count:
         raise NeecoError(f"--device: {word}: there are {count}, counted from 0; use cuda:{count - 1} or less")
     device = torch.device("cuda" if name == "auto" else word)
-    by_triton = drawing and cuda_backend() == "triton"
-    refusal = _not_built_for(device) or (missing(device) if by_triton else None)
+    refusal = _not_built_for(device) or (missing(device) if drawing else None)
     if refusal and name == "auto":
         warnings.warn(f"--device auto: working on the CPU: {refusal}", stacklevel=2)
         return torch.device("cpu")
     if refusal:
         raise NeecoError(f"--device: {word}: {refusal}")
-    if by_triton:
+    if drawing:
         require_triton(device)
     return device
 

@@ -1,8 +1,7 @@
-"""`rasterize`: the entry point of rendering, with four backends."""
+"""`rasterize`: the entry point of rendering, with three backends."""
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -10,16 +9,15 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from neeco.errors import NeecoError, install_hint
+from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
-from neeco.raster.devices import cuda_backend
 from neeco.raster.native import runs_native
 from neeco.raster.resampling import draw_through, of_learned_size, widened
 from neeco.raster.shadow import shadowed
 from neeco.raster.triton.ready import require_triton
 from neeco.raster.types import Gaussians, Layer, Rendering
 
-BACKENDS = ("auto", "reference", "cpu", "cuda", "triton")
+BACKENDS = ("auto", "reference", "cpu", "triton")
 SH_COUNTS = (1, 4, 9, 16)
 
 
@@ -37,10 +35,9 @@ def rasterize(
     channels [N, C], C <= 32: composited like colour over background 0. background [3]: colour behind all, by
     default the Gaussians' background, or black. alone: sets of Gaussians, [N] bool each, that are also rendered without
     the others, alpha and depth only and without gradient (`Rendering.alone`).
-    backend: "cpu" (native, float32), "reference" (plain torch, any float type and device, slow), "cuda" (gsplat),
-    "triton" (neeco's own, float32, on a CUDA device), or "auto": for tensors on a CUDA device cuda where gsplat is
-    installed, else triton; cpu for those on the CPU, reference on other devices and within
-    `kernels("torch")`. The camera's pose may stay on the CPU.
+    backend: "cpu" (native, float32), "reference" (plain torch, any float type and device, slow), "triton"
+    (float32, on a CUDA device), or "auto": triton for tensors on a CUDA device, cpu for those on the CPU, reference on
+    other devices and within `kernels("torch")`. The camera's pose may stay on the CPU.
 
     Defined by the reference:
     - the projected covariance gets 0.3 px^2 on its diagonal; the projection is linearised at the mean, moved to within
@@ -68,7 +65,7 @@ def rasterize(
     gaussians = shadowed(gaussians, camera, partial(depth_maps, backend=backend))
     if backend == "auto":
         on_cpu = "cpu" if runs_native(gaussians.means) else "reference"
-        backend = cuda_backend() if gaussians.means.is_cuda else on_cpu
+        backend = "triton" if gaussians.means.is_cuda else on_cpu
     if backend == "cpu":
         from neeco.raster.cpu_backend import rasterize_cpu
 
@@ -94,14 +91,6 @@ def _rasterize_by(
         from neeco.raster.reference import rasterize_reference
 
         return rasterize_reference(gaussians, camera, channels, background)
-    if backend == "cuda":
-        if not torch.cuda.is_available() or importlib.util.find_spec("gsplat") is None:
-            raise NeecoError(
-                f"backend: cuda: needs a CUDA device and gsplat; {install_hint('cuda')}, or use backend='cpu'"
-            )
-        from neeco.raster.gsplat_backend import rasterize_cuda
-
-        return rasterize_cuda(gaussians, camera, channels, background)
     if backend == "triton":
         require_triton(gaussians.means.device)
         from neeco.raster.triton_backend import rasterize_triton

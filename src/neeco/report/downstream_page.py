@@ -20,7 +20,7 @@ from neeco.report.charts import PALETTE, Level, Series, inline_svg, legend, line
 from neeco.report.downstream_examples import example_sections
 from neeco.report.page import REPORT_FILE, split_counts, write_page
 from neeco.report.study_pages import Figure, Section
-from neeco.studies.downstream.conditions import MATCH, PASTE, PERMUTED, REAL
+from neeco.studies.downstream.conditions import PASTE, PERMUTED, REAL
 from neeco.studies.downstream.intervals import CONFIDENCE, Scores, arms_of
 from neeco.studies.downstream.results import (
     HELPS,
@@ -53,7 +53,6 @@ QUESTIONS = {  # what a paired difference answers, as `question` finds it
     "sets": "one set against another",
     "use": "one way of using a set against the plain one",
     "paste": "cut-and-paste, against the better of labelled frames alone and augmented",
-    "match": "labelled frames in another recording's colours, against the better of them alone and augmented",
     "augmentation": "strong augmentation against none",
 }
 HEADLINES = {  # of questions: how the sentence begins
@@ -110,7 +109,7 @@ def question(row: Row, experiment: Experiment) -> str:
     if PERMUTED in words:
         return "control"
     if not synthetic:
-        return next((word for word in (PASTE, MATCH) if word in words), "augmentation")
+        return "paste" if PASTE in words else "augmentation"
     if reference:
         return "use" if synthetic == reference else "sets"
     return "beside" if REAL in words else "alone"

@@ -208,7 +208,7 @@ def mark_moving(deformation: Deformation, canonical: CanonicalGaussians, states:
     moved = torch.stack([deformation.deltas(canonical, state).means for state in states])  # [F, N, 3]
     spread = (moved - moved.mean(0)).square().sum(-1).mean(0).sqrt()
     size = spread.clamp_min(MIN_MOTION_MM).log()
-    evaluated = spread > MIN_MOTION_MM  # those behind the gate would be a second cluster of their own
+    evaluated = spread > MIN_MOTION_MM  # those that nothing moves would be a second cluster of their own
     threshold = otsu(size[evaluated]) if evaluated.any() else math.inf
     return canonical.with_extras(**{MEMBERSHIP: (size > threshold).float()})
 

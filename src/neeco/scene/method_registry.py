@@ -17,6 +17,7 @@ from neeco.settings import structure
 DEFAULT = "kinematic"
 PACKAGE = "neeco.methods"  # our package, and the entry point group of others
 REMOVED = ("label_shares",)  # settings of methods in scenes and runs before the release of version 0.3
+REMOVED_IF_OFF = ("gate_mm", "carried_places")  # the same of 0.3 and older; scenes that use them cannot be read
 
 
 @cache
@@ -66,8 +67,11 @@ def method_settings(method: str, values: Mapping[str, Any]) -> Any:
 
 
 def without_removed(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a method's own settings as stored by any version, without those that are none any more."""
-    return {name: value for name, value in values.items() if name not in REMOVED}
+    """Return a method's own settings as stored by any version, without those that are none any more. One that is, and
+    that the scene depends on, stays: no method accepts it."""
+    return {
+        name: value for name, value in values.items() if name not in REMOVED and (value or name not in REMOVED_IF_OFF)
+    }
 
 
 def make_deformation(method: str, instruments: tuple[Instrument, ...], settings: Any = None) -> Deformation:

@@ -108,16 +108,15 @@ def _directions(device: torch.device | str) -> Tensor:
     return constant(tuple(value for corner in DIRECTIONS for value in corner), torch.device(device)).view(-1, 3)
 
 
-def visible_pixels(posed: Gaussians, camera: Camera, weight: Tensor | None = None) -> Tensor:
-    """Return the number [N] of the camera's pixels, weighted by `weight` [H, W], that every posed Gaussian covers: the
-    gradient of a rendered channel of 1."""
+def visible_pixels(posed: Gaussians, camera: Camera) -> Tensor:
+    """Return the number [N] of the camera's pixels that every posed Gaussian covers: the gradient of a rendered channel
+    of 1."""
     channel = torch.ones_like(posed.opacities)[:, None].requires_grad_()
     with torch.enable_grad():
         unlit = replace(posed, sh=posed.sh[:, :1], headlight=None)
         composited = rasterize(unlit, camera, channels=channel).channels
         assert composited is not None
-        total = composited.sum() if weight is None else (composited[..., 0] * weight).sum()
-        (pixels,) = torch.autograd.grad(total, channel)
+        (pixels,) = torch.autograd.grad(composited.sum(), channel)
     return pixels[:, 0]
 
 

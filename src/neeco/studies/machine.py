@@ -18,7 +18,6 @@ import torch
 
 from neeco.capture.model import Capture, Frame
 from neeco.errors import counted
-from neeco.raster.devices import cuda_backend
 from neeco.raster.native import simd, synchronise, threads
 from neeco.training.run import TrainedRun
 
@@ -45,7 +44,7 @@ def machine(device: torch.device, workers: int | None = None) -> dict[str, Any]:
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "backend": f"{cuda_backend()} (CUDA {torch.version.cuda})" if on_gpu else f"cpu ({simd()})",
+        "backend": f"triton (CUDA {torch.version.cuda})" if on_gpu else f"cpu ({simd()})",
         "gpu": torch.cuda.get_device_name(device) if on_gpu else None,
     } | ({} if workers is None else {"workers": workers, "threads_per_worker": share})
 

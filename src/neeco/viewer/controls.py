@@ -93,15 +93,6 @@ def interpolated_state(states: Sequence[State], frame: float) -> State:
     return State(moved, (1 - share) * start.time + share * end.time, start.tissue)
 
 
-def corresponding_frame(frame: float, frames: int, others: int) -> float:
-    """The place in a recording of `others` frames that belongs to `frame` of one of `frames`: the same where they are
-    equally long, else at the same share of it; to a frame itself the nearest."""
-    if frames == others:
-        return frame
-    there = frame / (frames - 1) * (others - 1) if frames > 1 else 0.0
-    return float(round(there)) if frame == int(frame) else there
-
-
 def shafts_of(scene: DrawableScene) -> dict[str, Shaft]:
     """Every instrument's shaft: as learned, where the method learns one."""
     if not is_gaussian(scene) or not scene.recorded.states:

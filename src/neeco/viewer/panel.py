@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial, reduce
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,11 +25,10 @@ if TYPE_CHECKING:
 
 MAX_INSTRUMENTS, MAX_JOINTS = 8, 24  # instruments that get controls; joints of one that get a slider
 SLIDE_MM, YAW_DEG = 30.0, 45.0
-SPLIT, SIDE_BY_SIDE = "split picture", "side by side"
 NONE_CHOSEN = "—"
 PLOTS_EVERY_S = 0.5  # while more becomes known
 PLOT_HEIGHT = 140  # px
-PLOT_COLORS = ("#228be6", "#f76707")
+PLOT_COLOR = "#228be6"
 LINE = 80  # characters of a name or message that are shown
 
 
@@ -47,12 +46,12 @@ class Actions:
 
 
 class Panel:
-    """Controls of the first run that is shown; `runs` are all."""
+    """Controls of the run that is shown."""
 
-    def __init__(self, client: viser.ClientHandle, runs: Sequence[LoadedRun], actions: Actions) -> None:
-        self._gui, self._runs, self._actions = client.gui, tuple(runs), actions
+    def __init__(self, client: viser.ClientHandle, loaded: LoadedRun, actions: Actions) -> None:
+        self._gui, self._loaded, self._actions = client.gui, loaded, actions
         self._worst: list[int] = []
-        self._plotted: tuple[tuple[Timeline, int], ...] = ()  # and how many frames were known when they were shown
+        self._plotted: tuple[Timeline, int] | None = None  # and how many frames were known when it was shown
         self._plotted_at = 0.0
         self._gui.main_panel.dock_right()  # or it would hide a part of the picture
         self.status = self._gui.add_html("")
@@ -70,62 +69,41 @@ class Panel:
     @property
     def place(self) -> float:
         """Place in the recording, in frames."""
-        frame, last = float(self.frame.value), len(self._runs[0].recorded.states) - 1
+        frame, last = float(self.frame.value), len(self._loaded.recorded.states) - 1
         # a browser may say anything
         return min(max(frame, 0.0), float(last)) if math.isfinite(frame) else 0.0
 
-    @property
-    def side_by_side(self) -> bool:
-        """Whether each run has its own part of the window."""
-        return len(self._runs) > 1 and self.layout.value == SIDE_BY_SIDE
-
-    def show_timelines(self, timelines: Sequence[Timeline]) -> None:
+    def show_timeline(self, timeline: Timeline) -> None:
         """Draw what is known of the frames' PSNR, and list the worst."""
-        so_far = tuple((timeline, timeline.count) for timeline in timelines)
+        so_far = timeline, timeline.count
         now = time.perf_counter()
-        grows = any(not timeline.done for timeline in timelines)
-        if so_far == self._plotted or (grows and now - self._plotted_at < PLOTS_EVERY_S):
+        if so_far == self._plotted or (not timeline.done and now - self._plotted_at < PLOTS_EVERY_S):
             return
         self._plotted, self._plotted_at = so_far, now
-        names, splits = self._runs[0].recorded.names, self._runs[0].recorded.splits
-        # of another recording there is no frame in common
-        known = [timeline.known() for timeline in timelines if timeline.loaded.recorded.names == names]
-        if not known:  # the run has changed, and this panel not yet
+        names, splits = self._loaded.recorded.names, self._loaded.recorded.splits
+        frames, values = timeline.known()
+        # the names differ where the run has changed, and this panel not yet
+        if timeline.loaded.recorded.names != names or len(frames) < 2:
             return
-        common = reduce(np.intersect1d, [frames for frames, _ in known])
-        if len(common) < 2:
-            return
-        self._draw_plot((common.astype(np.float64), *(psnr[np.isin(frames, common)] for frames, psnr in known)))
-        worst = timelines[0].worst()
+        self._draw_plot((frames.astype(np.float64), values))
+        worst = timeline.worst()
         options = [f"{frame}: {psnr:.1f} dB, {splits[frame]}, {names[frame]}" for frame, psnr in worst]
         if self.worst.value == NONE_CHOSEN and (NONE_CHOSEN, *options) != tuple(self.worst.options):
             self._worst = [frame for frame, _ in worst]
             self.worst.options = (NONE_CHOSEN, *options)
 
     def _add_picture(self) -> None:
-        gui, views = self._gui, views_of(self._runs[0].scene, bool(self._runs[0].frames))
+        gui, views = self._gui, views_of(self._loaded.scene, bool(self._loaded.frames))
         with gui.add_folder("Picture"):
             self.view = gui.add_dropdown("show", views, initial_value=IMAGE)
-            self.layout = gui.add_dropdown(
-                "two runs",
-                (SPLIT, SIDE_BY_SIDE),
-                initial_value=SIDE_BY_SIDE,
-                visible=len(self._runs) > 1,
-                hint="Side by side, cameras, points and arrows are hidden.",
-            )
-            self.divide = gui.add_slider("divide at (%)", 0, 100, 1, 50, visible=False)
         self.view.on_update(self._moved)
-        self.divide.on_update(self._moved)
-        self.layout.on_update(self._layout_changed)
 
     def _add_recording(self) -> None:
-        gui, first = self._gui, self._runs[0]
+        gui, first = self._gui, self._loaded
         last = len(first.recorded.states) - 1
         poses = [camera.world_from_camera for camera in first.recorded.cameras]
         with gui.add_folder("Recording"):
             hint = "Between two frames the state is interpolated."
-            if any(len(run.recorded.states) != last + 1 for run in self._runs):
-                hint += " A run with another number of frames is at the same share of its recording."
             self.frame = gui.add_slider("frame", 0.0, float(last), 0.1, 0.0, hint=hint)
             self.play = gui.add_checkbox("play", False)
             self.follows = gui.add_checkbox(
@@ -142,7 +120,7 @@ class Panel:
         self.go.on_click(lambda _: self._actions.go_to(round(self.place)))
 
     def _add_instruments(self) -> list[InstrumentPanel]:
-        first = self._runs[0]
+        first = self._loaded
         if (more := len(first.scene.instruments) - MAX_INSTRUMENTS) > 0:
             self._gui.add_html(message_html(f"{more} more instruments stay as recorded: no room for their sliders"))
         ranges = slider_ranges(first.scene.instruments, first.recorded.states)
@@ -160,7 +138,7 @@ class Panel:
 
     def _add_timeline(self) -> None:
         self._plot: Any = None
-        self._timeline_folder = self._gui.add_folder("PSNR of every frame", visible=bool(self._runs[0].frames))
+        self._timeline_folder = self._gui.add_folder("PSNR of every frame", visible=bool(self._loaded.frames))
         with self._timeline_folder:
             self.worst = self._gui.add_dropdown(
                 "worst", (NONE_CHOSEN,), initial_value=NONE_CHOSEN, hint="Go to that frame, state and camera."
@@ -169,7 +147,7 @@ class Panel:
 
     def _add_saving(self) -> None:
         gui = self._gui
-        labelled = bool(self._runs[0].scene.label_names)
+        labelled = bool(self._loaded.scene.label_names)
         with gui.add_folder("Keep"):
             keep = gui.add_button("keep this state", hint="And this camera, for neeco synthesize --states.")
             forget = gui.add_button("forget the last kept")
@@ -187,29 +165,21 @@ class Panel:
         if self._plot is not None:
             self._plot.data = data
             return
-        series: list[dict[str, Any]] = [{"label": "frame"}]
-        for color, run in zip(PLOT_COLORS, self._runs, strict=False):
-            label = f"{run.name} (dB)"[:LINE]
-            series.append({"label": label, "stroke": color, "width": 1.5, "points": {"show": False}})
+        label = f"{self._loaded.name} (dB)"[:LINE]
         with self._timeline_folder:
             self._plot = self._gui.add_uplot(
                 data,
-                tuple(series[: len(data)]),
+                ({"label": "frame"}, {"label": label, "stroke": PLOT_COLOR, "width": 1.5, "points": {"show": False}}),
                 scales={"x": {"time": False}, "y": {"auto": True}},
                 axes=({"size": 32}, {"size": 34}),
-                legend={"show": len(data) > 2},
-                height=PLOT_HEIGHT + (30 if len(data) > 2 else 0),
+                legend={"show": False},
+                height=PLOT_HEIGHT,
                 padding=(6, 8, 0, 0),
             )
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:  # else the program moved it
             self._actions.changed()
-
-    def _layout_changed(self, event: viser.GuiEvent[Any]) -> None:
-        self.divide.visible = not self.side_by_side
-        self.cameras.visible = self.points.visible = not self.side_by_side
-        self._moved(event)
 
     def _worst_chosen(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is None or self.worst.value == NONE_CHOSEN:
@@ -334,29 +304,28 @@ def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: flo
     )
 
 
-def status_html(parts: Sequence[RunPicture], seconds: float, size: tuple[int, int], note: str) -> str:
-    """HTML of the status: what is shown, how well, how fast. seconds: of the rendering; size: (width, height) in px;
-    note: what else is to be known."""
-    lines = []
-    for part in parts:
-        loaded, scene = part.loaded, part.loaded.scene
-        frame = min(max(round(part.frame), 0), len(loaded.recorded.names) - 1)
-        count = "no Gaussians" if scene.num_gaussians is None else f"{scene.num_gaussians:,} Gaussians"
-        training = [] if loaded.iteration is None else [f"iteration {loaded.iteration:,}, still training"]
-        place = f"{part.frame:g} ({_text(loaded.recorded.names[frame])}, {_text(loaded.recorded.splits[frame])})"
-        lines += [
-            f"<b>{_text(loaded.name)}</b>",
-            " · ".join([_text(scene.method), count, *training]),
-            f"frame {place}" + ("" if part.exact else ", steered or between frames"),
-        ]
-        if part.score is not None:
-            overlap = "" if part.score.iou is None else f" · IoU {part.score.iou:.3f}"
-            lines.append(f"PSNR {part.score.psnr:.2f} dB{overlap}")
-        if loaded.recorded.still:
-            lines.append("still scope: views far from the recorded one show what no frame saw")
-        if part.trouble:
-            lines.append(_text(part.trouble, 3 * LINE))
-    lines.append(f"{seconds * 1e3:.0f} ms at {size[0]} × {size[1]}")
+def status_html(shown: RunPicture, seconds: float, note: str) -> str:
+    """HTML of the status: what is shown, how well, how fast. seconds: of the rendering; note: what else is to be
+    known."""
+    loaded, scene = shown.loaded, shown.loaded.scene
+    frame = min(max(round(shown.frame), 0), len(loaded.recorded.names) - 1)
+    count = "no Gaussians" if scene.num_gaussians is None else f"{scene.num_gaussians:,} Gaussians"
+    training = [] if loaded.iteration is None else [f"iteration {loaded.iteration:,}, still training"]
+    place = f"{shown.frame:g} ({_text(loaded.recorded.names[frame])}, {_text(loaded.recorded.splits[frame])})"
+    lines = [
+        f"<b>{_text(loaded.name)}</b>",
+        " · ".join([_text(scene.method), count, *training]),
+        f"frame {place}" + ("" if shown.exact else ", steered or between frames"),
+    ]
+    if shown.score is not None:
+        overlap = "" if shown.score.iou is None else f" · IoU {shown.score.iou:.3f}"
+        lines.append(f"PSNR {shown.score.psnr:.2f} dB{overlap}")
+    if loaded.recorded.still:
+        lines.append("still scope: views far from the recorded one show what no frame saw")
+    if shown.trouble:
+        lines.append(_text(shown.trouble, 3 * LINE))
+    height, width = shown.picture.depth.shape
+    lines.append(f"{seconds * 1e3:.0f} ms at {width} × {height}")
     return _block([*lines, _text(note, 3 * LINE)] if note else lines)
 
 

@@ -1,11 +1,11 @@
-"""The viewed run folders: their scenes, also during training, and the score of each frame."""
+"""The viewed run folder: its scene, also during training, and the score of each frame."""
 
 from __future__ import annotations
 
 import contextlib
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 SCENE_FILE = "scene.safetensors"
 ASSUMED_MM = 100.0  # from a camera to what it looks at, where no camera looks at the scene's centre
 DISTANCE_UNITS = 10.0  # viser's units of length, from a recorded camera to what it looks at
-WATCH_S = 2.0  # between two checks of the run folders
+WATCH_S = 2.0  # between two checks of the run folder
 TIMELINE_WIDTH = 320  # px at most of the images that a timeline compares
 FIELD_WIDTH = 48  # px, of a radiance field's, which take a hundred times as long
 WORST = 8  # frames that a timeline lists
@@ -274,58 +274,47 @@ def spread_order(count: int) -> list[int]:
     return [k for k in mirrored if k < count]
 
 
-class ViewedRuns:
-    """The runs that all browsers of a server share, and what is known of their frames. Any thread may use it."""
+class ViewedRun(WatchedRun):
+    """The run that all browsers of a server share, and what is known of its frames. Any thread may use it."""
 
-    def __init__(self, paths: Sequence[Path], device: torch.device | None = None, tissue: str | None = None) -> None:
-        """Raises NeecoError for a run folder without a scene, and for runs of different captures."""
-        self.watched = [WatchedRun(path, device, tissue) for path in paths]
-        worlds = [loaded.world for loaded in self.loaded]
-        if len(set(worlds)) > 1:
-            raise NeecoError(
-                f"view: {paths[1]}: was trained on {worlds[1]}, {paths[0]} on {worlds[0]}; compare runs of one capture"
-            )
-        self.distance = self.loaded[0].distance  # mm
+    def __init__(self, path: Path, device: torch.device | None = None, tissue: str | None = None) -> None:
+        """Raises NeecoError for a run folder without a scene."""
+        super().__init__(path, device, tissue)
+        self.distance = self.loaded.distance  # mm
         self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
-        self.timelines = [Timeline(loaded) for loaded in self.loaded]
+        self.timeline = Timeline(self.loaded)
         self._ended = threading.Event()
 
-    @property
-    def loaded(self) -> list[LoadedRun]:
-        """Content of the runs when they were last read."""
-        return [run.loaded for run in self.watched]
-
     def refresh(self) -> bool:
-        """Read what has changed; whether anything was. Its frames are scored anew."""
-        changed = [run.refresh() for run in self.watched]
-        for number, loaded in enumerate(self.loaded):
-            if changed[number]:
-                self.timelines[number] = Timeline(loaded)
-                score_frame.cache_clear()  # or it would hold the scenes of before
-        return any(changed)
+        """Read the run again if it has changed; whether it was. Its frames are scored anew."""
+        changed = super().refresh()
+        if changed:
+            self.timeline = Timeline(self.loaded)
+            score_frame.cache_clear()  # or it would hold the scenes of before
+        return changed
 
     def watch(self, changed: Callable[[], None]) -> None:
-        """Look at the run folders from time to time, in a thread of its own, and call `changed` where one changed or
-        can no longer be read; until `end_watch`."""
+        """Look at the run folder from time to time, in a thread of its own, and call `changed` where it changed or can
+        no longer be read; until `end_watch`."""
 
         def look() -> None:
             while not self._ended.wait(WATCH_S):
-                troubles = [run.trouble for run in self.watched]
-                if self.refresh() or troubles != [run.trouble for run in self.watched]:
+                trouble = self.trouble
+                if self.refresh() or trouble != self.trouble:
                     changed()
 
         threading.Thread(target=look, name="neeco-watcher", daemon=True).start()
 
     def end_watch(self) -> None:
-        """Look at the run folders no more."""
+        """Look at the run folder no more."""
         self._ended.set()
 
-    def advance_timelines(self) -> bool:
+    def advance_timeline(self) -> bool:
         """Score one more frame; False: all are."""
-        for timeline in self.timelines:
-            if not timeline.done:
-                # of a frame whose image cannot be read the status says so to whoever goes there
-                with timeline.loaded.scene.torch_threads(), contextlib.suppress(NeecoError):
-                    timeline.advance()
-                return True
-        return False
+        timeline = self.timeline
+        if timeline.done:
+            return False
+        # of a frame whose image cannot be read the status says so to whoever goes there
+        with timeline.loaded.scene.torch_threads(), contextlib.suppress(NeecoError):
+            timeline.advance()
+        return True

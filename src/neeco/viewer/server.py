@@ -1,4 +1,4 @@
-"""`neeco view`: a web server that shows runs and lets them be steered, to every browser that connects.
+"""`neeco view`: a web server that shows a run and lets it be steered, to every browser that connects.
 
 viser serves the page. Every request passes our access control first, and no tunnel or other host is ever asked for.
 """
@@ -22,7 +22,7 @@ from neeco.geometry.camera import Camera
 from neeco.labels.drawing import to_numpy
 from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 from neeco.viewer.access import HOST, PORT, AccessControl, free_port, url_of
-from neeco.viewer.runs import ViewedRuns
+from neeco.viewer.runs import ViewedRun
 from neeco.viewer.saving import SavedStates
 from neeco.viewer.session import ClientSession, RenderThread
 from neeco.viewer.viser_scene import field_of_view, upward
@@ -30,7 +30,6 @@ from neeco.viewer.viser_scene import field_of_view, upward
 if TYPE_CHECKING:
     import viser
 
-MAX_RUNS = 2
 MISSING = f"view: needs viser; {install_hint('view')}"
 MAX_BROWSERS = 32  # at once
 # Keys on a focused slider are the slider's own. viser turns the camera by arrows that are pressed anywhere but in a
@@ -79,37 +78,35 @@ class ViserPage:
 
 
 class ViewerServer(ViserPage):
-    """A server that shows runs."""
+    """A server that shows a run."""
 
     def __init__(
         self,
-        runs: Sequence[Path],
+        run: Path,
         host: str = HOST,
         port: int = PORT,
         device: torch.device | None = None,
         size: SizeSettings = RECORDED_SIZE,
         tissue: str | None = None,
     ) -> None:
-        """One run, or two to compare. port: or the next that is free. size: of saved images, and sharp pictures are as
-        high. tissue: which of several is shown; None: the first. Raises NeecoError."""
-        if not 1 <= len(runs) <= MAX_RUNS:
-            raise NeecoError(f"view: {len(runs)} runs given; give one, or two to compare")
+        """port: or the next that is free. size: of saved images, and sharp pictures are as high. tissue: which of
+        several is shown; None: the first. Raises NeecoError."""
         require_viser()
-        self.runs = ViewedRuns(runs, device, tissue)
-        camera = self.runs.loaded[0].recorded.cameras[0]
-        height = size.of(camera.width, camera.height)[1]
+        self.run = ViewedRun(run, device, tissue)
+        cameras = self.run.loaded.recorded.cameras
+        height = size.of(cameras[0].width, cameras[0].height)[1]
         self._sharp_px = None if size == RECORDED_SIZE else height
-        self.saved = SavedStates(runs[0], size)
-        self.render_thread = RenderThread(self.runs.advance_timelines)
-        super().__init__(host, port, self.runs.loaded[0].recorded.cameras, self.runs.distance, self.runs.unit)
+        self.saved = SavedStates(run, size)
+        self.render_thread = RenderThread(self.run.advance_timeline)
+        super().__init__(host, port, cameras, self.run.distance, self.run.unit)
         self._server.on_client_connect(self._connect)
         self._server.on_client_disconnect(lambda client: self.render_thread.remove(client.client_id))
         self.render_thread.start()
-        self.runs.watch(self.render_thread.request)
+        self.run.watch(self.render_thread.request)
 
     def stop(self) -> None:
         """End the rendering, then the server."""
-        self.runs.end_watch()
+        self.run.end_watch()
         self.render_thread.stop()
         super().stop()
 
@@ -117,7 +114,7 @@ class ViewerServer(ViserPage):
         def connected() -> bool:
             return client.client_id in self._server.get_clients()
 
-        session = ClientSession(client, self.runs, self.saved, self.render_thread, connected, self._sharp_px)
+        session = ClientSession(client, self.run, self.saved, self.render_thread, connected, self._sharp_px)
         self.render_thread.add(session)
 
 

@@ -18,9 +18,9 @@ from neeco.errors import NeecoError
 from neeco.labels.drawing import to_numpy
 from neeco.viewer.controls import Controls, controlled_state, interpolated_state
 from neeco.viewer.panel import Actions, Panel, message_html, status_html
-from neeco.viewer.runs import LoadedRun, ViewedRuns
+from neeco.viewer.runs import LoadedRun, ViewedRun
 from neeco.viewer.saving import SavedStates
-from neeco.viewer.views import Picture, RunPicture, render_run, scored, side_by_side, split
+from neeco.viewer.views import Picture, RunPicture, render_run, scored
 from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fitting_view, jump, pose_of, stands_at
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ class ClientSession:
     def __init__(
         self,
         client: viser.ClientHandle,
-        runs: ViewedRuns,
+        run: ViewedRun,
         saved: SavedStates,
         thread: RenderThread,
         connected: Callable[[], bool],
@@ -196,15 +196,15 @@ class ClientSession:
     ) -> None:
         self.key = client.client_id
         self.status_at = 0.0  # time.perf_counter() of the last status; 0: no picture was sent yet
-        self._client, self._runs, self._saved, self._thread, self._connected = client, runs, saved, thread, connected
+        self._client, self._run, self._saved, self._thread, self._connected = client, run, saved, thread, connected
         self._resolution = AdaptiveResolution(sharp_px)
         self._saving = False
         self._played_at: float | None = None
-        self._shape = 0.0  # of a run's part of the window, width by height
+        self._shape = 0.0  # of the window, width by height
         self._camera_frame = 0  # whose camera the window was sent to last
         self._followed: int | None = 0  # the frame that the camera went along to
         self._set_dark(True)
-        self._loaded, self.overlays, self._panel = self._build(runs.loaded)
+        self._loaded, self.overlays, self._panel = self._build(run.loaded)
         self._go_to(0)
         client.camera.on_update(lambda _: self._request())
 
@@ -212,44 +212,38 @@ class ClientSession:
         """Render what is asked for now: coarsely, or sharp with its numbers."""
         if not self._connected():
             return
-        current = self._runs.loaded
-        if [run.signature for run in current] != [run.signature for run in self._loaded]:
+        current = self._run.loaded
+        if current.signature != self._loaded.signature:
             self._client.gui.reset()
             self._client.scene.reset()
             self._loaded, self.overlays, self._panel = self._build(current)
         self._loaded = current
         began = time.perf_counter()
         self._fit_window()
-        controls, window, share = self._follow_recording(), self._client.camera, self._share
-        height = self._resolution.height(sharp, window.image_height, aspect_of(window) * share * len(current))
-        camera = browser_camera(window, self._runs.unit, height, share)
-        view = self._panel.view.value
+        controls, window = self._follow_recording(), self._client.camera
+        height = self._resolution.height(sharp, window.image_height, aspect_of(window))
+        camera = browser_camera(window, self._run.unit, height)
         try:
-            parts = [render_run(self._runs, k, controls, camera, view) for k in range(len(current))]
+            shown = render_run(self._run, controls, camera, self._panel.view.value)
         except NeecoError as error:
             self._panel.status.content = message_html(str(error))
             return
-        pictures = [part.picture for part in parts]
-        if len(pictures) == 1 or self._panel.side_by_side:
-            whole = side_by_side(pictures)
-        else:
-            whole = split(pictures[0], pictures[1], self._panel.divide.value / 100)
         seconds = time.perf_counter() - began
-        self._resolution.record(seconds, sum(picture.depth.size for picture in pictures))
+        self._resolution.record(seconds, shown.picture.depth.size)
         if self._connected():
-            self._send(whole, sharp)
-            self._show_status(parts, whole, seconds, sharp)
+            self._send(shown.picture, sharp)
+            self._show_status(shown, seconds, sharp)
 
     def tick(self, now: float) -> float | None:
         """Let the recording play on, and show what is newly known of its frames. now: of time.perf_counter(); returns
         when to be called again, or None: nothing moves by itself."""
         if not self._connected():
             return None
-        self._panel.show_timelines(self._runs.timelines)
+        self._panel.show_timeline(self._run.timeline)
         if not self._panel.play.value:
             self._played_at = None
             return None
-        per_s, frames = frames_per_s(self._loaded[0]), len(self._loaded[0].recorded.states)
+        per_s, frames = frames_per_s(self._loaded), len(self._loaded.recorded.states)
         if self._played_at is None:
             self._played_at = now
         ahead = int((now - self._played_at) * per_s)
@@ -259,8 +253,8 @@ class ClientSession:
             self._request()
         return self._played_at + 1 / per_s
 
-    def _build(self, runs: list[LoadedRun]) -> tuple[list[LoadedRun], Overlays, Panel]:
-        """Return the runs, and create overlays and panel for them."""
+    def _build(self, loaded: LoadedRun) -> tuple[LoadedRun, Overlays, Panel]:
+        """Return the run, and create overlays and panel for it."""
         actions = Actions(
             changed=self._request,
             go_to=self._go_to,
@@ -270,9 +264,9 @@ class ClientSession:
             save_image=self._save_image,
             dark=self._set_dark,
         )
-        points = None if runs[0].capture is None else runs[0].capture.points
-        overlays = Overlays(self._client, runs[0].recorded.cameras, points, self._runs.unit, self._go_to, self._request)
-        return runs, overlays, Panel(self._client, runs, actions)
+        points = None if loaded.capture is None else loaded.capture.points
+        overlays = Overlays(self._client, loaded.recorded.cameras, points, self._run.unit, self._go_to, self._request)
+        return loaded, overlays, Panel(self._client, loaded, actions)
 
     def _request(self) -> None:
         self._thread.request(self.key)
@@ -283,47 +277,41 @@ class ClientSession:
 
     def _jump_to(self, frame: int) -> None:
         self._camera_frame = frame
-        camera = self._loaded[0].recorded.cameras[frame]
-        jump(self._client, camera, self._runs.unit, self._runs.distance, self._share)
-
-    @property
-    def _share(self) -> float:
-        """Share of the window's width of one run's picture."""
-        return 1 / len(self._loaded) if self._panel.side_by_side else 1.0
+        camera = self._loaded.recorded.cameras[frame]
+        jump(self._client, camera, self._run.unit, self._run.distance)
 
     def _fit_window(self) -> None:
         """Show all of the recorded image where the window has changed its shape and stands at its camera."""
-        window, recorded = self._client.camera, self._loaded[0].recorded.cameras[self._camera_frame]
-        shape = aspect_of(window) * self._share
+        window, recorded = self._client.camera, self._loaded.recorded.cameras[self._camera_frame]
+        shape = aspect_of(window)
         if shape == self._shape:
             return
         self._shape = shape
-        if stands_at(browser_camera(window, self._runs.unit, MIN_PX), recorded, self._runs.distance):
+        if stands_at(browser_camera(window, self._run.unit, MIN_PX), recorded, self._run.distance):
             window.fov = fitting_view(recorded, shape)
 
     def _follow_recording(self) -> Controls:
         """Return the sliders' values, after sliders and camera have followed the recording."""
         panel = self._panel
         controls = panel.controls(self.overlays)
-        recorded = interpolated_state(self._loaded[0].recorded.states, controls.frame)
+        recorded = interpolated_state(self._loaded.recorded.states, controls.frame)
         for instrument in panel.instruments:
             instrument.follow(recorded.instruments[instrument.name])
         frame = round(controls.frame)
         if panel.follows.value and frame != self._followed:
             self._jump_to(frame)
         self._followed = frame if panel.follows.value else None
-        alone = not panel.side_by_side
-        self.overlays.show(alone and panel.cameras.value, alone and panel.points.value)
+        self.overlays.show(panel.cameras.value, panel.points.value)
         return controls
 
     def _state(self) -> State:
-        """Return what the first run shows now."""
-        first = self._loaded[0]
-        return controlled_state(first.recorded.states, first.shafts, self._panel.controls(self.overlays))
+        """Return the state that is shown now."""
+        loaded = self._loaded
+        return controlled_state(loaded.recorded.states, loaded.shafts, self._panel.controls(self.overlays))
 
     def _pose(self) -> np.ndarray:
         """world_from_camera [4, 4] mm of the window."""
-        return pose_of(self._client.camera.wxyz, self._client.camera.position, self._runs.unit)
+        return pose_of(self._client.camera.wxyz, self._client.camera.position, self._run.unit)
 
     def _toggle_gizmo(self, name: str, number: int, on: bool) -> None:
         if not on:
@@ -335,11 +323,11 @@ class ClientSession:
         self._panel.instruments[number].straighten()
 
     def _save_state(self) -> None:
-        saved, loaded = self._saved, self._loaded[0]
+        saved, loaded = self._saved, self._loaded
         self._report(lambda: f"kept: {saved.add(loaded, self._state(), self._pose())} in {saved.states_path}")
 
     def _remove_state(self) -> None:
-        saved, loaded = self._saved, self._loaded[0]
+        saved, loaded = self._saved, self._loaded
         self._report(lambda: f"kept: {saved.remove_last(loaded)} in {saved.states_path}")
 
     def _save_image(self) -> None:
@@ -351,7 +339,7 @@ class ClientSession:
 
         def save() -> None:
             try:
-                self._report(lambda: f"written: {self._saved.save_image(self._loaded[0], state, pose)}")
+                self._report(lambda: f"written: {self._saved.save_image(self._loaded, state, pose)}")
             finally:
                 self._saving = False
 
@@ -368,28 +356,27 @@ class ClientSession:
     def _set_dark(self, on: bool) -> None:
         self._client.gui.configure_theme(dark_mode=on, show_logo=False, show_share_button=False)
 
-    def _send(self, whole: Picture, sharp: bool) -> None:
+    def _send(self, picture: Picture, sharp: bool) -> None:
         depth = None
-        if self.overlays.shown and not self._panel.side_by_side:
+        if self.overlays.shown:
             # 0 is nothing there: far away, not at the eye
-            depth = np.where(whole.depth > 0, whole.depth * self._runs.unit, np.inf)
+            depth = np.where(picture.depth > 0, picture.depth * self._run.unit, np.inf)
         quality = JPEG_SHARP if sharp else JPEG_MOVING
-        self._client.scene.set_background_image(whole.pixels, format="jpeg", jpeg_quality=quality, depth=depth)
+        self._client.scene.set_background_image(picture.pixels, format="jpeg", jpeg_quality=quality, depth=depth)
         self._client.flush()
 
-    def _show_status(self, parts: list[RunPicture], whole: Picture, seconds: float, sharp: bool) -> None:
+    def _show_status(self, shown: RunPicture, seconds: float, sharp: bool) -> None:
         now = time.perf_counter()
         if not sharp and now - self.status_at < STATUS_EVERY_S:
             return
         self.status_at = now
-        notes = list(dict.fromkeys(part.note for part in parts if part.note))
+        notes = [shown.note] if shown.note else []
         if sharp:  # else things move on before the numbers are read
             try:
-                parts = [scored(part) for part in parts]
+                shown = scored(shown)
             except NeecoError as error:
                 notes.append(str(error))
-        size = whole.pixels.shape[1], whole.pixels.shape[0]
-        self._panel.status.content = status_html(parts, seconds, size, "; ".join(notes))
+        self._panel.status.content = status_html(shown, seconds, "; ".join(notes))
 
 
 def frames_per_s(loaded: LoadedRun) -> float:

@@ -1,4 +1,4 @@
-"""The views of a scene in a state (image, labels, depth, ...), and a run's part of a browser's window."""
+"""The views of a scene in a state (image, labels, depth, ...), and a run's picture in a browser's window."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from neeco.raster import rasterize
 from neeco.raster.devices import readable_failures
 from neeco.raster.types import Rendering
 from neeco.scene.gaussian_scene import is_gaussian
-from neeco.viewer.controls import Controls, controlled_state, corresponding_frame
-from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRuns, score_frame
+from neeco.viewer.controls import Controls, controlled_state
+from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRun, score_frame
 from neeco.viewer.viser_scene import stands_at
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class RunPicture:
-    """A run's part of the window, and what the status says of it."""
+    """A run's picture, and what the status says of it."""
 
     loaded: LoadedRun
     picture: Picture
@@ -114,31 +114,9 @@ def dimmed(shown: Picture) -> Picture:
     return replace(shown, pixels=to_uint8(shown.pixels * DIMMED))
 
 
-def side_by_side(pictures: list[Picture]) -> Picture:
-    """Join pictures of one height, with white lines between them."""
-    if len(pictures) == 1:
-        return pictures[0]
-    pixels = np.concatenate([shown.pixels for shown in pictures], 1)
-    for edge in np.cumsum([shown.pixels.shape[1] for shown in pictures])[:-1]:
-        pixels[:, edge - 1 : edge + 1] = 255
-    return Picture(pixels, np.concatenate([shown.depth for shown in pictures], 1), _joined_notes(pictures))
-
-
-def split(left: Picture, right: Picture, share: float) -> Picture:
-    """One picture left of a white line at `share` of the width, the other right of it; both are of one size."""
-    edge = round(share * left.pixels.shape[1])
-    pixels = np.concatenate([left.pixels[:, :edge], right.pixels[:, edge:]], 1)
-    pixels[:, max(0, edge - 1) : edge + 1] = 255
-    depth = np.concatenate([left.depth[:, :edge], right.depth[:, edge:]], 1)
-    return Picture(pixels, depth, _joined_notes([left, right]))
-
-
-def render_run(runs: ViewedRuns, number: int, controls: Controls, camera: Camera, view: str) -> RunPicture:
-    """Render run `number` from `camera`, at the controls, which were made for the first run. Raises
-    NeecoError."""
-    first, loaded = runs.loaded[0], runs.loaded[number]
-    frames = len(first.recorded.states), len(loaded.recorded.states)
-    controls = replace(controls, frame=corresponding_frame(controls.frame, *frames))
+def render_run(run: ViewedRun, controls: Controls, camera: Camera, view: str) -> RunPicture:
+    """Render a run from `camera`, at the controls. Raises NeecoError."""
+    loaded = run.loaded
     scene, state = loaded.scene, controlled_state(loaded.recorded.states, loaded.shafts, controls)
     frame = controls.recorded_frame
     as_recorded = frame is not None and stands_at(camera, loaded.recorded.cameras[frame], loaded.distance)
@@ -152,7 +130,6 @@ def render_run(runs: ViewedRuns, number: int, controls: Controls, camera: Camera
         else:
             shown = dimmed(picture(scene, state, camera, IMAGE))
             note = ONLY_RECORDED if view == DIFFERENCE else f"{view}: a scene of method {scene.method} has none"
-    trouble = runs.watched[number].trouble or loaded.trouble
     return RunPicture(
         loaded=loaded,
         picture=shown,
@@ -160,7 +137,7 @@ def render_run(runs: ViewedRuns, number: int, controls: Controls, camera: Camera
         exact=frame is not None,
         seen_as_recorded=as_recorded,
         note=note or shown.note,
-        trouble=trouble,
+        trouble=run.trouble or loaded.trouble,
     )
 
 
@@ -193,7 +170,3 @@ def _depth_picture(depth: np.ndarray) -> Picture:
     grey = np.clip((far - depth) / max(far - near, 1e-6), 0, 1) * there
     note = f"white {near:.1f} mm or nearer, black {far:.1f} mm"
     return Picture(to_uint8(np.repeat(grey[..., None], 3, 2) * 255), depth, note)
-
-
-def _joined_notes(pictures: list[Picture]) -> str:
-    return "; ".join(dict.fromkeys(shown.note for shown in pictures if shown.note))

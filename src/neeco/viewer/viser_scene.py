@@ -59,9 +59,9 @@ def field_of_view(camera: Camera) -> float:
     return 2 * math.atan(camera.height / 2 / camera.fy)
 
 
-def browser_camera(window: viser.CameraHandle, unit: float, height: int, share: float = 1.0) -> Camera:
-    """The camera of the browser's window, rendered `height` px high and `share` of the window wide."""
-    width = max(1, round(height * aspect_of(window) * share))
+def browser_camera(window: viser.CameraHandle, unit: float, height: int) -> Camera:
+    """The camera of the browser's window, rendered `height` px high."""
+    width = max(1, round(height * aspect_of(window)))
     focal = height / 2 / math.tan(min(max(window.fov, NARROWEST), WIDEST) / 2)
     pose = torch.from_numpy(pose_of(window.wxyz, window.position, unit))
     return Camera(pose, focal, focal, width / 2, height / 2, width=width, height=height)
@@ -82,16 +82,15 @@ def fitting_view(camera: Camera, aspect: float) -> float:
     return 2 * math.atan(max(camera.height / 2 / camera.fy, across))
 
 
-def jump(client: viser.ClientHandle, camera: Camera, unit: float, distance: float, share: float = 1.0) -> None:
-    """Send the browser's camera exactly to a recorded one; it orbits about what lies `distance` mm ahead. share: of the
-    window's width, that is to show it all."""
+def jump(client: viser.ClientHandle, camera: Camera, unit: float, distance: float) -> None:
+    """Send the browser's camera exactly to a recorded one; it orbits about what lies `distance` mm ahead."""
     pose = to_numpy(camera.world_from_camera)
     with client.atomic():
         # the up direction first, or the orbit controls keep the old roll
         client.camera.up_direction = -pose[:3, 1]
         client.camera.position = pose[:3, 3] * unit
         client.camera.look_at = (pose[:3, 3] + distance * pose[:3, 2]) * unit
-        client.camera.fov = fitting_view(camera, aspect_of(client.camera) * share)
+        client.camera.fov = fitting_view(camera, aspect_of(client.camera))
 
 
 class Overlays:

@@ -58,17 +58,12 @@ def picture_of(parts: np.ndarray, seed: int) -> np.ndarray:
 
 
 def write_set(root: Path, count: int = 6, size: tuple[int, int] = (48, 40), info: bool = True) -> Path:
-    """A data set of `count` images; soft/ says 200 of 255 in the instrument, ignore/ the two rows at its top."""
+    """A data set of `count` images."""
     for index in range(count):
         parts, name = bar_parts(index, size), f"{index:06d}.png"
         save_rgb(root / "images" / name, picture_of(parts, index))
         save_grey(root / "masks" / name, (parts > 0) * 255)
         save_grey(root / "parts" / name, parts)
-        save_grey(root / "soft" / name, (parts > 0) * 200)
-        top = np.flatnonzero((parts > 0).any(axis=1))[0]
-        ignored = np.zeros_like(parts)
-        ignored[top : top + 2] = 255
-        save_grey(root / "ignore" / name, ignored)
     if info:
         write_ids(root)
     return root

@@ -452,7 +452,7 @@ def test_what_cannot_be_taught_is_refused(spec: DownstreamSettings, change, told
         plan_downstream(replace(spec, **change))
 
 
-@pytest.mark.parametrize("name", ["real", "strong", "pool", "soft", "a+b", "", "../up", "a/b"])
+@pytest.mark.parametrize("name", ["real", "strong", "paste", "a+b", "", "../up", "a/b"])
 def test_names_of_sets_that_mean_something_are_refused(spec: DownstreamSettings, name: str) -> None:
     data = replace(spec.sets[0], name=name)
     with refused(f"--sets {name}: ", "call the set"):
@@ -497,19 +497,6 @@ def test_labels_of_ones_own_are_taught_and_the_truth_is_tested(
     assert result["labelled"] == 2
     assert result["jobs"][0]["splits"]["test"]["iou"] < 0.3  # it learned the tissue, as it was told
     assert any(str(labels) in note for note in result["notes"])
-
-
-def test_soft_targets_of_parts_are_refused(spec: DownstreamSettings) -> None:
-    with refused("--conditions kin+soft: ", "use --classes instrument"):
-        plan_downstream(replace(replace(spec, conditions=("kin+soft",)), classes="parts"))
-    assert plan_downstream(replace(replace(spec, conditions=("kin+ignore",)), classes="parts"))
-
-
-def test_edges_that_a_set_lacks_are_refused_before_the_work(spec: DownstreamSettings, drawn: Path) -> None:
-    shutil.rmtree(drawn / "soft")
-    plan_downstream(spec)
-    with refused("--sets kin", "soft", "kin+hard"):
-        plan_downstream(replace(spec, conditions=("kin", "kin+soft")))
 
 
 def test_a_model_that_lacks_something_is_refused_with_the_remedy(spec, monkeypatch: pytest.MonkeyPatch) -> None:

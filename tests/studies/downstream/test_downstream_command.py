@@ -140,7 +140,7 @@ def test_weights_of_one_experiment_begin_another(words, recorded: Path, tmp_path
         (["--num-real", "few"], "--num-real: 'few' is neither a number of labelled frames nor all"),
         (["--num-real", "99"], "--num-real: 99 labelled frames are asked for, the capture has 10; use all"),
         (["--conditions", "kin+reel"], "--conditions kin+reel: 'reel' is neither"),
-        (["--conditions", "kin+soft+ignore"], "one of hard, soft, ignore at most"),
+        (["--conditions", "kin+soft"], "--conditions kin+soft: 'soft' is neither"),
         (["--folds", "0"], "--folds: 0 is none at all; give at least 1"),
         (["--workers", "0"], "--workers: 0 is none at all"),
         (["--steps", "0"], "--steps: 0 is none at all"),

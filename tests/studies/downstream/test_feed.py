@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from downstream_world import Held, batch_of, square, squares
+from downstream_world import Held, batch_of, squares
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neeco.studies.downstream import batches
-from neeco.studies.downstream.batches import SCHEDULES, BatchSampler, training_image
+from neeco.studies.downstream.batches import BatchSampler, training_image
 from neeco.studies.downstream.samples import Example, LeastRecentlyUsed
 
 REAL, SETS = squares(3, 0, 16), (squares(11, 10, 16), squares(1, 50, 16))
@@ -36,30 +35,23 @@ def shares(feed: BatchSampler, count: int, done: float) -> list[float]:
 
 @settings(deadline=None, max_examples=30)
 @given(st.integers(0, 99), st.lists(st.integers(1, 9), min_size=1, max_size=8))
-def test_half_of_a_balanced_batch_is_recorded_whatever_there_are(seed: int, sizes: list[int]) -> None:
-    feed, total = BatchSampler(REAL, SETS, seed=seed, schedule="balanced"), Counter()
+def test_synthetic_sources_take_turns_whatever_the_batches(seed: int, sizes: list[int]) -> None:
+    feed, total = BatchSampler(REAL, SETS, seed=seed), Counter()
     for size in sizes:
         total += Counter(source_of(name) for name in names(feed, size))
-    assert 0 <= total[0] - (total[1] + total[2]) <= 1
+    assert total[0] == 0
     assert abs(total[1] - total[2]) <= 1
 
 
-def test_each_schedule_has_its_shares_at_the_start_and_at_the_end() -> None:
-    found = {}
-    for schedule in SCHEDULES:
-        feed = BatchSampler(REAL, SETS, seed=0, schedule=schedule)
-        found[schedule] = [shares(feed, 60, done) for done in (0.0, 0.59, 0.61, 0.71, 0.99)]
-    alone, mixed, none = [1.0, 0.0, 0.0], [0.5, 0.25, 0.25], [0.0, 0.5, 0.5]
-    assert found["balanced"] == [mixed] * 5
-    assert found["finetune"] == [none, none, alone, alone, alone]
-    assert found["blend"] == [mixed, mixed, mixed, alone, alone]
-    assert found["pool"] == [[3 / 15, 11 / 15, 1 / 15]] * 5  # every image as often
+def test_synthetic_images_come_first_then_recorded_ones_alone() -> None:
+    feed = BatchSampler(REAL, SETS, seed=0)
+    alone, none = [1.0, 0.0, 0.0], [0.0, 0.5, 0.5]
+    assert [shares(feed, 60, done) for done in (0.0, 0.59, 0.61, 0.71, 0.99)] == [none, none, alone, alone, alone]
 
 
 def test_where_there_is_one_kind_it_is_all_there_is() -> None:
-    for schedule in SCHEDULES:
-        assert shares(BatchSampler(REAL, seed=0, schedule=schedule), 9, 0.0) == [1, 0, 0]
-        assert shares(BatchSampler((), SETS, seed=0, schedule=schedule), 8, 0.9) == [0, 0.5, 0.5]
+    assert shares(BatchSampler(REAL, seed=0), 9, 0.0) == [1, 0, 0]
+    assert shares(BatchSampler((), SETS, seed=0), 8, 0.9) == [0, 0.5, 0.5]
     assert BatchSampler((), [(), SETS[0]], seed=0).sources == [SETS[0]]
 
 
@@ -108,14 +100,6 @@ def test_targets_are_shares_of_area() -> None:
     assert batch.shares[0, 2].tolist() == [[0, 0, 1, 0], [0, 0, 1, 0]]
     assert batch.shares[0].sum(0).numpy() == pytest.approx(np.ones((2, 4)))
     assert batch.valid[0].tolist() == [[1, 1, 1, 1], [1, 1, 1, 0]]
-
-
-def test_soft_targets_are_the_share_of_instrument() -> None:
-    soft = replace(square(0), coverage=np.full((64, 64), 0.4, np.float32))
-    batch = batch_of([soft, square(0)], (16, 16))
-    assert batch.shares[0, 1].numpy() == pytest.approx(np.full((16, 16), 0.4), abs=2e-3)
-    assert batch.shares[1, 1].max() == 1
-    assert batch.valid.min() == 1
 
 
 def test_boxes_of_a_batch_are_those_of_its_examples() -> None:

@@ -30,8 +30,8 @@ SIZE = (48, 40)
 PARTS = ("shaft", "wrist", "jaws")
 
 
-def loaded(root: Path, classes=WHOLE, edges="hard", count=None) -> list[Example]:
-    return [sample.load() for sample in synthetic_samples(ImageSet("set", root, count), classes, edges, SIZE)]
+def loaded(root: Path, classes=WHOLE, count=None) -> list[Example]:
+    return [sample.load() for sample in synthetic_samples(ImageSet("set", root, count), classes, SIZE)]
 
 
 def refused(*words: str):
@@ -49,7 +49,6 @@ def test_one_class_is_every_part(drawn: Path) -> None:
     assert example.image.dtype == example.classes.dtype == np.uint8
     assert np.array_equal(example.image, picture_of(bar_parts(1), 1))
     assert example.valid is None
-    assert example.coverage is None
 
 
 def test_of_parts_both_jaws_are_one_class(drawn: Path) -> None:
@@ -100,25 +99,10 @@ def test_boxes_end_after_the_last_pixel_and_nothing_has_none() -> None:
     assert numbers.shape == (0,)
 
 
-def test_edges_are_read_where_they_are_asked_for(drawn: Path) -> None:
-    parts = bar_parts(0)
-    top = int(np.argwhere(parts)[0][0])
-    soft, ignore = loaded(drawn, edges="soft")[0], loaded(drawn, edges="ignore")[0]
-    assert soft.valid is None
-    assert soft.coverage is not None
-    assert soft.coverage.dtype == np.float32
-    assert np.allclose(soft.coverage, (parts > 0) * 200 / 255)
-    assert ignore.coverage is None
-    assert ignore.valid is not None
-    assert not ignore.valid[top : top + 2].any()
-    assert ignore.valid.sum() == (40 - 2) * 48
-    assert np.array_equal(ignore.classes, loaded(drawn)[0].classes)
-
-
 def test_a_count_takes_the_first_images(drawn: Path) -> None:
-    samples = synthetic_samples(ImageSet("set", drawn, 4), WHOLE, "hard", SIZE)
+    samples = synthetic_samples(ImageSet("set", drawn, 4), WHOLE, SIZE)
     assert [sample.name for sample in samples] == ["000000", "000001", "000002", "000003"]
-    assert len(synthetic_samples(ImageSet("set", drawn), WHOLE, "hard", SIZE)) == 6
+    assert len(synthetic_samples(ImageSet("set", drawn), WHOLE, SIZE)) == 6
 
 
 def annotated(drawn: Path, splits: list[str]) -> Path:
@@ -132,7 +116,7 @@ def annotated(drawn: Path, splits: list[str]) -> Path:
 
 def test_of_annotated_frames_only_those_trained_on_are_learned_from(drawn: Path) -> None:
     splits = ["test", "train", "train", "unseen", "train", "test"]
-    samples = synthetic_samples(ImageSet("set", annotated(drawn, splits)), WHOLE, "hard", SIZE)
+    samples = synthetic_samples(ImageSet("set", annotated(drawn, splits)), WHOLE, SIZE)
     assert [sample.name for sample in samples] == ["000001", "000002", "000004"]
 
 
@@ -173,7 +157,7 @@ def test_sets_that_cannot_be_read_are_refused(drawn: Path, tmp_path: Path) -> No
     with refused("--sets set", "has 6 images, not 7; synthesize more"):
         loaded(drawn, count=7)
     with refused("--sets set", "is 48x40, the capture's frames are 60x50"):
-        synthetic_samples(ImageSet("set", drawn), WHOLE, "hard", (60, 50))
+        synthetic_samples(ImageSet("set", drawn), WHOLE, (60, 50))
     (drawn / "parts" / "000005.png").unlink()
     assert len(loaded(drawn, count=5)) == 5
     with refused("--sets set", "000005.png", "every image needs its labels"):
@@ -190,20 +174,12 @@ def test_an_image_of_another_size_is_refused_wherever_it_stands(drawn: Path) -> 
         loaded(drawn)
 
 
-@pytest.mark.parametrize("linked", ["images", "images/000003.png", "parts/000003.png", "soft", "dataset.json"])
+@pytest.mark.parametrize("linked", ["images", "images/000003.png", "parts/000003.png", "dataset.json"])
 def test_a_set_is_read_from_its_own_folder_alone(linked: str, drawn: Path, tmp_path: Path) -> None:
     (drawn / linked).rename(tmp_path / "elsewhere")
     (drawn / linked).symlink_to(tmp_path / "elsewhere")
     with refused(linked, "a link leads out of"):
-        loaded(drawn, edges="soft")
-
-
-@pytest.mark.parametrize("edges", ["soft", "ignore"])
-def test_a_set_without_its_edges_is_refused(edges, drawn: Path) -> None:
-    (drawn / edges / "000002.png").unlink()
-    with refused("--sets set", f"{edges}/000002.png", "set+hard"):
-        loaded(drawn, edges=edges)
-    assert len(loaded(drawn)) == 6
+        loaded(drawn)
 
 
 def test_ids_that_mean_nothing_are_refused(drawn: Path) -> None:
@@ -211,7 +187,7 @@ def test_ids_that_mean_nothing_are_refused(drawn: Path) -> None:
     parts[0, 0] = 9
     save_grey(drawn / "parts" / "000000.png", parts)
     with refused("000000.png: id 9 has no class", "dataset.json"):
-        synthetic_samples(ImageSet("set", drawn), WHOLE, "hard", SIZE)  # known before the work
+        synthetic_samples(ImageSet("set", drawn), WHOLE, SIZE)  # known before the work
 
 
 def test_a_description_with_numbers_that_are_none_is_refused(drawn: Path) -> None:

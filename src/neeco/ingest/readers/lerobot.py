@@ -24,6 +24,7 @@ from PIL import Image
 from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
 from neeco.errors import NeecoError
+from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import (
     IMAGES,
     OTHER,
@@ -36,7 +37,6 @@ from neeco.ingest.readers import (
     choose_stream,
     compare_counts,
 )
-from neeco.ingest.readers.choices import find_rotations
 from neeco.ingest.readers.columns import (
     QUATERNION_WXYZ,
     ROTATION_MATRIX,
@@ -55,6 +55,7 @@ UNNAMED = "instrument"  # what a body is called that nothing names
 MAX_PIXELS = 90_000_000  # of an image, as for files of images
 IMAGES_AT_ONCE = 16  # of those that stand in Parquet
 MAX_IMAGES = 10**7  # of a film: timestamps beyond are those of a clock
+UNIT_TOLERANCE = 1e-3  # of a quaternion's length, and of R^T R - I: rounding of float32 and text
 DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
 
@@ -341,6 +342,32 @@ def _meaning(key: str, columns: Sequence[str]) -> NamedFrame:
     return meaning_in([key], dvrk=dvrk) or meaning_in(columns, dvrk=dvrk) or unsaid(dvrk=dvrk)
 
 
+def find_rotations(values: np.ndarray) -> list[tuple[int, str]]:
+    """Return (first column, QUATERNION_WXYZ or ROTATION_MATRIX) of rotations among numbers [R, C]: four of unit length
+    in either order, of which more than one changes, or nine that are a rotation matrix in every row."""
+    values = values.astype(np.float64)
+    values = values[np.isfinite(values).all(axis=1)]
+    if not len(values):
+        return []
+    found, place = [], 0
+    while place <= values.shape[1] - 4:
+        four = values[:, place : place + 4]
+        nine = values[:, place : place + 9]
+        if nine.shape[1] == 9 and _are_rotations(nine.reshape(-1, 3, 3)):
+            found.append((place, ROTATION_MATRIX))
+            place += 9
+        elif np.abs(np.linalg.norm(four, axis=1) - 1).max() < UNIT_TOLERANCE and (np.ptp(four, axis=0) > 0).sum() > 1:
+            found.append((place, QUATERNION_WXYZ))
+            place += 4
+        else:
+            place += 1
+    return found
+
+
+def _are_rotations(matrices: np.ndarray) -> bool:
+    return bool(rotation_error(matrices).max() < UNIT_TOLERANCE and (np.linalg.det(matrices) > 0).all())
+
+
 def _rotation_asks(values: np.ndarray, columns: Sequence[str]) -> tuple[str, ...]:
     """Return the columns that may be a rotation by their numbers [R, C], as lines to choose from."""
     asks = []
@@ -350,8 +377,7 @@ def _rotation_asks(values: np.ndarray, columns: Sequence[str]) -> tuple[str, ...
             size, why = 9, "or column by column: list them so that they stand row by row"
         if place >= 3:
             asks.append(f"  position: {_flow(columns[place - 3 : place])}   # stands before the rotation")
-        form = kind if kind == ROTATION_MATRIX else QUATERNION_WXYZ
-        asks.append(f"  {form}: {_flow(columns[place : place + size])}   # {why}")
+        asks.append(f"  {kind}: {_flow(columns[place : place + size])}   # {why}")
     return tuple(asks)
 
 

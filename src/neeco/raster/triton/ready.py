@@ -36,10 +36,7 @@ def missing(device: torch.device) -> str | None:
     capability = torch.cuda.get_device_capability(device)
     if capability < OLDEST:
         has, needs = (".".join(map(str, version)) for version in (capability, OLDEST))
-        return (
-            f"{device} has compute capability {has}, Triton needs {needs}; {install_hint('cuda')} to render with "
-            "gsplat, or use --device cpu"
-        )
+        return f"{device} has compute capability {has}, Triton needs {needs}; use --device cpu"
     return None
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -14,10 +13,7 @@ from torch import Tensor
 from neeco.studies.downstream.samples import Example, LeastRecentlyUsed, Sample
 from neeco.synthesis.augmentation import Outline, augment, moved
 
-Schedule = Literal["balanced", "pool", "finetune", "blend"]
-SCHEDULES: tuple[Schedule, ...] = get_args(Schedule)
-DEFAULT_SCHEDULE: Schedule = "finetune"
-REAL_ALONE_FROM = {"finetune": 0.6, "blend": 0.7}  # of the steps: recorded frames alone from here on
+REAL_ALONE_FROM = 0.6  # share of the steps after which recorded frames alone are learned
 
 
 @dataclass(frozen=True)
@@ -62,8 +58,6 @@ def training_image(sample: Sample, size: tuple[int, int], classes: int, outlines
 def shrink(example: Example, size: tuple[int, int], classes: int, outlines: bool = False) -> TrainingImage:
     """An example at a model's input size (width, height). classes: how many there are. outlines: with them."""
     whole = np.stack([example.classes == k + 1 for k in range(classes)], 2).astype(np.float32)  # [H, W, C]
-    if example.coverage is not None:
-        whole = example.coverage[..., None]
     weight = np.ones(whole.shape[:2], np.float32) if example.valid is None else example.valid.astype(np.float32)
     shares = cv2.resize(whole * weight[..., None], size, interpolation=cv2.INTER_AREA).reshape(*size[::-1], classes)
     valid = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
@@ -103,10 +97,9 @@ def _boxes(outlines: Sequence[Outline]) -> tuple[np.ndarray, np.ndarray]:
 class BatchSampler:
     """Draws samples from sources without end. A source is shuffled anew after each pass.
 
-    sources: recorded frames where there are any, then the synthetic ones, of whom each has an equal share. schedule:
-    when which are drawn, where there are both. `balanced`: recorded and synthetic ones in turn. `pool`: all from one
-    pool. `finetune`: synthetic ones, then recorded ones alone. `blend`: in turn, then recorded ones alone. The seed
-    decides the order. augmented: whether a batch is to be strongly augmented.
+    sources: recorded frames where there are any, then the synthetic ones, of which each has an equal share. Where there
+    are both, synthetic ones are drawn until REAL_ALONE_FROM, then recorded ones alone. The seed decides the order.
+    augmented: whether a batch is to be strongly augmented.
     """
 
     def __init__(
@@ -115,16 +108,14 @@ class BatchSampler:
         synthetic: Sequence[Sequence[Sample]] = (),
         *,
         seed: int,
-        schedule: Schedule = DEFAULT_SCHEDULE,
         augmented: bool = False,
     ) -> None:
         self.sources = [source for source in (real, *synthetic) if source]
-        self.schedule = schedule if real and len(self.sources) > 1 else None
+        self._fine_tunes = bool(real) and len(self.sources) > 1
         self.augmented = augmented
         self.rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
         self._orders = [self._shuffled(source) for source in self.sources]
-        self._pool = self._shuffled([sample for source in self.sources for sample in source])
-        self._drawn = [0, 0]  # from all, from the synthetic ones
+        self._turn = int(self._fine_tunes)  # the second synthetic source, if there is one, comes first
 
     def draw(self, count: int, done: float) -> list[Sample]:
         """Return the next `count` samples. done: share of the training that is done, in [0, 1]."""
@@ -132,17 +123,11 @@ class BatchSampler:
 
     def _next_source(self, done: float) -> Iterator[Sample]:
         """The source whose turn it is."""
-        turn = self._drawn[0]
-        self._drawn[0] += 1
-        if self.schedule is None:
-            return self._orders[turn % len(self._orders)]
-        if self.schedule == "pool":
-            return self._pool
-        alone = done >= REAL_ALONE_FROM.get(self.schedule, 2.0)
-        if alone or (self.schedule != "finetune" and turn % 2 == 0):
-            return self._orders[0]
-        self._drawn[1] += 1
-        return self._orders[1 + self._drawn[1] % (len(self._orders) - 1)]
+        orders = self._orders
+        if self._fine_tunes:
+            orders = orders[:1] if done >= REAL_ALONE_FROM else orders[1:]
+        self._turn += 1
+        return orders[(self._turn - 1) % len(orders)]
 
     def _shuffled(self, source: Sequence[Sample]) -> Iterator[Sample]:
         while True:

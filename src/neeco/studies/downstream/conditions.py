@@ -9,13 +9,8 @@ from typing import Literal
 import numpy as np
 
 from neeco.errors import NeecoError
-from neeco.studies.downstream.batches import DEFAULT_SCHEDULE, SCHEDULES, Schedule
-from neeco.studies.downstream.samples import Edges
 
-REAL, STRONG, PASTE, MATCH, PERMUTED = "real", "strong", "paste", "match", "permuted"
-EDGES: tuple[Edges, ...] = ("hard", "soft", "ignore")
-DEFAULT_EDGES: Edges = "hard"
-RESERVED = (REAL, STRONG, PASTE, MATCH, PERMUTED, *SCHEDULES, *EDGES)
+RESERVED = REAL, STRONG, PASTE, PERMUTED = "real", "strong", "paste", "permuted"
 BASELINES = (REAL, f"{REAL}+{STRONG}")  # without synthetic images: the better of them is the reference
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 
@@ -31,10 +26,7 @@ class Condition:
     real: bool = False  # with labelled recorded frames
     strong: bool = False  # with strong augmentation of every image
     paste: bool = False  # with the labelled instruments pasted over backgrounds
-    match: bool = False  # half of the labelled frames' images in the colours of another recording
     permuted: bool = False  # the sets' labels belong to other images
-    edges: Edges = DEFAULT_EDGES  # how the edges of synthetic labels are learned
-    schedule: Schedule = DEFAULT_SCHEDULE  # when recorded and when synthetic images are learned
 
 
 def parse_condition(name: str, sets: Collection[str]) -> Condition:
@@ -49,19 +41,11 @@ def parse_condition(name: str, sets: Collection[str]) -> Condition:
             raise refuse(f"{word!r} is neither {', '.join(RESERVED)} nor a set; name it in --sets")
     if len(set(words)) < len(words):
         raise refuse("a word stands in it twice")
-    edges = [edge for edge in EDGES if edge in words]
-    schedules = [schedule for schedule in SCHEDULES if schedule in words]
     chosen = tuple(word for word in words if word in sets)
-    if len(edges) > 1 or (edges and not chosen):
-        raise refuse(f"one of {', '.join(EDGES)} at most, and only together with a set")
     if PERMUTED in words and not chosen:
         raise refuse(f"{PERMUTED} only together with a set, whose labels it permutes")
     if PASTE in words and REAL not in words:
         raise refuse(f"{PASTE} only together with {REAL}, whose instruments it pastes")
-    if MATCH in words and REAL not in words:
-        raise refuse(f"{MATCH} only together with {REAL}; synthesize the set with --match-colors")
-    if len(schedules) > 1 or (schedules and not (REAL in words and (chosen or PASTE in words))):
-        raise refuse(f"one of {', '.join(SCHEDULES)} at most, and only together with {REAL} and a set or {PASTE}")
     if not chosen and REAL not in words:
         raise refuse("nothing to learn from; add real or a set")
     return Condition(
@@ -70,10 +54,7 @@ def parse_condition(name: str, sets: Collection[str]) -> Condition:
         real=REAL in words,
         strong=STRONG in words,
         paste=PASTE in words,
-        match=MATCH in words,
         permuted=PERMUTED in words,
-        edges=edges[0] if edges else DEFAULT_EDGES,
-        schedule=schedules[0] if schedules else DEFAULT_SCHEDULE,
     )
 
 

@@ -14,7 +14,6 @@ from neeco.errors import NeecoError
 from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.studies.downstream.conditions import (
-    DEFAULT_EDGES,
     REAL,
     RESERVED,
     Condition,
@@ -36,7 +35,6 @@ from neeco.studies.downstream.samples import (
 )
 from neeco.studies.machine import machine, threads_per_worker
 from neeco.studies.study import JobEvent, check_output, check_workers, run_and_record
-from neeco.synthesis.backgrounds import ImageFolder
 
 SCHEMA = "neeco-downstream/2"
 FILE = "downstream.json"
@@ -71,14 +69,9 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
     _check_tests(settings, capture)
     if settings.backgrounds is not None:
         background_files(settings.backgrounds)
-    if settings.match_colors is not None:
-        ImageFolder.of(settings.match_colors, "match_colors")
     size = frame_size(recorded_samples(capture, settings.splits[0], settings.classes))
-    images = {}
-    for data in settings.sets:
-        edges = {condition.edges for condition in conditions if data.name in condition.sets}
-        for edge in sorted(edges) or [DEFAULT_EDGES]:
-            images[data.name] = len(synthetic_samples(data, class_names(capture, settings.classes), edge, size))
+    classes = class_names(capture, settings.classes)
+    images = {data.name: len(synthetic_samples(data, classes, size)) for data in settings.sets}
     counts, labelled = _counts(settings, capture, conditions)
     _check_inputs(settings, capture, size)
     entries = settings.output.iterdir() if settings.output.is_dir() else ()
@@ -91,8 +84,6 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
         more = "a number of labelled frames" if absent[0].real else "0, for sets alone"
         raise NeecoError(f"--num-real: leaves nothing to train {absent[0].name} on; add {more}")
     jobs = _jobs(settings, conditions, counts)
-    if not jobs:
-        raise NeecoError("--conditions: boxes have no soft edges; use a model that predicts masks")
     for job in jobs:
         job.check()
     return DownstreamPlan(
@@ -132,16 +123,7 @@ def _conditions(settings: DownstreamSettings) -> list[Condition]:
     if len(set(names)) < len(names):
         raise NeecoError(f"--sets: a name stands twice in {' '.join(names)}; name each set differently")
     words = default_conditions(names) if settings.conditions is None else settings.conditions
-    conditions = [parse_condition(word, names) for word in dict.fromkeys(words)]
-    for condition in conditions:
-        if condition.match and settings.match_colors is None:
-            raise NeecoError(f"--conditions {condition.name}: in whose colours? give --match-colors FOLDER")
-        if condition.edges == "soft" and settings.classes == "parts":
-            raise NeecoError(
-                f"--conditions {condition.name}: soft/ says how much of a pixel is instrument, not of which part; "
-                "use --classes instrument"
-            )
-    return conditions
+    return [parse_condition(word, names) for word in dict.fromkeys(words)]
 
 
 def _splits(capture: Capture, requested: Sequence[str]) -> tuple[str, ...]:
@@ -206,14 +188,12 @@ def _check_inputs(settings: DownstreamSettings, capture: Capture, frame: tuple[i
 def _jobs(
     settings: DownstreamSettings, conditions: Sequence[Condition], counts: Sequence[int]
 ) -> tuple[DownstreamJob, ...]:
-    """The first fold of everything comes first: results halfway are of all conditions. Soft edges are of masks alone:
-    boxes have none, it would be the plain condition again."""
+    """The first fold of everything comes first: results halfway are of all conditions."""
     return tuple(
         DownstreamJob(settings, model, condition, real, fold)
         for fold in range(settings.folds)
         for model in settings.models
         for condition in conditions
-        if condition.edges == DEFAULT_EDGES or model_class(model).predicts == "masks"
         for real in counts
         if bool(real) == condition.real
     )

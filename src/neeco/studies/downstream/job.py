@@ -21,7 +21,6 @@ from neeco.files import read_json, require_like, require_same, write_atomically,
 from neeco.raster.devices import device_of
 from neeco.studies.downstream.batches import BatchSampler
 from neeco.studies.downstream.conditions import Condition, FrameSelection, labelled_frames
-from neeco.studies.downstream.matching import matched_samples
 from neeco.studies.downstream.model import Model, TrainedModel, TrainingTask, input_size, model_class
 from neeco.studies.downstream.paste import PASTED_IMAGES, pasted_samples
 from neeco.studies.downstream.samples import (
@@ -64,7 +63,6 @@ class DownstreamSettings:
     folds: int = 5
     conditions: tuple[str, ...] | None = None
     backgrounds: Path | None = None  # folder of images to paste over; None: the labelled frames, filled in
-    match_colors: Path | None = None  # folder of frames of another recording, whose colours `match` takes
     labels: Path | None = None  # folder of masks for the recorded training frames; None: the capture's truth
     classes: ClassNames = "instrument"
     frame_selection: FrameSelection = "spread"
@@ -164,7 +162,6 @@ class DownstreamJob:
     def identity(self) -> dict[str, Any]:
         """Return what a folder must agree with to be this job's. Its keys are those of job.json."""
         settings, kind, condition = self.settings, model_class(self.model), self.condition
-        mixed = condition.real and bool(self.sets or condition.paste) and kind.keeps_order
         return {
             "model": self.model,
             "condition": condition.name,
@@ -174,10 +171,7 @@ class DownstreamJob:
             "labels": absolute(settings.labels),
             "transforms": settings.transforms,
             "sets": [data.described() for data in self.sets],
-            "edges": condition.edges if self.sets else None,
-            "schedule": condition.schedule if mixed else None,
             "backgrounds": absolute(settings.backgrounds) if condition.paste else None,
-            "match_colors": absolute(settings.match_colors) if condition.match else None,
             "pasted": settings.pasted if condition.paste else None,
             "classes": settings.classes,
             "pick": settings.frame_selection,
@@ -255,18 +249,13 @@ class DownstreamJob:
         names = class_names(capture, settings.classes)
         synthetic: list[Sequence[Sample]] = []
         for data in self.sets:
-            samples = synthetic_samples(data, names, condition.edges, size)
+            samples = synthetic_samples(data, names, size)
             synthetic.append(permuted(samples) if condition.permuted else samples)
         if condition.paste:
             synthetic.append(pasted_samples(labelled, settings.backgrounds, self.fold, settings.pasted))
-        real: Sequence[Sample] = labelled
-        if condition.match and settings.match_colors is not None:
-            real = matched_samples(labelled, settings.match_colors, self.fold)
         return TrainingTask(
             classes=names,
-            batches=BatchSampler(
-                real, synthetic, seed=self.fold, schedule=condition.schedule, augmented=condition.strong
-            ),
+            batches=BatchSampler(labelled, synthetic, seed=self.fold, augmented=condition.strong),
             size=settings.input_of(kind, size),
             steps=settings.steps_of(kind),
             batch=settings.batch_of(kind),

@@ -64,7 +64,6 @@ class Model(ABC):
     steps: ClassVar[int]  # that suffice for a few hundred images
     batch: ClassVar[int]
     accepts_weights: ClassVar[bool] = True
-    keeps_order: ClassVar[bool] = True  # whether it takes images in the order of the task's batches
 
     @classmethod
     @abstractmethod

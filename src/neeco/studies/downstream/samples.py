@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from neeco.capture.checks.truth import PARTS_FILE
-from neeco.capture.images import image_files, image_size, open_image, read_image_bytes, read_labels
+from neeco.capture.images import image_files, image_size, read_image_bytes, read_labels
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, truth_file, truth_names
@@ -22,7 +22,6 @@ from neeco.evaluation.mask_metrics import pairs_of
 from neeco.files import read_bytes, read_json, read_text, require_inside
 
 ClassNames = Literal["instrument", "parts"]
-Edges = Literal["hard", "soft", "ignore"]
 WHOLE = ("instrument",)  # the classes where an instrument is one
 CACHE_BYTES = 1 << 30  # of decoded images of one kind that a process keeps
 DATASET_FILE, STATES_FILE, IMAGE_FOLDER = "dataset.json", "states.jsonl", "images"
@@ -60,7 +59,6 @@ class Example:
     classes: np.ndarray  # uint8 [H, W], 0 tissue, else the class, from 1
     instruments: np.ndarray  # uint8 [H, W], 0 tissue, else the instrument, from 1
     valid: np.ndarray | None = None  # bool [H, W], False where pixels are neither learned nor scored; None: all valid
-    coverage: np.ndarray | None = None  # float32 [H, W], instrument's share of each pixel; None: all or nothing
 
     @property
     def bytes(self) -> int:
@@ -202,13 +200,11 @@ class RecordedSample:
 
 @dataclass(frozen=True)
 class SyntheticSample:
-    """An image of a data set. `soft`, `ignore`: files of its edges, where they are used."""
+    """An image of a data set."""
 
     image: Path
     labels: Path
     label_map: LabelMap
-    soft: Path | None = None
-    ignore: Path | None = None
 
     @property
     def name(self) -> str:
@@ -216,7 +212,7 @@ class SyntheticSample:
 
     @property
     def key(self) -> Hashable:
-        return self.image, self.labels, self.label_map.key, self.soft, self.ignore
+        return self.image, self.labels, self.label_map.key
 
     def load(self) -> Example:
         """Raises NeecoError where a file is of another size, or has an id without a class."""
@@ -224,9 +220,7 @@ class SyntheticSample:
         ids = read_labels(self.labels, size).numpy()
         self.label_map.check(ids, self.labels, f"name it in {DATASET_FILE}, or synthesize the set again")
         pixels = read_image_bytes(self.image).numpy()
-        valid = None if self.ignore is None else _read_grey(self.ignore, size) < 128
-        coverage = None if self.soft is None else _read_grey(self.soft, size).astype(np.float32) / 255
-        return Example(pixels, self.label_map.classes[ids], self.label_map.instruments[ids], valid, coverage)
+        return Example(pixels, self.label_map.classes[ids], self.label_map.instruments[ids])
 
 
 def permuted(samples: Sequence[SyntheticSample]) -> tuple[SyntheticSample, ...]:
@@ -234,10 +228,7 @@ def permuted(samples: Sequence[SyntheticSample]) -> tuple[SyntheticSample, ...]:
     order = np.random.default_rng(0).permutation(len(samples))
     source = dict(zip(order.tolist(), np.roll(order, 1).tolist(), strict=True))
     others = [samples[source[index]] for index in range(len(samples))]
-    return tuple(
-        replace(sample, labels=other.labels, soft=other.soft, ignore=other.ignore)
-        for sample, other in zip(samples, others, strict=True)
-    )
+    return tuple(replace(sample, labels=other.labels) for sample, other in zip(samples, others, strict=True))
 
 
 @dataclass(frozen=True)
@@ -337,9 +328,7 @@ def frame_size(samples: Sequence[RecordedSample]) -> tuple[int, int]:
     return next(iter(sizes))
 
 
-def synthetic_samples(
-    data: ImageSet, classes: Sequence[str], edges: Edges, size: tuple[int, int]
-) -> tuple[SyntheticSample, ...]:
+def synthetic_samples(data: ImageSet, classes: Sequence[str], size: tuple[int, int]) -> tuple[SyntheticSample, ...]:
     """The images of a data set in their order, each with its labels; the first `count` of them.
 
     The dataset.json of `neeco synthesize` says what ids mean; without it, masks/ separate instrument and tissue. Of a
@@ -360,7 +349,6 @@ def synthetic_samples(
     for image in images[: data.count]:
         require_inside(image, data.path)
         file = data.file(labels, f"{image.stem}.png")
-        edge_files = {} if edges == "hard" else {edges: data.file(edges, f"{image.stem}.png")}
         if not file.is_file():
             raise data.error(f"{file}: no such file; every image needs its labels")
         found = image_size(image)
@@ -369,9 +357,7 @@ def synthetic_samples(
                 f"{image} is {found[0]}x{found[1]}, the capture's frames are {size[0]}x{size[1]}; synthesize it from "
                 "a run of this capture"
             )
-        for missing in (path for path in edge_files.values() if not path.is_file()):
-            raise data.error(f"{missing}: no such file; synthesize the set again, or use {data.name}+hard")
-        samples.append(SyntheticSample(image, file, label_map, **edge_files))
+        samples.append(SyntheticSample(image, file, label_map))
     samples[0].load()  # raises before the work where its ids have no class
     return tuple(samples)
 
@@ -415,8 +401,3 @@ def _labels_of(data: ImageSet, classes: Sequence[str]) -> tuple[str, LabelMap]:
             f"{data.path}: its labels have none of the parts {', '.join(classes)}; use --classes instrument"
         )
     return "parts", label_map
-
-
-def _read_grey(file: Path, size: tuple[int, int]) -> np.ndarray:
-    """uint8 [H, W] of an 8-bit grey image."""
-    return np.asarray(open_image(file, size).convert("L"))

@@ -42,7 +42,6 @@ class Yolo(Model):
     steps = 400
     batch = 8
     accepts_weights = False  # they are pickles: for that program alone to open
-    keeps_order = False  # that program shuffles
 
     @classmethod
     def missing_requirement(cls) -> str | None:

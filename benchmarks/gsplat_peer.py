@@ -1,4 +1,4 @@
-"""The cuda backend: gsplat (the extra `cuda`) renders, plain torch evaluates the colours."""
+"""gsplat as a peer to measure against: it renders, plain torch evaluates the colours."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from neeco.raster.reference import camera_from_world, headlight_factor, sh_color
 from neeco.raster.types import Gaussians, Headlight, Rendering
 
 
-def rasterize_cuda(
-    gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
+def rasterize_gsplat(
+    gaussians: Gaussians, camera: Camera, channels: Tensor | None = None, background: Tensor | None = None
 ) -> Rendering:
-    """`rasterize` through gsplat >= 1.4, float32, on the device of the means.
+    """`rasterize` of a pinhole without shadows through gsplat >= 1.4, float32, on the device of the means.
 
     gsplat does not define the order of equal depths; everything else follows the reference to float32 accuracy.
     """
