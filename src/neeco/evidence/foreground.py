@@ -3,7 +3,7 @@
 The scene's tissue, rendered without instruments, is each image's background. A shadow dims it by one factor, so that a
 pixel is described by the factor that fits best (`shade`) and by what that leaves, as a share of the brightness
 (`residual`). Two densities of these two are learned from the images themselves: of tissue, where no instrument is near,
-any shade of a shadow being as likely; of the instruments, well inside of where they are rendered. Their ratio tells
+lit as there or in any shade of a shadow; of the instruments, well inside of where they are rendered. Their ratio tells
 which of the two a pixel shows, and says nothing where both are alike: a black shaft is no shadow of dark cloth where
 its residuals differ from those of cloth, and undetermined where they do not.
 """
@@ -108,17 +108,13 @@ class Foreground:
         inside = [view.usable & view.inside(settings.inside_px) for view in views]
         if min(sum(int(mask.sum()) for mask in masks) for masks in (far, inside)) < settings.least_pixels:
             return None
-        of_tissue = np.concatenate([view.residual[mask] for view, mask in zip(views, far, strict=True)])
-        residuals = np.concatenate([view.residual[mask] for view, mask in zip(views, inside, strict=True)])
-        shades = np.concatenate([view.shade[mask] for view, mask in zip(views, inside, strict=True)])
-        n_residuals, n_shades = settings.residuals[2], settings.shades[2]
-        row, column = _bins(residuals, shades, settings)
-        instrument = np.bincount(row * n_shades + column, minlength=n_residuals * n_shades).reshape(n_residuals, -1)
-        row = _bins(of_tissue, np.ones_like(of_tissue), settings)[0]
-        middles = np.linspace(*settings.shades[:2], 2 * n_shades + 1)[1::2]
+        instrument = _counts(views, inside, settings)
+        lit = _counts(views, far, settings)
+        middles = np.linspace(*settings.shades[:2], 2 * settings.shades[2] + 1)[1::2]
         shadow = (middles > settings.shadow[0]) & (middles < settings.shadow[1])
-        tissue = np.bincount(row, minlength=n_residuals)[:, None] * shadow
-        instrument, tissue = (_density(counts.astype(float), settings) for counts in (instrument, tissue))
+        tissue = lit + lit.sum(1, keepdims=True) * shadow / shadow.sum()  # as often in a shadow as not
+        instrument, tissue = (_density(counts, settings) for counts in (instrument, tissue))
+        of_tissue = np.concatenate([view.residual[mask] for view, mask in zip(views, far, strict=True)])
         noise = float(np.quantile(of_tissue, settings.noise_quantile))
         return Foreground(np.log(instrument / tissue), noise, settings)
 
@@ -141,6 +137,15 @@ def _bins(residuals: np.ndarray, shades: np.ndarray, settings: ForegroundSetting
     ):  # fmt: skip
         found.append(((values - low) / (high - low) * count).astype(int).clip(0, count - 1))
     return found[0], found[1]
+
+
+def _counts(views: Sequence[Comparison], masks: Sequence[np.ndarray], settings: ForegroundSettings) -> np.ndarray:
+    """Count the pixels of views in masks [H, W] by residual and shade, [R, S]."""
+    shape = settings.residuals[2], settings.shades[2]
+    counts = np.zeros(shape)
+    for view, mask in zip(views, masks, strict=True):
+        np.add.at(counts, _bins(view.residual[mask], view.shade[mask], settings), 1)
+    return counts
 
 
 def _density(counts: np.ndarray, settings: ForegroundSettings) -> np.ndarray:
