@@ -1,1 +1,1 @@
-"""What is instrument in an image, by what the learned tissue does not explain."""
+"""Foreground of images: what shows an instrument, by what the learned tissue does not explain."""

@@ -1,4 +1,4 @@
-"""How likely each pixel of an image shows an instrument, given the tissue of a scene: the foreground.
+"""Foreground of an image: how likely each pixel shows an instrument, given the tissue of a scene.
 
 The scene's tissue, rendered without instruments, is each image's background. A shadow dims it by one factor, so that a
 pixel is described by the factor that fits best (`shade`) and by what that leaves, as a share of the brightness
@@ -26,9 +26,9 @@ from neeco.raster import rasterize
 from neeco.scene.gaussian_scene import GaussianScene
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ForegroundSettings:
-    """How pixels are compared, and when they tell anything."""
+    """Settings of the comparison: of densities, and of when a pixel tells anything."""
 
     window_px: int = 3  # over which residuals are averaged
     dark: float = 0.03  # added to the brightness [0, 1] that residuals are shares of: the camera's noise in the dark
@@ -119,7 +119,7 @@ class Foreground:
         return Foreground(np.log(instrument / tissue), noise, settings)
 
     def certainty(self, view: Comparison, near: float) -> np.ndarray:
-        """Of every pixel of a view [H, W]: 1 certainly an instrument, -1 certainly tissue, 0 not known. No instrument
+        """Return of every pixel of a view [H, W]: 1 certainly an instrument, -1 certainly tissue, 0 not known. No instrument
         shows farther than `near` (share of the width) from a rendered one."""
         log_ratio = self.ratio[_bins(view.residual, view.shade, self.settings)]
         instrument, tissue = (

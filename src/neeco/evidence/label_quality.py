@@ -1,4 +1,4 @@
-"""How good labels are where no mask is known: what images show of an instrument against what is labelled."""
+"""Quality of labels where no mask is known: what images show of an instrument against what is labelled."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class LabelQuality:
 
     @property
     def iou(self) -> float:
-        """Intersection over union."""
+        """Intersection over union that follows."""
         if min(self.recall, self.precision) <= 0:
             return 0.0
         return 1 / (1 / self.recall + 1 / self.precision - 1)
 
     @property
     def doubt(self) -> str | None:
-        """Why these labels are doubtful, if they are."""
+        """Reason to doubt these labels, if there is one."""
         if self.iou >= LEAST_IOU:
             return None
         return (
@@ -41,7 +41,7 @@ class LabelQuality:
         )
 
     def as_json(self) -> dict[str, float]:
-        """For files of numbers."""
+        """Return the numbers for files."""
         return {"iou": self.iou, "recall": self.recall, "precision": self.precision}
 
 

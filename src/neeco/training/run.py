@@ -80,8 +80,8 @@ class TrainedRun:
         known = noted.get(LABEL_QUALITY)
         doubt = None if known is None else LabelQuality(known["recall"], known["precision"]).doubt
         joints = noted.get("joints", {}).items()
-        lost = (f"joint {name}: {joint['verdict']}" for name, joint in joints if joint.get("found") is False)
-        return (*([doubt] if doubt else []), *lost)
+        unfound = (f"joint {name}: {joint['verdict']}" for name, joint in joints if joint.get("found") is False)
+        return (*([doubt] if doubt else []), *unfound)
 
     def require_trusted(self, verb: str) -> None:
         """Raise NeecoError where the labels that `verb` is to write are doubtful, unless `force`."""
