@@ -119,8 +119,8 @@ class Foreground:
         return Foreground(np.log(instrument / tissue), noise, settings)
 
     def certainty(self, view: Comparison, near: float) -> np.ndarray:
-        """Return of every pixel of a view [H, W]: 1 certainly an instrument, -1 certainly tissue, 0 not known. No instrument
-        shows farther than `near` (share of the width) from a rendered one."""
+        """Return of every pixel of a view [H, W]: 1 certainly an instrument, -1 certainly tissue, 0 not known. No
+        instrument shows farther than `near` (share of the width) from a rendered one."""
         log_ratio = self.ratio[_bins(view.residual, view.shade, self.settings)]
         instrument, tissue = (
             np.clip((sign * log_ratio - math.log(least)) / math.log(most / least), 0, 1)
