@@ -32,11 +32,13 @@ class ForegroundSettings:
 
     window_px: int = 3  # over which residuals are averaged
     dark: float = 0.03  # added to the brightness [0, 1] that residuals are shares of: the camera's noise in the dark
-    shadow: tuple[float, float] = (0.45, 1.05)  # range of shades of tissue; darker than any shadow is an instrument
+    shadow: tuple[float, float] = (0.2, 1.05)  # range of shades of tissue; darker than any shadow is an instrument
     residuals: tuple[float, float, int] = (-6.0, 1.0, 28)  # range of their logarithms, and bins
     shades: tuple[float, float, int] = (0.0, 1.5, 15)  # range, and bins
     smoothing: float = 1.0  # bins, standard deviation
-    floor: float = 0.02  # share of a uniform density in each: what was not sampled is not impossible
+    # share of a uniform density in each: what was not sampled is not impossible; instruments have parts that were not
+    unsampled_tissue: float = 0.02
+    unsampled_instrument: float = 0.2
     # ratios of the densities up to which a pixel tells nothing and from which on it tells all: of an instrument's to
     # the tissue's, and of the tissue's to an instrument's
     instrument: tuple[float, float] = (3.0, 20.0)
@@ -108,12 +110,12 @@ class Foreground:
         inside = [view.usable & view.inside(settings.inside_px) for view in views]
         if min(sum(int(mask.sum()) for mask in masks) for masks in (far, inside)) < settings.least_pixels:
             return None
-        instrument = _counts(views, inside, settings)
         lit = _counts(views, far, settings)
-        middles = np.linspace(*settings.shades[:2], 2 * settings.shades[2] + 1)[1::2]
-        shadow = (middles > settings.shadow[0]) & (middles < settings.shadow[1])
-        tissue = lit + lit.sum(1, keepdims=True) * shadow / shadow.sum()  # as often in a shadow as not
-        instrument, tissue = (_density(counts, settings) for counts in (instrument, tissue))
+        shaded = _shaded(lit.sum(1) / lit.sum(), settings)
+        instrument = _without_tissue(_counts(views, inside, settings), shaded)
+        tissue = lit / lit.sum() + shaded / max(shaded.sum(), 1e-9)  # as often in a shadow as not
+        instrument = _density(instrument, settings.unsampled_instrument, settings.smoothing)
+        tissue = _density(tissue, settings.unsampled_tissue, settings.smoothing)
         of_tissue = np.concatenate([view.residual[mask] for view, mask in zip(views, far, strict=True)])
         noise = float(np.quantile(of_tissue, settings.noise_quantile))
         return Foreground(np.log(instrument / tissue), noise, settings)
@@ -148,6 +150,33 @@ def _counts(views: Sequence[Comparison], masks: Sequence[np.ndarray], settings: 
     return counts
 
 
-def _density(counts: np.ndarray, settings: ForegroundSettings) -> np.ndarray:
-    smooth: np.ndarray = gaussian_filter(counts, settings.smoothing, mode="nearest")
-    return (1 - settings.floor) * smooth / smooth.sum() + settings.floor / smooth.size
+def _shaded(lit: np.ndarray, settings: ForegroundSettings) -> np.ndarray:
+    """Return the density of the tissue's residuals at every shade that a shadow may have [R, S], each column of sum 1,
+    0 at others; lit: that of lit tissue [R]. Residuals are shares of the brightness: in a shadow they stay where they
+    are the tissue's, and grow as it darkens where they are the camera's noise; anything between is as likely."""
+    (low, high, n_residuals), (dark, light, n_shades) = settings.residuals, settings.shades
+    found = np.zeros((n_residuals, n_shades))
+    for column, shade in enumerate(np.linspace(dark, light, 2 * n_shades + 1)[1::2]):
+        if settings.shadow[0] < shade < settings.shadow[1]:
+            most = round(max(0.0, -math.log(shade)) / (high - low) * n_residuals)
+            shifted = [np.concatenate([np.zeros(bins), lit[: n_residuals - bins]]) for bins in range(most + 1)]
+            found[:, column] = np.mean(shifted, 0)
+    return found
+
+
+def _without_tissue(inside: np.ndarray, shaded: np.ndarray) -> np.ndarray:
+    """Return the counts [R, S] inside of rendered instruments less the tissue among them, such as shadows that the
+    scene takes for an instrument. At a shade, at most twice the pixels below the median of the tissue's residuals, of
+    density `shaded` [R, S], can be tissue; where these are most, they are taken for it, unless little would be left:
+    then the instrument looks like tissue."""
+    below = np.cumsum(shaded, 0) - shaded / 2 < 0.5
+    most = (inside * below).sum(0) / np.maximum((shaded * below).sum(0), 0.5)
+    totals = inside.sum(0)
+    tissue = np.where((most > totals / 2) & (shaded.sum(0) > 0), np.minimum(most, totals), 0)
+    left = np.maximum(inside - tissue * shaded, 0)
+    return left if left.sum() > inside.sum() / 2 else inside
+
+
+def _density(counts: np.ndarray, unsampled: float, smoothing: float) -> np.ndarray:
+    smooth: np.ndarray = gaussian_filter(counts, smoothing, mode="nearest")
+    return (1 - unsampled) * smooth / smooth.sum() + unsampled / smooth.size
