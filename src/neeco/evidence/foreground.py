@@ -111,8 +111,8 @@ class Foreground:
         if min(sum(int(mask.sum()) for mask in masks) for masks in (far, inside)) < settings.least_pixels:
             return None
         lit = _counts(views, far, settings)
-        shaded = _shaded(lit.sum(1) / lit.sum(), settings)
-        instrument = _without_tissue(_counts(views, inside, settings), shaded)
+        shaded, bound = _shaded(lit.sum(1) / lit.sum(), settings)
+        instrument = _without_tissue(_counts(views, inside, settings), bound, settings)
         tissue = lit / lit.sum() + shaded / max(shaded.sum(), 1e-9)  # as often in a shadow as not
         instrument = _density(instrument, settings.unsampled_instrument, settings.smoothing)
         tissue = _density(tissue, settings.unsampled_tissue, settings.smoothing)
@@ -150,31 +150,31 @@ def _counts(views: Sequence[Comparison], masks: Sequence[np.ndarray], settings: 
     return counts
 
 
-def _shaded(lit: np.ndarray, settings: ForegroundSettings) -> np.ndarray:
+def _shaded(lit: np.ndarray, settings: ForegroundSettings) -> tuple[np.ndarray, np.ndarray]:
     """Return the density of the tissue's residuals at every shade that a shadow may have [R, S], each column of sum 1,
-    0 at others; lit: that of lit tissue [R]. Residuals are shares of the brightness: in a shadow they stay where they
-    are the tissue's, and grow as it darkens where they are the camera's noise; anything between is as likely."""
+    0 at others, and its upper bound; lit: that of lit tissue [R]. Residuals are shares of the brightness: in a shadow
+    they stay where they are the tissue's, and grow as it darkens where they are the camera's noise. The bound is of
+    noise alone; in the density, anything between is as likely."""
     (low, high, n_residuals), (dark, light, n_shades) = settings.residuals, settings.shades
-    found = np.zeros((n_residuals, n_shades))
+    density, bound = np.zeros((2, n_residuals, n_shades))
     for column, shade in enumerate(np.linspace(dark, light, 2 * n_shades + 1)[1::2]):
         if settings.shadow[0] < shade < settings.shadow[1]:
             most = round(max(0.0, -math.log(shade)) / (high - low) * n_residuals)
             shifted = [np.concatenate([np.zeros(bins), lit[: n_residuals - bins]]) for bins in range(most + 1)]
-            found[:, column] = np.mean(shifted, 0)
-    return found
+            density[:, column], bound[:, column] = np.mean(shifted, 0), shifted[-1]
+    return density, bound
 
 
-def _without_tissue(inside: np.ndarray, shaded: np.ndarray) -> np.ndarray:
+def _without_tissue(inside: np.ndarray, bound: np.ndarray, settings: ForegroundSettings) -> np.ndarray:
     """Return the counts [R, S] inside of rendered instruments less the tissue among them, such as shadows that the
-    scene takes for an instrument. At a shade, at most twice the pixels below the median of the tissue's residuals, of
-    density `shaded` [R, S], can be tissue; where these are most, they are taken for it, unless little would be left:
-    then the instrument looks like tissue."""
-    below = np.cumsum(shaded, 0) - shaded / 2 < 0.5
-    most = (inside * below).sum(0) / np.maximum((shaded * below).sum(0), 0.5)
-    totals = inside.sum(0)
-    tissue = np.where((most > totals / 2) & (shaded.sum(0) > 0), np.minimum(most, totals), 0)
-    left = np.maximum(inside - tissue * shaded, 0)
-    return left if left.sum() > inside.sum() / 2 else inside
+    scene takes for an instrument. bound [R, S]: density of the tissue's residuals at each shade, at most. Where half of
+    all pixels of a shade lie below its median, or nearly, they are tissue, all that lie within it; unless little would
+    be left: then the instrument looks like tissue."""
+    share = np.cumsum(bound, 0) - bound  # up to each row
+    below = (inside * (share < 0.5)).sum(0)
+    tissue = (bound.sum(0) > 0) & (below > inside.sum(0) / 4)
+    left = np.where(tissue & (share < settings.noise_quantile), 0, inside)
+    return left if left.sum() > inside.sum() / 4 else inside
 
 
 def _density(counts: np.ndarray, unsampled: float, smoothing: float) -> np.ndarray:
