@@ -72,12 +72,10 @@ def test_images_tell_instrument_from_shadow_and_tissue_where_the_scene_is_wrong(
     assert int(middle[:, :33].max()) < 64
 
 
-def test_a_tissue_that_explains_the_images_badly_tells_nothing_wrong() -> None:
+def test_a_tissue_that_explains_the_images_badly_tells_nothing() -> None:
     session = session_of(Scene(), noise=0.08)
     observe_silhouettes(session)
-    values = session.silhouettes.values[0][20:76]
-    assert int(values[:, 38:59].min()) >= UNKNOWN - 5
-    assert int(values[:, :30].max()) <= UNKNOWN + 5
+    assert session.silhouettes is None
 
 
 def test_a_dark_shaft_before_dark_tissue_is_not_taken_for_tissue() -> None:

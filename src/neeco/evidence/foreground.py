@@ -114,10 +114,10 @@ class Foreground:
         shaded, bound = _shaded(lit.sum(1) / lit.sum(), settings)
         instrument = _without_tissue(_counts(views, inside, settings), bound, settings)
         tissue = lit / lit.sum() + shaded / max(shaded.sum(), 1e-9)  # as often in a shadow as not
-        instrument = _density(instrument, settings.unsampled_instrument, settings.smoothing)
-        tissue = _density(tissue, settings.unsampled_tissue, settings.smoothing)
         of_tissue = np.concatenate([view.residual[mask] for view, mask in zip(views, far, strict=True)])
         noise = float(np.quantile(of_tissue, settings.noise_quantile))
+        instrument = _density(instrument, settings.unsampled_instrument, settings.smoothing)
+        tissue = _density(tissue, settings.unsampled_tissue, settings.smoothing)
         return Foreground(np.log(instrument / tissue), noise, settings)
 
     def certainty(self, view: Comparison, near: float) -> np.ndarray:

@@ -11,6 +11,7 @@ from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
 
 OBSERVED_AT = (0.1, 0.32, 0.6)  # shares of the run
 N_SAMPLED = 20  # frames from which densities are learned
+MAX_NOISE = 0.12  # of the tissue (share of its brightness), above which it is not learned well enough to tell anything
 NEAR = 0.075  # of the images' width: no instrument shows farther from a rendered one
 
 
@@ -23,7 +24,7 @@ def observe_silhouettes(session: GaussianSession) -> None:
     count = len(session.views.frames)
     sampled = {index: _view(session, index) for index in evenly_spaced(count, N_SAMPLED)}
     foreground, known = Foreground.learned(list(sampled.values())), session.silhouettes
-    if foreground is None or (known is not None and foreground.noise >= known.noise):
+    if foreground is None or foreground.noise > MAX_NOISE or (known is not None and foreground.noise >= known.noise):
         return
     values = []
     for index in range(count):
