@@ -174,6 +174,8 @@ def cmdline(pid: int) -> bytes:
 def resumed(verb: Verb, whole: Undisturbed, work: Path) -> list[str]:
     """Give the command again; what is wrong with what it ends in."""
     ended = Child([*verb.words, *verb.resume], work).wait()
+    if ended.status == 1 and "nothing was begun" in ended.told:
+        ended = Child(verb.words, work).wait()
     if ended.status == 1 and "exists already" in ended.told and not verb.resume:
         return differences(whole.files, digests(verb.shelf))  # it was whole when it was killed
     if ended.status != 0:

@@ -26,7 +26,7 @@ from rendered.draws import SIZES, draw_world
 from rendered.world_capture import write_world
 
 from neeco.errors import NeecoError
-from neeco.files import read_json, write_json
+from neeco.files import finite, read_json, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 METHOD = "import neeco.methods.kinematic.deformation as m; "
@@ -172,7 +172,7 @@ def run_path(work: Path, title: str, seed: int) -> Path:
 
 
 def _name(title: str) -> str:
-    return re.sub(r"[^\w.-]+", "-", title).strip("-")
+    return "here" if title == "." else re.sub(r"[^\w.-]+", "-", title).strip("-")
 
 
 def capture_path(work: Path, seed: int) -> Path:
@@ -218,7 +218,7 @@ def _run(build: Build, seed: int, work: Path, options: tuple[str, ...]) -> dict[
     }
     if trained.status == 0:
         result |= _evaluated(build, run)
-    write_json(result_path(work, build.title, seed), result)
+    write_json(result_path(work, build.title, seed), finite(result))
     return result
 
 

@@ -58,9 +58,8 @@ def summary_of(results: Sequence[Result]) -> Summary:
     ious = np.sort([iou_of(result) for result in results])
     failed = [result for result in results if has_failed(result)]
     right = [result for result in results if is_right(result)]
-    over = np.array(
-        [result["over_sd"]["turn_shift_joints"] for result in results if "over_sd" in result] or [[np.nan] * 3]
-    )
+    stated = [result["over_sd"]["turn_shift_joints"] for result in results if "over_sd" in result]
+    over = np.array(stated or [[None] * 3], float)  # None: without joints
     with np.errstate(invalid="ignore"):
         rms = np.sqrt(np.nanmean(np.where(np.isfinite(over), over, np.nan) ** 2, 0))
     return Summary(

@@ -413,19 +413,21 @@ def _unfolded(value: Any, known: dict[int, int]) -> int:
 
 
 def read_begun(
-    output: Path, name: str, resume: bool, work: str, read: Callable[[Path], Any] | None = None
+    output: Path, name: str, resume: bool | None, work: str, read: Callable[[Path], Any] | None = None
 ) -> dict[str, Any] | None:
     """Return what file `name` in folder `output` says of the `work` (a noun) begun there; None for a vacant folder.
 
-    read: reads it from the folder; None: the file is JSON. Raises NeecoError where `output` may not be written to: it
-    is a file, is not empty (without `resume`), or holds something else.
+    resume: continue it; None: where it was begun. read: reads it from the folder; None: the file is JSON. Raises
+    NeecoError where `output` is no folder, vacant (with `resume`) or not empty (without), or holds something else.
     """
     file = output / name
     if output.exists() and not output.is_dir():
-        raise NeecoError(f"{output}: is a file; give a folder")
+        raise NeecoError(f"{output}: is {'a file' if output.is_file() else 'a device, pipe or socket'}; give a folder")
     if is_vacant(output):
+        if resume:
+            raise NeecoError(f"{output}: nothing was begun there; leave out --resume, or correct the path")
         return None
-    if not resume:
+    if resume is False:
         raise NeecoError(f"{output}: not empty; give another folder, or --resume to continue {work} begun there")
     if not file.exists():
         raise NeecoError(f"{output}: not empty and no {name} in it; give another folder (only {work} is continued)")

@@ -23,6 +23,11 @@ _PLACEHOLDERS = (
     (_XML + rb"<(?:!doctype\s+html|html[\s>])", _PAGE),
     (_XML + rb"<Error>\s*<Code>|(?:404: Not Found|Entry not found|Access to \S+ \S+ is restricted\b.*)\s*\Z", _ANSWER),
 )  # what clones and downloads leave in a file's place: how it begins, and what to do
+_KINDS = {
+    "recording.yaml": ("a recording, ", "`neeco ingest` makes a capture of it, for `neeco train`"),
+    "config.yaml": ("a run, ", "its config.yaml names its capture"),
+    "transforms.json": ("a capture, ", "`neeco train` makes a run of it"),
+}  # of folders, by a file that they hold
 PLACEHOLDERS = [(re.compile(start, re.DOTALL | re.IGNORECASE), problem) for start, problem in _PLACEHOLDERS]
 
 
@@ -49,3 +54,12 @@ def placeholder(path: Path) -> str | None:
         return None  # the reader says why
     head = read_head(path, HEAD_BYTES).removeprefix(b"\xef\xbb\xbf")
     return next((problem for start, problem in PLACEHOLDERS if start.match(head)), None)
+
+
+def misplaced(path: Path, wanted: str, content: str = "") -> tuple[str, str]:
+    """Return what is wrong with `path`, which is not what was `wanted`, a folder that holds `content`, and a remedy."""
+    if not path.is_dir():
+        kind = "is a file" if path.is_file() else "is a device, pipe or socket" if path.exists() else "no such folder"
+        return kind, f"give {wanted}"
+    kinds = [words for name, words in _KINDS.items() if (path / name).is_file()] or [("", f"one holds {content}")]
+    return f"is {kinds[0][0]}not {wanted}", kinds[0][1]

@@ -252,6 +252,8 @@ def test_unregistered_instruments_are_a_warning_and_not_located(folder):
     folder.edit(_head("instrument_frame", "unregistered"))
     assert problems(folder) == []
     assert_found(folder, "instrument_frame", "unregistered", "warning")
+    (said,) = [problem for problem in problems(folder, "warning") if problem.field == "instrument_frame"]
+    assert "in recording.yaml state camera_from_base" in said.remedy
 
 
 def test_damaged_images_are_errors(folder):
@@ -354,7 +356,7 @@ def test_a_file_that_is_no_capture_is_one_error(folder, text):
 
 def test_no_folder_and_empty_folder_are_errors(tmp_path):
     assert "no such folder" in check_capture(tmp_path / "none")[0].message
-    assert "no such file" in check_capture(tmp_path)[0].message
+    assert str(check_capture(tmp_path)[0]).startswith(f"{tmp_path}: is not the folder of a capture; one holds")
 
 
 def test_the_verb_prints_and_returns_a_status(folder, capsys):

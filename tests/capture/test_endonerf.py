@@ -77,7 +77,7 @@ def test_frames_pair_by_name_and_test_as_the_successors_do(endonerf):
     ("name", "told"),
     [
         ("images/frame-000004.color.png", "frame-000004.color.png: is not a file; expected an image"),
-        ("poses_bounds.npy", "no such file"),
+        ("poses_bounds.npy", "is not the folder of a capture"),
     ],
 )
 def test_a_pipe_is_refused_and_never_waited_for(name, told, endonerf):

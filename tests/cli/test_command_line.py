@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -172,11 +173,61 @@ def test_version_is_the_package_version(capsys: pytest.CaptureFixture[str]) -> N
     assert capsys.readouterr().out == f"neeco {__version__}\n"
 
 
-@pytest.mark.parametrize("words", [[], ["synthesise"], *([verb, "--no-such-option"] for verb in cli.VERBS)])
-def test_wrong_usage_exits_2(words: list[str]) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        [], ["synthesise"], ["--bogus"], ["train"], ["synthesize", "run"], ["train", "one", "two", "--output", "run"],
+        ["view", "run", "--export"], ["ingest", "--intrinsics", "1", "2"],
+        ["synthesize", "run", "--output", "set", "--count", "4", "--views", "orb"],
+        *([verb, "--no-such-option"] for verb in cli.VERBS),
+    ],
+)  # fmt: skip
+def test_wrong_usage_is_one_line_and_exits_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
         cli.main(words)
     assert left.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("neeco: error: ")
+    assert re.search(r"`neeco( [a-z-]+)? --help`|did you mean", line)
+    assert "│" not in line
+    assert "(required)" not in line
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["view", "run", "--export"], "--export page.html"),
+        (["ingest", "--intrinsics", "1", "2"], "FX FY CX CY"),
+        (["train", "capture"], "missing --output PATH: Run folder to write"),
+    ],
+)
+def test_what_an_option_needs_is_said_where_it_is_missing(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(words)
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ([], "no source"),
+        (["left.mp4"], "--video left.mp4"),
+        (["my left.AVI", "--output", "made"], "--video 'my left.AVI'"),
+        (["--init", "nope.bag"], "nope.bag: no such file"),
+        (["--init", "nope"], "nope: no such file"),
+        (["--video", "left.mp4"], "--output: "),
+    ],
+)
+def test_ingest_asks_for_the_source_that_it_lacks(
+    words: list[str], told: str, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["ingest", *words]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert told in line
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("verb", cli.VERBS)
@@ -277,3 +328,56 @@ def test_help_is_a_verb_and_a_file_is_no_capture(tmp_path: Path, capsys: pytest.
     (tmp_path / "README.md").write_text("# read me")
     assert cli.main(["check", str(tmp_path / "README.md")]) == 1
     assert "is no capture" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "check"])
+@pytest.mark.parametrize(
+    ("holds", "told"),
+    [
+        ("recording.yaml", "is a recording, not {}; `neeco ingest` makes a capture of it"),
+        ("config.yaml", "is a run, not {}; its config.yaml names its capture"),
+        ("transforms.json", "is a capture, not {}; `neeco train` makes a run of it"),
+        ("jaw.csv", "is not {}; one holds "),
+        ("a pipe", "is a device, pipe or socket; give {}"),
+        ("nothing", "no such "),
+    ],
+)
+def test_a_folder_of_another_kind_is_called_what_it_is(
+    verb: str, holds: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if (verb, holds) in (("evaluate", "config.yaml"), ("check", "transforms.json")):
+        return  # what is asked for
+    given = tmp_path / "raw"
+    if holds == "a pipe":
+        os.mkfifo(given)
+    elif holds != "nothing":
+        given.mkdir()
+        (given / holds).write_text("{}")
+    assert cli.main([verb, str(given)]) == 1
+    printed = capsys.readouterr()
+    wanted = "a run folder" if verb == "evaluate" else "the folder of a capture"
+    assert f"{given}: {told.format(wanted)}" in (printed.err if verb == "evaluate" else printed.out)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["synthesize", "run", "--output", "set", "--count", "3", "--class-names"],
+        ["annotate", "run", "--formats", "--output", "set"],
+        ["evaluate", "run", "--splits", "--align"],
+        ["train", "capture", "--joints", "--output", "run"],
+    ],
+)
+def test_an_option_of_several_values_without_one_is_refused(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    option = next(word for word in words if word in ("--class-names", "--formats", "--splits", "--joints"))
+    assert cli.main(words) == 1
+    assert capsys.readouterr().err == f"neeco: error: {option}: no value follows; give one or more, or leave it out\n"
+
+
+@pytest.mark.parametrize("words", [["evaluate", "run"], ["score-masks", "drawn", "true"], ["check", "capture"]])
+def test_numbers_go_to_no_file_without_the_ending_json(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*words, "--json=ev"]) == 1
+    told = "--json: ev has no ending; name a file that ends in .json, or none, to print the numbers"
+    assert capsys.readouterr().err == f"neeco: error: {told}\n"

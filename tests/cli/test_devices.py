@@ -184,13 +184,14 @@ class TestADeviceThatFails:
         assert line.startswith("neeco: error: --device: the GPU gave up (CUDA error: unspecified launch failure): ")
 
     def test_what_is_kept_is_told_once_there_is_something(self, tmp_path: Path) -> None:
-        begun = tmp_path / "config.yaml"
-        with pytest.raises(torch.cuda.OutOfMemoryError), resumable("go on", begun):
+        begun = tmp_path / "run"
+        with pytest.raises(torch.cuda.OutOfMemoryError), resumable(begun, "go on"):
             raise torch.cuda.OutOfMemoryError
-        with pytest.raises(KeyboardInterrupt, match=r"^$"), resumable("go on", begun):
+        with pytest.raises(KeyboardInterrupt, match=r"^$"), resumable(begun, "go on"):
             raise KeyboardInterrupt
-        begun.touch()
-        with pytest.raises(NeecoError, match=r"memory is full: .*; go on$"), resumable("go on", begun):
+        begun.mkdir()
+        (begun / "config.yaml").touch()
+        with pytest.raises(NeecoError, match=r"memory is full: .*; go on$"), resumable(begun, "go on"):
             raise torch.cuda.OutOfMemoryError
-        with pytest.raises(KeyboardInterrupt, match=r"^go on$"), resumable("go on", begun):
+        with pytest.raises(KeyboardInterrupt, match=r"^go on$"), resumable(begun, "go on"):
             raise KeyboardInterrupt

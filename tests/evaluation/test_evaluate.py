@@ -31,6 +31,7 @@ def test_a_scene_scored_on_its_own_drawings_is_nearly_perfect(world, tmp_path):
     run = make_run(world, tmp_path)
     seen = []
     evaluation = evaluated(run, progress=lambda *event: seen.append(event))
+    assert all(done == total for done, total in {what: count for what, *count in seen}.values())  # the last of each
     numbers = evaluation["given"]["test"]
     assert set(evaluation["given"]) == {"test", "unseen"}
     assert numbers["psnr"] > 45  # 8 bit rounding
@@ -75,6 +76,12 @@ def test_without_truth_the_mask_numbers_are_null_and_a_note_says_so(world, tmp_p
     assert numbers["psnr_instrument"] is None
     assert numbers["mask_frames"] == 0
     assert any("no frame has a true or reference mask" in note for note in evaluation["notes"])
+
+
+def test_what_holds_of_several_splits_is_noted_once(world, tmp_path):
+    evaluation = evaluated(make_run(world, tmp_path, truth=False), ["train", "test"])
+    (note,) = [note for note in evaluation["notes"] if "no frame has a true or reference mask" in note]
+    assert note.startswith("train, test: psnr_instrument, mask_iou, part_iou: null")
 
 
 def test_reference_masks_of_some_frames_are_used_and_counted(world, tmp_path):

@@ -106,7 +106,10 @@ def test_a_wrong_base_ends_in_one_line(tmp_path, base, message):
     ("text", "message"),
     [
         ('{"name": "PSM1", "measured_cp": []}', "measured_cp: states the arm in the base of the arm that holds"),
-        ('{"x": 1}', "base-frame.*: is missing"),
+        ('{"x": 1}', r"base-frame.*: is missing; .* or write \{transform: 4 rows, mm, sd_mm: 8, sd_deg: 5\}"),
+        ('{"matrix": [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]]}', "matrix.*: in metres"),
+        ('{"matrix": [[1, 0, 0, 100]]}', "matrix"),
+        ('{"matrix": [[1, 0, 0, 100], [0, 1, 0, 0], [0, 0, 1, 200], [0, 0, 0, 1]], "unit": "m"}', "unit: unknown key"),
         ("transform", "is not a camera registration"),
     ],
 )
@@ -114,6 +117,15 @@ def test_another_file_than_a_registration_ends_in_one_line(tmp_path, text, messa
     (tmp_path / "reg.json").write_text(text)
     with pytest.raises(NeecoError, match=message):
         read_dvrk_registration(tmp_path / "reg.json")
+
+
+@pytest.mark.parametrize("key", ["matrix", "transform"])
+@pytest.mark.parametrize("deviations", [{}, {"sd_mm": 3.0, "sd_deg": 2.0}])
+def test_a_file_may_state_what_recording_yaml_states(tmp_path, key, deviations):
+    (tmp_path / "reg.json").write_text(json.dumps({key: MILLIMETRES} | deviations))
+    base = read_dvrk_registration(tmp_path / "reg.json")
+    np.testing.assert_allclose(base.matrix, MILLIMETRES)
+    assert (base.sd_mm, base.sd_deg) == (deviations.get("sd_mm", 8.0), deviations.get("sd_deg", 5.0))
 
 
 QUATERNION = {"qx": -(0.5**0.5), "qy": 0.0, "qz": 0.0, "qw": 0.5**0.5}  # base_from_camera of MILLIMETRES

@@ -200,7 +200,7 @@ def test_nothing_is_overwritten_and_failures_leave_nothing(nerfstudio, tmp_path)
 
 def test_a_folder_that_is_no_capture_is_refused(tmp_path):
     (tmp_path / "photos").mkdir()
-    with pytest.raises(NeecoError, match=r"transforms\.json: no such file, nor .* poses_bounds\.npy"):
+    with pytest.raises(NeecoError, match=r"photos: is not the folder of a capture; .* poses_bounds\.npy"):
         convert_folder(tmp_path / "photos", tmp_path / "capture")
     with pytest.raises(NeecoError, match="no such folder"):
         convert_folder(tmp_path / "absent", tmp_path / "capture")

@@ -172,6 +172,18 @@ def test_logs_that_never_meet_the_video_are_refused_before_any_work(recording: P
         ingest(read_recording(recording), tmp_path / "capture", silent)
 
 
+def test_what_is_counted_is_counted_to_its_total(recorded, tmp_path):
+    last: dict[str, tuple[int, int]] = {}
+
+    def note(what: str, done: int, total: int) -> None:
+        last[what] = done, total
+
+    ingest(read_recording(recorded.folder / "recording.yaml"), tmp_path / "capture", note)
+    counted = {what: count for what, count in last.items() if not what.startswith("cameras")}  # some find no place
+    assert counted["looking at the frames"][1] == recorded.frames
+    assert all(done == total for done, total in counted.values())
+
+
 def test_an_arm_in_another_base_than_the_scopes_is_where_it_would_be_in_the_same(recorded, tmp_path):
     plain = read_capture(ingest(read_recording(recorded.folder / "recording.yaml"), tmp_path / "one", silent).capture)
     base = np.eye(4)  # world_from_base

@@ -15,7 +15,7 @@ from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import IngestSettings, Splits
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.sources import recording_from_flags
+from neeco.ingest.sources import open_questions, recording_from_flags
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 
@@ -94,6 +94,28 @@ def test_init_writes_what_the_flags_say(folder):
                 read_reading_log(mine.joints[joint]).values, read_reading_log(theirs.joints[joint]).values
             )
     assert recording.laparoscope.path.name == "camera.csv"
+
+
+def test_init_asks_for_the_lens_and_the_clock_that_no_file_states(folder):
+    def asked() -> list[str]:
+        draft = write_template(folder)
+        return [draft.splitlines()[line - 1] for line, _ in open_questions(draft)]
+
+    lens = folder / "lens.json"
+    lens.write_text(json.dumps({"fl_x": 290, "fl_y": 290, "cx": 160, "cy": 128, "w": 320, "h": 256}))
+    assert not any("intrinsics" in line or "clock" in line for line in asked())
+    lens.unlink()
+    (folder / "logs/sync.json").unlink()
+    (folder / "capture").mkdir()
+    document = {"fl_x": 1, "frames": [], "clocks": {"em": {"offset_s": 0.1, "sd_s": 0.001}}}  # as `ingest` writes it
+    (folder / "capture/transforms.json").write_text(json.dumps(document))
+    assert [line.strip() for line in asked() if "intrinsics" in line or "clock" in line] == [
+        "# intrinsics: [290, 290, 160, 128]   # no calibration was found",
+        "# clock: em   # left out, it is its own, whose offset nothing states",
+    ]
+    (folder / "recording.yaml").write_text(write_template(folder).replace("# clock: em ", "clock: em "))
+    [instrument] = read_recording(folder / "recording.yaml").instruments
+    assert instrument.joints["jaw_angle"].clock == "em"
 
 
 def test_init_asks_for_what_no_header_says(world):
@@ -333,3 +355,23 @@ def test_two_instruments_with_one_joint_name_have_two_clocks(world, folder):
     text = "video: video.mp4\ninstruments:\n"
     text += "".join(f"  - name: {name}\n    joints: {{jaw: logs/jaw.csv}}\n" for name in ("left", "right"))
     assert read_recording(world.text(text, "recording.yaml")).clocks == ("left.jaw", "right.jaw")
+
+
+def test_a_fault_of_a_flag_is_told_by_its_flag(folder):
+    (folder / "empty").mkdir()
+    with pytest.raises(NeecoError, match=r"--video: .*empty: holds no images; give a folder of frames"):
+        recording_from_flags(folder / "empty")
+    (folder / "frames").mkdir()
+    Image.new("RGB", (8, 8)).save(folder / "frames" / "1.png")
+    with pytest.raises(NeecoError, match=r"--video: .*frames: when were the images taken\? Give --fps"):
+        recording_from_flags(folder / "frames")
+    joint = ("jaw_angle", folder / "logs/jaw_calibration.csv", folder / "logs/jaw.csv")
+    with pytest.raises(
+        NeecoError, match=r"--joint jaw_angle: .*calibration\.csv has no times, .*jaw\.csv has; give the"
+    ):
+        flags(folder, joints=[joint])
+    with pytest.raises(NeecoError, match=r"^--intrinsics: fl_x, fl_y: must be two positive focal lengths in pixels"):
+        flags(folder, intrinsics=(-290, 290, 160, 128)).read_lens()
+    with pytest.raises(NeecoError) as told:
+        flags(folder, intrinsics=None, calibration=folder / "logs/jaw.csv").read_lens()
+    assert str(told.value).count("jaw.csv") == 1

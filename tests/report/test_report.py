@@ -60,6 +60,14 @@ def test_the_page_says_the_numbers_and_the_notes(reported):
     assert "0.4 min" in text
 
 
+def test_a_tile_says_what_its_number_means(reported):
+    tiles = re.findall(r'<div class="tile">.*?</div>', reported[-1].read_text(), re.DOTALL)
+    assert len(tiles) >= 4
+    for abbreviation, meaning in (("PSNR", "30 is close"), ("IoU", "1 is perfect"), ("Gaussians", "make up the scene")):
+        assert all(meaning in tile for tile in tiles if abbreviation in tile)
+    assert not any("as given" in tile for tile in tiles)
+
+
 def test_every_picture_of_a_frame_says_whether_it_is_recorded_or_rendered(reported):
     text = reported[-1].read_text()
     captions = re.findall(r"<figcaption>(.*?)</figcaption>", text)

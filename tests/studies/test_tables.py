@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from neeco.studies.comparison import (
     RUN_METRICS,
     SPLIT_METRICS,
     ComparisonResult,
+    absent_notes,
     comparison_csv,
     summarise,
     table_texts,
@@ -126,3 +128,23 @@ def test_the_terminal_shows_every_number_whole(comparison: ComparisonResult, wid
     assert all(text in shown for text in ("21.00 ± 1.41", "0.100 ± 0.000", "1.00 ± 0.00", "failed"))
     assert max(map(len, shown.splitlines())) <= width
     assert (len(parts) > len(tables)) == (width < 100)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        ({}, ["psnr_instrument: no run has it: the capture has no masks", "mask_iou: no run has it: the capture has"]),
+        ({"psnr_instrument": 20.0}, ["mask_iou: no run has it: no method here carries labels"]),
+        (None, ["psnr: no run has it: no run finished", "mask_iou: no run has it: no run finished"]),
+    ],
+)
+def test_the_one_reason_why_no_run_has_a_number_is_given(
+    numbers: dict[str, float] | None, told: list[str], comparison: ComparisonResult
+) -> None:
+    jobs = [{"name": "a_b", "method": "3dgs", "seed": 0, "error": "", "splits": {}}] if numbers is None else []
+    if numbers is not None:
+        jobs = [job("a_b", 0, 20.0)]
+        jobs[0]["splits"]["test"] |= numbers
+    notes = absent_notes(replace(comparison, summary=summarise(["a_b"], ["test"], jobs)))
+    assert all(any(note.startswith(words) for note in notes) for words in told)
+    assert sum("mask_iou" in note for note in notes) == 1

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -181,6 +183,25 @@ def test_a_frame_that_is_not_trusted_is_listed_and_not_written(made: Path) -> No
     assert page.index("</b> 005") < page.index("</b> 000")  # worst first
     assert ": not written" in page
     assert "http" not in page.replace("http://www.w3.org/", "")
+
+
+def test_files_are_numbered_anew_and_the_card_and_the_command_say_so(
+    made: Path,
+    recorded: RecordedRun,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = " ".join((made / "README.md").read_text().split())
+    assert "Files are numbered anew: the field `frame` of `states.jsonl` has the name" in words
+    trusted = SimpleNamespace(**vars(recorded), capture=recorded.capture, require_trusted=lambda verb: None)
+    monkeypatch.setattr("neeco.training.run.open_gaussian_run", lambda *_, **__: nullcontext(trusted))
+    assert main(["annotate", "run", "--output", str(tmp_path / "set")]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"7 of 8 frames in {tmp_path / 'set'}; 1 trusted less than 0.8: left out",
+        "numbered anew; field frame of states.jsonl has the capture's name; worst first: "
+        f"{tmp_path / 'set' / 'annotate.html'}",
+    ]
 
 
 def test_the_same_again_gives_the_same_bytes_and_so_does_going_on(

@@ -250,6 +250,12 @@ def test_interrupted_and_resumed_is_the_same_data_set(made, run, tmp_path, monke
     assert contents(output) == contents(made)
 
 
+def test_a_data_set_that_was_not_begun_is_not_resumed(run, tmp_path):
+    with pytest.raises(NeecoError, match="none: nothing was begun there; leave out --resume, or correct the path"):
+        synthesize(run, tmp_path / "none", SETTINGS, resume=True)
+    assert not (tmp_path / "none").exists()
+
+
 @pytest.mark.parametrize("folder", ["soft", "ignore"])
 def test_an_image_without_one_of_its_files_is_drawn_again(made, run, tmp_path, folder):
     output = tmp_path / "dataset"
@@ -272,7 +278,7 @@ def test_a_data_set_killed_before_its_first_whole_file_begins_again(made, run, t
     (tmp_path / "set").mkdir()
     for name in (LOCK, f"{TEMPORARY}abc.json"):
         (tmp_path / "set" / name).touch()
-    synthesize(run, tmp_path / "set", SETTINGS, resume=True)
+    synthesize(run, tmp_path / "set", SETTINGS)
     assert contents(tmp_path / "set") == contents(made)
 
 

@@ -227,7 +227,7 @@ def test_names_of_classes_that_fit_no_instrument_are_refused(
 def test_a_larger_data_set_is_larger_in_every_format_it_was_begun_in(runs: list[FakeRun], tmp_path: Path) -> None:
     for count, formats in ((1, ("coco",)), (2, ("imagefolder",))):
         settings = Settings(count=count, tissue_tolerance_mm=2.0)
-        synthesize(runs[0], tmp_path / "set", settings, formats, resume=True, instrument_runs=runs[1:])  # type: ignore[arg-type]
+        synthesize(runs[0], tmp_path / "set", settings, formats, resume=count > 1, instrument_runs=runs[1:])  # type: ignore[arg-type]
     assert len(json.loads((tmp_path / "set/coco/instances.json").read_text())["images"]) == 2
 
 

@@ -35,7 +35,6 @@ def behind_the_camera(state, path) -> str:
 
 
 @pytest.mark.parametrize("there", [False, True])
-@pytest.mark.parametrize("resume", [False, True])
 @pytest.mark.parametrize(
     ("states", "told"),
     [
@@ -45,7 +44,7 @@ def behind_the_camera(state, path) -> str:
         ("interpolate", "image 0: no acceptable state in 3 attempts"),
     ],
 )
-def test_a_refused_data_set_leaves_the_disk_as_it_was(there, resume, states, told, run, tmp_path, state, monkeypatch):
+def test_a_refused_data_set_leaves_the_disk_as_it_was(there, states, told, run, tmp_path, state, monkeypatch):
     (tmp_path / "bad.jsonl").write_text("{\n")
     behind_the_camera(state, tmp_path / "behind.jsonl")
     if states == "interpolate":
@@ -55,7 +54,7 @@ def test_a_refused_data_set_leaves_the_disk_as_it_was(there, resume, states, tol
         output.mkdir(parents=True)
     given = states if states == "interpolate" else str(tmp_path / states)
     with pytest.raises(NeecoError, match=told):
-        synthesize(run, output, replace(SETTINGS, states=given), resume=resume)
+        synthesize(run, output, replace(SETTINGS, states=given))
     if there:
         assert list(output.iterdir()) == []
     else:

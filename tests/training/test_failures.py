@@ -253,8 +253,20 @@ def test_a_run_killed_before_its_first_whole_file_begins_again(capture: Path, tm
     (tmp_path / "run").mkdir()
     for name in (LOCK, f"{TEMPORARY}abc.yaml"):
         (tmp_path / "run" / name).touch()
-    run = train(capture, tmp_path / "run", CONFIG, resume=True)
+    with pytest.raises(NeecoError, match="run: nothing was begun there; leave out --resume, or correct the path"):
+        train(capture, tmp_path / "run", CONFIG, resume=True)
+    run = train(capture, tmp_path / "run", CONFIG)
     assert hidden_files(run) == []
+
+
+def test_where_nothing_was_begun_nothing_is_resumed(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "runs" / "none"
+    assert main(["train", str(capture), "--output", str(output), "--resume"]) == 1
+    remedy = "leave out --resume, or correct the path"
+    assert capsys.readouterr().err == f"neeco: error: {output}: nothing was begun there; {remedy}\n"
+    assert not output.parent.exists()
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,7 @@ def session(tmp_path: Path) -> GaussianSession:
         hinges.wrist_start.fill_(-20.0)
         hinges.radius.fill_(3.0)
     session = new_session(scene, TrainingViews.read(frames), TrainConfig(method="kinematic"), print)
+    session.iteration = session.length.iterations
     scene.requires_grad_(False)
     return session
 
@@ -100,6 +101,17 @@ def test_a_hinge_in_the_wrong_place_is_reported(wrong: str, session: GaussianSes
     told = verdict(session)
     assert told["found"] is False
     assert "NOT found" in told["verdict"]
+
+
+def test_no_joint_is_judged_after_few_iterations(session: GaussianSession) -> None:
+    told: list[str] = []
+    session.report, session.iteration = told.append, 500
+    with torch.no_grad():
+        hinges_of(session).scale.fill_(0.0)
+    judged = verdict(session)
+    assert judged["found"] is None
+    assert judged["verdict"].startswith("not judged: 500 iterations are too few, usual are ")
+    assert told == []
 
 
 def test_a_joint_that_no_log_has_is_not_sent_to_its_log(session: GaussianSession) -> None:

@@ -17,8 +17,10 @@ from pathlib import Path
 import pytest
 
 from neeco.cli import main
+from neeco.errors import NeecoError
 from neeco.training import train as module
 from neeco.training.config import training_config
+from neeco.training.run import load_run, read_checkpoint
 from neeco.training.session import GaussianSession
 from neeco.training.train import ProgressRow, deferred_interrupts, train
 
@@ -51,9 +53,10 @@ def test_a_stopped_run_keeps_its_last_step_and_ends_in_the_same_bytes(
         assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGTERM, handlers[1])
-    steps: list[int] = []
-    train(capture, tmp_path / "cut", CONFIG, resume=True, progress=lambda row: steps.append(row.iteration))
-    assert min(step for step in steps if step) == stop + 1  # nothing is done twice
+    rows: list[ProgressRow] = []
+    train(capture, tmp_path / "cut", CONFIG, resume=True, progress=rows.append)
+    assert min(row.iteration for row in rows if row.iteration) == stop + 1  # nothing is done twice
+    assert (rows[-1].num_gaussians, rows[-1].progress) == (load_run(whole).scene.num_gaussians, 1.0)
     assert (tmp_path / "cut" / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
 
 
@@ -126,8 +129,9 @@ def test_the_command_line_tells_how_to_go_on_and_going_on_works(capture: Path, t
     assert found, told
     assert int(found[1]) % CONFIG.checkpoint_interval != 0  # so the checkpoint was written for this stop
     assert shlex.split(found[2]) == ["train", str(capture), "--output", str(tmp_path / "my run"), "--resume"]
-    from neeco.training.run import read_checkpoint
-
+    with pytest.raises(NeecoError, match="training has not finished here") as unfinished:
+        load_run(tmp_path / "my run")
+    assert f"`neeco {found[2]}`" in str(unfinished.value)
     assert read_checkpoint(tmp_path / "my run")[1]["iteration"] == int(found[1])
 
 

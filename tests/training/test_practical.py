@@ -50,3 +50,4 @@ def test_a_recording_in_which_nothing_moves_with_the_poses_is_refused(grasper: P
     with pytest.raises(NeecoError, match="nothing in the images moves with its recorded pose") as raised:
         train(capture, tmp_path / "run", CONFIG)
     assert "\n" not in str(raised.value)
+    assert "in recording.yaml state camera_from_base" in str(raised.value)

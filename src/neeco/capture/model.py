@@ -30,6 +30,10 @@ SCHEMA = "neeco-capture/1"  # of the folder that holds a capture
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
 UNKNOWN_DEG = 180.0  # the standard deviation of an angle of which nothing is known
 REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
+HOW_TO_REGISTER = (  # poses that are not in the cameras' world
+    "in recording.yaml state camera_from_base (a robot's base to a still camera; or unknown, which searches it), "
+    "poses: {…, frame: camera}, or laparoscope (the tracker of a scope that moves), and ingest again"
+)
 MIN_DEVIATION = 1e-9  # coordinates that vary less in the recording do not count as changing
 
 

@@ -16,7 +16,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import make_dataclass
+from dataclasses import is_dataclass, make_dataclass
 from typing import Any, get_type_hints
 
 from neeco import __version__
@@ -164,24 +164,33 @@ def _dispatch(words: list[str]) -> int:
     import tyro
 
     config = (tyro.conf.FlagCreatePairsOff,)
-    if not words or words[0].startswith("-"):
-        complete = bool(words) and words[0] in COMPLETION
-        choices = {name: _verb([name])[1] if complete else _named_only(name, line) for name, line in VERBS.items()}
+    if words and words[0] in ("-h", "--help", *COMPLETION):
+        choices = {  # stand-ins in the overview, for which no verb is imported
+            name: _verb([name])[1]
+            if words[0] in COMPLETION
+            else make_dataclass(name.replace("-", "_"), [], namespace={"__doc__": line})
+            for name, line in VERBS.items()
+        }
         tyro.extras.subcommand_cli_from_dict(choices, prog="neeco", description=DESCRIPTION, args=words, config=config)
         raise SystemExit(USAGE)
-    if words[0] not in VERBS:
-        meant = nearest(words[0], [*VERBS, "help"])
+    if not words or words[0] not in VERBS:
+        meant = nearest(words[0], [*VERBS, "help"]) if words else None
         hint = "" if meant is None else f"did you mean {meant}? "
-        _print_error(f"{words[0]}: no such verb; {hint}`neeco --help` lists all")
+        problem = f"{words[0]}: no such verb" if words else "no verb given"
+        _print_error(f"{problem}; {hint}`neeco --help` lists all")
         raise SystemExit(USAGE)
     run, arguments = _verb(words)
-    from neeco.cli._output import number_values
+    from neeco.cli._output import number_values, usage_error
 
+    box = io.StringIO()  # tyro frames what is wrong
     try:
-        parsed = tyro.cli(arguments, prog=f"neeco {words[0]}", args=words[1:], config=config, registry=number_values())
+        with contextlib.redirect_stderr(box):
+            parsed = tyro.cli(
+                arguments, prog=f"neeco {words[0]}", args=words[1:], config=config, registry=number_values()
+            )
     except SystemExit as end:
         if end.code:
-            _misspelt_options(words, arguments)
+            _print_error(usage_error(box.getvalue(), words, arguments))
         elif words[0] == "train":
             importlib.import_module(f"{__name__}.train").explain(words)
         raise
@@ -192,6 +201,10 @@ def _dispatch(words: list[str]) -> int:
     from neeco.raster.native import keep_freed_memory
 
     keep_freed_memory()
+    groups = (parsed, *filter(is_dataclass, vars(parsed).values()))
+    for word in (word for word in words if word.startswith("--")):
+        if any(vars(group).get(word[2:].replace("-", "_")) == () for group in groups):
+            raise NeecoError(f"{word}: no value follows; give one or more, or leave it out")
     with readable_failures():
         return run(parsed)
 
@@ -209,21 +222,3 @@ def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any
 
     state_defaults(arguments)
     return module.run, arguments
-
-
-def _misspelt_options(words: Sequence[str], arguments: Callable[..., Any]) -> None:
-    """Print a line for every option that a verb does not have and that is nearly one, behind tyro's list of what is
-    missing, which does not connect the two."""
-    from neeco.cli._output import option_names
-
-    known = [*option_names(arguments), "--help"]
-    for word in words:
-        option = word.partition("=")[0]
-        meant = nearest(option, known)
-        if option.startswith("--") and option not in known and meant is not None:
-            _print_error(f"{option}: no such option of {words[0]}; did you mean {meant}?")
-
-
-def _named_only(name: str, line: str) -> Callable[..., Any]:
-    """Return a stand-in for a verb in the overview, which is not imported."""
-    return make_dataclass(name.replace("-", "_"), [], namespace={"__doc__": line})

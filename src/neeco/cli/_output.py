@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
+import re
 import types
 import typing
 from collections.abc import Iterator, Sequence
@@ -20,7 +22,7 @@ from rich.table import Column, Table
 from rich.text import Text
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, nearest
 from neeco.files import finite, new_folder, require_replaceable, write_json
 from neeco.settings import WORDS, described, field_texts, value_words
 
@@ -156,9 +158,10 @@ def ready_for_json(path: Path | None) -> Iterator[None]:
     Raises NeecoError for a folder, a name of another format, or a file whose folder cannot be written to.
     """
     file = None if path == STANDARD_OUTPUT else path
-    if file is not None and file.is_dir():
-        raise NeecoError(f"--json: {file} is a folder; name a file")
     if file is not None:
+        if file.is_dir() or not file.suffix:  # more likely a word that is not of --json
+            problem = "is a folder" if file.is_dir() else "has no ending"
+            raise NeecoError(f"--json: {file} {problem}; name a file that ends in .json, or none, to print the numbers")
         require_ending("--json", file, ".json")
         require_replaceable(file)
     with nullcontext() if file is None else new_folder(file.parent):
@@ -180,6 +183,9 @@ def state_defaults(kind: Any) -> None:
         if dataclasses.is_dataclass(bare):
             state_defaults(bare)  # type: ignore[arg-type]
             continue
+        if tyro.conf.Positional in markers and not any(getattr(marker, "metavar", None) for marker in markers):
+            name = f"[{field.name} ...]" if typing.get_origin(bare) is tuple else field.name
+            kind.__annotations__[field.name] = hint = Annotated[hint, tyro.conf.arg(metavar=name.upper())]
         required = field.default is dataclasses.MISSING and typing.get_origin(bare) is tuple
         empty = required or field.default in (None, ())
         if empty and field.name in texts and tyro.conf.UseAppendAction not in markers:
@@ -206,6 +212,28 @@ def option_names(kind: Any) -> list[str]:
             name = next(filter(None, (getattr(marker, "name", None) for marker in markers)), field.name)
             names.append(f"--{'no-' if field.default is True else ''}{name.replace('_', '-')}")
     return names
+
+
+def usage_error(box: str, words: Sequence[str], kind: Any) -> str:
+    """Return in one line what is wrong with a command line that tyro refused in a framed `box`: the options that its
+    verb does not have and that are nearly one, else tyro's words without its frame and its list of similar options."""
+    known, slips = [*option_names(kind), "--help"], []
+    for option in (word.partition("=")[0] for word in words):
+        if option.startswith("--") and option not in known and (meant := nearest(option, known)) is not None:
+            slips.append(f"{option}: no such option of {words[0]}; did you mean {meant}?")
+    if slips:
+        return " ".join(slips)
+    rows = [row[2:].rstrip("│ ") for row in re.sub("\x1b\\[[0-9;]*m", "", box).splitlines()[1:-1]]
+    rows = rows[bool(rows) and not rows[0].strip("-") :]  # the title's rule, where the frame is ASCII
+    first = list(itertools.takewhile(lambda row: row.strip("─-"), rows))  # up to the next rule
+    line = " ".join(f"{row}:" if re.match(" {4}[^ ]", row) else row for row in first)  # names of what is missing
+    line = re.sub(r"[. ]*\(required\)", ";", " ".join(line.split())).rstrip(".;").removeprefix("Error parsing ")
+    line = re.sub("^Missing from [^:]+:", f"{words[0]}: missing", line)
+    line = line.replace("Unrecognized options:", f"{words[0]}: no such option or argument:")
+    if value := re.search(r"Missing value for argument '--([\w-]+)'", line):
+        text = field_texts(kind).get(value[1].replace("-", "_"), "").partition(DEFAULT)[0]
+        line = f"--{value[1]}: needs a value: {text}".rstrip(" .:")
+    return f"{line}; see `neeco {words[0]} --help`"
 
 
 def number_values() -> ConstructorRegistry:

@@ -12,10 +12,12 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.progress import BarColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from neeco.cli._output import whole_lines
 from neeco.errors import NeecoError, visible
+from neeco.files import is_vacant
 from neeco.raster.devices import device_failure
 
 if TYPE_CHECKING:
@@ -42,7 +44,7 @@ class Bars:
             BarColumn(bar_width=20 if console.width >= WIDE else 5),
             TextColumn("{task.fields[text]}"),
             TimeElapsedColumn(),
-            TimeRemainingColumn(),
+            _TimeLeft(),
         )
         self.bar = Progress(*columns, console=console)
         self.tasks: dict[str, TaskID] = {}
@@ -77,7 +79,7 @@ class Bars:
             for before in self.stages:
                 self._complete(before)
             self.stages.append(task)
-        self.bar.update(task, completed=done, total=total or None, text=f"{done}/{total}" if total else "")
+        self._update(task, done, f"{done}/{total}" if total else "", total=total or None)
 
     def training(self, row: ProgressRow) -> None:
         """Progress of `train`."""
@@ -85,9 +87,11 @@ class Bars:
         if row.note:
             self._print(row.note, style="dim")
             return
+        if not self._found(task).completed:  # preparation counts, and the time before an interruption
+            self._found(task).start_time = self.bar.get_time() - row.seconds
         size = f", {row.num_gaussians} Gaussians" if row.num_gaussians else ""
         text = f"iteration {row.iteration}, PSNR {row.psnr:.1f} dB{size}"
-        self.bar.update(task, completed=row.progress, text=text)
+        self._update(task, row.progress, text, row.seconds_left)
 
     def end(self, title: str) -> None:
         """Complete the bar of `title`, if there is one."""
@@ -108,7 +112,7 @@ class Bars:
         share = news.share * (1 - EVALUATION_SHARE)
         if news.stage == "evaluating":
             share = 1 - EVALUATION_SHARE * (1 - news.share)
-        self.bar.update(task, completed=share, text=f"{news.stage} {news.text}".rstrip())
+        self._update(task, share, f"{news.stage} {news.text}".rstrip())
 
     def _task(self, title: str, total: float | None = 1.0) -> TaskID:
         if self.bar.console.is_terminal:
@@ -116,12 +120,23 @@ class Bars:
         elif not self.tasks:
             self.lines.start()
         if title not in self.tasks:
-            self.tasks[title] = self.bar.add_task(title, total=total, text="")
+            self.tasks[title] = self.bar.add_task(title, total=total, text="", ends=None)
         return self.tasks[title]
 
+    def _found(self, task: TaskID) -> Task:
+        return next(one for one in self.bar.tasks if one.id == task)
+
+    def _update(
+        self, task: TaskID, done: float, text: str, left: float | None = None, *, total: float | None = 1.0
+    ) -> None:
+        """Note progress, and when all is done: in `left` s, by default at the speed so far."""
+        if left is None and total and done:
+            left = (self._found(task).elapsed or 0.0) * (total / done - 1)
+        ends = None if left is None else self.bar.get_time() + left
+        self.bar.update(task, completed=done, total=total, text=text, ends=ends)
+
     def _complete(self, task: TaskID) -> None:
-        found = next(one for one in self.bar.tasks if one.id == task)
-        total = found.total or 1.0
+        total = self._found(task).total or 1.0
         self.bar.update(task, completed=total, total=total)
 
     def _print_lines(self) -> None:
@@ -133,14 +148,29 @@ class Bars:
         self.bar.console.print(visible(line), style=style, markup=False, highlight=False, soft_wrap=True)
 
 
+class _TimeLeft(ProgressColumn):
+    """Time that a task still takes, counted down between two reports of its progress."""
+
+    max_refresh = 0.5
+
+    def render(self, task: Task) -> Text:
+        left = _seconds_left(task)
+        return Text("" if left is None else f"{_duration(left)} left", style="progress.remaining")
+
+
+def _seconds_left(task: Task) -> float | None:
+    ends = task.fields["ends"]
+    return None if ends is None or task.finished else max(0.0, ends - task.get_time())
+
+
 def _line(task: Task) -> str:
     """State what is done, how far it is, and how long it still takes at the speed so far."""
     passed = task.finished_time or task.elapsed or 0.0
     words = [f"{task.percentage:.0f} %"] if task.total else []
     words += [task.fields["text"]] if task.fields["text"] else []
     words += [f"{_duration(passed)} passed"]
-    if task.total and 0 < task.completed < task.total:
-        words += [f"about {_duration(passed * (task.total / task.completed - 1))} left"]
+    if (left := _seconds_left(task)) is not None:
+        words += [f"about {_duration(left)} left"]
     return f"{task.description}: {', '.join(words)}"
 
 
@@ -157,15 +187,13 @@ def counting(title: str, total: int | None = None) -> Iterator[Callable[..., Non
 
 
 @contextmanager
-def resumable(how: str, begun: Path | None = None) -> Iterator[None]:
-    """Report `how` to resume where Ctrl-C, a failing GPU or too little memory ends the block, once `begun` exists.
-
-    Ctrl-C's own message goes first where it has one. Raises KeyboardInterrupt and NeecoError.
-    """
+def resumable(begun: Path, how: str = "it is kept; run the same command again with --resume") -> Iterator[None]:
+    """Report `how` to resume where Ctrl-C, whose own message goes first, a failing GPU or too little memory ends the
+    block, once folder `begun` has files. Raises KeyboardInterrupt and NeecoError."""
     try:
         yield
     except (KeyboardInterrupt, Exception) as error:
-        if begun is not None and not begun.exists():
+        if is_vacant(begun):
             raise
         if isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt(*(error.args or (how,))) from None
@@ -178,22 +206,23 @@ def train_with_progress(
     capture: Path, output: Path, config: TrainConfig, device: torch.device, *, resume: bool = False
 ) -> Path:
     """`train` with a bar that shows PSNR, Gaussians and time left. Returns the run's folder."""
+    from neeco.training.run import resume_command
     from neeco.training.train import train
 
-    run = shlex.quote(str(output))
-    how = f"go on with: neeco train {shlex.quote(str(capture))} --output {run} --resume"
+    run, how = shlex.quote(str(output)), f"go on with: {resume_command(capture, output)}"
     started: list[int] = []  # the iteration of the first row
 
     def show(row: ProgressRow) -> None:
         if not row.note and not started:
             started.append(row.iteration)
             slow = "; a CUDA device would be used if there were one" if device.type == "cpu" else ""
-            took = row.seconds / row.progress if row.progress > 0 else 0.0
-            forecast = f"takes about {_duration(took)} in all, estimated anew as it goes on" if took else "begins"
+            left = row.seconds_left
+            whole = "begins" if left is None else f"takes about {_duration(row.seconds + left)} in all"
+            forecast = f"{whole}, estimated anew as it goes on"
             bars.training(replace(row, note=f"training on {device.type} {forecast}{slow}; watch it: neeco view {run}"))
         bars.training(row)
 
-    with Bars() as bars, resumable(how, output / "config.yaml"):
+    with Bars() as bars, resumable(output, how):
         path = train(capture, output, config, device=device, resume=resume, progress=show)
         bars.end("training")
     return path

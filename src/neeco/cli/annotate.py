@@ -51,10 +51,7 @@ def run(arguments: Arguments) -> int:
     with open_gaussian_run(arguments.run, "annotate", device, force=arguments.force) as trained:
         trained.require_trusted("annotate")
         capture = None if arguments.capture is None else read_checked(arguments.capture)
-        with (
-            counting("annotate") as advance,
-            resumable("what was done is kept; run the same command again with --resume", arguments.output),
-        ):
+        with counting("annotate") as advance, resumable(arguments.output):
             annotated = annotate_capture(
                 trained,
                 arguments.output,
@@ -67,5 +64,8 @@ def run(arguments: Arguments) -> int:
                 on_progress=advance,
             )
         page = write_annotated_page(annotated.output, annotated.records, annotated.capture, arguments.min_trust)
-    print(f"{annotated.written} of {len(annotated.records)} frames in {annotated.output}; worst first: {page}")
+    count, left = len(annotated.records), len(annotated.records) - annotated.written
+    out = f"; {left} trusted less than {arguments.min_trust:g}: left out" if left else ""
+    print(f"{annotated.written} of {count} frames in {annotated.output}{out}")
+    print(f"numbered anew; field frame of states.jsonl has the capture's name; worst first: {page}")
     return 0

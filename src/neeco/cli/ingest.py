@@ -74,10 +74,13 @@ def run(args: Ingest) -> int:
             raise NeecoError("--init: looks at one folder or file; give one")
         print(*write_draft(args.source[0] if args.source else Path(), print), sep="\n")
         return 0
+    if not args.source and args.video is None:
+        raise NeecoError("ingest: no source; give recording.yaml (`neeco ingest --init` drafts it) or --video FILE")
+    folder = folder_to_convert(args.source)
     if args.output is None:
         raise NeecoError("--output: give the folder of the capture to write")
     output = Path(os.path.normpath(args.output))  # a/../b is b, whatever a is
-    if (folder := folder_to_convert(args.source)) is not None:
+    if folder is not None:
         _refuse_others(args, f"{folder}: a folder in another format", keep=("output",))
         for sentence in convert_folder(folder, output):
             print(f"note: {visible(sentence)}")
@@ -126,8 +129,7 @@ def recordings_of(args: Ingest) -> list[Recording]:
         keep = ("output", "frames", "json", "strict")
         _refuse_others(args, f"{args.source[0]}: says what was recorded", keep)
         return read_recordings(args.source, args.frames)
-    if args.video is None:
-        raise NeecoError("--video: give the video (or images' folder), or a recording.yaml (`neeco ingest --init`)")
+    assert args.video is not None
     recording = recording_from_flags(
         args.video, args.instrument, args.laparoscope, args.joint, args.intrinsics, args.calibration,
         sync=args.sync, frames=args.frames, fps=args.fps, shaft_diameter=args.shaft_diameter,

@@ -43,7 +43,7 @@ def run(arguments: Arguments) -> int:
     with (
         open_gaussian_run(arguments.run, "refine", device, force=arguments.force) as opened,
         Bars() as bars,
-        resumable("run the same command again with --resume", arguments.output),
+        resumable(arguments.output),
     ):
         path = refine_run(
             opened,

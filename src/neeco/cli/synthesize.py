@@ -56,10 +56,7 @@ def run(arguments: Arguments) -> int:
         check_hub(arguments.push_to_hub)
     settings = arguments.settings
     tissue, instruments = _runs(arguments)
-    with (
-        Bars() as bars,
-        resumable("what was rendered is kept; run the same command again with --resume", arguments.output),
-    ):
+    with Bars() as bars, resumable(arguments.output):
         made = synthesize(
             tissue,
             arguments.output,
@@ -74,7 +71,7 @@ def run(arguments: Arguments) -> int:
         )
     if made.still and settings.views in VIEWS_OF_STILL:
         print(f"the scope stood still: views are {VIEWS_OF_STILL[settings.views]}")
-    print(f"{made.images} images in {made.output} ({made.made_now} rendered now); look at preview.png")
+    print(f"{made.images} images in {made.output} ({made.made_now} rendered now); see {made.output / 'preview.png'}")
     for reason, times in made.refused.items():
         print(f"refused {counted(times, 'state')}: instrument {reason}")
     if made.skipped:

@@ -43,7 +43,7 @@ def run(arguments: Arguments) -> int:
     from neeco.api import track
     from neeco.cli._progress import Bars, resumable
 
-    with Bars() as bars, resumable("what was done is kept; run the same command again with --resume", arguments.output):
+    with Bars() as bars, resumable(arguments.output):
         tracked = track(**vars(arguments), progress=bars.stage)
     print(f"{tracked.written} of {len(tracked.records)} frames in {tracked.output}; all of them: {tracked.page}")
     print(f"verdict: {tracked.verdict}")

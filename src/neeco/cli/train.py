@@ -72,15 +72,11 @@ def explain(words: Sequence[str]) -> None:
     from neeco.cli._output import print_settings
     from neeco.scene.method_registry import DEFAULT, method_class, methods
 
-    named = [word.removeprefix("--method=") for before, word in pairwise(["", *words]) if _names_method(before, word)]
-    method = method_class((named or [DEFAULT])[-1].partition("+")[0])
+    named = [word for before, word in pairwise(["", *words]) if before == "--method" or word.startswith("--method=")]
+    method = method_class((named or [DEFAULT])[-1].removeprefix("--method=").partition("+")[0])
     others = ", ".join(name for name in methods() if name != method.method)
     print_settings(
         f"settings of method {method.method}: --set deformation.NAME=VALUE",
         method.Settings,
         f"of other methods: neeco train --method NAME --help ({others})",
     )
-
-
-def _names_method(before: str, word: str) -> bool:
-    return before == "--method" or word.startswith("--method=")

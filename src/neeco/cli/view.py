@@ -38,7 +38,7 @@ class Arguments:
     annotate: bool = False
     """Pose frames of the capture given by hand; answers go to hand_posed.yaml in it, and its states are solved anew."""
     export: Path | None = None
-    """Write this HTML file instead."""
+    """Write one HTML file instead, as in --export page.html."""
     size: tyro.conf.OmitArgPrefixes[SizeSettings] = RECORDED_SIZE
     sh: int = 3
     """Degree of the spherical harmonics that an exported file keeps, 0 to 3; lower is smaller."""
@@ -75,7 +75,9 @@ def run(arguments: Arguments) -> int:
 
 
 def is_capture(path: Path) -> bool:
-    """Whether a folder is a capture, and no run."""
+    """Whether a folder is a capture, and no run. Raises NeecoError where nothing is there."""
+    if not path.exists():
+        raise NeecoError(f"{path}: no such run folder, nor a capture; correct the path")
     return (path / "transforms.json").is_file() and not (path / "config.yaml").exists()
 
 

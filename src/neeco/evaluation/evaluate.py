@@ -169,22 +169,24 @@ def evaluate_run(
     notes = _scene_notes(scene, networks, names)
     sections: list[dict[str, Any]] = [{kind: {} for kind in kinds} for _ in range(4)]
     result, pair_assignment, per_frame, by_tissue = sections
+    splits_of: dict[str, list[str]] = {}  # by note
     for split in splits:
         frames = capture.split(split)
         tallies = {kind: _Tally(PartTally(names)) for kind in kinds}
-        for index, frame in enumerate(frames):
-            report(split, index, len(frames))
+        for done, frame in enumerate(frames, 1):
             _score_frame(context, frame, tallies)
-        report(split, len(frames), len(frames))
+            report(split, done, len(frames))
         fps, count = _speed(scene, frames)
         for kind, tally in tallies.items():
             numbers, pair_assignment[kind][split] = _summary(scene, tally)
             result[kind][split] = numbers | {"fps": fps, "num_gaussians": count, "frames": len(frames)}
             per_frame[kind][split] = tally.rows
             by_tissue[kind][split] = _by_tissue(frames, tally.scores)
-        notes += _split_notes(split, result["given"][split])
+        for note in _split_notes(result["given"][split]):
+            splits_of.setdefault(note, []).append(split)
         if len(scene.recorded.tissues) > 1:
             notes += [_tissue_note(split, *found) for found in by_tissue["given"][split].items()]
+    notes += [f"{', '.join(concerned)}: {note}" for note, concerned in splits_of.items()]
     labels = {
         "threshold": threshold_of(scene),
         "names": [list(name) for name in scene.label_names],
@@ -393,19 +395,19 @@ def _scene_notes(scene: DrawableScene, networks: Mapping[str, Lpips], names: Map
     return notes
 
 
-def _split_notes(split: str, numbers: dict[str, Any]) -> list[str]:
+def _split_notes(numbers: dict[str, Any]) -> list[str]:
     masked, frames = numbers["mask_frames"], numbers["frames"]
     if masked == 0:
         return [
-            f"{split}: psnr_instrument, mask_iou, part_iou: null, no frame has a true or reference mask, so the labels "
+            "psnr_instrument, mask_iou, part_iou: null, no frame has a true or reference mask, so the labels "
             "are not measured; draw the instrument in five frames, save each as truth/masks/NAME_OF_THE_IMAGE.png of "
             "the capture (0 tissue, else part ids), and evaluate again"
         ]
     notes = []
     if masked < frames:
-        notes.append(f"{split}: psnr_instrument, mask_iou: over the {masked} of {frames} frames that have a mask")
+        notes.append(f"psnr_instrument, mask_iou: over the {masked} of {frames} frames that have a mask")
     if all(value is None or math.isnan(value) for value in numbers["part_iou"].values()):
-        notes.append(f"{split}: part_iou: null, the masks do not tell parts or the scene has none")
+        notes.append("part_iou: null, the masks do not tell parts or the scene has none")
     if math.isnan(numbers["psnr_uncovered"]):
-        notes.append(f"{split}: psnr_uncovered: null, the training frames saw all its tissue")
+        notes.append("psnr_uncovered: null, the training frames saw all its tissue")
     return notes

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from neeco.capture.documents import Problem
-from neeco.capture.model import UNKNOWN_DEG, Capture
+from neeco.capture.model import HOW_TO_REGISTER, UNKNOWN_DEG, Capture
 from neeco.geometry.lines import frame_about
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import PLACED_DEG, PLACED_MM, Registration
@@ -42,8 +42,9 @@ class Assessment:
 
     @property
     def conclusion(self) -> str:
-        """Advice on training, and the facts behind it."""
-        return f"{ADVICE[self.level]}: {'; '.join(self.facts)}"
+        """Advice on training: the facts behind a good verdict; the warnings have those behind another."""
+        behind = {"good": "; ".join(self.facts), "careful": "better without what is listed above"}
+        return f"{ADVICE[self.level]}: {behind.get(self.level, 'correct what is listed above, and ingest again')}"
 
     @property
     def others(self) -> list[str]:
@@ -75,6 +76,13 @@ class _Evidence:
     fact: str
     level: int
     warning: str = ""
+
+    @property
+    def reason(self) -> str:
+        """The warning, with what is usual."""
+        usual = re.search(r"( \(usual: [^()]*\))?$", self.fact)
+        assert usual is not None
+        return re.sub(r"(\.?)$", lambda end: usual[0] + end[1], self.warning, count=1)
 
     @classmethod
     def of(cls, sentence: str, *, severe: bool) -> _Evidence:
@@ -110,7 +118,8 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
         for name, clock in result.clocks.items()
         if not np.isfinite(clock.sd)
     ]
-    if result.in_video and not _rolls_known(capture):
+    deviations = [state.uncertainty for frame in capture.frames for state in frame.state.instruments.values()]
+    if result.in_video and any(item is not None and item.rotation_deg[2] >= UNKNOWN_DEG for item in deviations):
         words = "The instrument's roll is not known: log it, or pose frames by hand, before training."
         evidence.append(_Evidence.of(words, severe=False))
     others = [problem for problem in problems if problem not in grave]
@@ -119,8 +128,8 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
         words = "No instrument was tracked: only methods without states, such as 3dgs, can be trained."
         evidence.append(_Evidence.of(words, severe=False))
     elif not capture.registered:
-        words = "Cameras and instrument do not meet: instrument poses are in a frame of their own, so that it cannot "
-        evidence.append(_Evidence.of(words + "be rendered where it was.", severe=True))
+        words = f"Cameras and instrument do not meet: its poses are in a frame of their own; {HOW_TO_REGISTER}."
+        evidence.append(_Evidence.of(words, severe=True))
     return _judged(evidence, result, capture)
 
 
@@ -128,7 +137,7 @@ def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -
     """Return the assessment that all evidence gives, the worst first."""
     ordered = sorted(evidence, key=lambda item: -item.level)
     facts = tuple(item.fact for item in ordered[:N_FACTS])
-    warnings = tuple(item.warning for item in ordered if item.level)
+    warnings = tuple(item.reason for item in ordered if item.level)
     worst = ordered[0].level if ordered else 0
     if worst == 2:
         return Assessment("bad", "Doubtful: " + _lower(warnings[0]), warnings, facts)
@@ -143,12 +152,6 @@ def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -
 def _sentence(text: str) -> str:
     begun = text if re.match(r"\S+\.\w+:", text) else text[0].upper() + text[1:]  # a file's name stays
     return begun + ("" if text.endswith((".", "?")) else ".")
-
-
-def _rolls_known(capture: Capture) -> bool:
-    """Return whether every state's roll has a standard deviation below UNKNOWN_DEG."""
-    deviations = [state.uncertainty for frame in capture.frames for state in frame.state.instruments.values()]
-    return all(item is None or item.rotation_deg[2] < UNKNOWN_DEG for item in deviations)
 
 
 def _lower(sentence: str) -> str:

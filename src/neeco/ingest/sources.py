@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,13 +12,38 @@ from typing import Any
 from neeco.errors import NeecoError
 from neeco.files import write_text
 from neeco.ingest.cameras.still_scene import video_stands_still
-from neeco.ingest.readers import format_of
+from neeco.ingest.readers import format_of, read_table
+from neeco.ingest.readers.columns import recognise_time
+from neeco.ingest.readers.video import IMAGES, VIDEOS
 from neeco.ingest.recording.file import RecordingSection, read_recording
 from neeco.ingest.recording.model import MAX_SHAFT_MM, MIN_FRAMES, Recording
 from neeco.ingest.recording.sections import faults_in, node_of, read_section
-from neeco.ingest.recording.template import holds_streams, open_questions, write_template
+from neeco.ingest.recording.template import holds_streams, write_template
 
 RECORDING = "recording.yaml"
+
+
+# Lines of a draft that leave something open: what marks the first of them, and what to write there
+_QUESTIONS = (
+    (r"^  - name: ", "what is the instrument called in labels? Correct its name"),
+    (r"^ +# kinematics: \{dvrk_tool", "which tool is it? Remove the # and give its file, or write out its links below"),
+    (r"^ +# camera_from_base: \{transform", "how does the robot's base stand to the camera? Remove the # of one line"),
+    (r"a guess: correct it", "at which rate were these taken? Correct the number"),
+    (r"# units: .*nothing says them", "in which units? Correct them and remove the #"),
+    (r"^# intrinsics: .*no calibration was found", "which lens? Remove the # and give a calibration's file or numbers"),
+    (r"^ +# clock: .*its own", "is it the clock of the poses? Remove the #; else give its offset in sync, below"),
+    (r"is not clear: ", "which columns hold it? Name them"),
+    (r"^ +# +(?:frame|quaternion\w*|rotation\w*|euler\w*): ", "what do its poses mean? Correct it, remove the #"),
+)
+
+
+def open_questions(draft: str) -> list[tuple[int, str]]:
+    """Return the lines of a drafted recording.yaml, from 1, that only the one who recorded can answer, and what to
+    write there."""
+    found = []
+    for number, line in enumerate(draft.splitlines(), 1):
+        found += [(number, words) for marks, words in _QUESTIONS if re.search(marks, line)][:1]
+    return found
 
 
 def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
@@ -39,6 +66,8 @@ def folder_to_convert(sources: Sequence[Path]) -> Path | None:
     """Return the folder that holds cameras in another format; None where the sources are files of recordings. Raises
     NeecoError for what is neither."""
     for source in sources:
+        if source.suffix.lower() in VIDEOS:
+            raise NeecoError(f"{source}: is a video; give it as --video {shlex.quote(str(source))}")
         if (known := format_of(source)) is not None and source.exists():
             raise NeecoError(
                 f"{source}: is in a recording's format ({known.format}) but does not state the meaning of its streams; "
@@ -82,6 +111,10 @@ def recording_from_flags(
     for option, file in given:
         if file is not None and not Path(file).exists():
             raise NeecoError(f"{option}: {file}: no such file; correct the path")
+    for joint, log, table in joints:
+        timed = [recognise_time(read_table(Path(file)).header).time for file in (log, table) if file is not None]
+        if timed[0] is None and timed[-1] is not None:
+            raise NeecoError(f"--joint {joint}: {log} has no times, {table} has; give the log first, its table second")
     names = [joint for joint, *_ in joints]
     twice = next((joint for joint in names if names.count(joint) > 1), None)
     if twice is not None:
@@ -101,6 +134,10 @@ def recording_from_flags(
         raise NeecoError(f"--intrinsics: takes FX FY CX CY, not {len(intrinsics)} numbers")
     video = Path(video)
     is_folder = video.is_dir() and format_of(video) is None
+    if is_folder and fps is None:
+        images = any(entry.suffix.lower() in IMAGES for entry in video.iterdir())
+        problem = "when were the images taken? Give --fps" if images else "holds no images; give a folder of frames"
+        raise NeecoError(f"--video: {video}: {problem}")
     tool = {
         "name": "instrument",
         "poses": _plain(instrument),

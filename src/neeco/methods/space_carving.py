@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from neeco.capture.model import Frame
+from neeco.capture.model import HOW_TO_REGISTER, Frame
 from neeco.errors import NeecoError
 from neeco.geometry.projection import project
 from neeco.raster import rasterize
@@ -253,8 +253,8 @@ def carved_shape(session: GaussianSession, evidence: Evidence, name: str, genera
     shape = carve(evidence, name, generator, search)
     if shape is None:
         raise NeecoError(
-            f"instrument {name!r}: nothing in the images moves with its recorded pose; check that its poses are in the "
-            "cameras' world frame and in mm (`neeco check`), or train with --method nps as published"
+            f"instrument {name!r}: nothing in the images moves with its recorded pose; check that its poses are in mm "
+            f"and in the cameras' world frame (`neeco check`): {HOW_TO_REGISTER}; or train with --method nps"
         )
     if moves_with_pose(session, evidence, name, shape):
         return shape
@@ -280,7 +280,7 @@ def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, sha
     if not moves:
         session.report(
             f"warning: {name}: the images hardly depend on its recorded pose; its shape is searched around the "
-            "tracked frame, and its labels may be wrong (record more motion, or check that poses are registered)"
+            f"tracked frame, and its labels may be wrong: record more motion, or register its poses ({HOW_TO_REGISTER})"
         )
     return moves
 

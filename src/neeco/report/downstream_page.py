@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup, escape
-from matplotlib.axes import Axes
 
 from neeco.capture.model import Capture
 from neeco.errors import counted
@@ -78,15 +77,22 @@ def write_downstream_report(output: Path, experiment: Experiment, capture: Captu
         write_text(output / "data" / name, text)
     models = " and ".join(model["name"] for model in experiment["models"])
     from_scratch = not any(model["weights"] for model in experiment["models"])
+    scored = {split: row["frames"] for job in experiment["jobs"] for split, row in job["splits"].items() if row}
+    counts = [f"{scored.get(split, len(capture.split(split)))} frames of {split}" for split in experiment["splits"]]
     intro = (
         f"{models} trained{' from scratch' if from_scratch else ''} on recorded frames that somebody labelled, on "
-        f"synthetic images, and on both, always in as many steps; tested on {_tested(experiment, capture)}, recorded, "
+        f"synthetic images, and on both, always in as many steps; tested on {', '.join(counts)}, recorded, "
         "which no training saw."
     )
     failed = failed_jobs(experiment)
     notes = [note for note in experiment["notes"] if not note.startswith("failed: ")]  # which stand apart
     lists = [Section(title=title, notes=lines) for title, lines in (("What failed", failed), ("Notes", notes)) if lines]
-    made = Section(title="How it was made", facts=_facts(experiment, capture), listings=_set_listings(experiment))
+    listings = [
+        (f"set {entry['name']}: how it was made", json.dumps(entry["made_by"], indent=1, ensure_ascii=False))
+        for entry in experiment["sets"]
+        if entry["made_by"]
+    ]
+    made = Section(title="How it was made", facts=_facts(experiment, capture), listings=listings)
     return write_page(
         output / REPORT_FILE,
         "study.html",
@@ -254,20 +260,17 @@ def difference_chart(experiment: Experiment, model: Row, split: str) -> Markup:
             reference = f" − {row['against']}" if key in ("sets", "use") else ""
             name = (title_of(row["condition"], row["real"]) + reference)[:45]
             color = {HELPS: "good", HURTS: "bad"}.get(verdict(row), "soft")
-            _draw_interval(axes, y, row, reach, PALETTE[color])
+            shade = PALETTE[color]
+            axes.plot([0, 0], [y - 0.5, y + 0.5], color=PALETTE["edge"], linewidth=1)
+            if row["low"] is not None:
+                low, high = np.clip([row["low"], row["high"]], -reach, reach)
+                axes.plot([low, high], [y, y], color=shade, linewidth=2)
+                axes.plot(low, y, color=shade, marker="|" if low == row["low"] else "<", markersize=7)
+                axes.plot(high, y, color=shade, marker="|" if high == row["high"] else ">", markersize=7)
+            axes.plot(row["difference"], y, color=shade, marker="o", markersize=6)
         place = axes.get_yaxis_transform()
         axes.annotate(name, (0, y), (-290, 0), place, "offset points", va="center", color=PALETTE[color])
     return inline_svg(axes, f"differences of {model['name']} on {split}")
-
-
-def _draw_interval(axes: Axes, y: float, row: Row, reach: float, color: str) -> None:
-    axes.plot([0, 0], [y - 0.5, y + 0.5], color=PALETTE["edge"], linewidth=1)
-    if row["low"] is not None:
-        low, high = np.clip([row["low"], row["high"]], -reach, reach)
-        axes.plot([low, high], [y, y], color=color, linewidth=2)
-        axes.plot(low, y, color=color, marker="|" if low == row["low"] else "<", markersize=7)
-        axes.plot(high, y, color=color, marker="|" if high == row["high"] else ">", markersize=7)
-    axes.plot(row["difference"], y, color=color, marker="o", markersize=6)
 
 
 def _trainings(experiment: Experiment) -> list[Section]:
@@ -292,13 +295,6 @@ def _trainings(experiment: Experiment) -> list[Section]:
     head = ["model, trained on", "labelled frames", "steps", "input", "batch", "s", "CPU s"]
     text = f"{budget_text(experiment)}. The weights after the last step are tested."
     return [Section(title="Training", text=text, head=head, rows=rows)]
-
-
-def _tested(experiment: Experiment, capture: Capture) -> str:
-    """`12 frames of test and 8 frames of unseen`."""
-    scored = {split: row["frames"] for job in experiment["jobs"] for split, row in job["splits"].items() if row}
-    counts = [f"{scored.get(split, len(capture.split(split)))} frames of {split}" for split in experiment["splits"]]
-    return ", ".join(counts)
 
 
 def _facts(experiment: Experiment, capture: Capture) -> list[tuple[str, str]]:
@@ -326,11 +322,3 @@ def _set_words(entry: Row) -> str:
         return f"{images}; how they were made is not known: it has no dataset.json"
     scene = f", synthesized from {made['scene']}" if made["scene"] else ""
     return f"{images}{scene}; dataset.json sha256 {entry['sha256'][:12]}"
-
-
-def _set_listings(experiment: Experiment) -> list[tuple[str, str]]:
-    return [
-        (f"set {entry['name']}: how it was made", json.dumps(entry["made_by"], indent=1, ensure_ascii=False))
-        for entry in experiment["sets"]
-        if entry["made_by"]
-    ]

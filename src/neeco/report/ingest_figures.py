@@ -253,7 +253,10 @@ def _mean_axes(poses: np.ndarray) -> np.ndarray:
 def view(tracks: Tracks, title: str, across: np.ndarray, down: np.ndarray) -> str:
     """Return the tracks projected along across x down, as inline SVG; both [3] in the tracks' frame."""
     plane = np.stack([across, down], axis=1).astype(np.float64)  # [3, 2]
-    low, high = _extent(tracks, plane)
+    shown = [tracks.camera @ plane, *(track[np.isfinite(track[:, 0])] @ plane for track in tracks.instruments.values())]
+    if len(tracks.points):  # but for strays
+        shown.append(np.quantile(tracks.points @ plane, [STRAY, 1 - STRAY], axis=0))
+    low, high = np.concatenate(shown).min(axis=0), np.concatenate(shown).max(axis=0)
     scale = min((WIDTH - 2 * MARGIN) / max(high[0] - low[0], 1e-9), (HEIGHT - 3 * MARGIN) / max(high[1] - low[1], 1e-9))
     offset = np.array([WIDTH, HEIGHT + MARGIN]) / 2 - scale * (low + high) / 2
 
@@ -280,15 +283,6 @@ def view(tracks: Tracks, title: str, across: np.ndarray, down: np.ndarray) -> st
     axes.plot([end - length * scale, end], [HEIGHT - 10] * 2, color=PALETTE["ink"], linewidth=2, clip_on=False)
     axes.text(end, HEIGHT - 16, f"{length:g} mm", ha="right")
     return inline_svg(axes, title)
-
-
-def _extent(tracks: Tracks, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return low and high [2] of the picture: all tracks, and the points but for strays."""
-    shown = [tracks.camera @ plane, *(track[np.isfinite(track[:, 0])] @ plane for track in tracks.instruments.values())]
-    if len(tracks.points):
-        shown.append(np.quantile(tracks.points @ plane, [STRAY, 1 - STRAY], axis=0))
-    all_of = np.concatenate(shown)
-    return all_of.min(axis=0), all_of.max(axis=0)
 
 
 def _draw_line(axes: Axes, places: np.ndarray, breaks: np.ndarray, color: str, width: float) -> None:

@@ -76,11 +76,18 @@ class Ingested:
         shown += [f"wrong: {problem}" for problem in errors_only(self.problems)]
         shown.append(f"capture: {self.output}  ({counted(len(self.problems), 'remark')} by `neeco check`)")
         shown.append(f"page: {', '.join(str(self.output / page_of(tissue)) for tissue in self.results)}")
+        verdicts: list[str] = []
         for tissue, verdict in self.verdicts.items():
             first, *others = verdict.lines()
             of = f"{tissue}: " if tissue else ""
-            shown += [f"verdict: {of}{first}", *others, f"{of}{verdict.conclusion}"]
-        return shown
+            verdicts += [f"verdict: {of}{first}", *others, f"{of}{verdict.conclusion}"]
+        stated = " ".join(verdicts).casefold()
+
+        def repeats(line: str) -> bool:
+            kind, _, words = line.partition(": ")
+            return kind in ("note", "wrong") and words.rstrip(".").casefold() in stated
+
+        return [line for line in shown if not repeats(line)] + verdicts
 
 
 def page_of(tissue: str) -> str:
@@ -133,7 +140,7 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
         capture=capture,
         verdict=verdict,
         splits=split_counts(capture),
-        eyes=2 if len(capture.frames) > len(result.selected) else 1,  # a stereo partner's frames are training frames
+        second=len(capture.frames) - len(result.selected),  # images of a stereo partner, which are training frames
         in_view=[
             (item.name, figures.in_view(capture, item.name)) for item in capture.instruments if capture.registered
         ],

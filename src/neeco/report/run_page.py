@@ -47,7 +47,7 @@ IMAGE_SCORES = (
     Score("psnr_covered", "PSNR covered", "{:.2f}", "PSNR without the tissue that no training frame saw."),
     Score("covered_fraction", "covered", "{:.1%}", "How much of the visible tissue at least one training frame saw."),
     Score("fps", "FPS", "{:.1f}", "Posed images rendered per second on the machine that evaluated."),
-    Score("num_gaussians", "Gaussians", "{:,}", "Gaussians used by one rendering."),
+    Score("num_gaussians", "Gaussians", "{:,}", "Gaussians of the finished scene; finishing adds some, as of shafts."),
     Score("frames", "frames", "{}", "How many frames were scored."),
 )  # fmt: skip
 LABEL_SCORES = (
@@ -61,7 +61,7 @@ KINDS = {
     "given": "As given: rendered at the poses the capture states, tracker errors included",
     "aligned": "Aligned: instrument and camera pose fitted to each recorded image first, the scene unchanged",
 }
-KIND_NAMES = {"given": "as given", "aligned": "aligned"}
+KIND_NAMES = {"given": "in the recorded poses", "aligned": "in poses fitted to each image"}
 
 
 def write_report(
@@ -86,7 +86,7 @@ def write_report(
         curve(rows, "loss", "loss (log scale)", logarithmic=True),
         curve(rows, "num_gaussians", "Gaussians"),
     ]
-    config = run_path / "config.yaml"
+    found, config = _flat(getattr(scene, "diagnostics", {})), run_path / "config.yaml"
     return write_page(
         run_path / REPORT_FILE,
         "run.html",
@@ -107,7 +107,8 @@ def write_report(
         full_scale=FULL_SCALE,
         tints=_tints(scene),
         curves=[chart for chart in curves if chart],
-        **_diagnostics(getattr(scene, "diagnostics", {})),
+        diagnostics=[(name, _plain(value)) for name, value in found if name.split(" · ")[-1] != "verdict"],
+        verdicts=[value for name, value in found if name.split(" · ")[-1] == "verdict"],
         preview=synthesis_preview and preview_uri(synthesis_preview),
         playable=playable,
         facts=_facts(capture, scene, rows),
@@ -185,17 +186,19 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
     tiles = []
     for split, numbers in evaluation["given"].items():
         if numbers["psnr"] is not None:
-            tiles.append((f"{numbers['psnr']:.1f} dB", f"PSNR, {split}, as given"))
+            what = f"PSNR, {split} frames: similarity to the recorded (30 is close, 20 rough)"
+            tiles.append((f"{numbers['psnr']:.1f} dB", what))
     for split, numbers in evaluation[labelled].items():
         if numbers["mask_iou"] is not None:
-            tiles.append((f"{numbers['mask_iou']:.3f}", f"mask IoU, {split}, {KIND_NAMES[labelled]}"))
+            what = f"overlap of labels and true masks (IoU; 1 is perfect), {split} frames {KIND_NAMES[labelled]}"
+            tiles.append((f"{numbers['mask_iou']:.3f}", what))
     doubts = evaluation.get("doubts", ())
-    tiles.append(("doubtful" if doubts else "no doubt", "about labels, by what training measured"))
+    tiles.append(("doubtful" if doubts else "no doubt", "trust in the labels, by what training measured (see Notes)"))
     first = next(iter(evaluation["given"].values()), None)
     if first is not None:
-        tiles.append((f"{first['fps']:.1f}", "posed images rendered per second"))
+        tiles.append((f"{first['fps']:.1f}", "images rendered per second, each of another state"))
         if first["num_gaussians"] is not None:
-            tiles.append((f"{first['num_gaussians']:,}", "Gaussians"))
+            tiles.append((f"{first['num_gaussians']:,}", "Gaussians (coloured blobs) that make up the scene"))
     return tiles
 
 
@@ -244,15 +247,6 @@ def _tints(scene: DrawableScene) -> list[tuple[str, str]]:
     several = len({instrument for instrument, _ in scene.label_names}) > 1
     names = [f"{instrument} {part}" if several else part for instrument, part in scene.label_names]
     return [(part_color(part), name.replace("_", " ")) for part, name in enumerate(names, 1)]
-
-
-def _diagnostics(diagnostics: Mapping[str, Any]) -> dict[str, Any]:
-    """The scene's diagnostics of its own joints, from training data alone."""
-    items = [(name, value, name.split(" · ")[-1] == "verdict") for name, value in _flat(diagnostics)]
-    return {
-        "diagnostics": [(name, _plain(value)) for name, value, is_verdict in items if not is_verdict],
-        "verdicts": [value for _, value, is_verdict in items if is_verdict],
-    }
 
 
 def _flat(value: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
@@ -314,26 +308,16 @@ def phase_starts(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
 
 def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: bool = False) -> str:
     """A chart of `key` over iterations, dashed lines where a phase begins; "" when fewer than two rows have numbers."""
-    points = [(float(row["iteration"]), float(row[key])) for row in rows if _is_number(row.get(key))]
-    points = _averaged([(x, y) for x, y in points if y > 0 or not logarithmic])
+    known = [row for row in rows if type(row.get(key)) in (int, float) and math.isfinite(row[key])]
+    points = [(float(row["iteration"]), float(row[key])) for row in known if row[key] > 0 or not logarithmic]
     if len(points) < 2:
         return ""
+    if (run := -(-len(points) // MAX_POINTS)) > 1:  # means of equally many, so that a noisy curve reads as its trend
+        groups = [points[start : start + run] for start in range(0, len(points), run)]
+        points = [(group[-1][0], sum(y for _, y in group) / len(group)) for group in groups]
     series = [Series("", 0, tuple(points))]
     note, starts = f"{short(points[-1][1])} at the end", phase_starts(rows)
     return line_chart(title, "iterations", series, starts=starts, note=note, logarithmic=logarithmic, size=SMALL)
-
-
-def _averaged(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """At most MAX_POINTS points: means of equally many, so that a noisy curve reads as its trend."""
-    if len(points) <= MAX_POINTS:
-        return points
-    run = -(-len(points) // MAX_POINTS)
-    groups = [points[start : start + run] for start in range(0, len(points), run)]
-    return [(group[-1][0], sum(y for _, y in group) / len(group)) for group in groups]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 PAGE = "annotate.html"

@@ -399,7 +399,7 @@ def derive_capture(capture: Capture, transforms: str, derived: Derived, seed: in
     """
     recipe: dict[str, Any] = {"source": str(capture.root.absolute()), "transforms": transforms}
     recipe |= {"states_sha256": _digest(capture), "seed": seed, **asdict(derived)}
-    if (begun := read_begun(output, RECIPE_FILE, resume=True, work="a capture made by ablate")) is not None:
+    if (begun := read_begun(output, RECIPE_FILE, resume=None, work="a capture made by ablate")) is not None:
         begun = asdict(Derived(derived.name)) | begun  # it may lack fields that are newer
         require_same(str(output / RECIPE_FILE), ((key, begun.get(key), recipe[key]) for key in recipe), REMEDY)
         if (output / "transforms.json").exists():

@@ -79,10 +79,6 @@ RUN_COLUMNS = (
 SPLIT_METRICS = tuple(column.key for column in SPLIT_COLUMNS)
 MASK_METRICS = tuple(column.key for column in MASK_COLUMNS)
 RUN_METRICS = ("seconds", "processor_seconds", "fps", "num_gaussians", "peak_memory_mb", "iterations")
-ABSENT = {  # why nobody has a number
-    "psnr_instrument": "the capture has no true masks, or no run finished",
-    "mask_iou": "no method here carries labels, the capture has no true masks, or no run finished",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -406,10 +402,12 @@ def tables_of(comparison: ComparisonResult) -> list[ResultTable]:
 def absent_notes(comparison: ComparisonResult) -> list[str]:
     """Return notes on what the tables lack, and why."""
     notes = list(comparison.notes)
+    known = {key for key in SPLIT_METRICS if any(row[key]["n"] for row in comparison.summary)}
+    masked = "psnr_instrument" in known
+    why = "no run finished" if not known else "no method here carries labels" if masked else "the capture has no masks"
     for key in SPLIT_METRICS:
-        known = any(row[key]["n"] for row in comparison.summary)
-        if not known and not any(note.startswith(key) for note in notes):
-            notes.append(f"{key}: no run has it: {ABSENT.get(key, 'no run finished')}")
+        if key not in known and not any(note.startswith(key) for note in notes):
+            notes.append(f"{key}: no run has it: {why}")
     if not any(row["seconds"]["std"] is not None for row in comparison.summary):
         notes.append("no ± is given: one seed has no standard deviation; give --seeds 2 or more")
     return notes

@@ -125,10 +125,9 @@ def measure_speed(
     cases = [(index, device) for device in devices for index in range(len(runs))]
     times: dict[tuple[int, torch.device], list[float]] = {case: [] for case in cases}
     for step in range(N_ROUNDS):
-        for number, (index, where) in enumerate(cases):
-            report(step * len(cases) + number, N_ROUNDS * len(cases))
+        for number, (index, where) in enumerate(cases, 1):
             times[index, where] += _timed(runs[index][2], frames, where)
-    report(N_ROUNDS * len(cases), N_ROUNDS * len(cases))
+            report(step * len(cases) + number, N_ROUNDS * len(cases))
     rows = []
     for (index, where), seconds in times.items():
         (name, seed, run), median = runs[index], statistics.median(seconds)

@@ -94,15 +94,14 @@ def score_runs(
 ) -> list[Row]:
     """Render the masks of every (name, seed, run folder) into `output`/masks/<name>-seed<k>/<split>/ and score them."""
     rows: list[Row] = []
-    for index, (name, seed, path) in enumerate(runs):
-        report(index, len(runs))
+    for done, (name, seed, path) in enumerate(runs, 1):
         with open_run(path, device) as run:
             completed = run.scene.recorded.completed(capture, run.scene.instruments)
             for split in splits:
                 folder = output / "masks" / f"{name}-seed{seed}" / split
                 if draw_masks(run, folder, completed.split(split)):
                     rows += score_folder(name, seed, folder, capture, [split])[0]
-    report(len(runs), len(runs))
+        report(done, len(runs))
     return rows
 
 

@@ -92,7 +92,7 @@ def check_output(output: Path, file: str, schema: str, capture: Path, noun: str)
     noun: name of the study, for messages. Raises NeecoError when `output` is no folder, holds something else, or the
     study of another capture.
     """
-    stored = read_begun(output, file, resume=True, work=noun)
+    stored = read_begun(output, file, resume=None, work=noun)
     if stored is not None:
         now = {"schema": schema, "capture": str(capture.absolute())}
         require_same(str(output / file), ((key, stored.get(key), now[key]) for key in now), REMEDY)

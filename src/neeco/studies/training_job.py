@@ -257,7 +257,7 @@ def _train(
             job.train_config,
             capture=capture,
             device=device,
-            resume=(job.folder / "config.yaml").exists(),
+            resume=None,
             progress=report_row,
             watch=recorder.after_step,
             clock=CLOCKS[job.budget.clock],

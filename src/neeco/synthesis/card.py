@@ -23,7 +23,8 @@ TAGS = ["surgical-instruments", "endoscopy", "6d-pose-estimation", "gaussian-spl
 SYNTHETIC = """The images were rendered by a Gaussian-splatting model learned from a recording, in states of the
 instruments that were not recorded. Labels come from the same model: exact for what is rendered."""
 RECORDED = """The images were recorded. Their labels were rendered by a Gaussian-splatting model of the recording, at
-poses fitted to each image; images whose labels could not be trusted were left out."""
+poses fitted to each image; images whose labels could not be trusted were left out. Files are numbered anew: the field
+`frame` of `states.jsonl` has the name that the frame has in its capture."""
 TEXT = """---
 {front}---
 

@@ -200,8 +200,7 @@ def description(
 def check_output(output: Path, description: dict[str, Any], resume: bool) -> bool:
     """Return whether a data set was begun in `output` in the same way. Raises NeecoError when it may not be written
     to."""
-    begun = read_begun(output, INFO, resume, "a data set")
-    if begun is None:
+    if (begun := read_begun(output, INFO, resume, "a data set")) is None:
         return False
     if not isinstance(begun.get("settings"), dict):
         raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")

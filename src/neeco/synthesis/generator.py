@@ -212,7 +212,7 @@ class SampleGenerator:
             raise StatesRefused(f"image {index}: its given state was refused ({format_counts(refused)})", refused)
         raise StatesRefused(
             f"image {index}: no acceptable state in {settings.max_attempts} attempts ({format_counts(refused)}); "
-            "use --states interpolate, a smaller --margin, --no-tissue-check or --resume with more --max-attempts",
+            "use --states interpolate, a smaller --margin, --no-tissue-check or more --max-attempts (and --resume)",
             refused,
         )
 

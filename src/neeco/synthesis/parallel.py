@@ -97,7 +97,7 @@ def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], w
                 if event.stage == "abandoned":
                     raise NeecoError(
                         f"--workers: workers keep dying over image {tasks[event.index][0]} ({event.value}); is there "
-                        "memory enough? use fewer workers and --resume"
+                        "memory enough? use fewer workers (and --resume)"
                     )
                 for found in event.value if event.stage == "done" else ():
                     yield found.write(output) if isinstance(found, Encoded) else found

@@ -217,7 +217,7 @@ def _found(scene: GaussianScene, frames: Sequence[Frame], report: Progress) -> l
     """Return the frames in which the instruments of `scene` are found, with their states."""
     fitter, found = fitter_of(scene), []
     search = Search.of(fitter)
-    for done, frame in enumerate(frames):
+    for done, frame in enumerate(frames, 1):
         report("looking for the instruments' colours", done, len(frames))
         fit = search.anywhere(fitter.view(frame, None))
         if fit is not None:

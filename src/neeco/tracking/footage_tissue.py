@@ -91,7 +91,7 @@ def _learned(capture: Capture, run: Path, iterations: int, device: torch.device,
     config, camera = training_config(METHOD, {"iterations": iterations}), capture.frames[0].camera
     limit = config.gaussian_limits(float(camera.width * camera.height))[0]
     config = replace(config, max_tissue_gaussians=min(MAX_GAUSSIANS, limit))
-    train(capture.root, run, config, capture=capture, device=device, resume=run.exists(), progress=progress)
+    train(capture.root, run, config, capture=capture, device=device, resume=None, progress=progress)
     return load_run(run, device).gaussians("track").scene
 
 

@@ -79,7 +79,7 @@ def refine_run(
     config = with_fields(
         stored_config(run.path, run.config), {"refine.latency": False, "transforms": "transforms.json"}
     )
-    return train(folder, output / RUN, config, device=device, resume=(output / RUN).exists(), progress=on_row)
+    return train(folder, output / RUN, config, device=device, resume=None, progress=on_row)
 
 
 def _tracked_frames(path: Path, scene: GaussianScene) -> list[Frame]:

@@ -356,10 +356,8 @@ def _first_state(footage: Capture, frame: Frame, scene: GaussianScene) -> State:
 
 def _check_output(output: Path, info: dict[str, Any], resume: bool) -> None:
     """Raise NeecoError when `output` may not be written to."""
-    if output.is_dir() and {entry.name for entry in output.iterdir()} <= {FOOTAGE, LOCK}:
+    if output.is_dir() and {FOOTAGE} <= {entry.name for entry in output.iterdir()} <= {FOOTAGE, LOCK}:
         return
-    begun = read_begun(output, INFO, resume, "tracked footage")
-    if begun is None:
-        return
-    keys = ("schema", "version", "scene_sha256", "captures_sha256", "start", "tissue")
-    require_same(str(output / INFO), ((key, begun.get(key), info[key]) for key in keys))
+    if (begun := read_begun(output, INFO, resume, "tracked footage")) is not None:
+        keys = ("schema", "version", "scene_sha256", "captures_sha256", "start", "tissue")
+        require_same(str(output / INFO), ((key, begun.get(key), info[key]) for key in keys))

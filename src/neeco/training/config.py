@@ -195,7 +195,9 @@ def training_config(
         named: list[tuple[str, Any]] = list(assignments.items())
     else:
         named = [name_and_value("--set", assignment, "ssim_weight=0.2") for assignment in assignments]
-    changed = config_to_dict(_with_preset(base, named))
+    preset = [value for name, value in named if name == "deformation.preset"]  # an unknown one is refused later
+    fields_of_it = method_class(base.method).presets.get(preset[-1], {}) if preset else {}
+    changed = config_to_dict(with_fields(base, fields_of_it))
     changed |= {option: value for option, value in values.items() if value is not None}
     for option, value in named:
         _assign(changed, option, value, parse=not isinstance(assignments, Mapping))
@@ -251,14 +253,6 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for name, value in values.items():
         flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return flat
-
-
-def _with_preset(config: TrainConfig, assignments: Sequence[tuple[str, Any]]) -> TrainConfig:
-    """Return `config` with the fields of the preset that `assignments` name; an unknown one is refused later."""
-    chosen = [value for name, value in assignments if name == "deformation.preset"]
-    presets = method_class(config.method).presets
-    preset: TrainConfig = with_fields(config, presets.get(chosen[-1], {}) if chosen else {})
-    return preset
 
 
 def check_ranges(config: TrainConfig) -> None:

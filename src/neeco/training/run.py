@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -32,6 +33,7 @@ from neeco.files import (
     require_utf8,
     write_text,
 )
+from neeco.placeholders import misplaced
 from neeco.scene.drawable import DrawableScene
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import DAMAGED, load_scene, pack_scene, require_numbers, save_tensors, unpack_scene
@@ -71,8 +73,8 @@ class TrainedRun:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons to doubt the labels, by what training measured: too few iterations, labels that leave out what the
-        images show of the instrument or take in tissue, joints that were not found."""
+        """Reasons to doubt the labels, by what training measured: too few iterations, else labels that leave out
+        what the images show of the instrument or take in tissue, and joints that were not found."""
         recorded, noted = len(self.scene.recorded.names), getattr(self.scene, "diagnostics", {})
         usual = replace(method_defaults(self.config["method"]), iterations=None).for_frames(recorded).length
         if usual.is_short(done := noted.get("iterations", usual.iterations)):
@@ -116,9 +118,15 @@ def load_run(path: Path, device: torch.device | None = None, *, force: bool = Fa
     path = Path(path)
     config = read_config(path)
     if not (path / SCENE_FILE).is_file():
-        raise NeecoError(f"{path}: training has not finished here; continue it with `neeco train … --resume`")
+        command = resume_command(config["capture"], path)
+        raise NeecoError(f"{path}: training has not finished here; go on with: `{command}`")
     scene = load_scene(path / SCENE_FILE)
     return TrainedRun(path, scene if device is None else scene.to(device), config, force)
+
+
+def resume_command(capture: Path | str, run: Path) -> str:
+    """Return the command that continues the training of a run."""
+    return f"neeco train {shlex.quote(str(capture))} --output {shlex.quote(str(run))} --resume"
 
 
 @contextmanager
@@ -144,13 +152,13 @@ def read_config(path: Path) -> dict[str, Any]:
     path = Path(path)
     require_utf8(path)
     file = path / CONFIG_FILE
-    if not path.is_dir():
-        raise NeecoError(f"{path}: no such run folder; make one with `neeco train`")
+    if not path.exists():
+        raise NeecoError(f"{path}: no such run folder; correct the path, or make one with `neeco train`")
     for entry in path.glob("*"):
         if not entry.is_dir():  # folders that their owner has linked there are no part of the run
             require_inside(entry, path)
     if not os.path.lexists(file):
-        raise NeecoError(f"{path}: not a run folder (config.yaml is missing); make one with `neeco train`")
+        raise NeecoError(f"{path}: {'; '.join(misplaced(path, 'a run folder', 'config.yaml, by `neeco train`'))}")
     config = parse_yaml(file, read_text(file, "the settings of a run as YAML"), "train again")
     if not isinstance(config, dict) or config.get("schema") != SCHEMA:
         found = config.get("schema") if isinstance(config, dict) else None

@@ -185,7 +185,10 @@ class GaussianSession(GaussianTraining):
         assert gradient is not None
         self.statistics.record(gradient, views * camera.width, views * camera.height)  # of the frame's own loss
         self.refinement.step(index, progress)
-        return total, loss, _squared_error(rendering.color.detach(), target, mask)
+        image = rendering.color.detach()  # [H, W, 3]
+        if mask is None:
+            return total, loss, mse_loss(image, target)
+        return total, loss, ((image - target).square() * mask[..., None]).sum() / (3 * mask.sum()).clamp_min(1)
 
     def corrected(self, index: int) -> tuple[State, Camera]:
         """Return the state and camera of training frame `index` as refined so far."""
@@ -343,8 +346,8 @@ class GaussianSession(GaussianTraining):
         for part, item in found.items():
             if item.applied:
                 self.report(
-                    f"{part}: errors depend on the state ({item.explained:.0%} of their variance is predicted for "
-                    "stretches left out): new states are corrected, too"
+                    f"{part}: similar recorded states have similar errors ({item.explained:.0%} of their variance is "
+                    "predicted from other frames), so new states are corrected, too"
                 )
 
     def finish(self) -> None:
@@ -427,10 +430,3 @@ def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.nd
 def trust_of(state: State) -> float:
     """Return the weight of a frame in the loss: the least trust of its states, 1 for recorded ones."""
     return min((1.0 if given.trust is None else given.trust for given in state.instruments.values()), default=1.0)
-
-
-def _squared_error(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-    if mask is None:
-        return mse_loss(image, target)
-    squared = (image - target).square()  # [H, W, 3]
-    return (squared * mask[..., None]).sum() / (3 * mask.sum()).clamp_min(1)

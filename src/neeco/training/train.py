@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 import signal
 import threading
 import time
@@ -37,6 +36,7 @@ from neeco.training.run import (
     reporting_damage,
     require_same_capture,
     restore_session,
+    resume_command,
     save_checkpoint,
     stored_config,
     write_config,
@@ -59,7 +59,13 @@ class ProgressRow:
     phase: int = 1
     seconds: float = 0.0
     progress: float = 0.0  # in [0, 1]
+    prepared: float = 0.0  # of the seconds, those before the first iteration
     note: str = ""  # a line for the user
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Time until the end at the speed so far; None before there is progress."""
+        return (self.seconds - self.prepared) * (1 / self.progress - 1) if self.progress > 0 else None
 
 
 ShowRow = Callable[[ProgressRow], None]
@@ -73,7 +79,7 @@ def train(
     *,
     capture: Capture | None = None,
     device: torch.device = CPU,
-    resume: bool = False,
+    resume: bool | None = False,
     progress: ShowRow | None = None,
     watch: Watch | None = None,
     clock: Callable[[], float] = time.monotonic,
@@ -82,14 +88,14 @@ def train(
 
     Writes config.yaml, metrics.jsonl and checkpoint/ while running, and scene.safetensors at the end. capture: what
     `read_checked` returned for the path, where it was read already. resume: continue an interrupted run under the
-    settings it was begun with, which `config` must not contradict, on the same kind of device. clock: seconds that
-    `minutes` counts (time.process_time: CPU time), without those of `watch`. The same seed gives the same scene on a
-    CPU, interrupted or not, unless `minutes` is set.
+    settings it was begun with, which `config` must not contradict, on the same kind of device; None: where one was
+    begun. clock: seconds that `minutes` counts (time.process_time: CPU time), without those of `watch`. The same seed
+    gives the same scene on a CPU, interrupted or not, unless `minutes` is set.
 
     SIGINT or SIGTERM ends the run between two steps with a checkpoint, a second one at once; the message of
     KeyboardInterrupt says how to resume. A failure before the first step leaves no run folder behind. Raises NeecoError
-    for a capture that `neeco check` refuses, a non-empty `output` without `resume`, other settings or another capture
-    than the run was begun with, or a loss that is not finite.
+    for a capture that `neeco check` refuses, an `output` that is not empty without `resume` or vacant with it, other
+    settings or another capture than the run was begun with, or a loss that is not finite.
     """
     capture_path, output = Path(capture_path), Path(output)
     if (stored := read_begun(output, CONFIG_FILE, resume, "a run", read_config)) is not None:
@@ -101,7 +107,7 @@ def train(
     config = replace(config, deformation=method_class(config.method).resolved(config.deformation))
     contradicted: list[str] = []
     if capture is None:
-        capture = read_checked(capture_path, config.transforms, None if resume else contradicted.append)
+        capture = read_checked(capture_path, config.transforms, None if stored else contradicted.append)
     digest = fingerprint(capture)
     if stored is not None:
         require_same_capture(output, capture.root, digest)
@@ -111,11 +117,11 @@ def train(
     frames = _training_frames(capture, capture_path, config)
     config = config.for_frames(len(frames))
     log = _Log(output / "metrics.jsonl", progress, watch, clock)
-    go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
+    go_on = f"go on with: {resume_command(capture_path, output)}"
     with own_folder(output), method_class(config.method).torch_threads(), _stating_memory(frames, config):
         try:
             views = TrainingViews.read(frames, config.scale).to(device)
-            session = _begin(capture, views, output if resume else None, config, log)
+            session = _begin(capture, views, output if stored else None, config, log)
             log.truncate(session.iteration)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("before the first step; run the same command again") from None
@@ -128,11 +134,18 @@ def train(
             _run(session, output, config, log, stop, go_on)
         try:
             log.note("finishing: labels, shaft, diagnostics")
-            _check_finite(session)
+            try:
+                require_numbers(pack_scene(session.scene)[0])
+            except ValueError as error:
+                raise NeecoError(
+                    f"training: the scene diverged: {error} after {session.iteration} iterations; "
+                    "train anew with another --seed or a milder schedule"
+                ) from None
             session.finish()
             if states := session.training_states():
                 write_json(output / STATES_FILE, {"schema": "neeco-states/1", "frames": states})
             save_scene(session.scene, output / SCENE_FILE)
+            log.finished(session)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"while finishing; {go_on}") from None
     return output
@@ -217,8 +230,8 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
             session.seconds, last = session.seconds + now - last, now
             if session.phase != phase:
                 phase = session.phase
-                why = "enough of the run is over" if session.forced else "PSNR is high enough and the loss falls"
-                log.note(f"phase {phase} of the schedule begins at iteration {session.iteration}: {why}")
+                why = "enough of the run is over" if session.forced else "PSNR is high enough"
+                log.note(f"iteration {session.iteration}: details are learned from now on, phase {phase} ({why})")
             session.between_steps(before)
             if due(config.log_interval, iteration, session.iteration):
                 log.row(session)
@@ -240,17 +253,6 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: t
         save_checkpoint(session, output)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"at iteration {session.iteration}; {go_on}") from None
-
-
-def _check_finite(session: Session) -> None:
-    """Raise NeecoError when a learned number is not finite, or too large to be read again."""
-    try:
-        require_numbers(pack_scene(session.scene)[0])
-    except ValueError as error:
-        raise NeecoError(
-            f"training: the scene diverged: {error} after {session.iteration} iterations; "
-            "train anew with another --seed or a milder schedule"
-        ) from None
 
 
 @contextmanager
@@ -303,8 +305,9 @@ class _Log:
             phase=session.phase,
             seconds=round(session.seconds, 2),
             progress=round(session.progress, 4),
+            prepared=session.prepared,
         )
-        entry = {key: value for key, value in vars(self.last).items() if key != "note"}
+        entry = {key: value for key, value in vars(self.last).items() if key not in ("prepared", "note")}
         try:
             with self.path.open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(entry, allow_nan=False) + "\n")
@@ -312,6 +315,11 @@ class _Log:
             raise cannot_write(self.path, error) from error
         if self.progress:
             self.progress(self.last)
+
+    def finished(self, session: Session) -> None:
+        """Show the scene's final number of Gaussians."""
+        if self.progress and self.last.iteration:
+            self.progress(replace(self.last, num_gaussians=session.scene.num_gaussians, progress=1.0))
 
     def note(self, text: str) -> None:
         if self.progress:

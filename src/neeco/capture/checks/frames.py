@@ -40,8 +40,11 @@ def check_frames(parsed: Parsed) -> None:
     elif counts["train"] < FEW_TRAIN_FRAMES:
         message = f"few frames: {counts['train']} to train on, fewer than {FEW_TRAIN_FRAMES} give a poor scene"
         frames.warning(message, "record more if you can")
-    for part in parsed.by_tissue():
-        _check_still(part)
+    for part in parsed.by_tissue() if parsed.still else ():
+        cameras = [frame.camera.world_from_camera.double() for frame in part.with_cameras().frames]
+        if (count := len({tuple(pose.numpy().round(6).ravel().tolist()) for pose in cameras})) > MAX_STILL_CAMERAS:
+            message = f"is 'still', but the frames have {count} different cameras"
+            parsed.header("camera_motion").error(message, "write 'moving', or correct transform_matrix")
     trained = Counter(frame.state.tissue for frame in parsed.frames if frame.split == "train")
     for tissue in parsed.tissues:
         if not trained[tissue.name]:
@@ -58,15 +61,6 @@ def check_frames(parsed: Parsed) -> None:
             place.child("file_path").error(message, "list every image once")
 
 
-def _check_still(parsed: Parsed) -> None:
-    """Report a scope stated to stand still that has more cameras than a stereo scope."""
-    placed = parsed.with_cameras().frames
-    poses = {tuple(frame.camera.world_from_camera.double().numpy().round(6).ravel().tolist()) for frame in placed}
-    if parsed.still and len(poses) > MAX_STILL_CAMERAS:
-        message = f"is 'still', but the frames have {len(poses)} different cameras"
-        parsed.header("camera_motion").error(message, "write 'moving', or correct transform_matrix")
-
-
 def _check_times(parsed: Parsed) -> None:
     frames = parsed.header("frames")
     latest: dict[tuple[str, str | None], float] = {}
@@ -75,7 +69,8 @@ def _check_times(parsed: Parsed) -> None:
     for frame, place in zip(parsed.frames, parsed.places, strict=True):
         time, poses = frame.state.time, [state.pose.numpy().tobytes() for state in frame.state.instruments.values()]
         first = instants.setdefault((place.file, time, *poses), frame.camera)
-        if first is not frame.camera and not _same_view(first, frame.camera):
+        views = [(one.fx, one.fy, one.cx, one.cy, one.world_from_camera.tolist()) for one in (first, frame.camera)]
+        if first is not frame.camera and views[0] != views[1]:
             continue  # another camera at the same instant
         if time < latest.get((place.file, frame.state.tissue), time):
             backwards.append(place)
@@ -89,11 +84,6 @@ def _check_times(parsed: Parsed) -> None:
         more = f" (and {len(backwards) - 1} more times)" if len(backwards) > 1 else ""
         remedy = "right if the capture joins recordings or cameras; else sort the frames"
         backwards[0].child("time").warning(f"time goes backwards here{more}", remedy)
-
-
-def _same_view(one: Camera, other: Camera) -> bool:
-    intrinsics = [(camera.fx, camera.fy, camera.cx, camera.cy) for camera in (one, other)]
-    return intrinsics[0] == intrinsics[1] and torch.equal(one.world_from_camera, other.world_from_camera)
 
 
 @dataclass(frozen=True)

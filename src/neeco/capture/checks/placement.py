@@ -18,7 +18,7 @@ from neeco.capture.checks.motion import POSES, MotionVerdict, judge_motion
 from neeco.capture.checks.motion_evidence import MotionEvidence
 from neeco.capture.checks.pictures import Pictures
 from neeco.capture.documents import Node, errors_only, printable
-from neeco.capture.model import Instrument, InstrumentState
+from neeco.capture.model import HOW_TO_REGISTER, Instrument, InstrumentState
 from neeco.capture.points import sampled
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.lines import across_projectors
@@ -160,9 +160,7 @@ def _check_instruments(parsed: Parsed, extent: _Extent | None, pictures: Picture
     verdicts: dict[str, MotionVerdict] = {}
     if not parsed.registered and parsed.instruments:
         message = "instrument poses are 'unregistered': in a tracker's or robot's own frame, not the cameras' world"
-        remedy = (
-            "where an instrument is in the images must be learned, and cannot be checked here; register it if you can"
-        )
+        remedy = f"where an instrument is in the images cannot be checked; {HOW_TO_REGISTER}"
         parsed.header("instrument_frame").warning(message, remedy)
     cameras = CameraArrays.of([frame.camera for frame in parsed.frames])
     for instrument in parsed.instruments:
@@ -202,7 +200,9 @@ def _check_instrument(
     outside = "every image" if not visible.any() else f"{len(visible) - int(visible.sum())} of {len(visible)} images"
     fault, verdict = None, None
     if visible.mean() < MIN_VISIBLE:
-        evidence = _motion_evidence(parsed, instrument, pictures)
+        everywhere = all(instrument.name in frame.state.instruments for frame in parsed.frames)
+        clean = not errors_only(parsed.places[0].report.problems)
+        evidence = MotionEvidence.of(parsed, pictures) if everywhere and clean else None
         if evidence is None:
             fault = _instrument_fault(cameras, poses, float(visible.mean()))
         else:  # the images decide where they can
@@ -247,13 +247,6 @@ def _check_instrument(
             remedy = "a tracker drop-out or unit slip? repair the pose or drop the frame"
             places[index].child("pose").warning(message, remedy)
     return verdict
-
-
-def _motion_evidence(parsed: Parsed, instrument: Instrument, pictures: Pictures) -> MotionEvidence | None:
-    """The motion in the images, where they can be read and every frame has the instrument."""
-    everywhere = all(instrument.name in frame.state.instruments for frame in parsed.frames)
-    clean = not errors_only(parsed.places[0].report.problems)
-    return MotionEvidence.of(parsed, pictures) if everywhere and clean else None
 
 
 def _visible_body_point(cameras: CameraArrays, poses: np.ndarray) -> tuple[np.ndarray, float]:

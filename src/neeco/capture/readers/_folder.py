@@ -20,6 +20,7 @@ from neeco.capture.readers.parsed import Parsed, inside
 from neeco.errors import NeecoError
 from neeco.files import require_utf8
 from neeco.geometry.lens import Lens
+from neeco.placeholders import misplaced
 from neeco.plausible import other_size_fault
 
 
@@ -149,7 +150,7 @@ def _parse(path: Path, report: ProblemReport, transforms: str, background: float
     if os.path.isfile(path):
         path, transforms = path.parent, path.name
     if not os.path.isdir(path):
-        report.error(str(path), "", "no such folder", "give the folder of a capture")
+        report.error(str(path), "", *misplaced(path, "the folder of a capture"))
         return Parsed(path)
     try:
         file = inside(path, path, transforms)
@@ -172,6 +173,6 @@ def _parse(path: Path, report: ProblemReport, transforms: str, background: float
         return parse_colmap(models, path, report, as_source=as_source)
     if is_endonerf_folder(path):
         return parse_endonerf(path, report)
-    message = "no such file, nor transforms_train.json, a COLMAP model or poses_bounds.npy"
-    report.error("transforms.json", "", message, "is it a capture?")
+    content = "transforms.json, transforms_train.json, a COLMAP model or poses_bounds.npy"
+    report.error(str(path), "", *misplaced(path, "the folder of a capture", content))
     return Parsed(path)

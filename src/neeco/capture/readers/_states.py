@@ -67,7 +67,10 @@ def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
         nodes = _joint_nodes(item)
         joints = {joint: child.number() for joint, child in (nodes or {}).items()}
         known = {joint: value for joint, value in joints.items() if value is not None}
-        trust = _trust(item)
+        trust = item.child("trust").number() if item.has("trust") else None
+        if trust is not None and not 0 <= trust <= 1:
+            item.child("trust").error(f"is {trust:g}, not a share", "give 0 to 1, or leave it out")
+            trust = None
         uncertainty = parse_uncertainty(item.child("uncertainty"), known) if item.has("uncertainty") else None
         if name in states:
             item.child("name").error(f"{printable(name)} comes twice here", "keep one state per instrument")
@@ -182,15 +185,6 @@ def _deviations(node: Node, what: str) -> tuple[float, float, float] | None:
         node.error(f"{min(found):g} is no standard deviation", "give numbers of 0 or more")
         return None
     return found[0], found[1], found[2]
-
-
-def _trust(item: Node) -> float | None:
-    """The confidence of a tracked state; None where none is stated, or, reported, where it is no share."""
-    trust = item.child("trust").number() if item.has("trust") else None
-    if trust is not None and not 0 <= trust <= 1:
-        item.child("trust").error(f"is {trust:g}, not a share", "give 0 to 1, or leave it out")
-        return None
-    return trust
 
 
 def _is_unrecorded(joint: Node) -> bool:

@@ -81,11 +81,8 @@ def _by_name(parsed: Parsed) -> Parsed:
 def is_blender(document: Node) -> bool:
     """Return True if a transforms file has the field of view for intrinsics and no states, as Blender writes."""
     value = document.value
-    return "camera_angle_x" in value and "fl_x" not in value and not _lists_states(document)
-
-
-def _lists_states(document: Node) -> bool:
-    return "instruments" in document.value or any("instruments" in frame for frame in _frame_objects(document))
+    states = "instruments" in value or any("instruments" in frame for frame in _frame_objects(document))
+    return "camera_angle_x" in value and "fl_x" not in value and not states
 
 
 def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0, *, as_source: bool = False) -> Parsed:
@@ -189,7 +186,10 @@ def _parse_frames(
         name = splits.of(node, index)
         pose = node.child("transform_matrix").rigid()
         mask_path = _file(node.child("mask_path"), folder, parsed.root) if node.has("mask_path") else None
-        time = _time(node) if node.has("time") else float(index)
+        time = node.child("time").number() if node.has("time") else float(index)
+        if time is not None and (fault := time_fault(time)) is not None:
+            node.child("time").error(*fault)
+            time = None
         timed += node.has("time")
         instruments, tissue = parse_instruments(node), _tissue_of(node, parsed)
         if image_path is None:
@@ -212,14 +212,6 @@ def _parse_frames(
         parsed.timed = False
         for order, frame in enumerate(parsed.frames):
             parsed.frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
-
-
-def _time(frame: Node) -> float | None:
-    time = frame.child("time").number()
-    fault = None if time is None else time_fault(time)
-    if fault is not None:
-        frame.child("time").error(*fault)
-    return None if fault is not None else time
 
 
 def _parse_tissues(document: Node, folder: Path, parsed: Parsed) -> None:

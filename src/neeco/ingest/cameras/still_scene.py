@@ -165,7 +165,7 @@ def read_right_camera(
     if visible is not None and mask is not None:
         write_labels(mask, torch.from_numpy(visible.astype(np.uint8) * 255))
     names = {}
-    for done, (frame, image) in enumerate(video.read(sample)):
+    for done, (frame, image) in enumerate(video.read(sample), 1):
         progress("writing the right camera's frames", done, len(rows))
         row = rows[frame]
         names[row] = f"{stems[row]}_right.png"

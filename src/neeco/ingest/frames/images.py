@@ -234,7 +234,7 @@ def undistort_images(images: ChosenImages, lens: Lens, video: VideoSource, progr
 def _write(images: ChosenImages, video: VideoSource, progress: StageProgress) -> None:
     folder, names = images.folder / "raw", images.names
     folder.mkdir(exist_ok=True)
-    for done, (name, (_, image)) in enumerate(zip(names, video.read(images.selected.tolist()), strict=True)):
+    for done, (name, (_, image)) in enumerate(zip(names, video.read(images.selected.tolist()), strict=True), 1):
         progress("writing frames", done, len(names))
         straight = images.lens.undistort(image) if images.lens else image
         write_unsynced(folder / name, encoded_rgb(straight))
@@ -287,7 +287,7 @@ def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[i
     settings = recording.settings
 
     def images() -> Iterator[np.ndarray]:
-        for done, (_, image) in enumerate(data.video.read(range(count))):
+        for done, (_, image) in enumerate(data.video.read(range(count)), 1):
             progress("looking at the frames", done, count)
             yield image
 

@@ -108,7 +108,9 @@ def _header_and_rows(path: Path, lines: Sequence[Line]) -> tuple[list[str], list
         names = plain[place].cells
         if place > 0:
             names = _grouped(names, plain[place - 1].cells)
-        return _with_units(names, units), plain[place + (2 if units else 1) :]
+        known = [_unit_of(cell) for cell in units] + [None] * len(names)
+        names = [f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, known, strict=False)]
+        return names, plain[place + (2 if units else 1) :]
     commented = [line for line in lines if line.is_comment and line.number < plain[start].number]
     for line in reversed(commented):
         if len(line.cells) == len(plain[start].cells) and _names_columns(line, numeric):
@@ -145,11 +147,6 @@ def _unit_of(cell: str) -> str | None:
 def _are_units(cells: Sequence[str]) -> bool:
     filled = [cell for cell in cells if cell.strip("[]()- ")]
     return bool(filled) and sum(_unit_of(cell) is not None for cell in filled) > 0.5 * len(filled)
-
-
-def _with_units(names: Sequence[str], units: Sequence[str]) -> list[str]:
-    known = [_unit_of(cell) for cell in units] + [None] * len(names)
-    return [f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, known, strict=False)]
 
 
 def _grouped(names: list[str], groups: Sequence[str]) -> list[str]:

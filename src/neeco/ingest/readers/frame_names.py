@@ -46,7 +46,9 @@ class NamedFrame:
         """The question of a refusal; "" where nothing is open."""
         if self.frame is not None:
             return ""
-        *others, last = [f"frame: {name} ({_describe(name)})" for name in self.choices]
+        known = {name: f"the camera's, {axes.words}" for name, axes in CAMERA_FRAMES.items()}
+        known |= {BASE: "a robot's base or a tracker"}
+        *others, last = [f"frame: {name} ({known[name]})" for name in self.choices]
         return f"{self.why}; say so in the recording, under poses: {', '.join(others)}, or {last}"
 
     @property
@@ -134,11 +136,3 @@ def unsaid(*, dvrk: bool = False) -> NamedFrame:
 def of_dvrk(*names: str) -> bool:
     """Return whether any of some names of topics, columns or files is a dVRK's."""
     return any(_DVRK.search(name) for name in names)
-
-
-def _describe(frame: str) -> str:
-    """Return the meaning of a value of `frame`, in words."""
-    if frame == BASE:
-        return "a robot's base or a tracker"
-    convention = CAMERA_FRAMES[frame]
-    return f"the camera's, {convention.words}"

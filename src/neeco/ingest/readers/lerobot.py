@@ -109,7 +109,8 @@ class LeRobot(RecordingFormat):
         if part is not None and places[-1] >= len(places):  # the part was counted without the rows that were removed
             part = part[0], max(part[1], part[0] + (int(places[-1]) + 1) / data.fps)
         video = open_video(film.file, part=part)
-        numbers = _frame_numbers(video)
+        # the episode's frame of each of the video's, in which those that cannot be decoded are missing
+        numbers = np.rint(video.times / float(np.median(np.diff(video.times)))).astype(np.int64)
         damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
         count = int(places[-1]) + 1  # images that the states belong to, and those between
         last = int(numbers[-1]) + 1
@@ -322,12 +323,6 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.
         return stamps - stamps[0], order, rows, (f"{data.path.name}: {note}",)
     note = f"episode {episode.number}: its timestamps do not increase; taken as {data.fps:g} a second"
     return frames / data.fps, order, rows, (f"{data.path.name}: {note}",)
-
-
-def _frame_numbers(video: VideoSource) -> np.ndarray:
-    """Return the episode's frame of each of a video's, in which those that cannot be decoded are missing."""
-    step = float(np.median(np.diff(video.times)))
-    return np.rint(video.times / step).astype(np.int64)
 
 
 def _kind(feature: Feature) -> str:

@@ -289,8 +289,9 @@ class ParquetFile:
         part = self._file if wanted is None else self._file.subset(filter=wanted)
         for group in part.row_groups:
             data = self._file.metadata.row_group(group.id)
+            leaves = tuple(f"{name}." for name in columns)  # observation.state.list.element
             chunks = [data.column(index) for index in range(data.num_columns)]
-            read = [chunk for chunk in chunks if any(_is_of(chunk.path_in_schema, name) for name in columns)]
+            read = [chunk for chunk in chunks if f"{chunk.path_in_schema}.".startswith(leaves)]
             if sum(chunk.total_uncompressed_size for chunk in read) > MAX_BYTES:
                 raise NeecoError(
                     f"{self.path}: unpacks to over {MAX_BYTES >> 20} MiB at once; write smaller row groups"
@@ -345,11 +346,6 @@ def _whole(file: Path, name: str, values: np.ndarray) -> np.ndarray:
     if values.ndim != 1 or not np.issubdtype(values.dtype, np.integer) or (values < 0).any():
         raise NeecoError(f"{file}: {name}: holds no whole numbers from 0; download it again")
     return values
-
-
-def _is_of(path: str, column: str) -> bool:
-    """Return whether a leaf (`observation.state.list.element`) is of this column."""
-    return path == column or path.startswith(column + ".")
 
 
 def _boundary(path: Path) -> Path:

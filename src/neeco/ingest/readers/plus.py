@@ -54,7 +54,9 @@ class PlusSequence(RecordingFormat):
         found = []
         if sequence.has_images:
             frames, notes = _image_frames(sequence)
-            problem = None if len(frames) >= MIN_IMAGES else _too_few(sequence, frames, notes)
+            why = f" ({notes[0].partition(': ')[2]})" if notes else ""
+            few = f"{len(frames)} of {sequence.count} images can be used{why}; record again"
+            problem = None if len(frames) >= MIN_IMAGES else few
             color = "grey" if sequence.channels == 1 else "RGB"
             title = f"{color} images of {sequence.size[0]}x{sequence.size[1]}"
             rate = _rate(times, sequence.count)
@@ -191,12 +193,6 @@ def _image_frames(sequence: FrameSequence) -> tuple[list[int], list[str]]:
     if unstamped:
         notes.append(f"{name}: {unstamped} images have no {TIME} later than the one before; left out")
     return frames, notes
-
-
-def _too_few(sequence: FrameSequence, frames: Sequence[int], notes: Sequence[str]) -> str:
-    """Return why the images cannot be used, of which only these frames are good."""
-    why = f" ({notes[0].partition(': ')[2]})" if notes else ""
-    return f"{len(frames)} of {sequence.count} images can be used{why}; record again"
 
 
 def _times(sequence: FrameSequence) -> dict[int, float]:

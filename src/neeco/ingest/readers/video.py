@@ -24,6 +24,7 @@ from neeco.ingest.readers.columns import recognise_time, scale_of
 
 FURTHER_FORMATS = {".bmp": "BMP", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}  # opened under these names alone
 IMAGES = (".png", ".jpg", ".jpeg", *FURTHER_FORMATS)
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts", ".wmv", ".mxf")
 MIN_IMAGES = 2
 SQUARE = 0.005  # by which a square pixel's width and height may differ: 1 px of 200
 MAX_RATE = 1000.0  # frames a second, beyond which a file's own number is no rate
@@ -315,7 +316,8 @@ class _Scan:
                 order = [place for place, stamp in enumerate(ranked) if place == 0 or stamp > ranked[place - 1]]
                 notes.append(f"{self.path.name}: its frames' times fall; frames are taken in the order they are shown")
             if fps is not None:
-                own = _another_rate(1 / float(np.median(np.diff(times))), fps)
+                own = 1 / float(np.median(np.diff(times)))
+                own = None if abs(own / fps - 1) < SAME_RATE else own
                 times = np.arange(len(order)) / fps
             if own is not None:
                 notes.append(f"{self.path.name}: states {own:.4g} frames a second itself, the recording {fps:g}")
@@ -363,11 +365,6 @@ class _Scan:
         if self.turned:
             notes.append(f"{self.path.name}: states a rotation by {self.turned} degrees; its frames are used as stored")
         return notes
-
-
-def _another_rate(own: float, fps: float) -> float | None:
-    """A file's own frame rate where it is another than the one stated."""
-    return None if abs(own / fps - 1) < SAME_RATE else own
 
 
 def _rgb(frame: Any) -> np.ndarray:

@@ -18,12 +18,14 @@ from neeco.geometry.conventions import DVRK_ECM
 from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_of
-from neeco.ingest.recording.sections import Fault, existing_file, join_places, read_section, word
+from neeco.ingest.recording.sections import Fault, existing_file, faults_in, join_places, node_of, read_section, word
 
 BASE_KEY, WORLD_KEY = "camera_from_base", "world_from_base"  # to a still camera; to the laparoscope's tracker
 UNKNOWN = "unknown"
 DVRK_SD_MM, DVRK_SD_DEG = 8.0, 5.0  # accuracy of the dVRK's registration by a marker, by its own README: 5 to 10 mm
 MM = 1000.0  # per m
+STATED = f"{{transform: 4 rows, mm, sd_mm: {DVRK_SD_MM:g}, sd_deg: {DVRK_SD_DEG:g}}}"
+NEAR_MM = 10.0  # no base is nearer to a camera: a transform in metres
 WHAT = "a camera registration of the dVRK: JSON"
 _AXES = word((*CAMERA_FRAMES,), "is no convention", f"write one of {', '.join(CAMERA_FRAMES)}")
 
@@ -77,7 +79,7 @@ def same_base(one: StatedBase | None, other: StatedBase | None) -> bool:
 def _of_hand_eye(path: Path) -> StatedBase:
     """Read the YAML that easy_handeye saves, in metres: of a still camera (eye_on_hand: false), base_from_camera.
     Raises NeecoError."""
-    remedy = "give the YAML of easy_handeye, or write {transform: 4 rows, mm}"
+    remedy = f"give the YAML of easy_handeye, or write {STATED}"
     node = Node(parse_yaml(path, read_text(path, WHAT), remedy), str(path), "", RaisingReport())
     node.is_object()  # else it raises
     parameters, second = node.child("parameters"), node.has("transform")  # of easy_handeye2
@@ -94,14 +96,12 @@ def _of_hand_eye(path: Path) -> StatedBase:
     if not still:
         node.error(
             "does not say `eye_on_hand: false` (`calibration_type: eye_on_base`), so the camera may be on the robot",
-            "calibrate a camera that stands still, or write {transform: 4 rows, mm}",
+            f"calibrate a camera that stands still, or write {STATED}",
         )
     camera = parameters.child("tracking_base_frame") if parameters.has("tracking_base_frame") else None
     axes = CAMERA if camera is None else meaning_of(str(camera.value)).frame or ""
     if camera is not None and axes not in CAMERA_FRAMES:
-        camera.error(
-            f"is {printable(camera.value)}, and nothing says in which axes", "write {transform: 4 rows, mm, axes: …}"
-        )
+        camera.error(f"is {printable(camera.value)}, and nothing says in which axes", f"write {STATED[:-1]}, axes: …}}")
     numbers = [number for place in places if (number := place.number()) is not None]
     quaternion = np.array(numbers[3:])
     if not 0.99 < np.linalg.norm(quaternion) < 1.01:
@@ -129,6 +129,13 @@ def read_dvrk_registration(path: Path) -> StatedBase:
             f"{path}: is not {WHAT}; give the file …-registration-open-cv.json, or easy_handeye's YAML"
         ) from error
     node = Node(document, str(path), "", RaisingReport())
+    if isinstance(document, dict) and (key := next((key for key in ("matrix", "transform") if key in document), None)):
+        matrix = node.child(key).rigid()
+        if matrix is not None and np.abs(matrix[:3, 3]).max() < NEAR_MM:
+            node.child(key).error(f"is within {NEAR_MM:g} mm of the camera: in metres?", "give it in mm")
+        with faults_in(path):
+            usual = {"sd_mm": DVRK_SD_MM, "sd_deg": DVRK_SD_DEG, "transform": document.pop(key)}
+            return _stated(node_of(usual | document, path))
     if isinstance(document, dict) and "measured_cp" in document:
         node.child("measured_cp").error(
             "states the arm in the base of the arm that holds the scope, not in the camera's frame",
@@ -138,7 +145,7 @@ def read_dvrk_registration(path: Path) -> StatedBase:
     if not isinstance(frame.value, dict):
         frame.error(
             "is missing",
-            f"give {WHAT}, as …-registration-open-cv.json has it, or write {{transform: 4 rows, mm}} instead",
+            f"give {WHAT}, as …-registration-open-cv.json has it, or write {STATED} instead",
         )
     matrix = frame.child("transform").rigid()
     assert matrix is not None
@@ -155,14 +162,18 @@ def read_dvrk_registration(path: Path) -> StatedBase:
 
 
 def parse_base(node: Node) -> StatedBase:
-    """Return the base of `camera_from_base`: `unknown`, a file of the dVRK's registration or easy_handeye's, or a
-    BaseSection."""
+    """Return the base of `camera_from_base`: `unknown`, a file of the dVRK's registration, easy_handeye's or
+    the keys of a BaseSection, or such keys."""
     if node.value == UNKNOWN:
         return StatedBase()
     if isinstance(node.value, str):
         return read_dvrk_registration(existing_file(node))
     if not isinstance(node.value, dict):
-        raise Fault(node.field, f"expected `unknown`, a file or {{transform: …}}, found {printable(node.value)}")
+        raise Fault(node.field, f"expected `unknown`, a file or {STATED}, found {printable(node.value)}")
+    return _stated(node)
+
+
+def _stated(node: Node) -> StatedBase:
     stated = read_section(BaseSection, node)
     assert stated.transform is not None
     return StatedBase(CAMERA_FRAMES[stated.axes].poses_to_opencv(stated.transform), stated.sd_mm, stated.sd_deg)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,12 +63,13 @@ def draft_scope(
     calibrations: files of lenses in the folder of the frames' files; travel_mm: of the scope's own log, where there is
     one; stands_still: judges images, None: they are not looked at.
     """
-    left = frames[0]
-    right, stereo, problem = _second_camera(left, frames[1:], calibrations)
+    source = frames[0]
+    right, stereo, problem = _second_camera(source, frames[1:], calibrations)
     still, camera = False, "# camera: still          # or moving"
     looked = None
-    if stands_still is not None and (left.stream is not None or stereo):
-        looked = _looked(left, stands_still)
+    if stands_still is not None and (source.stream is not None or stereo):
+        with suppress(NeecoError):
+            looked = stands_still(source.open())
     if looked is False:
         camera += "; in frames spread over the recording, the background does not keep its place"
     elif looked and travel_mm is not None and travel_mm > MAX_TRAVEL_MM:
@@ -82,15 +84,8 @@ def draft_scope(
         example = f"# stereo: {{{(right or 'video: right.mp4')}, calibration: stereo.yaml}}"
         line = f"{example}   # {problem or 'its second camera, begun together: measures the depth of the tissue'}"
     return DraftedScope(
-        camera=camera, stereo=line, right=right, lens=_lens_remark(left, still), still=still,
+        camera=camera, stereo=line, right=right, lens=_lens_remark(source, still), still=still,
     )  # fmt: skip
-
-
-def _looked(frames: FoundFrames, stands_still: StandsStill) -> bool | None:
-    try:
-        return stands_still(frames.open())
-    except NeecoError:
-        return None
 
 
 def _second_camera(

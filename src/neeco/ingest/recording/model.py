@@ -225,12 +225,15 @@ class Recording:
             return lens, str(self.intrinsics)
         if isinstance(self.intrinsics, Path) and self.intrinsics.suffix.lower() == ".ini":  # which two cameras share
             return read_stereo(self.intrinsics)[0], str(self.intrinsics)
-        where = str(self.intrinsics) if isinstance(self.intrinsics, Path) else f"{self.path}: intrinsics"
+        flags = self.path == getattr(self.source, "folder", self.video)  # not a file that states a recording
+        place = "--intrinsics" if flags else f"{self.path}: intrinsics"
+        where = str(self.intrinsics) if isinstance(self.intrinsics, Path) else place
         try:
             return read_lens(self.intrinsics), where
         except NeecoError as error:
             # numbers know nothing of where they came from
-            raise NeecoError(f"{where}: {str(error).removeprefix('intrinsics: ')}") from error
+            problem = str(error).removeprefix("intrinsics: ").removeprefix(f"{where}: ")
+            raise NeecoError(f"{where}: {problem}") from error
 
 
 def _streams_of(file: Path) -> RecordingFormat | None:

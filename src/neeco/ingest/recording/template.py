@@ -19,7 +19,7 @@ from neeco.errors import NeecoError, visible
 from neeco.files import read_json, require_content
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers import IMAGES as IMAGE_STREAMS
-from neeco.ingest.readers import POSES, READINGS, Stream, format_of, numbers, read_table
+from neeco.ingest.readers import POSES, READINGS, Stream, Table, format_of, numbers, read_table
 from neeco.ingest.readers.columns import (
     BASE,
     MATRIX,
@@ -37,15 +37,15 @@ from neeco.ingest.readers.frame_names import NamedFrame, without_frame
 from neeco.ingest.readers.logs import with_named_frame
 from neeco.ingest.readers.ndi import tool_columns, tool_names
 from neeco.ingest.readers.rosbag import DVRK_WRIST
-from neeco.ingest.readers.video import IMAGES
+from neeco.ingest.readers.video import IMAGES, VIDEOS
 from neeco.ingest.recording.drafted_scope import FoundFrames, StandsStill, draft_scope
 from neeco.placeholders import placeholder
 
-VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts", ".wmv", ".mxf")
 MAX_FILES = 400  # looked at; a folder with more is not one recording
 MIN_IMAGES = 10  # in a folder of frames
 MAX_CALIBRATION_ROWS = 200
 MAX_OTHERS = 60  # listed as not used
+SAME_VALUES = 0.02  # of their span, by which copies of a log may differ: rounded, or a few rows less
 _EPISODES = re.compile(r"episodes (\d+) to (\d+)")
 _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)", re.IGNORECASE)
 
@@ -77,6 +77,10 @@ class _Log:
         return without_frame(self._name)
 
     @property
+    def place(self) -> str:
+        return ": ".join(filter(None, (self.file, self.stream.name if self.stream else None, self.tool)))
+
+    @property
     def _name(self) -> str:
         if self.stream is not None:
             return self.stream.body or re.sub(r"[^A-Za-z0-9]+", "_", self.stream.name).strip("_")
@@ -101,8 +105,8 @@ class _FolderFiles:
     syncs: list[str] = field(default_factory=list)
     poses: list[tuple[_Log, RecognisedColumns]] = field(default_factory=list)
     joints: list[tuple[_Log, RecognisedColumns, str, str | None]] = field(default_factory=list)
-    spans: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)  # of readings, by stream and column
     travels: dict[str, float] = field(default_factory=dict)  # mm, between the extremes of poses, by stream
+    values: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)  # `_summary`, by a log's place and column
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)  # of others, those that cannot be read
@@ -127,15 +131,15 @@ def write_template(
     Raises NeecoError when there are no images.
     """
     source = Path(source)
-    known = format_of(source)
-    if known is not None and source.exists():
+    if not source.exists():
+        raise NeecoError(f"{source}: no such file or folder; correct the path")
+    if (known := format_of(source)) is not None:
         known.require_package(source)
     require_content(source)
     if source.is_file() and (known is None or not known.streams(source)):
         raise NeecoError(f"{source}: is a file of no format that holds images and logs; give the recording's folder")
-    if not source.exists():
-        raise NeecoError(f"{source}: not there; give the recording's folder")
     found = _find_files(source)
+    _leave_out_copies(found)
     if not found.videos and not found.images:
         if found.image_problems:
             first, *rest = found.image_problems
@@ -145,9 +149,9 @@ def write_template(
     for problem in found.problems:
         report(problem)
     frames = [
-        FoundFrames(
-            _frames_line(log), log.file, found.folder / log.file, None if log.stream is None else log.stream.name
-        )
+        FoundFrames(f"video: {_scalar(log.file)}", log.file, found.folder / log.file)
+        if log.stream is None
+        else FoundFrames(f"video: {{{', '.join(log.lines())}}}", log.file, found.folder / log.file, log.stream.name)
         for log in found.videos
     ]
     frames += [
@@ -180,27 +184,6 @@ def write_template(
         others=found.others[:MAX_OTHERS],
         episodes=found.episodes,
     )
-
-
-# Lines of a draft that leave something open: what marks the first of them, and what to write there
-_QUESTIONS = (
-    (r"^  - name: ", "what is the instrument called in labels? Correct its name"),
-    (r"^ +# kinematics: \{dvrk_tool", "which tool is it? Remove the # and give its file, or write out its links below"),
-    (r"^ +# camera_from_base: \{transform", "how does the robot's base stand to the camera? Remove the # of one line"),
-    (r"a guess: correct it", "at which rate were these taken? Correct the number"),
-    (r"# units: .*nothing says them", "in which units? Correct them and remove the #"),
-    (r"is not clear: ", "which columns hold it? Name them"),
-    (r"^ +# +(?:frame|quaternion\w*|rotation\w*|euler\w*): ", "what do its poses mean? Correct it, remove the #"),
-)
-
-
-def open_questions(draft: str) -> list[tuple[int, str]]:
-    """Return the lines of a drafted recording.yaml, from 1, that only the one who recorded can answer, and what to
-    write there."""
-    found = []
-    for number, line in enumerate(draft.splitlines(), 1):
-        found += [(number, words) for marks, words in _QUESTIONS if re.search(marks, line)][:1]
-    return found
 
 
 def holds_streams(source: Path) -> bool:
@@ -279,30 +262,61 @@ def _classify_stream(found: _FolderFiles, log: _Log, stream: Stream, path: Path)
         header = table.header if stream.columns is None else (*(when.time or ()), *stream.columns)
         pose = recognise_pose(header)
         unit = split_unit(pose.position[0], "length")[1] if pose.position else None
-        if pose.position and unit:
-            places = numbers(table, pose.position)[0]
-            places = places[np.isfinite(places).all(axis=1)]
-            if len(places):
-                found.travels[stream.name] = UNITS["length"][unit] * float(np.linalg.norm(np.ptp(places, axis=0)))
+        places = _summary(found, log, table, pose.position or ())
+        if unit and np.isfinite(places).all():
+            found.travels[stream.name] = UNITS["length"][unit] * float(np.linalg.norm(places[2] - places[0]))
         found.poses.append((replace(log, in_base=table.frame in (None, BASE) and not stream.asks), pose))
-        found.joints += [(log, when, column, joint) for joint, column in stream.joints or ()]
+        for joint, column in stream.joints or ():
+            _summary(found, log, table, [column])
+            found.joints.append((log, when, column, joint))
         return
     angles = [column for column in table.header if split_unit(column, "angle")[1]]  # every angle is a joint
     named = [(None, column) for column in angles] if stream.joints is None else stream.joints
     for _, column in named:
-        values = numbers(table, [column])[0]
-        if np.isfinite(values).any():
-            found.spans[stream.name, column] = float(np.nanmin(values)), float(np.nanmax(values))
+        _summary(found, log, table, [column])
     found.joints += [(log, when, column, joint) for joint, column in named]
+
+
+def _leave_out_copies(found: _FolderFiles) -> None:
+    """List as not used what holds the values of another file's stream, in any unit."""
+    originals: list[tuple[_Log, str]] = []
+    found.poses.sort(key=lambda item: item[0].stream is None)
+    found.joints.sort(key=lambda item: item[0].stream is None)
+
+    def copied(log: _Log, column: str) -> bool:
+        values = found.values[log.place, column]
+        for other, of in originals:
+            if other.stream and other.file != log.file and _same(values, found.values[other.place, of]):
+                found.leave_out(f"{log.place}: {column} as in {other.place}: another copy of it")
+                return True
+        originals.append((log, column))
+        return False
+
+    found.poses = [item for item in found.poses if not copied(item[0], (item[1].position or ("",))[0])]
+    found.joints = [item for item in found.joints if not copied(item[0], item[2])]
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    """Return whether summaries [3, C] agree but for their unit."""
+    ratios = {a / b for kind in ("length", "angle") for a in UNITS[kind].values() for b in UNITS[kind].values()}
+    close = SAME_VALUES * (np.ptp(other, axis=0).max() or np.abs(other).max())
+    return one.shape == other.shape and any(np.allclose(ratio * one, other, rtol=0, atol=close) for ratio in ratios)
+
+
+def _summary(found: _FolderFiles, log: _Log, table: Table, columns: Sequence[str]) -> np.ndarray:
+    """Note and return the least, mean and greatest values [3, C] of columns over the rows that have all; NaN where none
+    has."""
+    values = numbers(table, columns)[0] if columns else np.empty((0, 1))
+    values = values[np.isfinite(values).all(axis=1)]
+    empty = np.full((3, values.shape[1]), np.nan)
+    summary = np.stack([values.min(0), values.mean(0), values.max(0)]) if len(values) else empty
+    found.values[log.place, next(iter(columns), "")] = summary
+    return summary
 
 
 def _without_place(message: str, path: Path, name: str) -> str:
     """A message without the file and the stream that it begins with."""
     return message.removeprefix(f"{path}: ").removeprefix(f"{name}: ").replace(str(path), path.name)
-
-
-def _frames_line(log: _Log) -> str:
-    return f"video: {_scalar(log.file)}" if log.stream is None else f"video: {{{', '.join(log.lines())}}}"
 
 
 def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
@@ -321,12 +335,14 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
                 found.leave_out(f"{name}: {tool}", _without_place(str(error), file, name))
                 continue
             found.poses.append((_Log(name, tool=tool), recognise_pose(own.header)))
+            _summary(found, _Log(name, tool=tool), own, found.poses[-1][1].position or ())
         return
     pose = recognise_pose(table.header)
     value, when = recognise_value(table.header)
     columns = [column for column in table.header if column]
     angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
     if pose.rotation or "rotation" in pose.unclear:
+        _summary(found, log, table, pose.position or ())
         found.poses.append((replace(log, meaning=meaning), pose))
         joints = joint_columns(columns, pose_bodies(columns))
         found.joints += [(log, when, column, _joint_of(column)) for column in joints]
@@ -338,12 +354,15 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
         found.calibrations.append((name, table.header))
     elif not (when.time and len(columns) <= 2):
         found.leave_out(f"{name}: columns {', '.join(columns[:10])[:100]}")
+    for column in [column for one, _, column, _ in found.joints if one == log]:
+        _summary(found, log, table, [column])
 
 
 def _is_sync(file: Path) -> bool:
     with suppress(NeecoError):
-        document = read_json(file)
-        return isinstance(document, dict) and any(key == "clocks" or key.endswith("_minus_video_s") for key in document)
+        held = document if isinstance(document := read_json(file), dict) else {}
+        offsets = held.get("clocks") or {key: held[key] for key in held if key.endswith("_minus_video_s")}
+        return isinstance(offsets, dict) and bool(offsets) and {*map(type, offsets.values())} <= {int, float}
     return False
 
 
@@ -413,7 +432,8 @@ def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value:
     time = [f"  time: {_list(when.time)}"] if when.time and log.stream is None else []
     # a table of several joints is a robot's, as its poses are
     clock = ["clock: em   # that of the poses: correct it where another computer logged it"]
-    lines = [*log.lines(), *(clock if named and log.stream is None else []), "columns:", *time]
+    own = [] if found.syncs else ["# clock: em   # left out, it is its own, whose offset nothing states"]
+    lines = [*log.lines(), *([] if log.stream else clock if named else own), "columns:", *time]
     lines.append(f"  value: {_scalar(value)}")
     stem = log.stem.lower()
     tables = [name for name, header in found.calibrations if value in header]
@@ -423,14 +443,11 @@ def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value:
     elif log.stream is None:
         lines.append("# calibration: table.csv   # of counts and angle_rad, where the values are counts")
     lines += _unit_lines(when, {} if tables else {"angle": (value,)})
-    span = found.spans.get((log.stream.name, value)) if log.stream is not None else None
-    if span is None or span[0] == span[1]:
+    least, _, most = found.values[log.place, value][:, 0].tolist()
+    if log.stream is None or not least < most:
         return [*lines, "# limits: [0, 1.5]   # rad, of the joint"]
-    low, high = math.floor(10 * span[0]) / 10, math.ceil(10 * span[1]) / 10
-    return [
-        *lines,
-        f"# limits: [{low:g}, {high:g}]   # how far it goes; its readings are {span[0]:.2f} to {span[1]:.2f}",
-    ]
+    low, high = math.floor(10 * least) / 10, math.ceil(10 * most) / 10
+    return [*lines, f"# limits: [{low:g}, {high:g}]   # how far it goes; its readings are {least:.2f} to {most:.2f}"]
 
 
 def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | None]) -> list[str]:

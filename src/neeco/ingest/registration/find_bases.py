@@ -104,7 +104,8 @@ def find_bases(
     arms = [_among_cameras(_arm(data, item, observed), registration) for item in unknown]
     found = {}
     # what moves most is found most easily, and then out of the way
-    for arm in sorted(arms, key=lambda arm: -arm.travel):
+    for number, arm in enumerate(sorted(arms, key=lambda arm: -arm.travel)):
+        progress("finding the robot's base", number, len(arms) if number else 0)
         name, clock = arm.item.name, arm.clock
         base, covered = _find(arm, observed, usable, alone=len(arms) == 1)
         usable = usable & ~covered

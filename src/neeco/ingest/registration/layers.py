@@ -232,7 +232,9 @@ def fit_layers(
     for share in EXCHANGED_SHARES:
         other = replace(medium, model=LayerModel(medium.model.arm.exchanged(share), WIDTHS_PX[1]))
         best, _ = _narrowed(other, mean, EXCHANGED_SD**2 * np.eye(N_PARAMETERS), N_TRIED[1], generator)
-        certainty = min(certainty, _certainty(other.losses(best) - losses))
+        # in standard deviations, where differences of one stretch are correlated
+        parts = np.array([part.mean() for part in np.array_split(other.losses(best) - losses, N_BLOCKS)])
+        certainty = min(certainty, float(parts.mean() / max(parts.std(ddof=1) / np.sqrt(N_BLOCKS), 1e-12)))
     mean, spread = _narrowed(fine, mean, WIDENING**2 * spread, N_TRIED[2], generator)
     base, clock, radius, ahead = fine.at(mean)
     return LayerFit(
@@ -267,12 +269,6 @@ def _narrowed(
         best = samples[order[: min(MAX_ELITE, count // 2)]]
         mean, spread = best.mean(0), 1.2 * np.cov(best.T)
     return mean, spread
-
-
-def _certainty(differences: np.ndarray) -> float:
-    """Mean of differences [F] in standard deviations, where those of one stretch are correlated."""
-    parts = np.array([part.mean() for part in np.array_split(differences, N_BLOCKS)])
-    return float(parts.mean() / max(parts.std(ddof=1) / np.sqrt(N_BLOCKS), 1e-12))
 
 
 def _covariance(trial: _Trial, mean: np.ndarray, generator: np.random.Generator) -> np.ndarray:

@@ -158,7 +158,8 @@ class _System:
         add(np.arange(BASE, start), np.zeros(LINE), np.array([LINE_SD_RAD] * 2 + [LINE_SD_MM] * 2))  # of a step
         prior, given = self.prior, self.prior.world_from_base
         if prior.sd_rad is not None and prior.sd_mm is not None:
-            add(np.arange(3), _turn_between(fit.world_from_base, given), prior.sd_rad)
+            turn = Rotation.from_matrix(fit.world_from_base[:3, :3] @ given[:3, :3].T)
+            add(np.arange(3), turn.as_rotvec(), prior.sd_rad)
             add(np.arange(3, 6), self.problem.pivot(fit.world_from_base) - self.problem.pivot(given), prior.sd_mm)
         if prior.sd_clock > 0:
             add(np.array([6]), np.array([fit.clock]), prior.sd_clock)
@@ -182,11 +183,6 @@ class _System:
     def prior_loss(self, fit: SilhouetteFit) -> float:
         """Sum of squares of the priors' residuals."""
         return float(np.square(self.prior_residuals(fit)[0]).sum())
-
-
-def _turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Rotation vector [3] rad by which a transform [4, 4] is turned against another."""
-    return np.asarray(Rotation.from_matrix(first[:3, :3] @ second[:3, :3].T).as_rotvec())
 
 
 def fit_silhouettes(

@@ -13,6 +13,7 @@ from neeco.geometry.lens import Lens
 from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_lengths, format_of
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
+from neeco.ingest.recording.base import STATED
 from neeco.ingest.recording.compatibility import check_recordings, episode_names, refusal
 from neeco.ingest.recording.model import STILL, Recording
 from neeco.ingest.timing.clock_search import GIVEN, MAX_LENGTH_S, ClockOffset
@@ -143,8 +144,8 @@ def require_answers(recording: Recording, poses: Mapping[str, PoseLog]) -> None:
         if recording.camera == STILL and in_base and base is None:
             raise NeecoError(
                 f"{place}: camera_from_base: missing; its poses are stated in a robot's base, and nothing says how "
-                "that stands to the camera: give {transform: 4x4, sd_mm: 8, sd_deg: 5} roughly measured, a file of the "
-                "dVRK's registration, or unknown (with kinematics)"
+                f"that stands to the camera: give {STATED} roughly measured, a file of the dVRK's registration, or "
+                "unknown (with kinematics)"
             )
         if base is not None and base.matrix is None and item.kinematics is None and len(item.joints) > 1:
             raise NeecoError(

@@ -114,9 +114,9 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
     explained = 1 - given / middle if middle > 0 else 0.0
     explains = bool(explained > MIN_JOINT_EXPLAINED and math.isfinite(explained))
     warning = scene.diagnostics.get("doubted_readings", {}).get(f"{instrument.name}.{name}")
-    cut_short = session.length.minutes is not None and session.length.is_short(session.iteration)
-    if cut_short:
-        verdict = f"not judged: {session.iteration} of {session.length.iterations:,} iterations are too few"
+    usual = replace(session.config, iterations=None).for_frames(len(session.views.frames)).length
+    if short := usual.is_short(session.iteration):
+        verdict = f"not judged: {session.iteration:,} iterations are too few, usual are {usual.iterations:,}"
     elif warning is not None:
         verdict = f"NOT found: {warning}"
     elif explains:
@@ -132,7 +132,7 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
             "unseen joint angles will look wrong (record a wider joint range, or check the joint's log)"
         )
     return {
-        "found": None if cut_short else explains and warning is None,
+        "found": None if short else explains and warning is None,
         "explained": round(explained, 4),
         **articulation.describe(name),
         "verdict": verdict,
