@@ -83,7 +83,17 @@ def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
         shelf.mkdir()
         return Verb(name, (*words, "--output", str(shelf / "out")), shelf, **more)  # type: ignore[arg-type]
 
-    draw = ("synthesize", str(run), "--no-tissue-check", "--min-share", "0", "--max-unobserved", "1", "--count")
+    draw = (
+        "synthesize",
+        str(run),
+        "--no-tissue-check",
+        "--min-share",
+        "0",
+        "--max-unobserved",
+        "1",
+        "--force",
+        "--count",
+    )
     made = {
         "train": lambda: verb("train", *train, touched=image, resume=("--resume",)),
         "synthesize": lambda: verb(
@@ -91,7 +101,7 @@ def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
         ),
         "workers": lambda: verb("workers", *draw, "10", "--workers", "2", resume=("--resume",), workers=True),
         "annotate": lambda: verb(
-            "annotate", "annotate", str(run), "--min-trust", "0", touched=image, resume=("--resume",)
+            "annotate", "annotate", str(run), "--min-trust", "0", "--force", touched=image, resume=("--resume",)
         ),
         "compare": lambda: verb(
             "compare", "compare", str(capture), "--methods", "3dgs", "kinematic", *settings[:2], touched=image

@@ -16,7 +16,7 @@ import yaml
 from forked import TESTS, Child, hasten_ingest, import_modules, module_at
 from PIL import Image
 
-DRAW = ["--no-tissue-check", "--min-share", "0", "--max-unobserved", "1"]
+DRAW = ["--no-tissue-check", "--min-share", "0", "--max-unobserved", "1", "--force"]  # of a run of 20 iterations
 
 
 def prepare(verbs: Sequence[str]) -> None:
@@ -72,7 +72,7 @@ def make_world(desk: Path, wanted: set[str]) -> None:
     (desk / "effects.yaml").write_text(yaml.safe_dump(effects))
     longer = {
         "set": ["synthesize", "run", "--count", "3", *DRAW],
-        "annotated": ["annotate", "run", "--min-trust", "0"],
+        "annotated": ["annotate", "run", "--min-trust", "0", "--force"],
         "compared": ["compare", "capture", "--methods", "3dgs", "--iterations", "3"],
     }
     for name in sorted(longer.keys() & wanted):

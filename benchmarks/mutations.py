@@ -185,10 +185,10 @@ CASES: dict[str, Case] = {
         2,
         ("run",),
     ),
-    "annotate": Case((*RUN, *CAPTURE), out("annotate", "run", "--min-trust", "0"), 0.4),
+    "annotate": Case((*RUN, *CAPTURE), out("annotate", "run", "--min-trust", "0", "--force"), 0.4),
     "annotate --resume": Case(
         ("annotated/dataset.json", "annotated/.records/*", "annotated/.records/*"),
-        lambda pick: ["annotate", "run", "--min-trust", "0", "--output", "annotated", "--resume"],
+        lambda pick: ["annotate", "run", "--min-trust", "0", "--force", "--output", "annotated", "--resume"],
         1,
         ("capture", "run"),
     ),

@@ -224,6 +224,11 @@ def test_names_of_classes_that_fit_no_instrument_are_refused(
     assert not (tmp_path / "set").exists()
 
 
+def test_a_value_that_is_no_number_is_refused_by_the_name_of_its_option() -> None:
+    with pytest.raises(NeecoError, match=r"--min-share: inf is not a finite number"):
+        Settings.from_values("synthesize", count=1, min_share=float("inf"))
+
+
 def test_a_larger_data_set_is_larger_in_every_format_it_was_begun_in(runs: list[FakeRun], tmp_path: Path) -> None:
     for count, formats in ((1, ("coco",)), (2, ("imagefolder",))):
         settings = Settings(count=count, tissue_tolerance_mm=2.0)

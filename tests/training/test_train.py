@@ -120,9 +120,12 @@ def test_a_full_folder_is_left_alone(capture: Path, tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["thesis.txt"]
 
 
-def test_a_loss_that_is_no_number_ends_the_run(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = neeco.training.session.photometric_loss
-    monkeypatch.setattr(neeco.training.session, "photometric_loss", lambda *a, **k: real(*a, **k) * float("nan"))
+@pytest.mark.parametrize("measure", ["photometric_loss", "mse_loss"])
+def test_a_loss_that_is_no_number_ends_the_run(
+    measure: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = getattr(neeco.training.session, measure)
+    monkeypatch.setattr(neeco.training.session, measure, lambda *a, **k: real(*a, **k) * float("nan"))
     with pytest.raises(NeecoError, match="the loss became nan at iteration 1, frame 0000"):
         train(capture, tmp_path / "run", config_of("3dgs"))
     assert not (tmp_path / "run" / "scene.safetensors").exists()

@@ -181,7 +181,11 @@ class Settings(ImageSettings):
         """The settings with `values`, by the fields' names; `owner` has them, in messages. Raises NeecoError naming the
         one that is unknown or does not fit."""
         given = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in values.items()}
-        settings = structure(cls, given, owner=owner)
+        try:
+            settings = structure(cls, given, owner=owner)
+        except NeecoError as error:
+            name, _, fault = str(error).partition(": ")
+            raise NeecoError(f"--{name.replace('_', '-')}: {fault}" if name in given else str(error)) from None
         settings.check()
         return settings
 

@@ -152,7 +152,8 @@ class GaussianSession(GaussianTraining):
         values = numbers(*terms)
         results = []
         for index, total, loss, squared_error in zip(chosen, values[::3], values[1::3], values[2::3], strict=True):
-            check_finite(total, self.iteration, f", frame {self.views.frames[index].name}")
+            for value in (total, squared_error):
+                check_finite(value, self.iteration, f", frame {self.views.frames[index].name}")
             results.append(StepResult.of(loss, squared_error))
             self.schedule.observe(self.iteration, loss, results[-1].psnr, progress)
         self._control_density(progress)
