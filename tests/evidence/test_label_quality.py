@@ -16,11 +16,11 @@ def view(label: slice, seed: int, *, dark: bool = False) -> Comparison:
     """A view of a shaft whose label covers the columns `label`: noisy tissue, a shadow beside the shaft; dark: a shaft
     that is a shade of the tissue but for larger residuals."""
     rng = np.random.default_rng(seed)
-    residual = np.exp(rng.normal(-3.6, 0.4, (HEIGHT, WIDTH)))
+    residual = np.exp(rng.normal(-3.6, 0.25, (HEIGHT, WIDTH)))
     shade = rng.normal(1, 0.05, (HEIGHT, WIDTH))
     shade[:, SHAFT.stop : SHAFT.stop + 8] = rng.uniform(0.5, 1, (HEIGHT, 8))
     width = SHAFT.stop - SHAFT.start
-    residual[:, SHAFT] = np.exp(rng.normal(-2.0 if dark else -0.5, 0.5, (HEIGHT, width)))
+    residual[:, SHAFT] = np.exp(rng.normal(-2.0 if dark else -0.5, 0.25, (HEIGHT, width)))
     shade[:, SHAFT] = rng.normal(0.55 if dark else 1.2, 0.1, (HEIGHT, width))
     rendered = np.zeros((HEIGHT, WIDTH))
     rendered[:, label] = 1

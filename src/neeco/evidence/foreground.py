@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.ndimage import gaussian_filter, minimum_filter, uniform_filter
 from torch import Tensor
 
 from neeco.capture.model import State
@@ -128,6 +128,7 @@ class Foreground:
             np.clip((sign * log_ratio - math.log(least)) / math.log(most / least), 0, 1)
             for sign, (least, most) in ((1, self.settings.instrument), (-1, self.settings.tissue))
         )
+        instrument = minimum_filter(instrument, self.settings.window_px)  # averages reach beyond outlines
         return np.asarray(np.where(view.usable, np.where(view.near(near), instrument, 0) - tissue, 0))
 
 
