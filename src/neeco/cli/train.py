@@ -55,14 +55,12 @@ def run(args: Arguments) -> int:
     from neeco.cli._progress import train_with_progress
     from neeco.raster.devices import device_of
     from neeco.training.config import FLAGS, training_config
-    from neeco.training.run import begun_config, load_run
+    from neeco.training.run import begun_config
 
     flags = {name: getattr(args, name) for name in FLAGS if name != "method"}
     begun = begun_config(args.output) if args.resume else None
     config = training_config(args.method, flags, args.set, begun)
     path = train_with_progress(args.capture, args.output, config, device_of(args.device), resume=args.resume)
-    doubts = load_run(path).doubts
-    print(f"verdict: {'DOUBTFUL: ' + '; '.join(doubts) if doubts else 'usable: nothing speaks against its labels'}")
     print(f"finished: {path}  (next: neeco evaluate {shlex.quote(str(path))})")
     return 0
 
