@@ -24,7 +24,7 @@ def view(label: slice, seed: int, *, dark: bool = False) -> Comparison:
     shade[:, SHAFT] = rng.normal(0.55 if dark else 1.2, 0.1, (HEIGHT, width))
     rendered = np.zeros((HEIGHT, WIDTH))
     rendered[:, label] = 1
-    return Comparison(shade, residual, rendered, np.ones((HEIGHT, WIDTH), bool))
+    return Comparison(shade, residual, residual, rendered, np.ones((HEIGHT, WIDTH), bool))
 
 
 def iou(label: slice) -> float:

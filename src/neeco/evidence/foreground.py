@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter, minimum_filter, uniform_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 from torch import Tensor
 
 from neeco.capture.model import State
@@ -54,11 +54,12 @@ SETTINGS = ForegroundSettings()
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """An image beside a scene's tissue: shade and residual [H, W], the label [H, W] in [0, 1] as rendered, and which
-    pixels count, bool [H, W]."""
+    """An image beside a scene's tissue: shade and residual [H, W], the residual of each pixel alone `own` [H, W], the
+    label [H, W] in [0, 1] as rendered, and which pixels count, bool [H, W]."""
 
     shade: np.ndarray
     residual: np.ndarray
+    own: np.ndarray
     label: np.ndarray
     usable: np.ndarray
 
@@ -81,7 +82,7 @@ class Comparison:
         brightness = settings.dark + uniform_filter(likely * tissue.mean(-1), window)
         label = channels[..., 0].cpu().numpy()
         usable = np.ones(label.shape, bool) if mask is None else mask.cpu().numpy()
-        return Comparison(shade, uniform_filter(off, window) / brightness, label, usable)
+        return Comparison(shade, uniform_filter(off, window) / brightness, off / brightness, label, usable)
 
     def near(self, share: float) -> np.ndarray:
         """bool [H, W]: pixels within `share` of the width of where an instrument may be rendered."""
@@ -123,13 +124,19 @@ class Foreground:
     def certainty(self, view: Comparison, near: float) -> np.ndarray:
         """Return of every pixel of a view [H, W]: 1 certainly an instrument, -1 certainly tissue, 0 not known. No
         instrument shows farther than `near` (share of the width) from a rendered one."""
-        log_ratio = self.ratio[_bins(view.residual, view.shade, self.settings)]
+        instrument, tissue = self._claims(view.residual, view.shade)
+        alone, _ = self._claims(view.own, view.shade)  # averages reach beyond outlines
+        instrument = np.where(view.near(near), np.minimum(instrument, alone), 0)
+        return np.asarray(np.where(view.usable, instrument - tissue, 0))
+
+    def _claims(self, residuals: np.ndarray, shades: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how certain pixels [H, W] are of an instrument, and of tissue, in [0, 1]."""
+        log_ratio = self.ratio[_bins(residuals, shades, self.settings)]
         instrument, tissue = (
             np.clip((sign * log_ratio - math.log(least)) / math.log(most / least), 0, 1)
             for sign, (least, most) in ((1, self.settings.instrument), (-1, self.settings.tissue))
         )
-        instrument = minimum_filter(instrument, self.settings.window_px)  # averages reach beyond outlines
-        return np.asarray(np.where(view.usable, np.where(view.near(near), instrument, 0) - tissue, 0))
+        return instrument, tissue
 
 
 def _bins(residuals: np.ndarray, shades: np.ndarray, settings: ForegroundSettings) -> tuple[np.ndarray, np.ndarray]:
