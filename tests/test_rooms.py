@@ -22,6 +22,7 @@ ROOMS = (  # from the top down; rooms of one line do not know each other
     ("methods",),
     ("training",),
     ("fitting",),
+    ("evidence",),
     ("scene",),
     ("capture",),
     ("raster",),

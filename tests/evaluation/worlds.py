@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,11 @@ class TinyScene:
 
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         return rasterize(self.at(state), camera, channels=self.label_channels() if labels and self.labelled else None)
+
+    @property
+    def canonical(self) -> SimpleNamespace:
+        rows = torch.arange(self.num_gaussians)
+        return SimpleNamespace(of_instruments=rows >= len(self.tissue))
 
     def motion(self) -> None:
         return None

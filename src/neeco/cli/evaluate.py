@@ -20,6 +20,7 @@ COLUMNS = (
     ("mask IoU", "mask_iou", "{:.3f}"),
     ("mask precision", "mask_precision", "{:.3f}"),
     ("mask recall", "mask_recall", "{:.3f}"),
+    ("estimated IoU", "estimated_iou", "{:.3f}"),
     ("recall on shafts", "shaft_recall", "{:.3f}"),
     ("shadow labelled", "shadow_labelled", "{:.1%}"),
     ("PSNR of observed tissue", "psnr_covered", "{:.2f}"),

@@ -10,12 +10,13 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neeco.capture.checks.truth import SHADOW_FOLDER
 from neeco.capture.images import read_mask
-from neeco.capture.model import Capture, Frame, State
+from neeco.capture.model import Capture, Frame, State, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
@@ -30,6 +31,8 @@ from neeco.evaluation.mask_metrics import (
     precision,
     to_truth_ids,
 )
+from neeco.evidence.foreground import Comparison, Foreground
+from neeco.evidence.label_quality import label_counts, quality_of
 from neeco.files import finite, require_inside, write_json
 from neeco.fitting.alignment import align_frame, pose_changes
 from neeco.geometry.camera import Camera
@@ -93,6 +96,7 @@ def labelled_shadow(mask: Tensor, truth: Tensor, shadow: Tensor, counted: Tensor
 
 
 EVALUATION_FILE = "evaluation.json"
+N_COMPARED = 12  # training frames from which instruments and tissue are told apart
 N_TIMED = 7  # renderings
 MAX_TIMED_S = 10.0  # after which a slow scene is not rendered again
 LPIPS_KEYS = {"alexnet": "lpips", "vgg16": "lpips_vgg"}  # AlexNet is the one its authors score with
@@ -106,6 +110,7 @@ class _Tally:
     parts: PartTally
     rows: list[dict[str, Any]] = field(default_factory=list)  # of every frame: its name, fit and scores
     scores: list[dict[str, float | None]] = field(default_factory=list)
+    counts: np.ndarray = field(default_factory=lambda: np.zeros(3))  # of `label_counts`, over all frames
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,7 @@ class _Context:
     capture: Capture
     networks: Mapping[str, Lpips]
     coverage: Mapping[str | None, Coverage]  # by tissue; None: there is one
+    foreground: Foreground | None  # tells instruments from tissue in images without masks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +161,8 @@ def evaluate_run(
     posed = require_gaussians(scene, "--align") if align else None
     report = progress or (lambda what, done, total: None)
     report("training views", 0, 1)
-    context = _Context(scene, posed, capture, networks, _coverage(scene, capture.split("train")))
+    train = capture.split("train")
+    context = _Context(scene, posed, capture, networks, _coverage(scene, train), _foreground(scene, train))
     report("training views", 1, 1)
     kinds = ("given", "aligned") if align else ("given",)
     names = truth_names(capture.root)
@@ -191,6 +198,21 @@ def evaluate_run(
     )
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
+
+
+def _foreground(scene: DrawableScene, frames: Sequence[Frame]) -> Foreground | None:
+    """Learn from training frames what is instrument; None where the scene does not tell instruments from tissue."""
+    if not is_gaussian(scene) or not scene.label_names:
+        return None
+    return Foreground.learned([_compared(scene, frames[place]) for place in evenly_spaced(len(frames), N_COMPARED)])
+
+
+def _compared(
+    scene: GaussianScene, frame: Frame, state: State | None = None, camera: Camera | None = None
+) -> Comparison:
+    """Compare a frame with the scene, in its own state unless another is given."""
+    learned = scene.recorded.as_learned(camera or frame.camera)
+    return Comparison.of(scene, state or frame.state, learned, frame.load_image(), frame.load_mask())
 
 
 def _coverage(scene: DrawableScene, frames: Sequence[Frame]) -> dict[str | None, Coverage]:
@@ -246,6 +268,8 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
             row["world_from_camera"] = camera.world_from_camera.tolist()
             row["joints"] = {name: dict(item.joints) for name, item in state.instruments.items()}
             row["world_from_instrument"] = {name: item.pose.tolist() for name, item in state.instruments.items()}
+        if context.foreground is not None and is_gaussian(scene):
+            tally.counts += label_counts(_compared(scene, frame, state, camera), context.foreground)
         drawing = draw(scene, state, camera)
         shadow = true_shadow
         if shadow is None and reference is not None and is_gaussian(scene):
@@ -300,6 +324,8 @@ def _scores(
 def _summary(scene: DrawableScene, tally: _Tally) -> tuple[dict[str, Any], dict[str, str]]:
     """Return means over the frames that have the number, and the assignment of the scene's pairs of parts."""
     numbers: dict[str, Any] = {key: mean_of([row[key] for row in tally.scores]) for key in tally.scores[0]}
+    quality = quality_of(tally.counts)
+    numbers |= {"estimated_iou": quality and quality.iou, "estimated_recall": quality and quality.recall}
     numbers["mask_frames"] = sum(row["psnr_instrument"] is not None for row in tally.scores)
     known = {part for _, part in scene.label_names}
     known |= {pair for pair, both in pairs_of(tally.parts.names.values()).items() if known & set(both)}

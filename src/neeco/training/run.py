@@ -21,6 +21,7 @@ from torch import Tensor
 from neeco import __version__
 from neeco.capture import Capture, fingerprint, read_capture
 from neeco.errors import NeecoError
+from neeco.evidence.label_quality import LABEL_QUALITY, LabelQuality
 from neeco.files import (
     YamlDumper,
     parse_yaml,
@@ -72,13 +73,9 @@ class TrainedRun:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons to doubt the labels, by what training measured: too few iterations, else joints not found."""
-        recorded, noted = len(self.scene.recorded.names), getattr(self.scene, "diagnostics", {})
-        usual = replace(method_defaults(self.config["method"]), iterations=None).for_frames(recorded).length
-        if usual.is_short(done := noted.get("iterations", usual.iterations)):
-            return (f"training ended after {done:,} iterations, usual are {usual.iterations:,}",)
-        joints = noted.get("joints", {}).items()
-        return tuple(f"joint {name}: {joint['verdict']}" for name, joint in joints if joint.get("found") is False)
+        """Reasons to doubt the labels (see `doubts_of`)."""
+        noted = getattr(self.scene, "diagnostics", {})
+        return doubts_of(noted, self.config["method"], len(self.scene.recorded.names))
 
     def require_trusted(self, verb: str) -> None:
         """Raise NeecoError where the labels that `verb` is to write are doubtful, unless `force`."""
@@ -99,6 +96,20 @@ class GaussianRun(TrainedRun):
     """A finished training run whose scene consists of Gaussians, which can be posed and labelled."""
 
     scene: GaussianScene
+
+
+def doubts_of(diagnostics: Mapping[str, Any], method: str, frames: int) -> tuple[str, ...]:
+    """Return the reasons to doubt the labels of a run on so many frames, by what training measured: too few iterations,
+    else labels that leave out what the images show of the instrument or take in tissue, and joints that were not
+    found."""
+    usual = replace(method_defaults(method), iterations=None).for_frames(frames).length
+    if usual.is_short(done := diagnostics.get("iterations", usual.iterations)):
+        return (f"training ended after {done:,} iterations, usual are {usual.iterations:,}",)
+    known = diagnostics.get(LABEL_QUALITY)
+    doubt = None if known is None else LabelQuality(known["recall"], known["precision"]).doubt
+    joints = diagnostics.get("joints", {}).items()
+    unfound = (f"joint {name}: {joint['verdict']}" for name, joint in joints if joint.get("found") is False)
+    return (*([doubt] if doubt else []), *unfound)
 
 
 def scene_digest(path: Path) -> str:

@@ -15,6 +15,8 @@ from torch import Tensor
 from torch.nn.functional import mse_loss
 
 from neeco.capture.model import Camera, Frame, State
+from neeco.evidence.foreground import Comparison, Foreground
+from neeco.evidence.label_quality import LABEL_QUALITY, label_counts, quality_of
 from neeco.fitting.refinement import Refinement
 from neeco.fitting.state_prediction import predict_corrections
 from neeco.raster import Rendering, rasterize
@@ -31,6 +33,8 @@ from neeco.training.density import GradientStatistics, control_density, reset_op
 from neeco.training.resolution import Resolution
 from neeco.training.schedule import Schedule, due, order_by_pose
 from neeco.training.silhouettes import Silhouettes
+
+N_JUDGED = 12  # training frames by which labels are judged at the end
 
 
 @dataclass(kw_only=True)
@@ -365,7 +369,23 @@ class GaussianSession(GaussianTraining):
             self._predict_states()
         self.refinement.scale_deviations(shares)
         scene.deformation.finish(self)
+        if scene.instruments:
+            self._judge_labels()
         scene.visibility()
+
+    @torch.no_grad()
+    def _judge_labels(self) -> None:
+        """Record how much of what the training images show of the instruments is labelled."""
+        views = []
+        for index in self.frames_along_poses(N_JUDGED):
+            state, camera = self.corrected(index)
+            views.append(Comparison.of(self.scene, state, camera, self.views.target(index), self.views.mask(index)))
+        foreground = Foreground.learned(views)
+        if foreground is None:
+            return
+        quality = quality_of(sum((label_counts(view, foreground) for view in views), np.zeros(3)))
+        if quality is not None:
+            self.scene.diagnostics[LABEL_QUALITY] = quality.as_json()
 
 
 def gaussian_session(training: GaussianTraining) -> GaussianSession:

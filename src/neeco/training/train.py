@@ -31,6 +31,7 @@ from neeco.training.run import (
     SCENE_FILE,
     STATES_FILE,
     checkpoint_path,
+    doubts_of,
     read_checkpoint,
     read_config,
     reporting_damage,
@@ -142,6 +143,9 @@ def train(
                     "train anew with another --seed or a milder schedule"
                 ) from None
             session.finish()
+            if getattr(session.scene, "instruments", ()):
+                doubts = doubts_of(session.scene.diagnostics, config.method, len(frames))
+                log.note(f"verdict: {'DOUBTFUL: ' + '; '.join(doubts) if doubts else 'usable: no doubt about labels'}")
             if states := session.training_states():
                 write_json(output / STATES_FILE, {"schema": "neeco-states/1", "frames": states})
             save_scene(session.scene, output / SCENE_FILE)

@@ -1,0 +1,190 @@
+"""Foreground of an image: how likely each pixel shows an instrument, given the tissue of a scene.
+
+The scene's tissue, rendered without instruments, is each image's background. A shadow dims it by one factor, so that a
+pixel is described by the factor that fits best (`shade`) and by what that leaves, as a share of the brightness
+(`residual`). Two densities of these two are learned from the images themselves: of tissue, where no instrument is near,
+lit as there or in any shade of a shadow; of the instruments, well inside of where they are rendered. Their ratio tells
+which of the two a pixel shows, and says nothing where both are alike: a black shaft is no shadow of dark cloth where
+its residuals differ from those of cloth, and undetermined where they do not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter, uniform_filter
+from torch import Tensor
+
+from neeco.capture.model import State
+from neeco.geometry.camera import Camera
+from neeco.raster import rasterize
+from neeco.scene.gaussian_scene import GaussianScene
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForegroundSettings:
+    """Settings of the comparison: of densities, and of when a pixel tells anything."""
+
+    window_px: int = 3  # over which residuals are averaged
+    dark: float = 0.03  # added to the brightness [0, 1] that residuals are shares of: the camera's noise in the dark
+    shadow: tuple[float, float] = (0.2, 1.05)  # range of shades of tissue; darker than any shadow is an instrument
+    residuals: tuple[float, float, int] = (-6.0, 1.0, 28)  # range of their logarithms, and bins
+    shades: tuple[float, float, int] = (0.0, 1.5, 15)  # range, and bins
+    smoothing: float = 1.0  # bins, standard deviation
+    # share of a uniform density in each: what was not sampled is not impossible; instruments have parts that were not
+    unsampled_tissue: float = 0.02
+    unsampled_instrument: float = 0.2
+    # ratios of the densities up to which a pixel tells nothing and from which on it tells all: of an instrument's to
+    # the tissue's, and of the tissue's to an instrument's
+    instrument: tuple[float, float] = (3.0, 20.0)
+    tissue: tuple[float, float] = (5.0, 30.0)
+    far: float = 0.04  # of the images' width from a rendered instrument: tissue without one
+    inside_px: int = 2  # from the outline of a rendered instrument: certainly one
+    least_pixels: int = 200  # of each kind, below which nothing is said
+    noise_quantile: float = 0.98  # of the tissue's residuals: its noise
+
+
+SETTINGS = ForegroundSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """An image beside a scene's tissue: shade and residual [H, W], the residual of each pixel alone `own` [H, W], the
+    label [H, W] in [0, 1] as rendered, and which pixels count, bool [H, W]."""
+
+    shade: np.ndarray
+    residual: np.ndarray
+    own: np.ndarray
+    label: np.ndarray
+    usable: np.ndarray
+
+    @staticmethod
+    @torch.no_grad()
+    def of(
+        scene: GaussianScene, state: State, camera: Camera, image: Tensor, mask: Tensor | None,
+        settings: ForegroundSettings = SETTINGS,
+    ) -> Comparison:  # fmt: skip
+        """Compare an image [H, W, 3] in [0, 1] of a `camera` with the scene in `state`."""
+        posed, instruments = scene.at(state), scene.canonical.of_instruments
+        channels = rasterize(posed, camera, channels=instruments.float()[:, None]).channels
+        assert channels is not None
+        tissue = rasterize(posed.select(~instruments), camera).color.clamp(0, 1).cpu().numpy()
+        shown, window = image.cpu().numpy(), settings.window_px
+        over, under = (uniform_filter((other * tissue).sum(-1), window) for other in (shown, tissue))
+        shade = over / np.maximum(under, 1e-6)
+        likely = np.clip(shade, *settings.shadow)
+        off = np.abs(shown - likely[..., None] * tissue).mean(-1)
+        brightness = settings.dark + uniform_filter(likely * tissue.mean(-1), window)
+        label = channels[..., 0].cpu().numpy()
+        usable = np.ones(label.shape, bool) if mask is None else mask.cpu().numpy()
+        return Comparison(shade, uniform_filter(off, window) / brightness, off / brightness, label, usable)
+
+    def near(self, share: float) -> np.ndarray:
+        """bool [H, W]: pixels within `share` of the width of where an instrument may be rendered."""
+        reach = 2 * math.ceil(share * self.label.shape[1]) + 1
+        return cv2.dilate((self.label > 0.1).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+
+    def inside(self, margin_px: int) -> np.ndarray:
+        """bool [H, W]: pixels so far inside of a rendered instrument."""
+        reach = 2 * margin_px + 1
+        return cv2.erode((self.label > 0.7).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Foreground:
+    """Tells instruments from tissue: the logarithm of the ratio of both densities [R, S] by bins of log residual and
+    shade; `noise`: the residual that nearly all of the tissue is below."""
+
+    ratio: np.ndarray
+    noise: float
+    settings: ForegroundSettings = SETTINGS
+
+    @staticmethod
+    def learned(views: Sequence[Comparison], settings: ForegroundSettings = SETTINGS) -> Foreground | None:
+        """Learn both densities from views; None where there is too little of either."""
+        far = [view.usable & ~view.near(settings.far) for view in views]
+        inside = [view.usable & view.inside(settings.inside_px) for view in views]
+        if min(sum(int(mask.sum()) for mask in masks) for masks in (far, inside)) < settings.least_pixels:
+            return None
+        lit = _counts(views, far, settings)
+        shaded, bound = _shaded(lit.sum(1) / lit.sum(), settings)
+        instrument = _without_tissue(_counts(views, inside, settings), bound, settings)
+        tissue = lit / lit.sum() + shaded / max(shaded.sum(), 1e-9)  # as often in a shadow as not
+        of_tissue = np.concatenate([view.residual[mask] for view, mask in zip(views, far, strict=True)])
+        noise = float(np.quantile(of_tissue, settings.noise_quantile))
+        instrument = _density(instrument, settings.unsampled_instrument, settings.smoothing)
+        tissue = _density(tissue, settings.unsampled_tissue, settings.smoothing)
+        return Foreground(np.log(instrument / tissue), noise, settings)
+
+    def certainty(self, view: Comparison, near: float) -> np.ndarray:
+        """Return of every pixel of a view [H, W]: 1 certainly an instrument, -1 certainly tissue, 0 not known. No
+        instrument shows farther than `near` (share of the width) from a rendered one."""
+        instrument, tissue = self._claims(view.residual, view.shade)
+        alone, _ = self._claims(view.own, view.shade)  # averages reach beyond outlines
+        instrument = np.where(view.near(near), np.minimum(instrument, alone), 0)
+        return np.asarray(np.where(view.usable, instrument - tissue, 0))
+
+    def _claims(self, residuals: np.ndarray, shades: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how certain pixels [H, W] are of an instrument, and of tissue, in [0, 1]."""
+        log_ratio = self.ratio[_bins(residuals, shades, self.settings)]
+        instrument, tissue = (
+            np.clip((sign * log_ratio - math.log(least)) / math.log(most / least), 0, 1)
+            for sign, (least, most) in ((1, self.settings.instrument), (-1, self.settings.tissue))
+        )
+        return instrument, tissue
+
+
+def _bins(residuals: np.ndarray, shades: np.ndarray, settings: ForegroundSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of residuals and shades [...] in the densities."""
+    found = []
+    for values, (low, high, count) in (
+        (np.log(np.maximum(residuals, 1e-6)), settings.residuals), (shades, settings.shades)
+    ):  # fmt: skip
+        found.append(((values - low) / (high - low) * count).astype(int).clip(0, count - 1))
+    return found[0], found[1]
+
+
+def _counts(views: Sequence[Comparison], masks: Sequence[np.ndarray], settings: ForegroundSettings) -> np.ndarray:
+    """Count the pixels of views in masks [H, W] by residual and shade, [R, S]."""
+    shape = settings.residuals[2], settings.shades[2]
+    counts = np.zeros(shape)
+    for view, mask in zip(views, masks, strict=True):
+        np.add.at(counts, _bins(view.residual[mask], view.shade[mask], settings), 1)
+    return counts
+
+
+def _shaded(lit: np.ndarray, settings: ForegroundSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Return the density of the tissue's residuals at every shade that a shadow may have [R, S], each column of sum 1,
+    0 at others, and its upper bound; lit: that of lit tissue [R]. Residuals are shares of the brightness: in a shadow
+    they stay where they are the tissue's, and grow as it darkens where they are the camera's noise. The bound is of
+    noise alone; in the density, anything between is as likely."""
+    (low, high, n_residuals), (dark, light, n_shades) = settings.residuals, settings.shades
+    density, bound = np.zeros((2, n_residuals, n_shades))
+    for column, shade in enumerate(np.linspace(dark, light, 2 * n_shades + 1)[1::2]):
+        if settings.shadow[0] < shade < settings.shadow[1]:
+            most = round(max(0.0, -math.log(shade)) / (high - low) * n_residuals)
+            shifted = [np.concatenate([np.zeros(bins), lit[: n_residuals - bins]]) for bins in range(most + 1)]
+            density[:, column], bound[:, column] = np.mean(shifted, 0), shifted[-1]
+    return density, bound
+
+
+def _without_tissue(inside: np.ndarray, bound: np.ndarray, settings: ForegroundSettings) -> np.ndarray:
+    """Return the counts [R, S] inside of rendered instruments less the tissue among them, such as shadows that the
+    scene takes for an instrument. bound [R, S]: density of the tissue's residuals at each shade, at most. Where half of
+    all pixels of a shade lie below its median, or nearly, they are tissue, all that lie within it; unless little would
+    be left: then the instrument looks like tissue."""
+    share = np.cumsum(bound, 0) - bound  # up to each row
+    below = (inside * (share < 0.5)).sum(0)
+    tissue = (bound.sum(0) > 0) & (below > inside.sum(0) / 4)
+    left = np.where(tissue & (share < settings.noise_quantile), 0, inside)
+    return left if left.sum() > inside.sum() / 4 else inside
+
+
+def _density(counts: np.ndarray, unsampled: float, smoothing: float) -> np.ndarray:
+    smooth: np.ndarray = gaussian_filter(counts, smoothing, mode="nearest")
+    return (1 - unsampled) * smooth / smooth.sum() + unsampled / smooth.size

@@ -1,0 +1,61 @@
+"""Quality of labels where no mask is known: what images show of an instrument against what is labelled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neeco.evidence.foreground import SETTINGS, Comparison, Foreground
+
+LABEL_QUALITY = "label_quality"  # of a scene's diagnostics
+LEAST_IOU = 0.8  # estimated, below which labels are doubtful
+NEAR = 0.2  # of the images' width: how far from a rendered instrument one may show that is not labelled
+LABELLED = 0.5  # rendered share of a pixel from which it is labelled
+CERTAIN = 0.25  # of certainty, from which a pixel counts
+
+
+@dataclass(frozen=True)
+class LabelQuality:
+    """Estimated quality of labels over some images, all in [0, 1]: the share of what images show of the instrument
+    that is labelled, the share of the label that does not show tissue, and the IoU that follows."""
+
+    recall: float
+    precision: float
+
+    @property
+    def iou(self) -> float:
+        """Intersection over union that follows."""
+        if min(self.recall, self.precision) <= 0:
+            return 0.0
+        return 1 / (1 / self.recall + 1 / self.precision - 1)
+
+    @property
+    def doubt(self) -> str | None:
+        """Reason to doubt these labels, if there is one."""
+        if self.iou >= LEAST_IOU:
+            return None
+        return (
+            f"labels cover {self.recall:.0%} of what the images show of the instrument, and {1 - self.precision:.0%} "
+            f"of them is tissue (estimated IoU {self.iou:.2f})"
+        )
+
+    def as_json(self) -> dict[str, float]:
+        """Return the numbers for files."""
+        return {"iou": self.iou, "recall": self.recall, "precision": self.precision}
+
+
+def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
+    """Count pixels of a view [3]: certain instrument that is labelled, that is not, and certain tissue that is."""
+    certainty, label = foreground.certainty(view, NEAR), view.label > LABELLED
+    instrument, tissue = certainty > CERTAIN, certainty < -CERTAIN
+    return np.array([(instrument & label).sum(), (instrument & ~label).sum(), (tissue & label).sum()])
+
+
+def quality_of(counts: np.ndarray) -> LabelQuality | None:
+    """Return the quality of labels with such counts [3], summed over their images; None where these show next to no
+    instrument for certain."""
+    both, missed, wrong = counts.tolist()
+    if both + missed < SETTINGS.least_pixels:
+        return None
+    return LabelQuality(both / (both + missed), both / max(1, both + wrong))

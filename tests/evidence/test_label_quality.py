@@ -1,0 +1,61 @@
+"""Without any mask, images tell how much of an instrument is labelled, and how much of the label is tissue."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from neeco.evidence.foreground import Comparison, Foreground
+from neeco.evidence.label_quality import label_counts, quality_of
+
+HEIGHT, WIDTH = 96, 128
+SHAFT = slice(50, 74)  # columns
+
+
+def view(label: slice, seed: int, *, dark: bool = False) -> Comparison:
+    """A view of a shaft whose label covers the columns `label`: noisy tissue, a shadow beside the shaft; dark: a shaft
+    that is a shade of the tissue but for larger residuals."""
+    rng = np.random.default_rng(seed)
+    residual = np.exp(rng.normal(-3.6, 0.25, (HEIGHT, WIDTH)))
+    shade = rng.normal(1, 0.05, (HEIGHT, WIDTH))
+    shade[:, SHAFT.stop : SHAFT.stop + 8] = rng.uniform(0.5, 1, (HEIGHT, 8))
+    width = SHAFT.stop - SHAFT.start
+    residual[:, SHAFT] = np.exp(rng.normal(-2.0 if dark else -0.5, 0.25, (HEIGHT, width)))
+    shade[:, SHAFT] = rng.normal(0.55 if dark else 1.2, 0.1, (HEIGHT, width))
+    rendered = np.zeros((HEIGHT, WIDTH))
+    rendered[:, label] = 1
+    return Comparison(shade, residual, residual, rendered, np.ones((HEIGHT, WIDTH), bool))
+
+
+def iou(label: slice) -> float:
+    both = max(0, min(label.stop, SHAFT.stop) - max(label.start, SHAFT.start))
+    return both / (label.stop - label.start + SHAFT.stop - SHAFT.start - both)
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("label", [SHAFT, slice(50, 66), slice(50, 60), slice(48, 79), slice(56, 78)])
+def test_the_estimated_iou_of_labels_is_near_the_true_one(label: slice, dark: bool) -> None:
+    views = [view(label, seed, dark=dark) for seed in range(3)]
+    foreground = Foreground.learned(views)
+    assert foreground is not None
+    quality = quality_of(sum((label_counts(shown, foreground) for shown in views), np.zeros(3)))
+    assert quality is not None
+    missed = label.start >= SHAFT.start and label.stop <= SHAFT.stop
+    assert quality.iou == pytest.approx(
+        iou(label), abs=0.06 if missed else 0.12
+    )  # of shadows that are labelled, less shows
+
+
+def test_labels_that_leave_out_a_dark_shaft_are_doubtful_and_right_ones_are_not() -> None:
+    for label, doubtful in ((slice(50, 60), True), (SHAFT, False)):
+        views = [view(label, seed, dark=True) for seed in range(3)]
+        foreground = Foreground.learned(views)
+        assert foreground is not None
+        quality = quality_of(sum((label_counts(shown, foreground) for shown in views), np.zeros(3)))
+        assert quality is not None
+        assert (quality.doubt is not None) == doubtful
+
+
+def test_nothing_is_said_of_images_without_an_instrument() -> None:
+    views = [view(slice(0, 0), seed) for seed in range(3)]
+    assert Foreground.learned(views) is None
