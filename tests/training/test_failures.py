@@ -277,6 +277,7 @@ def test_where_nothing_was_begun_nothing_is_resumed(
         ("window", "3"),
         ("window", '[["a", {}]]'),
         ("window", "[[NaN, 1]]"),
+        ("window", '[[1, "nan"]]'),
         ("scene", '{"a": 1}'),
     ],
 )

@@ -262,6 +262,8 @@ def read_checkpoint(run: Path) -> tuple[DrawableScene, dict[str, Any], dict[str,
         others = {name: t for name, t in tensors.items() if not name.startswith("scene/")}
         require_numbers(others)
         json.dumps(header, allow_nan=False)  # raises ValueError for NaN and infinity
+        if not all(isinstance(value, int | float) for row in header.get("window", []) for value in row):
+            raise ValueError("window: losses that are no numbers")
     return scene, header, others
 
 
