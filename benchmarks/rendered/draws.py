@@ -113,11 +113,6 @@ class World:
         return {"schema": "neeco-world/1", **asdict(self)}
 
     @property
-    def is_dark(self) -> bool:
-        """Whether the shaft is black."""
-        return self.finish == "black"
-
-    @property
     def lens(self) -> Lens:
         """The pinhole of the images; the vertical field of view does not depend on their size."""
         width, height = self.size

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +21,7 @@ from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussian
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
 from neeco.training.initial import begin_session
+from neeco.training.session import GaussianSession
 from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
 
 TISSUE, METAL = (0.6, 0.25, 0.2), (0.55, 0.57, 0.6)
@@ -59,7 +61,9 @@ def session_of(scene: Scene, noise: float = 0.0, metal: tuple[float, float, floa
     image += noise * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
     frames = (SimpleNamespace(name="a"),)
     views = SimpleNamespace(frames=frames, target=lambda index: image, mask=lambda index: None)
-    return SimpleNamespace(scene=scene, views=views, corrected=lambda index: (None, CAMERA), silhouettes=None)
+    session = SimpleNamespace(scene=scene, views=views, corrected=lambda index: (None, CAMERA), silhouettes=None)
+    session.compared = partial(GaussianSession.compared, session)
+    return session
 
 
 def test_images_tell_instrument_from_shadow_and_tissue_where_the_scene_is_wrong() -> None:

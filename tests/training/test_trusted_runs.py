@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.scene.training_session import UNLIMITED, RunLength
 from neeco.training.config import training_config
-from neeco.training.run import load_run
+from neeco.training.run import load_run, verdict_on
 from neeco.training.train import train
 
 SHORT = "its labels are doubtful: training ended after 3 iterations, usual are "
@@ -126,3 +127,17 @@ def test_an_equal_budget_of_minutes_counts_all_and_ends_at_once() -> None:
     length = RunLength(UNLIMITED, minutes=3)
     assert length.progress(5, seconds=180, prepared=100) == 1
     assert not length.is_short(5)
+
+
+@pytest.mark.parametrize(
+    ("measured", "verdict"),
+    [
+        ({}, "none: the images do not show how good the labels are"),
+        ({"label_quality": {"iou": 0.905, "recall": 0.95, "precision": 0.95}}, "usable: .*estimated IoU 0.9"),
+        ({"label_quality": {"iou": 0.5, "recall": 0.5, "precision": 1.0}}, "DOUBTFUL: labels cover 50% of what"),
+        ({"label_quality": {"iou": 0.905, "recall": 0.95, "precision": 0.95}, "iterations": 100}, "DOUBTFUL: training"),
+        ({"joints": {"a.jaw": {"found": False, "verdict": "NOT found"}}}, "DOUBTFUL: joint a.jaw: NOT found"),
+    ],
+)
+def test_a_verdict_says_no_more_than_was_measured(measured: dict[str, object], verdict: str) -> None:
+    assert re.match(verdict, verdict_on(measured, "kinematic", 60))

@@ -32,7 +32,7 @@ from neeco.evaluation.mask_metrics import (
     to_truth_ids,
 )
 from neeco.evidence.foreground import Comparison, Foreground
-from neeco.evidence.label_quality import label_counts, quality_of
+from neeco.evidence.label_quality import QUALITY, label_counts, quality_of
 from neeco.files import finite, require_inside, write_json
 from neeco.fitting.alignment import align_frame, pose_changes
 from neeco.geometry.camera import Camera
@@ -96,7 +96,6 @@ def labelled_shadow(mask: Tensor, truth: Tensor, shadow: Tensor, counted: Tensor
 
 
 EVALUATION_FILE = "evaluation.json"
-N_COMPARED = 12  # training frames from which instruments and tissue are told apart
 N_TIMED = 7  # renderings
 MAX_TIMED_S = 10.0  # after which a slow scene is not rendered again
 LPIPS_KEYS = {"alexnet": "lpips", "vgg16": "lpips_vgg"}  # AlexNet is the one its authors score with
@@ -204,15 +203,11 @@ def _foreground(scene: DrawableScene, frames: Sequence[Frame]) -> Foreground | N
     """Learn from training frames what is instrument; None where the scene does not tell instruments from tissue."""
     if not is_gaussian(scene) or not scene.label_names:
         return None
-    return Foreground.learned([_compared(scene, frames[place]) for place in evenly_spaced(len(frames), N_COMPARED)])
-
-
-def _compared(
-    scene: GaussianScene, frame: Frame, state: State | None = None, camera: Camera | None = None
-) -> Comparison:
-    """Compare a frame with the scene, in its own state unless another is given."""
-    learned = scene.recorded.as_learned(camera or frame.camera)
-    return Comparison.of(scene, state or frame.state, learned, frame.load_image(), frame.load_mask())
+    views = []
+    for frame in (frames[place] for place in evenly_spaced(len(frames), QUALITY.n_views)):
+        camera = scene.recorded.as_learned(frame.camera)
+        views.append(Comparison.of(scene, frame.state, camera, frame.load_image(), frame.load_mask()))
+    return Foreground.learned(views)
 
 
 def _coverage(scene: DrawableScene, frames: Sequence[Frame]) -> dict[str | None, Coverage]:
@@ -269,7 +264,8 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
             row["joints"] = {name: dict(item.joints) for name, item in state.instruments.items()}
             row["world_from_instrument"] = {name: item.pose.tolist() for name, item in state.instruments.items()}
         if context.foreground is not None and is_gaussian(scene):
-            tally.counts += label_counts(_compared(scene, frame, state, camera), context.foreground)
+            view = Comparison.of(scene, state, scene.recorded.as_learned(camera), image, mask)
+            tally.counts += label_counts(view, context.foreground)
         drawing = draw(scene, state, camera)
         shadow = true_shadow
         if shadow is None and reference is not None and is_gaussian(scene):

@@ -47,6 +47,8 @@ class ForegroundSettings:
     inside_px: int = 2  # from the outline of a rendered instrument: certainly one
     least_pixels: int = 200  # of each kind, below which nothing is said
     noise_quantile: float = 0.98  # of the tissue's residuals: its noise
+    max_noise: float = 0.12  # above which the tissue is not learned well enough to train labels by it
+    reach: float = 0.075  # of the images' width: no instrument shows farther from a rendered one while it is learned
 
 
 SETTINGS = ForegroundSettings()

@@ -9,10 +9,20 @@ import numpy as np
 from neeco.evidence.foreground import SETTINGS, Comparison, Foreground
 
 LABEL_QUALITY = "label_quality"  # of a scene's diagnostics
-LEAST_IOU = 0.8  # estimated, below which labels are doubtful
-NEAR = 0.2  # of the images' width: how far from a rendered instrument one may show that is not labelled
-LABELLED = 0.5  # rendered share of a pixel from which it is labelled
-CERTAIN = 0.25  # of certainty, from which a pixel counts
+
+
+@dataclass(frozen=True, kw_only=True)
+class QualitySettings:
+    """Settings of the estimate."""
+
+    n_views: int = 12  # training frames from which instruments and tissue are told apart
+    reach: float = 0.2  # of the images' width: how far from a rendered instrument one may show that is not labelled
+    labelled: float = 0.5  # rendered share of a pixel from which it is labelled
+    certain: float = 0.25  # certainty from which a pixel counts
+    least_iou: float = 0.8  # estimated, below which labels are doubtful
+
+
+QUALITY = QualitySettings()
 
 
 @dataclass(frozen=True)
@@ -33,7 +43,7 @@ class LabelQuality:
     @property
     def doubt(self) -> str | None:
         """Reason to doubt these labels, if there is one."""
-        if self.iou >= LEAST_IOU:
+        if self.iou >= QUALITY.least_iou:
             return None
         return (
             f"labels cover {self.recall:.0%} of what the images show of the instrument, and {1 - self.precision:.0%} "
@@ -47,8 +57,8 @@ class LabelQuality:
 
 def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
     """Count pixels of a view [3]: certain instrument that is labelled, that is not, and certain tissue that is."""
-    certainty, label = foreground.certainty(view, NEAR), view.label > LABELLED
-    instrument, tissue = certainty > CERTAIN, certainty < -CERTAIN
+    certainty, label = foreground.certainty(view, QUALITY.reach), view.label > QUALITY.labelled
+    instrument, tissue = certainty > QUALITY.certain, certainty < -QUALITY.certain
     return np.array([(instrument & label).sum(), (instrument & ~label).sum(), (tissue & label).sum()])
 
 

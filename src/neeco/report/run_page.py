@@ -54,6 +54,7 @@ LABEL_SCORES = (
     Score("mask_iou", "mask IoU", "{:.3f}", "Label mask against true mask: shared area over joint area; 1 is perfect."),
     Score("mask_precision", "precision", "{:.3f}", "How much of the label mask is truly instrument."),
     Score("mask_recall", "recall", "{:.3f}", "How much of the true mask is labelled."),
+    Score("estimated_iou", "estimated IoU", "{:.3f}", "The mask IoU, estimated from the images alone, without masks."),
     Score("shaft_recall", "recall, shafts", "{:.3f}", "How much of the true shafts is labelled instrument."),
     Score("shadow_labelled", "shadow labelled", "{:.1%}", "How much of the instruments' shadow on tissue is labelled."),
 )  # fmt: skip
@@ -193,7 +194,9 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
             what = f"overlap of labels and true masks (IoU; 1 is perfect), {split} frames {KIND_NAMES[labelled]}"
             tiles.append((f"{numbers['mask_iou']:.3f}", what))
     doubts = evaluation.get("doubts", ())
-    tiles.append(("doubtful" if doubts else "no doubt", "trust in the labels, by what training measured (see Notes)"))
+    measured = any(numbers.get("estimated_iou") is not None for numbers in evaluation["given"].values())
+    trust = "doubtful" if doubts else "no doubt" if measured else "unknown"
+    tiles.append((trust, "trust in the labels, by what training measured (see Notes)"))
     first = next(iter(evaluation["given"].values()), None)
     if first is not None:
         tiles.append((f"{first['fps']:.1f}", "images rendered per second, each of another state"))

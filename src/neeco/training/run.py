@@ -112,6 +112,15 @@ def doubts_of(diagnostics: Mapping[str, Any], method: str, frames: int) -> tuple
     return (*([doubt] if doubt else []), *unfound)
 
 
+def verdict_on(diagnostics: Mapping[str, Any], method: str, frames: int) -> str:
+    """Return in words what training measured of the labels (see `doubts_of`)."""
+    if doubts := doubts_of(diagnostics, method, frames):
+        return f"DOUBTFUL: {'; '.join(doubts)}"
+    if (known := diagnostics.get(LABEL_QUALITY)) is None:
+        return "none: the images do not show how good the labels are; score some masks"
+    return f"usable: labels agree with what the images show (estimated IoU {known['iou']:.2f})"
+
+
 def scene_digest(path: Path) -> str:
     """Return the SHA-256 of the scene in run folder `path`. Raises NeecoError for an unfinished run."""
     content = read_bytes(Path(path) / SCENE_FILE, "a learned scene", "no such file; train the run first")

@@ -16,7 +16,7 @@ from torch.nn.functional import mse_loss
 
 from neeco.capture.model import Camera, Frame, State
 from neeco.evidence.foreground import Comparison, Foreground
-from neeco.evidence.label_quality import LABEL_QUALITY, label_counts, quality_of
+from neeco.evidence.label_quality import LABEL_QUALITY, QUALITY, label_counts, quality_of
 from neeco.fitting.refinement import Refinement
 from neeco.fitting.state_prediction import predict_corrections
 from neeco.raster import Rendering, rasterize
@@ -33,8 +33,6 @@ from neeco.training.density import GradientStatistics, control_density, reset_op
 from neeco.training.resolution import Resolution
 from neeco.training.schedule import Schedule, due, order_by_pose
 from neeco.training.silhouettes import Silhouettes
-
-N_JUDGED = 12  # training frames by which labels are judged at the end
 
 
 @dataclass(kw_only=True)
@@ -194,6 +192,10 @@ class GaussianSession(GaussianTraining):
     def corrected(self, index: int) -> tuple[State, Camera]:
         """Return the state and camera of training frame `index` as refined so far."""
         return self.refinement.apply(index, *self.given[index], self.iteration)[:2]
+
+    def compared(self, index: int) -> Comparison:
+        """Return training frame `index` beside the scene as learned and refined so far."""
+        return Comparison.of(self.scene, *self.corrected(index), self.views.target(index), self.views.mask(index))
 
     def frames_along_poses(self, count: int) -> list[int]:
         """Return indices of at most `count` training frames, evenly spaced in the order of poses."""
@@ -376,10 +378,7 @@ class GaussianSession(GaussianTraining):
     @torch.no_grad()
     def _judge_labels(self) -> None:
         """Record how much of what the training images show of the instruments is labelled."""
-        views = []
-        for index in self.frames_along_poses(N_JUDGED):
-            state, camera = self.corrected(index)
-            views.append(Comparison.of(self.scene, state, camera, self.views.target(index), self.views.mask(index)))
+        views = [self.compared(index) for index in self.frames_along_poses(QUALITY.n_views)]
         foreground = Foreground.learned(views)
         if foreground is None:
             return

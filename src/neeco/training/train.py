@@ -31,7 +31,6 @@ from neeco.training.run import (
     SCENE_FILE,
     STATES_FILE,
     checkpoint_path,
-    doubts_of,
     read_checkpoint,
     read_config,
     reporting_damage,
@@ -40,6 +39,7 @@ from neeco.training.run import (
     resume_command,
     save_checkpoint,
     stored_config,
+    verdict_on,
     write_config,
 )
 from neeco.training.schedule import due
@@ -143,9 +143,8 @@ def train(
                     "train anew with another --seed or a milder schedule"
                 ) from None
             session.finish()
-            if getattr(session.scene, "instruments", ()):
-                doubts = doubts_of(session.scene.diagnostics, config.method, len(frames))
-                log.note(f"verdict: {'DOUBTFUL: ' + '; '.join(doubts) if doubts else 'usable: no doubt about labels'}")
+            if session.scene.label_names:
+                log.note(f"verdict: {verdict_on(session.scene.diagnostics, config.method, len(frames))}")
             if states := session.training_states():
                 write_json(output / STATES_FILE, {"schema": "neeco-states/1", "frames": states})
             save_scene(session.scene, output / SCENE_FILE)
