@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rendered.draws import SIZES, draw_world
+from rendered.draws import SIZES, World, draw_world
 from rendered.world_capture import write_world
 
 from neeco.errors import NeecoError
@@ -32,35 +32,63 @@ ROOT = Path(__file__).resolve().parents[1]
 METHOD = "import neeco.methods.kinematic.deformation as m; "
 SEARCH = "import neeco.methods.kinematic.discovery as m; "
 PASSES = "import neeco.methods.kinematic.state_passes as m; "
-NOTHING = "lambda *_: None"
-# mechanisms that can be switched off: by a statement before the command, or by options of `train`
-WITHOUT: dict[str, str | tuple[str, ...]] = {
-    "silhouettes": f"{METHOD}m.observe_silhouettes = {NOTHING}",
-    "interiors": f"{METHOD}m.fade_interior_tissue = {NOTHING}",
-    "states-before-training": f"{SEARCH}m.register_states = {NOTHING}",
-    "pose-registration": f"{SEARCH}m.correct_poses = {NOTHING}",
-    "state-fits": f"{METHOD}m.fit_states = {NOTHING}",
-    "contradictions": PASSES
-    + "; ".join(
-        f"m.{name} = {NOTHING}"
-        for name in ("refit_outliers", "judge_again", "judge_held_back", "hold_back", "leave_out_unexplained")
+NOTHING = "lambda *_, **__: None"
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """What can be switched off: by a statement before the command, or by options of `train`."""
+
+    left_out: str | tuple[str, ...]
+    linked: bool = False  # whether it works on stated links alone
+    joints: bool = False  # on logged joints alone
+    wrists: bool = False  # on wrists with stated links alone
+
+    def applies_to(self, world: World) -> bool:
+        """Whether the world has what the mechanism works on."""
+        links = world.links != "none" and world.joints
+        wrist = world.kind == "wrist"
+        return (
+            (links or not self.linked) and (world.joints or not self.joints) and (not self.wrists or (links and wrist))
+        )
+
+
+def _option(words: str, **needs: bool) -> Mechanism:
+    return Mechanism(("--set", words), **needs)
+
+
+WITHOUT: dict[str, Mechanism] = {
+    "silhouettes": Mechanism(f"{METHOD}m.observe_silhouettes = {NOTHING}"),
+    "interiors": Mechanism(f"{METHOD}m.fade_interior_tissue = {NOTHING}"),
+    "states-before-training": Mechanism(f"{SEARCH}m.register_states = {NOTHING}", linked=True),
+    "pose-registration": Mechanism(f"{SEARCH}m.correct_poses = {NOTHING}", linked=True),
+    "links-aligned": Mechanism(
+        f"{SEARCH}m.align_to_links = lambda session, links, evidence, name, shape, generator: shape", linked=True
     ),
-    "judging-again": f"{PASSES}m.judge_again = {NOTHING}",
-    "held-back": f"{PASSES}m.hold_back = m.judge_held_back = {NOTHING}",
-    "carving-again": f"{PASSES}m.carve_again = {NOTHING}",
-    "wrists-placed": f"{METHOD}m.place_wrists = {NOTHING}",
-    "wrists-again": ("--set", "deformation.refine_wrists=false"),
-    "shadow": ("--set", "deformation.shadow=false"),
-    "breathing": ("--set", "deformation.breathing=false"),
-    "label-sharpness": ("--set", "deformation.label_sharpness=0"),
-    "part-sharpness": ("--set", "deformation.part_sharpness=0"),
-    "spun-shaft": ("--set", "deformation.shaft_roll=0"),
-    "opacity-penalty": ("--set", "deformation.opacity_penalty=0"),
-    "extrapolated-tissue": ("--set", "deformation.extrapolate_tissue=false"),
-    "corrected-axes": ("--set", "deformation.stated_axes=false"),
-    "corrected-readings": ("--set", "deformation.stated_readings=false"),
-    "frame-poses": ("--set", "refine.frame_poses=false"),
-    "frame-joints": ("--set", "refine.frame_joints=false"),
+    "state-fits": Mechanism(f"{METHOD}m.fit_states = {NOTHING}"),
+    "contradictions": Mechanism(
+        PASSES
+        + "; ".join(
+            f"m.{name} = {NOTHING}"
+            for name in ("refit_outliers", "judge_again", "judge_held_back", "hold_back", "leave_out_unexplained")
+        )
+    ),
+    "judging-again": Mechanism(f"{PASSES}m.judge_again = {NOTHING}"),
+    "held-back": Mechanism(f"{PASSES}m.hold_back = m.judge_held_back = {NOTHING}"),
+    "carving-again": Mechanism(f"{PASSES}m.carve_again = {NOTHING}"),
+    "wrists-placed": Mechanism(f"{METHOD}m.place_wrists = {NOTHING}", wrists=True),
+    "wrists-again": _option("deformation.refine_wrists=false", wrists=True),
+    "shadow": _option("deformation.shadow=false"),
+    "breathing": _option("deformation.breathing=false"),
+    "label-sharpness": _option("deformation.label_sharpness=0"),
+    "part-sharpness": _option("deformation.part_sharpness=0"),
+    "spun-shaft": _option("deformation.shaft_roll=0"),
+    "opacity-penalty": _option("deformation.opacity_penalty=0"),
+    "extrapolated-tissue": _option("deformation.extrapolate_tissue=false"),
+    "corrected-axes": _option("deformation.stated_axes=false", linked=True),
+    "corrected-readings": _option("deformation.stated_readings=false", linked=True),
+    "frame-poses": _option("refine.frame_poses=false"),
+    "frame-joints": _option("refine.frame_joints=false", joints=True),
 }
 START = "import sys; from neeco.cli import main; sys.exit(main())"
 LAST_LINES = 12
@@ -77,10 +105,14 @@ class Build:
 
     def words(self, verb: str, *words: str) -> list[str]:
         """A command line of this build."""
-        left_out = WITHOUT.get(self.without, ())
+        left_out = WITHOUT[self.without].left_out if self.without else ()
         if isinstance(left_out, str):
             return [*self.python, "-c", f"{left_out}\n{START}", verb, *words]
         return [*self.python, "-c", START, verb, *words, *(left_out if verb == "train" else ())]
+
+    def applies_to(self, seed: int) -> bool:
+        """Whether the world has what is left out; elsewhere the build is the one that has all."""
+        return not self.without or WITHOUT[self.without].applies_to(draw_world(seed))
 
     @property
     def python(self) -> list[str]:
@@ -142,7 +174,12 @@ def run_all(
     builds: Sequence[Build], seeds: Sequence[int], work: Path, options: Sequence[str], workers: int, *, quick: bool
 ) -> None:
     """Run what is not there yet, every build on one world after the other; says each result as it comes."""
-    jobs = [(build, seed) for seed in seeds for build in builds if not result_path(work, build.title, seed).exists()]
+    jobs = [
+        (build, seed)
+        for seed in seeds
+        for build in builds
+        if build.applies_to(seed) and not result_path(work, build.title, seed).exists()
+    ]
     began = time.monotonic()
     with ProcessPoolExecutor(workers) as pool:
         drawn = {}
@@ -200,7 +237,7 @@ def _run(build: Build, seed: int, work: Path, options: tuple[str, ...]) -> dict[
     capture, run = capture_path(work, seed), run_path(work, build.title, seed)
     world = read_json(capture / "world.json")
     shutil.rmtree(run, ignore_errors=True)
-    checked = _command(build, "check", str(capture), "--json", "-")
+    checked = Ended(0, "", 0, 0) if build.without else _command(build, "check", str(capture), "--json", "-")
     scale = () if world["scale"] == 1.0 else ("--scale", str(world["scale"]))
     trained = _command(build, "train", str(capture), "--output", str(run), *scale, *options)
     result: dict[str, Any] = {

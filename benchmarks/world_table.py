@@ -104,6 +104,31 @@ def table_of(by_build: dict[str, list[Result]]) -> str:
     return "\n".join(lines)
 
 
+def ablations_of(reference: dict[int, Result], without: dict[str, dict[int, Result]]) -> str:
+    """Markdown: a row for each mechanism, over the worlds it applies to, the largest gain first. Results by seed: of
+    the build that has all, and of those that lack one mechanism each."""
+    rows = []
+    for name, by_seed in without.items():
+        seeds = [seed for seed in by_seed if seed in reference]
+        if not seeds:
+            continue
+        with_it, lacking = ([results[seed] for seed in seeds] for results in (reference, by_seed))
+        gains = np.array([iou_of(a) - iou_of(b) for a, b in zip(with_it, lacking, strict=True)])
+        a, b = summary_of(with_it), summary_of(lacking)
+        low, high = interval(gains)
+        rows.append((
+            gains.mean(),
+            f"| {name} | {np.count_nonzero(gains)} of {len(seeds)} | {gains.mean():+.3f} [{low:+.3f}, {high:+.3f}] "
+            f"| {gains.min():+.3f}, {gains.max():+.3f} | {a.worst_tenth:.3f}, {b.worst_tenth:.3f} "
+            f"| {a.failures}, {b.failures} | {a.silent}, {b.silent} | {a.seconds:.0f}, {b.seconds:.0f} |",
+        ))  # fmt: skip
+    head = [
+        "| mechanism | changes | gain of IoU | least, most | worst tenth: with, without | failures | silent | CPU s |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    return "\n".join([*head, *(line for _, line in sorted(rows, reverse=True))])
+
+
 STRATA: dict[str, Callable[[dict[str, Any]], str]] = {
     "shaft": lambda world: world["finish"],
     "background": lambda world: world["background"],

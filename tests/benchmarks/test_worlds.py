@@ -14,7 +14,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
 from rendered.draws import BACKGROUNDS, FINISHES, JAWS, KINDS, LINKS, SCOPES, SIZES, STATES, TRAIN_FRAMES, draw_world
 from rendered.world_capture import write_world
-from world_table import interval, summary_of, table_of
+from world_runs import WITHOUT
+from world_table import ablations_of, interval, summary_of, table_of
 
 from neeco.capture import read_capture
 from neeco.capture.checks import check_capture
@@ -72,3 +73,19 @@ def test_a_table_counts_failures_silence_and_false_alarms() -> None:
 def test_an_interval_holds_the_mean() -> None:
     low, high = interval(np.random.default_rng(0).normal(0.1, 0.05, 40))
     assert low < 0.1 < high
+
+
+def test_an_ablation_says_what_a_mechanism_gains() -> None:
+    whole = {seed: result(seed, 0.9) for seed in range(12)}
+    helped = {seed: result(seed, 0.8 if seed == 3 else 0.9) for seed in range(12)}
+    idle = {seed: result(seed, 0.9) for seed in range(5)}
+    rows = ablations_of(whole, {"idle": idle, "useful": helped, "unused": {}}).splitlines()[2:]
+    assert [row.split("|")[1:3] for row in rows] == [[" useful ", " 1 of 12 "], [" idle ", " 0 of 5 "]]
+    assert "+0.000, +0.100 | 0.900, 0.800" in rows[0]
+
+
+def test_a_mechanism_is_left_out_where_it_applies() -> None:
+    worlds = [draw_world(seed) for seed in range(60)]
+    for name, mechanism in WITHOUT.items():
+        assert any(mechanism.applies_to(world) for world in worlds), name
+    assert not any(WITHOUT["wrists-placed"].applies_to(world) for world in worlds if world.kind != "wrist")

@@ -169,6 +169,7 @@ def evaluate_run(
     sections: list[dict[str, Any]] = [{kind: {} for kind in kinds} for _ in range(4)]
     result, pair_assignment, per_frame, by_tissue = sections
     splits_of: dict[str, list[str]] = {}  # by note
+    doubts = list(run.doubts)
     for split in splits:
         frames = capture.split(split)
         tallies = {kind: _Tally(PartTally(names)) for kind in kinds}
@@ -181,6 +182,9 @@ def evaluate_run(
             result[kind][split] = numbers | {"fps": fps, "num_gaussians": count, "frames": len(frames)}
             per_frame[kind][split] = tally.rows
             by_tissue[kind][split] = _by_tissue(frames, tally.scores)
+        quality = quality_of(tallies[kinds[-1]].counts)  # at fitted poses where there are any: those of labels
+        if quality is not None and quality.doubt is not None:
+            doubts.append(f"{split}: {quality.doubt}")
         for note in _split_notes(result["given"][split]):
             splits_of.setdefault(note, []).append(split)
         if len(scene.recorded.tissues) > 1:
@@ -193,7 +197,7 @@ def evaluate_run(
     }
     parts = {"by_tissue": by_tissue} if len(scene.recorded.tissues) > 1 else {}
     evaluation: dict[str, Any] = finite(
-        result | {"notes": notes, "doubts": run.doubts, "labels": labels, "per_frame": per_frame} | parts
+        result | {"notes": notes, "doubts": doubts, "labels": labels, "per_frame": per_frame} | parts
     )
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation

@@ -14,14 +14,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from neeco.capture.model import HOW_TO_REGISTER, Frame
+from neeco.capture.model import HOW_TO_REGISTER, Frame, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.projection import project
+from neeco.methods.shaft_search import SETTINGS as SHAFT
+from neeco.methods.shaft_search import Silhouettes, find_shaft
 from neeco.raster import rasterize
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
@@ -29,6 +30,8 @@ from neeco.training.session import GaussianSession
 
 SOLID_LEVELS = (0.85, 0.75, 0.65)  # mean evidence of a solid point: the strictest level that enough points reach
 MIN_SOLID_POINTS = 8  # with fewer, nothing is carved
+N_LIKELY_POINTS = 600  # by which lines are searched
+LEAST_LIKELY = 0.4  # mean evidence of each
 MIN_COARSE_POINTS = 24  # solid points on the coarse grid; with fewer, the finer one is tried
 SEED_SPREAD = 0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame
 DARKEST_SHADOW = 0.66  # of the tissue's sRGB values: 40 % of its light
@@ -299,17 +302,31 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: C
     reach = 0.6 * evidence.distance
     views = posed_views(evidence, name, settings)
     for side in (settings.grid, settings.fine_grid):
-        solid, level = _solid_points(views, reach, side)
-        if len(solid) >= MIN_COARSE_POINTS:
+        points, scores, level = _solid_points(views, reach, side)
+        if int((scores > level).sum()) >= MIN_COARSE_POINTS:
             break
-    if len(solid) < MIN_SOLID_POINTS:
+    if int((scores > level).sum()) < MIN_SOLID_POINTS:
         return None
-    base, line, radius = _refine_axis(views, _shaft_frame(views, solid), 2 * reach / (side - 1), level)
-    if line.shape[0] < 4:
+    rows = torch.tensor(evenly_spaced(len(evidence.frames), SHAFT.n_frames), device=evidence.device)
+    coarse, fine = (
+        Silhouettes.of(
+            evidence.hits[rows], evidence.sizes[rows], evidence.intrinsics[rows], views.own[rows],
+            views.exchanged[0][rows], evidence.distance, width,
+        )
+        for width in SHAFT.widths_px
+    )  # fmt: skip
+    shaft = find_shaft(coarse, fine, points, scores, generator)
+    if shaft is None:
         return None
-    near, tip = float(line[0, 0]), float(line[-1, 0])
-    points = _sample_seeds(views.in_frame(base), near, tip, max(3 * radius, 0.08 * reach), settings.seeds, generator)
-    return _shape(base, line, radius, points, level)
+    direction, along = shaft.direction, (points - shaft.origin) @ shaft.direction
+    solid = along[scores > level]
+    ends = shaft.origin + torch.stack([solid.min(), solid.max()])[:, None] * direction
+    _, visible = score_points(evidence, views.own, ends)
+    if shaft.lead + float(visible[1] - visible[0]) < 0:  # the rear end is out of more images than the tip
+        direction = -direction
+    origin = shaft.origin + float((scores * along).sum() / scores.sum()) * shaft.direction
+    shape = carve_along(evidence, name, frame_along(origin, direction), level, generator, settings)
+    return None if shape is None else replace(shape, radius=shaft.radius)
 
 
 def carve_along(
@@ -340,30 +357,17 @@ def _shape(base: Tensor, line: Tensor, radius: float, points: Tensor, level: flo
     )
 
 
-def _solid_points(views: PosedViews, reach: float, side: int) -> tuple[Tensor, float]:
-    """Return the solid points [S, 3] of a grid of `side`^3 within `reach` mm of the frame's origin, and their level:
-    the strictest of SOLID_LEVELS that MIN_SOLID_POINTS of them reach."""
+def _solid_points(views: PosedViews, reach: float, side: int) -> tuple[Tensor, Tensor, float]:
+    """Return the N_LIKELY_POINTS points [Q, 3] with most evidence of a grid of `side`^3 within `reach` mm of the
+    frame's origin, their mean evidence [Q], and the strictest of SOLID_LEVELS that MIN_SOLID_POINTS of them reach."""
     ticks = torch.linspace(-reach, reach, side, device=views.evidence.device)
     grid = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     score, visible = views.scores(grid)
     score[visible <= 0.25] = 0
     level = next((level for level in SOLID_LEVELS if int((score > level).sum()) >= MIN_SOLID_POINTS), SOLID_LEVELS[-1])
-    return grid[score > level], level
-
-
-def _shaft_frame(views: PosedViews, solid: Tensor) -> Tensor:
-    """Return instrument_from_shaft [4, 4] by the principal axis of solid points [S, 3], towards the end that more
-    frames observe."""
-    center = solid.mean(0)
-    arm = (solid - center).double()
-    covariance = (arm[:, :, None] * arm[:, None, :]).sum(0)  # [3, 3]
-    direction = torch.from_numpy(np.linalg.eigh(covariance.cpu().numpy())[1][:, -1].copy()).to(solid)
-    along = (solid - center) @ direction
-    ends = torch.stack([center + along.min() * direction, center + along.max() * direction])
-    _, visible = score_points(views.evidence, views.own, ends)
-    if visible[0] > visible[1]:
-        direction = -direction
-    return frame_along(center, direction)
+    likely = score.topk(N_LIKELY_POINTS)
+    chosen = likely.indices[likely.values > LEAST_LIKELY]
+    return grid[chosen], score[chosen], level
 
 
 def frame_along(origin: Tensor, direction: Tensor) -> Tensor:
@@ -376,28 +380,6 @@ def frame_along(origin: Tensor, direction: Tensor) -> Tensor:
     frame[:3, 0], frame[:3, 1], frame[:3, 2] = x, torch.linalg.cross(direction, x), direction
     frame[:3, 3] = origin
     return frame
-
-
-def _refine_axis(views: PosedViews, base: Tensor, spacing: float, level: float) -> tuple[Tensor, Tensor, float]:
-    """Fit the axis to the solid's centre in slices, thrice; returns (base, centre line [Z, 3], radius mm)."""
-    half = 0.09 * views.evidence.distance
-    line, radius = base.new_zeros(0, 3), spacing
-    for _ in range(3):
-        rows, radius = _solid_line(views.in_frame(base), spacing, half, level)
-        if len(rows) < 4:
-            return base, base.new_zeros(0, 3), radius
-        line, area, visible = rows[:, :3], rows[:, 3], rows[:, 4]
-        near, tip = float(line[0, 0]), float(line[-1, 0])
-        # the ends are rarely observed (rear) or bend and open (front)
-        middle = (line[:, 0] > near + 0.15 * (tip - near)) & (line[:, 0] < near + 0.65 * (tip - near)) & (visible > 0.3)
-        if middle.sum() < 3:
-            middle = line[:, 0] < near + 0.65 * (tip - near)
-        slope = _robust_line(line[middle, 0], line[middle, 1:], (area * visible)[middle])
-        direction = base[:3, :3] @ torch.nn.functional.normalize(torch.cat([slope[0], slope.new_ones(1)]), dim=0)
-        origin = base[:3, :3] @ torch.cat([slope[1], slope.new_zeros(1)]) + base[:3, 3]
-        base = frame_along(origin, direction)
-        half = max(min(half, 4 * radius), 2 * spacing)
-    return base, line, radius
 
 
 def _solid_line(views: PosedViews, spacing: float, half: float, level: float) -> tuple[Tensor, float]:
@@ -434,25 +416,6 @@ def _slice_centers(views: PosedViews, spacing: float, half: float, level: float)
         area = (score > level).sum() * cell
         rows.append(torch.stack([z, center[0], center[1], area, visible.max()]))
     return torch.stack(rows) if rows else ticks.new_zeros(0, 5)
-
-
-def _robust_line(positions: Tensor, values: Tensor, weights: Tensor) -> Tensor:
-    """Fit slope and intercept [2, 2] of values [Z, 2] over positions [Z] by iteratively reweighted least squares.
-
-    In closed form: LAPACK's least squares may differ in the last bit from run to run with the memory's alignment.
-    """
-    robust = torch.ones_like(positions)
-    for _ in range(10):
-        weight = (weights * robust + 1e-9)[:, None]
-        total = weight.sum(0)
-        x = positions[:, None]
-        middle_x, middle_y = (weight * x).sum(0) / total, (weight * values).sum(0) / total
-        spread = (weight * (x - middle_x).square()).sum(0).clamp_min(1e-12)
-        slope = (weight * (x - middle_x) * (values - middle_y)).sum(0) / spread
-        intercept = middle_y - slope * middle_x
-        residual = (values - x * slope - intercept).norm(dim=1)
-        robust = 1 / (1 + (residual / residual.median().clamp_min(1e-3)) ** 2)
-    return torch.stack([slope, intercept])
 
 
 def _sample_seeds(
