@@ -56,6 +56,23 @@ def test_the_numbers_are_written_into_the_run_folder(world, tmp_path):
     assert "aligned" not in evaluation
 
 
+def test_labels_that_held_out_images_contradict_are_doubtful(world, tmp_path):
+    scene = world.TinyScene()
+    capture = world.make_capture(tmp_path, scene, ("train",) * 6 + ("test",) * 3, depth=24.0)
+    frames = [
+        world.moved(frame, world.translation(y=2.0), world.translation()) if frame.split == "test" else frame
+        for frame in capture.frames
+    ]
+    run = world.TinyRun(tmp_path, scene, replace(capture, frames=tuple(frames)), doubts=("few frames",))
+    evaluation = evaluated(run)
+    numbers = evaluation["given"]["test"]
+    assert numbers["mask_iou"] < 0.2
+    assert numbers["estimated_iou"] < 0.2
+    first, second = evaluation["doubts"]
+    assert first == "few frames"
+    assert second.startswith("test: labels cover")
+
+
 def test_aligned_scores_forgive_the_tracker_and_given_scores_do_not(world, tmp_path):
     run = make_run(world, tmp_path, ("train", "test"))
     wrong = world.moved(run.recorded.frames[1], world.translation(0.9, 0.6), world.translation())

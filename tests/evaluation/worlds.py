@@ -117,11 +117,14 @@ def state_at(x: float, y: float, z: float = 60.0, yaw: float = 0.0) -> State:
     return State({"bar": InstrumentState(translation(x, y, z, yaw))})
 
 
-def make_capture(root: Path, scene: TinyScene, splits: tuple[str, ...], *, truth: bool = True) -> Capture:
-    """One recorded image per entry of `splits`, drawn by the scene itself, so every score has a known best."""
+def make_capture(
+    root: Path, scene: TinyScene, splits: tuple[str, ...], *, truth: bool = True, depth: float = 60.0
+) -> Capture:
+    """One recorded image per entry of `splits`, drawn by the scene itself, so every score has a known best; the bar
+    `depth` mm from the world's origin."""
     frames = []
     for index, split in enumerate(splits):
-        state, camera = state_at(3.0 * index - 5, 2.0 * index - 3), camera_at(0.3 * index)
+        state, camera = state_at(3.0 * index - 5, 2.0 * index - 3, depth), camera_at(0.3 * index)
         rendering = rasterize(scene.at(state), camera, channels=TinyScene().label_channels())
         path = root / "images" / f"{index:03d}.png"
         write_image(path, rendering.color)
