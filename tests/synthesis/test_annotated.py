@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from rod_world import CAMERA, FakeRun, rod_state
+from rod_world import CAMERA, FakeRun, make_scene, rod_state
 
 from neeco import StoredImages
 from neeco.capture.images import write_image
@@ -156,6 +156,33 @@ def test_recorded_images_get_the_labels_that_the_scene_draws_at_fitted_poses(mad
         assert line["trust"]["value"] > 0.9
         assert line["moved"]["rod"]["mm"] + line["moved"]["camera"]["mm"] > 0.2
     assert {line["recorded_split"] for line in lines} == {"train", "test"}
+
+
+def test_a_label_without_its_shaft_is_not_trusted(tmp_path: Path) -> None:
+    """The rendering explains all that it labels; that an instrument shows beside it, only the image tells."""
+    camera = replace(CAMERA, fx=240.0, fy=240.0, cx=128.0, cy=96.0, width=256, height=192)
+    whole, frames = make_scene(), []
+    for index in range(6):
+        state = rod_state(x=2.0 * index - 7, y=3.0, jaw=0.1 * index)
+        with torch.no_grad():
+            image = whole.render(state, camera).color
+        noise = 0.02 * torch.randn(image.shape, generator=torch.Generator().manual_seed(index))
+        path = tmp_path / "images" / f"{index:03d}.png"
+        write_image(path, (image + noise).clamp(0, 1))
+        frames.append(Frame(path, camera, state, "test" if index == 2 else "train"))
+    points = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.float32))
+    (tmp_path / "scene.safetensors").write_bytes(b"the scene's bits")
+    trusted = []
+    for n_lost in (0, 45):  # of the 60 Gaussians of the shaft, from its rear on
+        scene = make_scene()
+        kept = torch.ones(len(scene.canonical), dtype=torch.bool)
+        tissue, instrument = scene.canonical.counts
+        kept[tissue : tissue + n_lost] = False
+        scene.canonical = scene.canonical.map(lambda tensor, kept=kept: tensor[kept], (tissue, instrument - n_lost))
+        run = RecordedRun(tmp_path, scene, Capture(tmp_path, tuple(frames), scene.instruments, points))
+        records = annotate_capture(run, tmp_path / f"without-{n_lost}", min_trust=0.0).records
+        trusted.append(min(record["trust"]["value"] for record in records))
+    assert trusted[0] > 0.8 > 0.65 > trusted[1]
 
 
 def test_a_frame_that_training_fitted_is_labelled_about_the_fitted_state(recorded: RecordedRun, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from neeco.capture.checks.truth import SHADOW_FOLDER
 from neeco.capture.images import read_mask
-from neeco.capture.model import Capture, Frame, State, evenly_spaced
+from neeco.capture.model import Capture, Frame, State
 from neeco.errors import NeecoError
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
@@ -32,7 +32,7 @@ from neeco.evaluation.mask_metrics import (
     to_truth_ids,
 )
 from neeco.evidence.foreground import Comparison, Foreground
-from neeco.evidence.label_quality import QUALITY, label_counts, quality_of
+from neeco.evidence.label_quality import label_counts, learned_foreground, quality_of
 from neeco.files import finite, require_inside, write_json
 from neeco.fitting.alignment import align_frame, pose_changes
 from neeco.geometry.camera import Camera
@@ -161,7 +161,14 @@ def evaluate_run(
     report = progress or (lambda what, done, total: None)
     report("training views", 0, 1)
     train = capture.split("train")
-    context = _Context(scene, posed, capture, networks, _coverage(scene, train), _foreground(scene, train))
+    context = _Context(
+        scene,
+        posed,
+        capture,
+        networks,
+        _coverage(scene, train),
+        learned_foreground(scene, train) if is_gaussian(scene) else None,
+    )
     report("training views", 1, 1)
     kinds = ("given", "aligned") if align else ("given",)
     names = truth_names(capture.root)
@@ -201,17 +208,6 @@ def evaluate_run(
     )
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
-
-
-def _foreground(scene: DrawableScene, frames: Sequence[Frame]) -> Foreground | None:
-    """Learn from training frames what is instrument; None where the scene does not tell instruments from tissue."""
-    if not is_gaussian(scene) or not scene.label_names:
-        return None
-    views = []
-    for frame in (frames[place] for place in evenly_spaced(len(frames), QUALITY.n_views)):
-        camera = scene.recorded.as_learned(frame.camera)
-        views.append(Comparison.of(scene, frame.state, camera, frame.load_image(), frame.load_mask()))
-    return Foreground.learned(views)
 
 
 def _coverage(scene: DrawableScene, frames: Sequence[Frame]) -> dict[str | None, Coverage]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from neeco.capture.model import Frame, evenly_spaced
 from neeco.evidence.foreground import SETTINGS, Comparison, Foreground
+from neeco.scene.gaussian_scene import GaussianScene
 
 LABEL_QUALITY = "label_quality"  # of a scene's diagnostics
 
@@ -20,6 +23,7 @@ class QualitySettings:
     labelled: float = 0.5  # rendered share of a pixel from which it is labelled
     certain: float = 0.25  # certainty from which a pixel counts
     least_iou: float = 0.8  # estimated, below which labels are doubtful
+    least_shown: int = 600  # px of an instrument in one image; of a smaller one, edges are too large a part
 
 
 QUALITY = QualitySettings()
@@ -55,6 +59,17 @@ class LabelQuality:
         return {"iou": self.iou, "recall": self.recall, "precision": self.precision}
 
 
+def learned_foreground(scene: GaussianScene, frames: Sequence[Frame]) -> Foreground | None:
+    """Learn from training frames what is instrument; None where the scene does not tell instruments from tissue."""
+    if not scene.label_names:
+        return None
+    views = []
+    for frame in (frames[place] for place in evenly_spaced(len(frames), QUALITY.n_views)):
+        camera = scene.recorded.as_learned(frame.camera)
+        views.append(Comparison.of(scene, frame.state, camera, frame.load_image(), frame.load_mask()))
+    return Foreground.learned(views)
+
+
 def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
     """Count pixels of a view [3]: certain instrument that is labelled, that is not, and certain tissue that is."""
     certainty, label = foreground.certainty(view, QUALITY.reach), view.label > QUALITY.labelled
@@ -62,10 +77,10 @@ def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
     return np.array([(instrument & label).sum(), (instrument & ~label).sum(), (tissue & label).sum()])
 
 
-def quality_of(counts: np.ndarray) -> LabelQuality | None:
-    """Return the quality of labels with such counts [3], summed over their images; None where these show next to no
-    instrument for certain."""
+def quality_of(counts: np.ndarray, least: int = SETTINGS.least_pixels) -> LabelQuality | None:
+    """Return the quality of labels with such counts [3], summed over their images; None where these show fewer than
+    `least` pixels of an instrument for certain."""
     both, missed, wrong = counts.tolist()
-    if both + missed < SETTINGS.least_pixels:
+    if both + missed < least:
         return None
     return LabelQuality(both / (both + missed), both / max(1, both + wrong))

@@ -54,7 +54,7 @@ class Shaft:
 
 
 @dataclass(frozen=True, eq=False)
-class Silhouettes:
+class CylinderViews:
     """Evidence of F frames for cylinders: unit rays [F, P, 3] of the cameras, what each pixel is worth [F, P],
     camera_from_instrument [F, 4, 4] as recorded, and with poses exchanged among the frames. `distance`: mm, that
     settings are shares of."""
@@ -67,8 +67,8 @@ class Silhouettes:
 
     @staticmethod
     def of(
-        hits: Tensor, sizes: Tensor, intrinsics: Tensor, own: Tensor, exchanged: Tensor, distance: float, width: int
-    ) -> Silhouettes:
+        *, hits: Tensor, sizes: Tensor, intrinsics: Tensor, own: Tensor, exchanged: Tensor, distance: float, width: int
+    ) -> CylinderViews:
         """Reduce evidence [F, H, W] in [0, 1] of images of `sizes` [F, 2] px to about `width` pixels."""
         pool = max(1, round(hits.shape[2] / width))
         small = avg_pool2d(hits[:, None], pool)[:, 0]
@@ -81,7 +81,7 @@ class Silhouettes:
         worth = torch.where(inside & moves, small - SETTINGS.threshold, 0.0)
         count = len(hits)
         rays = normalize(rays.reshape(count, -1, 3), dim=-1)
-        return Silhouettes(rays, worth.reshape(count, -1), own, exchanged, distance)
+        return CylinderViews(rays, worth.reshape(count, -1), own, exchanged, distance)
 
     def contrast(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return `gains` less those with exchanged poses."""
@@ -136,7 +136,7 @@ class Silhouettes:
 
 
 def find_shaft(
-    coarse: Silhouettes, fine: Silhouettes, points: Tensor, scores: Tensor, generator: torch.Generator
+    coarse: CylinderViews, fine: CylinderViews, points: Tensor, scores: Tensor, generator: torch.Generator
 ) -> Shaft | None:
     """Return the shaft of an instrument by points [Q, 3] mm on evidence, instrument frame, and their mean evidence [Q];
     None where these are no two apart. coarse, fine: the evidence for all candidates, and for the best of them."""

@@ -22,7 +22,7 @@ from neeco.capture.model import HOW_TO_REGISTER, Frame, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.geometry.projection import project
 from neeco.methods.shaft_search import SETTINGS as SHAFT
-from neeco.methods.shaft_search import Silhouettes, find_shaft
+from neeco.methods.shaft_search import CylinderViews, find_shaft
 from neeco.raster import rasterize
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
@@ -309,12 +309,17 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: C
         return None
     rows = torch.tensor(evenly_spaced(len(evidence.frames), SHAFT.n_frames), device=evidence.device)
     coarse, fine = (
-        Silhouettes.of(
-            evidence.hits[rows], evidence.sizes[rows], evidence.intrinsics[rows], views.own[rows],
-            views.exchanged[0][rows], evidence.distance, width,
+        CylinderViews.of(
+            hits=evidence.hits[rows],
+            sizes=evidence.sizes[rows],
+            intrinsics=evidence.intrinsics[rows],
+            own=views.own[rows],
+            exchanged=views.exchanged[0][rows],
+            distance=evidence.distance,
+            width=width,
         )
         for width in SHAFT.widths_px
-    )  # fmt: skip
+    )
     shaft = find_shaft(coarse, fine, points, scores, generator)
     if shaft is None:
         return None

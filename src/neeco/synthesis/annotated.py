@@ -1,6 +1,9 @@
 """`neeco annotate`: recorded frames, labelled by the scene, each with how far to trust its label.
 
-Trust is estimated in `neeco.evaluation.trust`.
+Trust is the smaller of two estimates of the label's overlap (IoU) with the instrument: by what the rendering leaves
+unexplained (`neeco.evaluation.trust`), where something covers the instrument; and by which pixels show an instrument
+(`neeco.evidence.label_quality`), where the scene has learned another shape. Over 136 frames of random worlds they
+correlate with the true IoU by .69 and .84, and are .10 and .02 too high on average; the smaller one by .84 and .015.
 """
 
 from __future__ import annotations
@@ -19,6 +22,8 @@ from neeco.capture.model import Capture, Frame, State
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import Trust, TypicalErrors, estimate_trust, typical_errors_of
+from neeco.evidence.foreground import Comparison, Foreground
+from neeco.evidence.label_quality import QUALITY, label_counts, learned_foreground, quality_of
 from neeco.fitting.alignment import STATE_ERRORS, AlignConfig, AlignedFrame, align_frame, pose_changes
 from neeco.geometry.distortion import field_pinhole
 from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
@@ -106,11 +111,13 @@ def annotate_capture(
     )
     with folder.being_written() as records:
         typical = typical_errors(scene, labeller, trained_on)
+        foreground = learned_foreground(scene, trained_on.split("train"))
         info["usual_errors"] = asdict(typical)
         annotator = _Annotator(
             scene=scene,
             labeller=labeller,
             typical=typical,
+            foreground=foreground,
             min_trust=min_trust,
             output=output,
             images=images,
@@ -138,6 +145,7 @@ class _Annotator:
     scene: GaussianScene
     labeller: CompositedLabels
     typical: TypicalErrors
+    foreground: Foreground | None
     min_trust: float
     output: Path
     images: ImageSettings
@@ -198,7 +206,14 @@ class _Annotator:
 
     def _fitted(self, frame: Frame, image: Tensor, start: Tensor | None) -> tuple[AlignedFrame, LayeredDrawing, Trust]:
         fit, drawing = fitted(self.scene, self.labeller, frame, image, start)
-        return fit, drawing, estimate_trust(drawing, image, frame.load_mask(), self.typical)
+        mask = frame.load_mask()
+        trust = estimate_trust(drawing, image, mask, self.typical)
+        if self.foreground is not None:
+            view = Comparison.of(self.scene, fit.state, self.scene.recorded.as_learned(fit.camera), image, mask)
+            quality = quality_of(label_counts(view, self.foreground), QUALITY.least_shown)
+            if quality is not None:
+                trust = replace(trust, value=min(trust.value, quality.iou))
+        return fit, drawing, trust
 
 
 def _without_keypoints_in(missing: Tensor, label: InstrumentLabel) -> InstrumentLabel:
