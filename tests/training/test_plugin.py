@@ -45,7 +45,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def test_an_installed_method_trains_evaluates_renders_synthesizes_and_is_viewed(site: Path, tmp_path: Path) -> None:
     install_plugin(site)
     capture, run = write_grasper(tmp_path / "capture", frames=12, sizes=((64, 48),)), tmp_path / "run"
-    settings = ["--set", "deformation.carving.tissue_steps=60", "--set", "deformation.carving.seeds=200"]
+    settings = ["--set", "deformation.carving.tissue_steps=60", "--set", "deformation.carving.seeds=1000"]
     assert (
         main(["train", str(capture), "--method", "rigid", "--output", str(run), "--iterations", "40", *settings]) == 0
     )
