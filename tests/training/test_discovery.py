@@ -90,6 +90,15 @@ def test_an_instrument_much_thinner_than_the_first_grid_is_carved() -> None:
     assert math.degrees(math.acos(min(1.0, float(direction[2])))) < 5
 
 
+def test_a_grid_of_few_points_carves_or_finds_nothing() -> None:
+    """`deformation.carving.grid` may be as small as 1; fewer points than the search looks for are no fault."""
+    evidence = make_evidence(MOUNTINGS["straight"])
+    for side in (1, 4, 8):
+        few = CarvingSettings(seeds=100, grid=side, fine_grid=side)
+        shape = carve(evidence, "tool", torch.Generator().manual_seed(0), few)
+        assert shape is None or len(shape.seeds) == 100
+
+
 def test_background_that_nothing_explains_is_not_carved() -> None:
     """A third of the still image is always evident; the instrument, which moves a little, is found beside it."""
     evidence = make_evidence(MOUNTINGS["straight"], motion=0.5)

@@ -11,7 +11,6 @@ rear, so that the two directions of a line differ.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -22,6 +21,8 @@ from torch.nn.functional import avg_pool2d, normalize
 class ShaftSettings:
     """Settings of the search. Lengths are shares of the median distance to the tissue."""
 
+    n_points: int = 600  # with most evidence, through which lines are tried
+    least_evidence: float = 0.4  # mean of each of these points
     n_frames: int = 16  # evenly spaced, that are compared
     widths_px: tuple[int, int] = (32, 64)  # of their evidence: for all candidates, and for the best
     n_pairs: int = 2400  # of points: candidates
@@ -83,10 +84,10 @@ class CylinderViews:
         rays = normalize(rays.reshape(count, -1, 3), dim=-1)
         return CylinderViews(rays, worth.reshape(count, -1), own, exchanged, distance)
 
-    def contrast(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return `gains` less those with exchanged poses."""
-        gains, leads, radii = self.gains(self.own, origins, directions)
-        return gains - self.gains(self.exchanged, origins, directions)[0], leads, radii
+    def contrast(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """Return what lines gain more than with exchanged poses [C] (see `gains`)."""
+        own, exchanged = (self.gains(poses, origins, directions)[0] for poses in (self.own, self.exchanged))
+        return own - exchanged
 
     def gains(
         self, transforms: Tensor, origins: Tensor, directions: Tensor, chunk: int = 64
@@ -150,10 +151,12 @@ def find_shaft(
     if not bool(apart.any()):
         return None
     origins, directions = points[firsts][apart], normalize(arms[apart], dim=1)
-    for count, gains_of in ((settings.n_likely, partial(coarse.gains, coarse.own)), (settings.n_best, coarse.contrast)):
-        gains, _, _ = gains_of(origins, directions)
-        best = gains.topk(min(count, len(gains))).indices
-        origins, directions = origins[best], directions[best]
+    gains, _, _ = coarse.gains(coarse.own, origins, directions)
+    best = gains.topk(min(settings.n_likely, len(gains))).indices
+    origins, directions = origins[best], directions[best]
+    contrast = coarse.contrast(origins, directions)
+    best = contrast.topk(min(settings.n_best, len(contrast))).indices
+    origins, directions = origins[best], directions[best]
     for number in range(settings.n_rounds):
         size = (len(origins) * settings.n_steps, 6)
         noise = torch.randn(size, generator=generator, device=generator.device).to(points) * 0.5**number

@@ -30,8 +30,6 @@ from neeco.training.session import GaussianSession
 
 SOLID_LEVELS = (0.85, 0.75, 0.65)  # mean evidence of a solid point: the strictest level that enough points reach
 MIN_SOLID_POINTS = 8  # with fewer, nothing is carved
-N_LIKELY_POINTS = 600  # by which lines are searched
-LEAST_LIKELY = 0.4  # mean evidence of each
 MIN_COARSE_POINTS = 24  # solid points on the coarse grid; with fewer, the finer one is tried
 SEED_SPREAD = 0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame
 DARKEST_SHADOW = 0.66  # of the tissue's sRGB values: 40 % of its light
@@ -363,15 +361,15 @@ def _shape(base: Tensor, line: Tensor, radius: float, points: Tensor, level: flo
 
 
 def _solid_points(views: PosedViews, reach: float, side: int) -> tuple[Tensor, Tensor, float]:
-    """Return the N_LIKELY_POINTS points [Q, 3] with most evidence of a grid of `side`^3 within `reach` mm of the
+    """Return the points [Q, 3] with most evidence of a grid of `side`^3 within `reach` mm of the
     frame's origin, their mean evidence [Q], and the strictest of SOLID_LEVELS that MIN_SOLID_POINTS of them reach."""
     ticks = torch.linspace(-reach, reach, side, device=views.evidence.device)
     grid = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     score, visible = views.scores(grid)
     score[visible <= 0.25] = 0
     level = next((level for level in SOLID_LEVELS if int((score > level).sum()) >= MIN_SOLID_POINTS), SOLID_LEVELS[-1])
-    likely = score.topk(N_LIKELY_POINTS)
-    chosen = likely.indices[likely.values > LEAST_LIKELY]
+    likely = score.topk(min(SHAFT.n_points, len(score)))
+    chosen = likely.indices[likely.values > SHAFT.least_evidence]
     return grid[chosen], score[chosen], level
 
 

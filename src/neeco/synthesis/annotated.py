@@ -2,8 +2,7 @@
 
 Trust is the smaller of two estimates of the label's overlap (IoU) with the instrument: by what the rendering leaves
 unexplained (`neeco.evaluation.trust`), where something covers the instrument; and by which pixels show an instrument
-(`neeco.evidence.label_quality`), where the scene has learned another shape. Over 136 frames of random worlds they
-correlate with the true IoU by .69 and .84, and are .10 and .02 too high on average; the smaller one by .84 and .015.
+(`neeco.evidence.label_quality`), where the scene has learned another shape.
 """
 
 from __future__ import annotations
