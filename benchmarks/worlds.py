@@ -78,7 +78,9 @@ def main() -> int:
     first = fresh_seed() if arguments.seed == "fresh" else int(arguments.seed)
     seeds = range(first, first + arguments.worlds)
     if arguments.verb == "ablate":
-        (commit,) = arguments.commits
+        commit, *others = arguments.commits
+        if others or ":" in commit:
+            raise NeecoError("--commits: ablate leaves mechanisms out of one build itself; give one commit or checkout")
         without = {name: f"{commit}:without-{name}" for name in WITHOUT}
         builds = builds_of([commit, *without.values()], arguments.work)
         run_all(builds, seeds, arguments.work, QUICK, arguments.workers, quick=True)
