@@ -6,6 +6,7 @@ A build is a commit, "." for this checkout or the folder of another, optionally 
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -15,7 +16,7 @@ import sys
 import sysconfig
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,52 +33,79 @@ ROOT = Path(__file__).resolve().parents[1]
 METHOD = "import neeco.methods.kinematic.deformation as m; "
 SEARCH = "import neeco.methods.kinematic.discovery as m; "
 PASSES = "import neeco.methods.kinematic.state_passes as m; "
+SESSION = "import neeco.training.session as m; "
 NOTHING = "lambda *_, **__: None"
+
+
+def always(world: World) -> bool:
+    """Every world."""
+    return True
+
+
+def jointed(world: World) -> bool:
+    """Joints are logged."""
+    return world.joints
+
+
+def linked(world: World) -> bool:
+    """Links are stated, and joints are logged."""
+    return world.links != "none" and world.joints
+
+
+def erring(world: World) -> bool:
+    """States have errors."""
+    return world.states != "exact"
+
+
+def mistaken(world: World) -> bool:
+    """States have larger errors than a tracker's, or some are wrong altogether."""
+    return world.states == "independent" or world.wrong > 0
+
+
+def mistaken_links(world: World) -> bool:
+    """The same, and links are stated."""
+    return mistaken(world) and linked(world)
+
+
+def based(world: World) -> bool:
+    """States are a robot's, whose base is off, and links are stated."""
+    return world.states == "encoders" and linked(world)
 
 
 @dataclass(frozen=True)
 class Mechanism:
-    """What can be switched off: by a statement before the command, or by options of `train`."""
+    """What can be left out, by a statement before the command or by options of `train`, and the worlds it works on."""
 
     left_out: str | tuple[str, ...]
-    linked: bool = False  # whether it works on stated links alone
-    joints: bool = False  # on logged joints alone
-    wrists: bool = False  # on wrists with stated links alone
-
-    def applies_to(self, world: World) -> bool:
-        """Whether the world has what the mechanism works on."""
-        links = world.links != "none" and world.joints
-        wrist = world.kind == "wrist"
-        return (
-            (links or not self.linked) and (world.joints or not self.joints) and (not self.wrists or (links and wrist))
-        )
+    applies_to: Callable[[World], bool] = always
 
 
-def _option(words: str, **needs: bool) -> Mechanism:
-    return Mechanism(("--set", words), **needs)
+def _option(words: str, applies_to: Callable[[World], bool] = always) -> Mechanism:
+    return Mechanism(("--set", words), applies_to)
 
 
 WITHOUT: dict[str, Mechanism] = {
     "silhouettes": Mechanism(f"{METHOD}m.observe_silhouettes = {NOTHING}"),
     "interiors": Mechanism(f"{METHOD}m.fade_interior_tissue = {NOTHING}"),
-    "states-before-training": Mechanism(f"{SEARCH}m.register_states = {NOTHING}", linked=True),
-    "pose-registration": Mechanism(f"{SEARCH}m.correct_poses = {NOTHING}", linked=True),
+    "states-before-training": Mechanism(f"{SEARCH}m.register_states = {NOTHING}", mistaken_links),
+    "pose-registration": Mechanism(f"{SEARCH}m.correct_poses = {NOTHING}", based),
     "links-aligned": Mechanism(
-        f"{SEARCH}m.align_to_links = lambda session, links, evidence, name, shape, generator: shape", linked=True
+        f"{SEARCH}m.align_to_links = lambda session, links, evidence, name, shape, generator: shape", linked
     ),
-    "state-fits": Mechanism(f"{METHOD}m.fit_states = {NOTHING}"),
+    "state-fits": Mechanism(f"{METHOD}m.fit_states = {NOTHING}", mistaken),
     "contradictions": Mechanism(
         PASSES
         + "; ".join(
             f"m.{name} = {NOTHING}"
             for name in ("refit_outliers", "judge_again", "judge_held_back", "hold_back", "leave_out_unexplained")
-        )
+        ),
+        mistaken,
     ),
-    "judging-again": Mechanism(f"{PASSES}m.judge_again = {NOTHING}"),
-    "held-back": Mechanism(f"{PASSES}m.hold_back = m.judge_held_back = {NOTHING}"),
-    "carving-again": Mechanism(f"{PASSES}m.carve_again = {NOTHING}"),
-    "wrists-placed": Mechanism(f"{METHOD}m.place_wrists = {NOTHING}", wrists=True),
-    "wrists-again": _option("deformation.refine_wrists=false", wrists=True),
+    "judging-again": Mechanism(f"{PASSES}m.judge_again = {NOTHING}", mistaken),
+    "held-back": Mechanism(f"{PASSES}m.hold_back = m.judge_held_back = {NOTHING}", mistaken),
+    "carving-again": Mechanism(f"{PASSES}m.carve_again = {NOTHING}", mistaken),
+    "wrists-placed": Mechanism(f"{METHOD}m.place_wrists = {NOTHING}", jointed),
+    "wrists-again": _option("deformation.refine_wrists=false", jointed),
     "shadow": _option("deformation.shadow=false"),
     "breathing": _option("deformation.breathing=false"),
     "label-sharpness": _option("deformation.label_sharpness=0"),
@@ -85,10 +113,11 @@ WITHOUT: dict[str, Mechanism] = {
     "spun-shaft": _option("deformation.shaft_roll=0"),
     "opacity-penalty": _option("deformation.opacity_penalty=0"),
     "extrapolated-tissue": _option("deformation.extrapolate_tissue=false"),
-    "corrected-axes": _option("deformation.stated_axes=false", linked=True),
-    "corrected-readings": _option("deformation.stated_readings=false", linked=True),
-    "frame-poses": _option("refine.frame_poses=false"),
-    "frame-joints": _option("refine.frame_joints=false", joints=True),
+    "corrected-axes": _option("deformation.stated_axes=false", linked),
+    "corrected-readings": _option("deformation.stated_readings=false", linked),
+    "predicted-errors": Mechanism(f"{SESSION}m.GaussianSession._predict_states = {NOTHING}", erring),
+    "frame-poses": _option("refine.frame_poses=false", erring),
+    "frame-joints": _option("refine.frame_joints=false", jointed),
 }
 START = "import sys; from neeco.cli import main; sys.exit(main())"
 LAST_LINES = 12
@@ -109,10 +138,6 @@ class Build:
         if isinstance(left_out, str):
             return [*self.python, "-c", f"{left_out}\n{START}", verb, *words]
         return [*self.python, "-c", START, verb, *words, *(left_out if verb == "train" else ())]
-
-    def applies_to(self, seed: int) -> bool:
-        """Whether the world has what is left out; elsewhere the build is the one that has all."""
-        return not self.without or WITHOUT[self.without].applies_to(draw_world(seed))
 
     @property
     def python(self) -> list[str]:
@@ -170,15 +195,21 @@ def _checked_out(commit: str, folder: Path) -> Path:
     return path
 
 
+def worlds_of(mechanism: str, first: int, count: int) -> list[int]:
+    """Seeds, from `first` on, of as many worlds that have what the mechanism works on."""
+    suited = (seed for seed in itertools.count(first) if WITHOUT[mechanism].applies_to(draw_world(seed)))
+    return list(itertools.islice(suited, count))
+
+
 def run_all(
-    builds: Sequence[Build], seeds: Sequence[int], work: Path, options: Sequence[str], workers: int, *, quick: bool
+    worlds: Mapping[int, Sequence[Build]], work: Path, options: Sequence[str], workers: int, *, quick: bool
 ) -> None:
-    """Run what is not there yet, every build on one world after the other; says each result as it comes."""
+    """Run what is not there yet: `worlds` has the builds by seed. Says each result as it comes."""
     jobs = [
         (build, seed)
-        for seed in seeds
+        for seed, builds in worlds.items()
         for build in builds
-        if build.applies_to(seed) and not result_path(work, build.title, seed).exists()
+        if not result_path(work, build.title, seed).exists()
     ]
     began = time.monotonic()
     with ProcessPoolExecutor(workers) as pool:
@@ -266,7 +297,7 @@ def _evaluated(build: Build, run: Path) -> dict[str, Any]:
         return {"status": ended.status, "said": ended.said.splitlines()[-LAST_LINES:]}
     evaluation = read_json(run / "evaluation.json")
     aligned, given = evaluation["aligned"], evaluation["given"]
-    keys = ("mask_iou", "mask_precision", "shaft_recall", "psnr", "psnr_instrument")
+    keys = ("mask_iou", "mask_precision", "shaft_recall", "part_iou", "psnr", "psnr_instrument", "estimated_iou")
     scores = {kind: {split: {key: rows[key] for key in keys} for split, rows in splits.items()}
               for kind, splits in (("aligned", aligned), ("given", given))}  # fmt: skip
     ious = [rows["mask_iou"] for rows in aligned.values()]

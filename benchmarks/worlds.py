@@ -19,8 +19,9 @@ against the first build (95 % intervals, worlds resampled), errors of right stat
 (rms; near 1 is right), CPU seconds of training, peak memory; the same by strata; the worst worlds, each with a picture
 (outline of the truth green, of the label magenta). --quick trains 1,000 iterations of worlds at 192x144.
 
-`ablate` runs --quick: a build as it is, and less each mechanism on the worlds that it applies to; DIR/ablations.md has
-a row for each: in how many worlds anything changes, what it gains, and the worst tenth with and without it.
+`ablate` runs --quick: a build as it is, and less each mechanism (or those of `--without`), each on the first --worlds
+worlds from S on that have what it works on; DIR/ablations.md has a row for each: in how many worlds anything changes,
+what it gains, aligned, as given and of parts, and the worst tenth with and without it.
 
 A change of an estimator is decided on 40 worlds of one seed, and reported on 40 others, `--seed fresh`: a seed from the
 hash of the last commit.
@@ -30,13 +31,14 @@ from __future__ import annotations
 
 import argparse
 import subprocess
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 import torch
 from rendered.draws import draw_world
 from rendered.world_capture import write_world
-from world_runs import ROOT, WITHOUT, builds_of, capture_path, result_path, run_all, run_path
+from world_runs import ROOT, WITHOUT, builds_of, capture_path, result_path, run_all, run_path, worlds_of
 from world_table import Result, ablations_of, pictures_of, strata_of, table_of, worst_of
 
 from neeco.errors import NeecoError
@@ -68,6 +70,8 @@ def main() -> int:
         runs.add_argument("--work", type=Path, required=True, help="folder for worlds, runs and results")
         runs.add_argument("--workers", type=int, default=2)
         runs.add_argument("--quick", action="store_true", help="small images, 1,000 iterations")
+        if name == "ablate":
+            runs.add_argument("--without", nargs="+", default=list(WITHOUT), choices=WITHOUT, metavar="NAME")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -81,18 +85,23 @@ def main() -> int:
         commit, *others = arguments.commits
         if others or ":" in commit:
             raise NeecoError("--commits: ablate leaves mechanisms out of one build itself; give one commit or checkout")
-        without = {name: f"{commit}:without-{name}" for name in WITHOUT}
-        builds = builds_of([commit, *without.values()], arguments.work)
-        run_all(builds, seeds, arguments.work, QUICK, arguments.workers, quick=True)
-        results = {name: results_of(arguments.work, title, seeds) for name, title in without.items()}
-        text = ablations_of(results_of(arguments.work, commit, seeds), results)
-        write_text(arguments.work / "ablations.md", f"{len(seeds)} worlds from seed {first}\n\n{text}\n")
+        suited = {name: worlds_of(name, first, arguments.worlds) for name in arguments.without}
+        whole, *lacking = builds_of([commit, *(f"{commit}:without-{name}" for name in suited)], arguments.work)
+        worlds = {
+            seed: [whole, *(build for build in lacking if seed in suited[build.without])]
+            for seed in sorted({seed for seeds in suited.values() for seed in seeds})
+        }
+        run_all(worlds, arguments.work, QUICK, arguments.workers, quick=True)
+        results = {build.without: results_of(arguments.work, build.title, suited[build.without]) for build in lacking}
+        text = ablations_of(results_of(arguments.work, commit, worlds), results)
+        write_text(arguments.work / "ablations.md", f"worlds from seed {first}\n\n{text}\n")
         print(text)
         return 0
     if arguments.verb == "run":
         builds = builds_of(arguments.commits, arguments.work)
         options = QUICK if arguments.quick else ()
-        run_all(builds, seeds, arguments.work, options, arguments.workers, quick=arguments.quick)
+        worlds = dict.fromkeys(seeds, builds)
+        run_all(worlds, arguments.work, options, arguments.workers, quick=arguments.quick)
     write_table(arguments.commits, seeds, arguments.work)
     return 0
 
@@ -103,7 +112,7 @@ def fresh_seed() -> int:
     return int(said.stdout[:8], 16)
 
 
-def results_of(work: Path, title: str, seeds: range) -> dict[int, Result]:
+def results_of(work: Path, title: str, seeds: Iterable[int]) -> dict[int, Result]:
     """Results of a build that are there, by seed."""
     paths = {seed: result_path(work, title, seed) for seed in seeds}
     return {seed: read_json(path) for seed, path in paths.items() if path.exists()}

@@ -105,6 +105,7 @@ class World:
     links: str
     joints: bool  # whether they are logged
     stated: bool  # whether uncertainties are stated
+    base: float  # error of a robot's base, times a usual one
     # how it is trained
     scale: float  # --scale
 
@@ -275,6 +276,7 @@ def draw_world(seed: int) -> World:
         joints=kind != "straight" and bool(rng.random() < 0.88),
         stated=states == "independent" and bool(rng.random() < 0.4),
         scale=float(one_of((1.0, 0.5, 0.75), (0.8, 0.1, 0.1))),
+        base=float(one_of((1.0, 4.0))) if states == "encoders" else 0.0,
     )
 
 

@@ -173,7 +173,7 @@ def _with_state_errors(world: World, capture: Capture) -> tuple[Capture, dict[st
         capture = with_errors(capture, sizes, 0.0, world.stated, rng)
     elif world.states == "encoders":  # a robot: its base is off, and its joints have play
         capture = with_errors(capture, tuple(0.25 * world.error_scale * size for size in USUAL), 1.0, False, rng)
-        capture = _off_base(capture, world.error_scale, rng)
+        capture = _off_base(capture, world.base * world.error_scale, rng)
     return with_outliers(capture, world.wrong, rng) if world.wrong else (capture, {})
 
 
