@@ -218,14 +218,14 @@ def test_standard_deviations_of_exact_states_are_of_the_size_of_their_correction
     refinement = Refinement(RefineConfig(frame_poses=True, frame_joints=True), frames, (instrument,), CPU)
     before = refinement.deviations(0)
     generator = torch.Generator().manual_seed(0)
-    refinement.frame_steps += 10
+    refinement.frame_steps += 40
     refinement.poses = 0.2 * refinement.pose_sd * torch.randn(refinement.poses.shape, generator=generator)
     refinement.joints = 2.0 * refinement.joint_sd * torch.randn(refinement.joints.shape, generator=generator)
     refinement.set_state(4, frames[4].state, frames[4].state, 3 * before)
     refinement.scale_deviations(refinement.prior_shares())
     shares = refinement.deviations(0) / before
     assert torch.all((shares[:6] > 0.15) & (shares[:6] < 0.4))
-    assert float(shares[6]) == pytest.approx(1.0)  # never larger than the prior
+    assert 2.0 < float(shares[6]) < 3.0  # larger than the prior, which knew nothing of them
     assert torch.allclose(refinement.deviations(4), 3 * before)  # a fit has its own
 
 
@@ -234,7 +234,7 @@ def test_standard_deviations_stay_where_an_image_could_not_be_fitted() -> None:
     frames, instrument = on_scopes(apart=False)
     refinement = Refinement(RefineConfig(frame_poses=True, frame_joints=True), frames, (instrument,), CPU)
     before = refinement.deviations(0)
-    refinement.frame_steps += 10
+    refinement.frame_steps += 40
     refinement.poses = 1e-4 * refinement.pose_sd
     for index in range(2, len(frames)):
         refinement.set_state(index, frames[index].state, frames[index].state, before)
@@ -242,11 +242,22 @@ def test_standard_deviations_stay_where_an_image_could_not_be_fitted() -> None:
     assert torch.allclose(refinement.deviations(0), before)
 
 
+def test_few_steps_tell_nothing_of_a_states_errors() -> None:
+    """Corrections are small because steps were few, not because states were exact."""
+    frames, instrument = on_scopes(apart=False)
+    refinement = Refinement(RefineConfig(frame_poses=True), frames, (instrument,), CPU)
+    refinement.frame_steps += 5
+    refinement.poses = 0.1 * refinement.pose_sd
+    assert refinement.prior_shares().tolist() == [1.0, 1.0, 1.0]
+    refinement.frame_steps += 40
+    assert max(refinement.prior_shares()[:2].tolist()) < 0.2
+
+
 def test_standard_deviations_stay_where_nothing_was_corrected() -> None:
     frames, instrument = on_scopes(apart=False)
     refinement = Refinement(RefineConfig(frame_poses=True), frames, (instrument,), CPU)
     assert refinement.prior_shares().tolist() == [1.0, 1.0, 1.0]  # no step was taken
-    refinement.frame_steps += 10
+    refinement.frame_steps += 40
     refinement.poses += 1e-4
     shares = refinement.prior_shares().tolist()
     assert max(shares[:2]) < 0.1

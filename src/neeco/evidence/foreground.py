@@ -131,9 +131,13 @@ class Foreground:
         instrument = np.where(view.near(near), np.minimum(instrument, alone), 0)
         return np.asarray(np.where(view.usable, instrument - tissue, 0))
 
+    def log_ratio(self, residuals: np.ndarray, shades: np.ndarray) -> np.ndarray:
+        """Return the logarithms of the ratio of densities, of an instrument's to the tissue's, at pixels [H, W]."""
+        return np.asarray(self.ratio[_bins(residuals, shades, self.settings)])
+
     def _claims(self, residuals: np.ndarray, shades: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how certain pixels [H, W] are of an instrument, and of tissue, in [0, 1]."""
-        log_ratio = self.ratio[_bins(residuals, shades, self.settings)]
+        log_ratio = self.log_ratio(residuals, shades)
         instrument, tissue = (
             np.clip((sign * log_ratio - math.log(least)) / math.log(most / least), 0, 1)
             for sign, (least, most) in ((1, self.settings.instrument), (-1, self.settings.tissue))

@@ -29,7 +29,7 @@ ON_CPU = ("frame_steps", "fitted", "weights")  # read in every step
 MM_PER_RAD = 20.0  # motion of a prismatic joint that counts as much as 1 rad of a revolute one
 MAX_SPEEDUP = 10.0  # of the learning rates where a pose is less certain than usual
 MIN_DEVIATION = 1e-4  # rad, mm: a standard deviation of 0 would hold a pose for ever
-MIN_STEPS = 5  # of a state, from which on its correction tells how wrong it was
+MEAN_DECAY = 0.4  # of the learning rates over a run: its mean
 MIN_SHARE = 0.05  # of a prior's standard deviations, that remain of a state's
 UNCORRECTED = 1.2  # times what was corrected: errors, as some remain that corrections do not explain
 MAX_NEIGHBOUR_S = 1.0  # s between instants whose unrecorded joints are similar
@@ -216,30 +216,32 @@ class Refinement:
     @torch.no_grad()
     def prior_shares(self) -> Tensor:
         """Return how large errors of states that were not fitted are [3], as shares of the priors' standard deviations:
-        of turns, shifts and readings; at most 1.
+        of turns, shifts and readings.
 
         Exact states are corrected only by as much as corrections are wrong; of the errors of others most is corrected.
-        Where most states were fitted, the shares are 1: images of the others hardly show an instrument, so that their
-        corrections tell nothing.
+        Corrections tell that only of states whose steps can amount to a tracker's errors. Where most states were
+        fitted, the shares are 1: images of the others hardly show an instrument, and corrections tell nothing.
         """
         steps = torch.stack([self.frame_steps[frames].sum() for frames in self.frames_of_instant])
         fitted = torch.stack([self.fitted[frames[0]] for frames in self.frames_of_instant])
         if 2 * int(fitted.sum()) > len(fitted):
             return self.pose_sd.new_ones(3)
-        taken = (steps >= MIN_STEPS) & ~fitted
+        config = self.config
+        least = max(config.prior_rotation / config.rotation_rate, config.prior_translation / config.translation_rate)
+        taken = (MEAN_DECAY * steps >= least) & ~fitted
         used, readings = taken.to(self.poses.device), self.learned[~self.unrecorded[self.learned]]
         poses, joints = self.poses[used] / self.pose_sd[used], self.joints[used] / self.joint_sd[used]
         parts = (poses[..., :3], poses[..., 3:], joints[:, readings])
         corrected = (self.config.frame_poses, self.config.frame_poses, self.config.frame_joints)
         shares = [
-            part.square().mean().sqrt() if learned and part.numel() else part.new_ones(())
+            UNCORRECTED * part.square().mean().sqrt() if learned and part.numel() else part.new_ones(())
             for part, learned in zip(parts, corrected, strict=True)
         ]
-        return (UNCORRECTED * torch.stack(shares)).clamp(MIN_SHARE, 1.0)
+        return torch.stack(shares).clamp(min=MIN_SHARE)
 
     @torch.no_grad()
     def scale_deviations(self, shares: Tensor) -> None:
-        """Reduce the standard deviations of states that were not fitted by `prior_shares` [3], at the end of a run."""
+        """Scale the standard deviations of states that were not fitted by `prior_shares` [3], at the end of a run."""
         readings = self.learned[~self.unrecorded[self.learned]]
         for instant, frames in enumerate(self.frames_of_instant):
             if not self.fitted[frames[0]]:

@@ -1,8 +1,8 @@
 """States of the training frames as unknowns of their true size, fitted to the images between training steps.
 
-A tracker's errors are corrected by gradients alone (`Refinement`). Where a sample of frames shows larger ones, every
-frame's state is fitted at marks of the run, and the instruments' shapes are carved anew from the fitted states: what
-wrong states taught is forgotten.
+A tracker's errors are corrected by gradients alone (`Refinement`). Where a sample of frames shows larger ones, the
+prior on corrections is as wide, every frame's state is fitted at marks of the run, and the instruments' shapes are
+carved anew from the fitted states: what wrong states taught is forgotten.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from neeco.methods.kinematic.contradictions import (
     refit_outliers,
 )
 from neeco.methods.kinematic.discovery import carve_again
-from neeco.methods.kinematic.state_registration import LARGE_ERRORS
 from neeco.methods.kinematic.state_search import LARGEST, StateSearch
 from neeco.training.session import GaussianSession
 
@@ -39,35 +38,34 @@ JUDGED_AGAIN_AT = CARVED_AT[-1]
 MARKS = tuple(sorted({*DECIDED_AT, *CARVED_AT, *FITTED_AT}))
 N_SAMPLED = 16  # frames by which errors are sized
 LARGE = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
-LARGE_OVER_KNOWN = 0.1  # the same over a tissue that is known well: fits are sharper there
 SCALE = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
 
 
 @torch.no_grad()
 def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, mark: float) -> None:
     """Fit the states of all training frames at a mark of the run where their errors are larger than a tracker's, which
-    the recording states, or images show at the first marks (see `_large_errors`)."""
+    the recording states, or images show at the first marks (see `size_errors`). States of instants that several
+    cameras show are corrected by gradients alone."""
     scene, refinement = session.scene, session.refinement
-    several = any(len(frames) > 1 for frames in refinement.frames_of_instant)
-    if several or not (scene.instruments and session.config.refine.frame_poses):
-        return  # gradients of several cameras' images determine an instant's state better than each image does
+    if not (scene.instruments and session.config.refine.frame_poses):
+        return
+    if any(len(frames) > 1 for frames in refinement.frames_of_instant):
+        # gradients of several cameras' images determine an instant's state better than each image does
+        if mark in DECIDED_AT and STATE_ERRORS not in scene.diagnostics:
+            size_errors(StateSearch.of(session, articulated), ())
+        return
     if mark == JUDGED_AGAIN_AT and (STATE_ERRORS in scene.diagnostics or contradicting_states(session)):
         judge_again(StateSearch.of(session, articulated))
     elif mark in CARVED_AT and HELD_BACK in scene.diagnostics:
         judge_held_back(StateSearch.of(session, articulated))
     if mark in DECIDED_AT and STATE_ERRORS not in scene.diagnostics:
-        search, first = StateSearch.of(session, articulated), mark == DECIDED_AT[0]
-        misfits = Misfits.of(search) if first else None
-        scale = _large_errors(search, misfits.outliers if misfits else (), first=first)
-        if scale is not None:
-            scene.diagnostics[STATE_ERRORS] = round(scale, 3)
-            session.report("the states' errors are larger than a tracker's: they are fitted to the images")
-            for (index,) in refinement.frames_of_instant:
-                refinement.set_deviations(index, search.deviations(index, SCALE))
-        if misfits is None and scale is not None:
+        search = StateSearch.of(session, articulated)
+        if mark == DECIDED_AT[0]:
+            misfits = Misfits.of(search)
+            large = size_errors(search, misfits.outliers)
+            refit_outliers(search, SCALE if large else LARGE, misfits, large=large)
+        elif size_errors(search, ()):
             hold_back(search, Misfits.of(search))
-        elif misfits is not None:
-            refit_outliers(search, LARGE if scale is None else SCALE, misfits, large=scale is not None)
     if STATE_ERRORS not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, last = StateSearch.of(session, articulated), mark == FITTED_AT[-1]
@@ -86,35 +84,23 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
             explained[index] = fit.fit.misfit
     if last:
         leave_out_unexplained(search, explained)
-    if mark in CARVED_AT and _is_shown(session):
+    if mark in CARVED_AT:
         with session.searching():
             carve_again(session, articulated)
 
 
-def _is_shown(session: GaussianSession) -> bool:
-    """Return whether images show what an instrument covers: by its colours before training, or by the learned tissue.
-    Elsewhere shapes that are carved from wrong states take in shadows, and fits without a stated size follow these."""
-    return session.silhouettes is not None or _is_expected(session)
-
-
-def _is_expected(session: GaussianSession) -> bool:
-    """Return whether silhouettes showed large errors before training; without stated links none are searched then."""
-    linked = any(instrument.kinematics is not None for instrument in session.scene.instruments)
-    return bool(session.scene.diagnostics.get(LARGE_ERRORS, not linked))
-
-
-def _large_errors(search: StateSearch, outliers: Sequence[int], *, first: bool) -> float | None:
-    """Return how large the states' errors are, times the usual ones of a robot, where they are stated to be larger than
-    a tracker's, or images show that they are; else None. first: whether at the first mark; rough hinges without stated
-    links hide less then."""
-    session = search.session
-    stated = search.stated_scale()
-    if stated > LARGE:
-        return stated
-    if not (_is_shown(session) if first else session.silhouettes or session.scene.diagnostics.get(LARGE_ERRORS)):
-        return None
-    scale = size_of_errors(search, outliers)
-    return scale if scale > (LARGE if _is_expected(session) else LARGE_OVER_KNOWN) else None
+def size_errors(search: StateSearch, outliers: Sequence[int]) -> bool:
+    """Return whether states have larger errors than a tracker's, which the recording states, or images show of all
+    states but `outliers`, and note that: their corrections have a prior of such errors from then on."""
+    session, stated = search.session, search.stated_scale()
+    scale = stated if stated > LARGE else size_of_errors(search, outliers)
+    if scale <= LARGE:
+        return False
+    session.scene.diagnostics[STATE_ERRORS] = round(scale, 3)
+    session.report("the states' errors are larger than a tracker's: they are fitted to the images")
+    for index, *_ in session.refinement.frames_of_instant:
+        session.refinement.set_deviations(index, search.deviations(index, SCALE))
+    return True
 
 
 def size_of_errors(search: StateSearch, outliers: Sequence[int]) -> float:

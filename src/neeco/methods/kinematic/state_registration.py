@@ -19,7 +19,6 @@ from neeco.training.session import GaussianSession
 
 WIDTH_PX = 320  # of the images compared
 MIN_STATES = 8  # with fewer, nothing is said about them
-LARGE_ERRORS = "large_errors_by_silhouettes"  # of a scene's diagnostics: whether all states err more than a tracker's
 
 
 def register_states(session: GaussianSession, articulations: Sequence[object]) -> FoundStates | None:
@@ -62,7 +61,6 @@ def register_states(session: GaussianSession, articulations: Sequence[object]) -
     found = find_states(given, expected, slides)
     if found is None:
         return None
-    scene.diagnostics[LARGE_ERRORS] = found.large
     if not found.inconsistent.any():  # errors of all states are refined while training
         return None
     _correct(session, found)
