@@ -322,10 +322,8 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: C
     if shaft is None:
         return None
     direction, along = shaft.direction, (points - shaft.origin) @ shaft.direction
-    solid = along[scores > level]
-    ends = shaft.origin + torch.stack([solid.min(), solid.max()])[:, None] * direction
-    _, visible = score_points(evidence, views.own, ends)
-    if shaft.lead + float(visible[1] - visible[0]) < 0:  # the rear end is out of more images than the tip
+    away = float((views.own[:, 2, :3] * direction).sum(1).mean())  # cosine to the view: tips point away from the camera
+    if shaft.lead + away < 0:
         direction = -direction
     origin = shaft.origin + float((scores * along).sum() / scores.sum()) * shaft.direction
     shape = carve_along(evidence, name, frame_along(origin, direction), level, generator, settings)
