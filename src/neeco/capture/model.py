@@ -27,6 +27,7 @@ from neeco.geometry.rotations import as_pose, number_text, position_text, rigid_
 from neeco.plausible import Fault, joint_fault
 
 SCHEMA = "neeco-capture/1"  # of the folder that holds a capture
+SEPARATE_TISSUES = "make one capture for each tissue, train each, and mix with `neeco synthesize --tissue RUN`"
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
 UNKNOWN_DEG = 180.0  # the standard deviation of an angle of which nothing is known
 REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
