@@ -134,7 +134,7 @@ def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgre
         if share is not None and share < SAME_PLACE:
             raise NeecoError(
                 f"{data.parts[episode].recording.path}: {name} shows another place than {before}: {share:.0%} of "
-                f"the background is where it was; {SEPARATE_TISSUES}"
+                f"the background is where it was; ingest each place alone; of several tissues, {SEPARATE_TISSUES}"
             )
         if share is not None and share < MOSTLY_SIMILAR:
             data.notes.add(
