@@ -70,7 +70,7 @@ scene is one more entry in `scenes.SCENES`.
               over each organ the other's instrument as it was recorded there, moved otherwise, under a single lamp: to
               be tracked by the other's run
     stomach-second
-              the bowel's very instrument, sensor and scope over the stomach: with bowel, one capture of two tissues
+              the bowel's very instrument, sensor and scope over the stomach
     bowel-wristed, stomach-wristed
               8 mm black shaft whose wrist pitches and, 9 mm further, yaws two unequal jaws; readings wrist_pitch and
               wrist_yaw with the encoders' offsets, play and noise; `kinematics` states every axis 5 degrees

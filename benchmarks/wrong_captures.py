@@ -240,8 +240,7 @@ def main() -> None:
     for capture in options.captures:
         folder, file = (capture.parent, capture.name) if capture.suffix == ".json" else (capture, "transforms.json")
         if options.right:
-            for parsed in parse_capture(folder, ProblemReport(), file).by_tissue():
-                margins(folder.name, parsed)
+            margins(folder.name, parse_capture(folder, ProblemReport(), file))
             continue
         with tempfile.TemporaryDirectory() as temporary:
             known = {problem.message for problem in inspect_capture(capture).problems}

@@ -277,7 +277,7 @@ SCENES |= {
     )
 }
 
-# The bowel's very instrument, sensor, jaw and scope over the stomach: a second tissue of one capture.
+# The bowel's very instrument, sensor, jaw and scope over the stomach.
 SCENES["stomach-second"] = replace(
     SCENES["bowel"],
     organ="stomach",

@@ -40,7 +40,6 @@ IN_FULL = {
         "synthesize --tissue runs/stomach --instruments runs/liver runs/bowel --count 4 --output mixed"
     ),
     "ingest --init FILE|FOLDER": "ingest --init FOLDER",
-    "view RUN --tissue NAME": "",  # of a run over several tissues: tests/viewer
 }
 # Options that a page names outside a command, in a command for each.
 OF_PROSE = """

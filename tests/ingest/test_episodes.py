@@ -115,6 +115,7 @@ def test_another_tissue_is_refused_by_name(tmp_path: Path) -> None:
                                               "units": {"angle": "rad"}}}}]}, "bar: joints (jaw)"),
         ({"camera": "moving"}, "camera: is not as"),
         ({"splits": {"test_every": 3}}, "splits: differs from that"),
+        ({"tissue": "bowel"}, "tissue: a capture has one tissue; leave the key out, or make one capture"),
     ],
 )  # fmt: skip
 def test_what_one_capture_cannot_hold_is_refused_in_one_line(

@@ -265,7 +265,7 @@ def test_a_reason_is_stated_once_with_what_is_usual(tmp_path, overlap, advice):
     verdict = assess_ingest(result, read_capture(SAMPLE))
     assert verdict.as_json()["advice"] == advice
     assert len(verdict.as_json()["facts"]) == 2
-    *_, last = lines = ingest_page.Ingested(tmp_path, {"": result}, {"": verdict}).lines()
+    *_, last = lines = ingest_page.Ingested(tmp_path, result, verdict).lines()
     assert last.startswith(f"{advice}: ")
     if advice != "good":
         lines = [line for line in lines if "outline of psm1" in line]

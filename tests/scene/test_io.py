@@ -112,6 +112,22 @@ def test_another_schema_is_refused_by_name(kinematic: GaussianScene, tmp_path: P
         load_scene(path)
 
 
+def test_a_run_over_several_tissues_is_refused_and_one_of_a_single_named_tissue_loads(
+    kinematic: GaussianScene, tmp_path: Path
+) -> None:
+    path = tmp_path / "scene.safetensors"
+
+    def name_tissues(*names: str) -> None:
+        save_scene(kinematic, path)
+        rewrite(path, lambda header: header.update(tissues=names))
+
+    name_tissues("bowel", "stomach")
+    with pytest.raises(NeecoError, match=r"scene\.safetensors: tissues: a scene has one tissue, and this 2; make one"):
+        load_scene(path)
+    name_tissues("bowel")
+    assert torch.equal(load_scene(path).canonical.means, kinematic.canonical.means)
+
+
 @pytest.mark.parametrize("grey", [1e300, -0.5, float("nan")])
 def test_a_background_that_is_not_grey_is_refused(kinematic: GaussianScene, tmp_path: Path, grey: float) -> None:
     path = tmp_path / "scene.safetensors"

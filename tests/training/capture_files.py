@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neeco.capture.images import write_image
-from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, Tissue
-from neeco.capture.readers import read_capture
+from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.capture.writer import write_capture as write_folder
 from neeco.geometry.rotations import rigid_from_vector, rotate_about
 from neeco.raster import Camera, Gaussians, rasterize
@@ -54,18 +52,11 @@ def write_capture(root: Path, *, instruments: bool = True) -> Path:
     return root
 
 
-def write_grasper(
-    root: Path,
-    *,
-    frames: int = 24,
-    sizes: tuple[tuple[int, int], ...] = ((80, 64),),
-    seed: int = 5,
-    tint: tuple[float, float, float] = (1.2, 0.6, 0.6),
-) -> Path:
-    """A two-jawed grasper that moves and opens before a wall of one tint, recorded in images of `sizes` in turn."""
-    rng = np.random.default_rng(seed)
+def write_grasper(root: Path, *, frames: int = 24, sizes: tuple[tuple[int, int], ...] = ((80, 64),)) -> Path:
+    """A two-jawed grasper that moves and opens before a red wall, recorded in images of `sizes` in turn."""
+    rng = np.random.default_rng(5)
     wall = torch.from_numpy(rng.uniform([-75, -60, 98], [75, 60, 102], (900, 3))).float()
-    wall_colors = torch.from_numpy(rng.uniform(0.3, 0.7, (900, 3)) * tint).float()
+    wall_colors = torch.from_numpy(rng.uniform(0.3, 0.7, (900, 3)) * (1.2, 0.6, 0.6)).float()
     (root / "images").mkdir(parents=True)
     taken = []
     for k in range(frames):
@@ -93,26 +84,6 @@ def write_grasper(
     points = PointCloud(wall.numpy(), wall_colors.numpy().clip(0, 1))
     instruments = (Instrument("grasper", {"jaw_angle": (0.0, 1.5)}),)
     write_folder(Capture(root, tuple(taken), instruments, points), root)
-    return root
-
-
-def write_tissues(root: Path) -> Path:
-    """The grasper before a red wall and before a green one, whose world is another: one capture of two tissues."""
-    frames, tissues, pixels = [], [], []
-    for number, (name, tint) in enumerate({"red": (1.2, 0.6, 0.6), "green": (0.6, 1.2, 0.6)}.items()):
-        own = read_capture(write_grasper(root.parent / f"{root.name}-{name}", frames=18, seed=5 + number, tint=tint))
-        moved = rigid_from_vector(number * torch.tensor([0.4, 2.0, -0.3, 30, -80, 20], dtype=torch.float64))
-        for frame in own.frames:
-            camera = replace(frame.camera, world_from_camera=moved.float() @ frame.camera.world_from_camera)
-            given = frame.state.instruments["grasper"]
-            state = State({"grasper": replace(given, pose=moved @ given.pose)}, frame.state.time, name)
-            path = root / f"{name}_{frame.name}.png"
-            frames.append(replace(frame, image_path=path, camera=camera, state=state))
-            pixels.append(frame.load_image_bytes())
-        positions = own.points.positions @ moved[:3, :3].float().numpy().T + moved[:3, 3].float().numpy()
-        tissues.append(Tissue(name, PointCloud(positions, own.points.colors)))
-    capture = Capture(root, tuple(frames), own.instruments, PointCloud(measured=False), tissues=tuple(tissues))
-    write_folder(capture, root, images=pixels)
     return root
 
 

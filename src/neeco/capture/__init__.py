@@ -13,7 +13,6 @@ from neeco.capture.model import (
     InstrumentState,
     PointCloud,
     State,
-    Tissue,
     Uncertainty,
     evenly_spaced,
 )
@@ -47,7 +46,6 @@ __all__ = [
     "Problem",
     "State",
     "StateLine",
-    "Tissue",
     "Uncertainty",
     "camera_to_json",
     "capture_of",

@@ -27,6 +27,7 @@ from neeco.geometry.rotations import as_pose, number_text, position_text, rigid_
 from neeco.plausible import Fault, joint_fault
 
 SCHEMA = "neeco-capture/1"  # of the folder that holds a capture
+SEPARATE_TISSUES = "make one capture for each tissue, train each, and mix with `neeco synthesize --tissue RUN`"
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
 UNKNOWN_DEG = 180.0  # the standard deviation of an angle of which nothing is known
 REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
@@ -97,14 +98,12 @@ class State:
         instruments: name -> InstrumentState, or (pose, joints): world_from_instrument [4, 4] in mm, and name -> rad
             (mm for sliding joints)
         time: s
-        tissue: name of the tissue whose world the poses are in, where a scene has several
 
         neeco.State({"maryland": (np.eye(4), {"jaw_angle": 0.4})}, time=1.2)
     """
 
     instruments: Mapping[str, InstrumentState] = field(default_factory=dict)
     time: float = 0.0  # s
-    tissue: str | None = None  # over which of several tissues, whose world the poses are in; None: there is one
 
     def __post_init__(self) -> None:
         given = {
@@ -117,8 +116,7 @@ class State:
 
     def __repr__(self) -> str:
         instruments = "".join(f"{name}: {state!r}, " for name, state in self.instruments.items())
-        tissue = "" if self.tissue is None else f", tissue={self.tissue!r}"
-        return f"State({instruments}time={number_text(self.time)} s{tissue})"
+        return f"State({instruments}time={number_text(self.time)} s)"
 
     def check(self, instruments: Sequence[Instrument], *, fitted: bool = False) -> None:
         """Raise NeecoError for what none of a scene's instruments can be: poses that are not rigid, instruments and
@@ -268,14 +266,6 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Tissue:
-    """One of a capture's several tissues: its name, and its sparse points. Each has a world of its own."""
-
-    name: str
-    points: PointCloud
-
-
-@dataclass(frozen=True)
 class Capture:
     """A recording ready to learn from. `read_capture` reads one from a folder, `write_capture` writes one."""
 
@@ -288,10 +278,9 @@ class Capture:
     timed: bool = True  # the recording says when each frame was taken; else `State.time` counts the frames
     lens: Lens | None = None  # through which it was recorded; its distortion is gone from the images
     still: bool = False  # the cameras stood still: nothing shows the tissue's depth from elsewhere
-    tissues: tuple[Tissue, ...] = ()  # where the frames name theirs; `points` are none's then
 
     def __post_init__(self) -> None:
-        for name, kind in {"root": Path, "frames": tuple, "instruments": tuple, "tissues": tuple}.items():
+        for name, kind in {"root": Path, "frames": tuple, "instruments": tuple}.items():
             object.__setattr__(self, name, kind(getattr(self, name)))
 
     def __repr__(self) -> str:
@@ -302,12 +291,6 @@ class Capture:
     def split(self, name: str) -> tuple[Frame, ...]:
         """The frames of one split, in recorded order."""
         return tuple(frame for frame in self.frames if frame.split == name)
-
-    def over(self, tissue: str) -> Capture:
-        """The capture of one of several tissues."""
-        frames = tuple(frame for frame in self.frames if frame.state.tissue == tissue)
-        points = next(item.points for item in self.tissues if item.name == tissue)
-        return replace(self, frames=frames, points=points, tissues=())
 
     @property
     def splits(self) -> tuple[str, ...]:
@@ -329,13 +312,12 @@ def _is_readable(value: object, only_cheaply: bool) -> bool:
     return not value.is_meta and not (only_cheaply and (value.requires_grad or value.device.type != "cpu"))
 
 
-def share_lamps(cameras: Sequence[Camera], states: Sequence[State]) -> tuple[Camera, ...]:
-    """Give the cameras of a still scope the lamps of the first one over each tissue: the second camera of a stereo
-    scope has none of its own."""
+def share_lamps(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """Give the cameras of a still scope the lamps of the first one: the second camera of a stereo scope has none of its
+    own."""
     shared = []
-    firsts: dict[str | None, Tensor] = {}
-    for camera, state in zip(cameras, states, strict=True):
-        first = firsts.setdefault(state.tissue, camera.world_from_camera)
+    for camera in cameras:
+        first = cameras[0].world_from_camera
         has_lamps = torch.equal(camera.world_from_camera, first)
         shared.append(camera if has_lamps else replace(camera, world_from_lamps=first))
     return tuple(shared)

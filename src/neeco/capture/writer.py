@@ -31,8 +31,7 @@ def write_capture(
     images: Sequence[Tensor | np.ndarray] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a capture folder: images/, masks/, sparse.ply (one for each of several tissues) and, last, transforms.json;
-    every file whole or not at all.
+    """Write a capture folder: images/, masks/, sparse.ply and, last, transforms.json; every file whole or not at all.
 
     Images and masks are copied bit by bit (transparent images are flattened on their background); poses read back
     exactly. Random points are not written. `images`: the pixels of every frame, [H, W, 3] in [0, 1] or uint8,
@@ -71,12 +70,6 @@ def write_capture(
     if capture.points.measured:
         write_ply(path / "sparse.ply", capture.points)
         header["ply_file_path"] = "sparse.ply"
-    for number, tissue in enumerate(capture.tissues, 1):
-        entry = {"name": tissue.name}
-        if tissue.points.measured:
-            entry["ply_file_path"] = f"sparse_{number}.ply"
-            write_ply(path / entry["ply_file_path"], tissue.points)
-        header.setdefault("tissues", []).append(entry)
     sync_disk()  # the files above were left to the system
     write_json(path / "transforms.json", header)
 
@@ -119,16 +112,14 @@ def fingerprint(capture: Capture) -> str:
         digest.update(json.dumps(capture.lens.to_json()).encode())
     if capture.still:
         digest.update(b"still")
-    digest.update(json.dumps([tissue.name for tissue in capture.tissues]).encode() if capture.tissues else b"")
-    for points in (capture.points, *(tissue.points for tissue in capture.tissues)):
-        digest.update(points.positions.tobytes())
-        digest.update(points.colors.tobytes())
+    digest.update(capture.points.positions.tobytes())
+    digest.update(capture.points.colors.tobytes())
     return digest.hexdigest()
 
 
 def state_to_json(state: State) -> dict[str, Any]:
     """The line of a state that `read_states` reads."""
-    return ({} if state.tissue is None else {"tissue": state.tissue}) | {
+    return {
         "time": state.time,
         "instruments": [
             {"name": name, "pose": instrument.pose.tolist(), "joints": dict(sorted(instrument.joints.items()))}
@@ -218,8 +209,6 @@ def _write_frame(
         "time": _number(frame.state.time),
         "split": frame.split,
     }
-    if frame.state.tissue is not None:
-        entry["tissue"] = frame.state.tissue
     if frame.mask_path is not None:
         entry["mask_path"] = f"masks/{name}{frame.mask_path.suffix}"
         _copy(frame.mask_path, path / entry["mask_path"])

@@ -72,8 +72,6 @@ def _summary_lines(summary: CaptureSummary) -> list[str]:
         lines.append(
             "scope: stands still; nothing shows the scene from elsewhere, so render views near the recorded ones"
         )
-    if summary.tissues:
-        lines.append("tissues: " + ", ".join(f"{count} frames of {name!r}" for name, count in summary.tissues.items()))
     for name, travel in summary.travel_mm.items():
         joints = [
             f"{joint.removeprefix(name + '.')} {low:.3g} .. {high:.3g}"

@@ -42,8 +42,6 @@ class Arguments:
     size: tyro.conf.OmitArgPrefixes[SizeSettings] = RECORDED_SIZE
     sh: int = 3
     """Degree of the spherical harmonics that an exported file keeps, 0 to 3; lower is smaller."""
-    tissue: str | None = None
-    """Which tissue to show of a run that has several. Default: the first."""
     device: Device = "auto"
 
 
@@ -66,11 +64,7 @@ def run(arguments: Arguments) -> int:
     from neeco.viewer.server import ViewerServer
 
     device = device_of(arguments.device)
-    with ViewerServer(
-        arguments.source, arguments.host, arguments.port, device, arguments.size, arguments.tissue
-    ) as viewer:
-        if len(shown := viewer.run.loaded.tissues) > 1:
-            print(f"the run has several tissues ({', '.join(shown)}); --tissue chooses which is shown")
+    with ViewerServer(arguments.source, arguments.host, arguments.port, device, arguments.size) as viewer:
         return _serve(viewer.address, arguments)
 
 
@@ -128,5 +122,5 @@ def _export(arguments: Arguments, output: Path) -> int:
     from neeco.viewer.export import export_page
 
     require_ending("--export", output, ".html", ".htm")
-    print(export_page(arguments.source, output, arguments.sh, device_of(arguments.device), arguments.tissue))
+    print(export_page(arguments.source, output, arguments.sh, device_of(arguments.device)))
     return 0

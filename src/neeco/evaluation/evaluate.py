@@ -120,7 +120,7 @@ class _Context:
     posed: GaussianScene | None  # `scene`, where its poses are fitted to the frames
     capture: Capture
     networks: Mapping[str, Lpips]
-    coverage: Mapping[str | None, Coverage]  # by tissue; None: there is one
+    coverage: Coverage
     foreground: Foreground | None  # tells instruments from tissue in images without masks
 
 
@@ -149,8 +149,8 @@ def evaluate_run(
     """Score a trained run on splits of its capture (see `held_out_splits`) and write `evaluation.json` into its folder.
 
     Returns {"given": {split: numbers}, "aligned": the same when `align`, "notes": [why a number is null], "labels":
-    {how masks were made and compared}, "doubts": [reasons to doubt the labels], "per_frame": {kind: {split: [row]}}},
-    and of several tissues "by_tissue": {kind: {split: {tissue: means}}}. None is "not known", never zero; psnr* in dB.
+    {how masks were made and compared}, "doubts": [reasons to doubt the labels], "per_frame": {kind: {split: [row]}}}.
+    None is "not known", never zero; psnr* in dB.
     networks: of `find_lpips`. The caller sets the number of torch threads (`open_run`). Raises NeecoError for unknown
     splits and unreadable frames.
     """
@@ -166,15 +166,15 @@ def evaluate_run(
         posed,
         capture,
         networks,
-        _coverage(scene, train),
+        observed_depths(scene, train),
         learned_foreground(scene, train) if is_gaussian(scene) else None,
     )
     report("training views", 1, 1)
     kinds = ("given", "aligned") if align else ("given",)
     names = truth_names(capture.root)
     notes = _scene_notes(scene, networks, names)
-    sections: list[dict[str, Any]] = [{kind: {} for kind in kinds} for _ in range(4)]
-    result, pair_assignment, per_frame, by_tissue = sections
+    sections: list[dict[str, Any]] = [{kind: {} for kind in kinds} for _ in range(3)]
+    result, pair_assignment, per_frame = sections
     splits_of: dict[str, list[str]] = {}  # by note
     doubts = list(run.doubts)
     for split in splits:
@@ -188,35 +188,22 @@ def evaluate_run(
             numbers, pair_assignment[kind][split] = _summary(scene, tally)
             result[kind][split] = numbers | {"fps": fps, "num_gaussians": count, "frames": len(frames)}
             per_frame[kind][split] = tally.rows
-            by_tissue[kind][split] = _by_tissue(frames, tally.scores)
         quality = quality_of(tallies[kinds[-1]].counts)  # at fitted poses where there are any: those of labels
         if quality is not None and quality.doubt is not None:
             doubts.append(f"{split}: {quality.doubt}")
         for note in _split_notes(result["given"][split]):
             splits_of.setdefault(note, []).append(split)
-        if len(scene.recorded.tissues) > 1:
-            notes += [_tissue_note(split, *found) for found in by_tissue["given"][split].items()]
     notes += [f"{', '.join(concerned)}: {note}" for note, concerned in splits_of.items()]
     labels = {
         "threshold": threshold_of(scene),
         "names": [list(name) for name in scene.label_names],
         "pair_assignment": pair_assignment,
     }
-    parts = {"by_tissue": by_tissue} if len(scene.recorded.tissues) > 1 else {}
     evaluation: dict[str, Any] = finite(
-        result | {"notes": notes, "doubts": doubts, "labels": labels, "per_frame": per_frame} | parts
+        result | {"notes": notes, "doubts": doubts, "labels": labels, "per_frame": per_frame}
     )
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
-
-
-def _coverage(scene: DrawableScene, frames: Sequence[Frame]) -> dict[str | None, Coverage]:
-    """Return the coverage of each tissue by the training frames."""
-    tissues: tuple[str | None, ...] = scene.recorded.tissues or (None,)
-    return {
-        tissue: observed_depths(scene, [frame for frame in frames if frame.state.tissue == tissue])
-        for tissue in tissues
-    }
 
 
 def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tuple[str, ...]:
@@ -237,7 +224,7 @@ def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tu
 def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) -> None:
     """Render one frame at its given poses and, where asked, at fitted ones; add the scores to the tallies."""
     scene = context.scene
-    unobserved, tissue = unobserved_tissue(context.coverage[frame.state.tissue], scene, frame)
+    unobserved, tissue = unobserved_tissue(context.coverage, scene, frame)
     reference = load_reference(context.capture, frame)
     image, mask = frame.load_image(), frame.load_mask()
     networks = context.networks if min(image.shape[:2]) >= MIN_SIZE else {}
@@ -332,30 +319,6 @@ def _summary(scene: DrawableScene, tally: _Tally) -> tuple[dict[str, Any], dict[
         parts |= {part: value for part, value in means.items() if part in known}
     numbers["part_iou"] = parts
     return numbers, {pair: way for pair, way in assignment.items() if pair in known}
-
-
-def _by_tissue(frames: Sequence[Frame], scores: Sequence[dict[str, float | None]]) -> dict[str, Any]:
-    """Return means over the frames of every tissue."""
-    groups: dict[str, list[dict[str, float | None]]] = {}
-    for frame, row in zip(frames, scores, strict=True):
-        groups.setdefault(frame.state.tissue or "", []).append(row)
-    return {
-        tissue: {key: mean_of([row[key] for row in rows]) for key in rows[0]} | {"frames": len(rows)}
-        for tissue, rows in groups.items()
-    }
-
-
-def _tissue_note(split: str, tissue: str, numbers: Mapping[str, Any]) -> str:
-    known = [
-        f"{name} {numbers[key]:{form}}"
-        for key, name, form in (
-            ("psnr", "PSNR", ".2f"),
-            ("psnr_instrument", "on the instrument", ".2f"),
-            ("mask_iou", "mask IoU", ".3f"),
-        )
-        if not math.isnan(numbers[key])
-    ]
-    return f"{split} over {tissue}: {numbers['frames']} frames, {', '.join(known)}"
 
 
 @torch.no_grad()

@@ -221,7 +221,7 @@ class TissueRenderer:
     def __init__(self, scene: GaussianScene, instruments: InstrumentRenderer | None = None) -> None:
         self.scene = scene
         self._instruments = instruments or InstrumentRenderer(scene)
-        self._posed: tuple[tuple[float, str | None], Gaussians] | None = None  # by time and tissue
+        self._posed: tuple[float, Gaussians] | None = None  # by time
 
     @property
     def shaded(self) -> bool:
@@ -240,9 +240,8 @@ class TissueRenderer:
 
     def _at(self, state: State) -> Gaussians:
         """Return the tissue at the time of `state`; it depends on nothing else of it."""
-        key = state.time, state.tissue
-        if self._posed is None or self._posed[0] != key:
-            self._posed = key, self.scene.at(state).select(slice(0, self.scene.canonical.counts[0]))
+        if self._posed is None or self._posed[0] != state.time:
+            self._posed = state.time, self.scene.at(state).select(slice(0, self.scene.canonical.counts[0]))
         return self._posed[1]
 
 

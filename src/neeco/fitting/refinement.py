@@ -6,7 +6,7 @@ The constant tracker-to-world correction is the scene's own (`GaussianScene.regi
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
@@ -94,8 +94,6 @@ class Refinement:
         self.instants, self.neighbours = _instants(frames, names)
         self.frames_of_instant = _members(self.instants)
         first = tuple(frames[shown[0]] for shown in self.frames_of_instant)
-        tissues = _members(_numbered([frame.state.tissue for frame in first]))
-        self.instants_of_tissue = [torch.tensor(rows, device=device) for rows in tissues]
         self.joints = torch.zeros(len(self.neighbours), len(self.readings), device=device)
         self.poses = torch.zeros(len(first), len(names), 6, device=device)
         self.cameras = torch.zeros(len(frames), 6, device=device)
@@ -309,14 +307,12 @@ class Refinement:
 
     @torch.no_grad()
     def center(self) -> None:
-        """Subtract the mean correction, of poses per tissue: a constant one belongs to the instrument's shape (and to
+        """Subtract the mean correction: a constant one belongs to the instrument's shape (and to
         `GaussianScene.registration`). The median where states were fitted, single ones of which were wrong."""
         used = (self.frame_steps > 0).nonzero()[:, 0]
         if len(used):
             instants = torch.tensor(sorted({self.instants[k] for k in used.tolist()}), device=self.poses.device)
-            for of_tissue in self.instants_of_tissue:
-                own = instants[torch.isin(instants, of_tissue)]
-                self.poses[own] -= self._middle(self.poses[own])
+            self.poses[instants] -= self._middle(self.poses[instants])
             self.joints -= torch.where(self.unrecorded, 0.0, self._middle(self.joints))
             used = used.to(self.cameras.device)
             self.cameras[used] -= self.cameras[used].mean(0)
@@ -407,15 +403,13 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
     numbers: dict[tuple[object, ...], int] = {}
     shown: list[int] = []
     times: list[float] = []
-    over: list[str | None] = []
     for frame in frames:
         poses = [frame.state.instruments[name].pose.double().numpy().tobytes() for name in instruments]
-        number = numbers.setdefault((frame.state.tissue, frame.state.time, *poses), len(numbers))
-        over += [frame.state.tissue] if number == len(times) else []
+        number = numbers.setdefault((frame.state.time, *poses), len(numbers))
         times += [frame.state.time] if number == len(times) else []
         shown.append(number)
-    near = [[k for k in (i - 1, i + 1) if 0 <= k < len(times) and over[k] == over[i]
-             and abs(times[k] - t) < MAX_NEIGHBOUR_S] or [i] for i, t in enumerate(times)]  # fmt: skip
+    near = [[k for k in (i - 1, i + 1) if 0 <= k < len(times) and abs(times[k] - t) < MAX_NEIGHBOUR_S] or [i]
+            for i, t in enumerate(times)]  # fmt: skip
     return shown, near
 
 
@@ -436,12 +430,6 @@ def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual_sd
     return priors
 
 
-def _numbered(keys: Sequence[Hashable]) -> list[int]:
-    """Return the number of each key, equal for equal keys."""
-    numbers: dict[Hashable, int] = {}
-    return [numbers.setdefault(key, len(numbers)) for key in keys]
-
-
 def _members(numbers: Sequence[int]) -> list[list[int]]:
     """Return the places in `numbers` of 0, of 1, and so on."""
     members: list[list[int]] = [[] for _ in range(max(numbers, default=-1) + 1)]
@@ -454,11 +442,11 @@ def _velocities(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> Tens
     """Return the velocity [F, I, 6] (rad/s, mm/s, body frame) from differences between neighbours in time, else 0."""
     count = len(frames)
     velocity = torch.zeros(count, len(instruments), 6)
-    order = sorted(range(count), key=lambda i: (frames[i].state.tissue or "", frames[i].state.time))
+    order = sorted(range(count), key=lambda i: frames[i].state.time)
     for place, index in enumerate(order):
         before, after = frames[order[max(place - 1, 0)]], frames[order[min(place + 1, count - 1)]]
         elapsed = after.state.time - before.state.time
-        if not 0 < elapsed < MAX_VELOCITY_S or before.state.tissue != after.state.tissue:
+        if not 0 < elapsed < MAX_VELOCITY_S:
             continue
         for k, name in enumerate(instruments):
             earlier, later = before.state.instruments[name].pose.double(), after.state.instruments[name].pose.double()

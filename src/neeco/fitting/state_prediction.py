@@ -46,7 +46,7 @@ def predict_corrections(
     shown: dict[int, int] = {}  # a frame of every instant
     for frame in (refinement.frame_steps > 0).nonzero()[:, 0].tolist():
         shown.setdefault(refinement.instants[frame], frame)
-    order = sorted(shown, key=lambda instant: _moment(frames[shown[instant]]))
+    order = sorted(shown, key=lambda instant: frames[shown[instant]].state.time)
     found: dict[str, Prediction] = {}
     if len(order) < MIN_INSTANTS:
         return found
@@ -83,10 +83,6 @@ def _consistent(rows: Tensor) -> Tensor:
     """Return which corrections [n] bool of `rows` [n, K] are none of a state that was wrong altogether."""
     off = (rows - rows.median(0).values).abs()
     return (off <= MAX_DEVIATIONS * off.median(0).values.clamp_min(1e-9)).all(1)
-
-
-def _moment(frame: Frame) -> tuple[str, float]:
-    return frame.state.tissue or "", frame.state.time
 
 
 def _best(features: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, float, float]:

@@ -75,12 +75,11 @@ def _absent_images(parsed: Parsed) -> list[str]:
 def _inverted_masks(capture: Capture) -> list[str]:
     """Return notes on loss masks that may be inverted."""
     masked = [frame for frame in capture.frames if frame.mask_path is not None]
-    found = []
+    points, found = measured_sample(capture.points), []
     for index in evenly_spaced(len(masked), MAX_BORDER_FRAMES, floor=True):
         frame, mask = masked[index], masked[index].load_mask_pixels()
-        points = {tissue.name: tissue.points for tissue in capture.tissues}.get(str(frame.state.tissue), capture.points)
         assert mask is not None
-        found.append(measure_hidden(frame.load_pixels(), mask, frame.camera, measured_sample(points)))
+        found.append(measure_hidden(frame.load_pixels(), mask, frame.camera, points))
     fault = masks_fault(found)
     return [] if fault is None else [f"Warning: {fault[0]} {fault[1]}."]
 

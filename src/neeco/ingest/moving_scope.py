@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.capture.model import PointCloud
+from neeco.capture.model import SEPARATE_TISSUES, PointCloud
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.cameras.sfm import StructureFromMotion
@@ -31,7 +31,6 @@ from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.shaft.video_instruments import find_in_video, on_masks
 from neeco.ingest.timing.episodes import Episodes
 from neeco.ingest.world import (
-    NAME_TISSUES,
     World,
     longest_lag,
     note_motion_contradiction,
@@ -126,7 +125,7 @@ def _check_joined(data: Episodes, placed: np.ndarray) -> None:
             raise NeecoError(
                 f"{part.recording.path}: {part.name} stands alone: {count} of its frames show enough of what the other "
                 f"recordings show to find their cameras together (at least {MIN_FRAMES} are needed); where it "
-                f"shows another tissue, {NAME_TISSUES}, else leave it out"
+                f"shows another tissue, {SEPARATE_TISSUES}, else leave it out"
             )
 
 

@@ -23,7 +23,6 @@ import torch
 
 from neeco.capture.model import BaseUncertainty, Capture, Frame, InstrumentState, State, Uncertainty
 from neeco.capture.writer import write_capture
-from neeco.errors import NeecoError
 from neeco.ingest.cameras.still_scene import RightCamera
 from neeco.ingest.frames.images import DropReason, choose_images
 from neeco.ingest.frames.views import StageProgress
@@ -54,40 +53,23 @@ def ingest(
     NeecoError for unusable input: file, row or key, and what to do.
     """
     recordings = separate([recording] if isinstance(recording, Recording) else recording)
-    if named := [item for item in recordings if item.tissue is not None]:
-        raise NeecoError(f"{named[0].path}: tissue: {named[0].tissue} is named; `ingest_tissues` makes such a capture")
     with staged(output) as folder:
         progress("reading logs and video", 0, 0)
-        world = find_world(read_episodes(recordings), folder, progress)
-        capture, result = finish(world, output)
+        data = read_episodes(recordings)
+        images = choose_images(data, folder, progress)
+        (folder / "sfm").mkdir()
+        find = find_still_world if is_still(data, images, progress) else find_moving_world
+        world = find(data, images, folder, progress)
+        note_frame_rates(world.data)
+        splits, rule = split_frames(world.data, world.views.frames, world.states, world.usable)
+        chosen = np.flatnonzero(world.usable & (splits != LEFT_OUT))
+        capture = _capture(world, splits, chosen)
+        dropped = {**world.images.dropped, **_left_out(world, splits)}
+        result = _result(world, output, capture, chosen, dropped, rule)
         write_capture(capture, folder / "capture")
         _measure_roll(world, result, folder / "capture", progress)
         complete(result, folder / "capture")
         return result
-
-
-def find_world(data: Episodes, folder: Path, progress: StageProgress) -> World:
-    """Choose frames and find their world; `folder` keeps its images, and everything temporary."""
-    images = choose_images(data, folder, progress)
-    (folder / "sfm").mkdir()
-    find = find_still_world if is_still(data, images, progress) else find_moving_world
-    return find(data, images, folder, progress)
-
-
-def finish(
-    world: World, output: Path, everywhere: Mapping[str, Mapping[str, np.ndarray]] | None = None
-) -> tuple[Capture, IngestResult]:
-    """Split the frames of a world; return the capture, whose images are in the world's folder, and the report.
-
-    everywhere: the readings over all tissues, by instrument and joint, where there are several.
-    """
-    data, views = world.data, world.views
-    note_frame_rates(data)
-    splits, rule = split_frames(data, views.frames, world.states, world.usable, everywhere)
-    chosen = np.flatnonzero(world.usable & (splits != LEFT_OUT))
-    capture = _capture(world, splits, chosen)
-    dropped = {**world.images.dropped, **_left_out(world, splits)}
-    return capture, _result(world, output, capture, chosen, dropped, rule)
 
 
 def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:

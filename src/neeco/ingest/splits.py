@@ -17,31 +17,22 @@ TEST_EVERY = 8  # frames, or episodes, of which one tests unless the recording s
 LEFT_OUT = "left out"  # split of a frame too close to an unseen one to train on
 
 
-def split_frames(
-    data: Episodes,
-    frames: np.ndarray,
-    states: States,
-    usable: np.ndarray,
-    everywhere: Mapping[str, Mapping[str, np.ndarray]] | None,
-) -> tuple[np.ndarray, str]:
+def split_frames(data: Episodes, frames: np.ndarray, states: States, usable: np.ndarray) -> tuple[np.ndarray, str]:
     """Split video frames [M] by the first tracked instrument's states where these are `usable` [M]; LEFT_OUT elsewhere.
 
-    Return the splits and the rule in words. everywhere: readings by instrument and joint over all of several worlds.
-    Raises NeecoError.
+    Return the splits and the rule in words. Raises NeecoError.
     """
     poses, joints = next(iter(states.values()), (np.tile(np.eye(4), (len(frames), 1, 1)), {}))
     where, rule = data.recording.path, data.recording.splits
-    known = next(iter((everywhere or {}).values()), {})
     by = rule.unseen_by if rule else None
     if by is not None and by not in joints:  # another instrument's
         owner = next((values for _, values in states.values() if by in values), None)
         if owner is None:
             raise NeecoError(f"{where}: splits.unseen_by: {by!r} belongs to an instrument without poses; name another")
         joints = owner
-        known = next((values for values in (everywhere or {}).values() if by in values), {})
     rule = rule or (Splits() if states else Splits(unseen_fraction=0.0))
     readings = {joint: values[usable] for joint, values in joints.items()}
-    assigned, words = assign_splits(frames[usable], poses[usable], readings, rule, data.ranges, known)
+    assigned, words = assign_splits(frames[usable], poses[usable], readings, rule, data.ranges)
     if "train" not in assigned:
         raise NeecoError(f"{where}: splits: leave no frame to train on ({words}); change them")
     for name in rule.test_episodes + rule.unseen_episodes:
@@ -65,13 +56,11 @@ def assign_splits(
     joints: Mapping[str, np.ndarray],
     rule: Splits,
     episodes: Mapping[str, tuple[int, int]] | None = None,
-    everywhere: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, str]:
     """Split video frames [N], given by number; return the splits [N] and the rule in words.
 
     Unseen frames are chosen by poses [N, 4, 4] of the instrument and readings [N] rad by joint. A frame too close to
-    one of them is LEFT_OUT. episodes: the frames (first, last) of each of several; everywhere: the readings over all of
-    several tissues, by which a joint's are unseen.
+    one of them is LEFT_OUT. episodes: the frames (first, last) of each of several.
     """
     episodes = episodes or {}
     whole = rule.test_episodes
@@ -98,7 +87,7 @@ def assign_splits(
         return splits, f"{words}; unseen: video frames {_ranges(rule.unseen)}"
     if rule.unseen_fraction == 0:
         return splits, f"{words}; unseen: none"
-    unseen, why = _extremes(poses, joints, everywhere or joints, rule.unseen_fraction, rule.unseen_by)
+    unseen, why = _extremes(poses, joints, rule.unseen_fraction, rule.unseen_by)
     if not unseen.any():
         return splits, f"{words}; unseen: none, as nothing moves"
     splits[unseen] = "unseen"
@@ -120,20 +109,16 @@ def _ranges(ranges: tuple[tuple[int, int], ...]) -> str:
 
 
 def _extremes(
-    poses: np.ndarray,
-    joints: Mapping[str, np.ndarray],
-    everywhere: Mapping[str, np.ndarray],
-    fraction: float,
-    by: str | None,
+    poses: np.ndarray, joints: Mapping[str, np.ndarray], fraction: float, by: str | None
 ) -> tuple[np.ndarray, str]:
     """Return the frames [N] at the far end of one joint, of the instrument's turn from its mean direction, or half of
     each; and the rule in words."""
-    moving = [name for name, values in everywhere.items() if np.ptp(values) > MIN_RANGE]
+    moving = [name for name, values in joints.items() if np.ptp(values) > MIN_RANGE]
     joint = by or (moving[0] if moving else None)
     share = fraction if by or joint is None else fraction / 2
     unseen, words = np.zeros(len(poses), dtype=bool), []
     if joint is not None:
-        limit = float(np.quantile(everywhere[joint], 1 - share))
+        limit = float(np.quantile(joints[joint], 1 - share))
         unseen |= joints[joint] > limit
         words.append(f"{joint} above {np.degrees(limit):.0f} deg")
     if by is None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.capture.model import PointCloud, evenly_spaced
+from neeco.capture.model import SEPARATE_TISSUES, PointCloud, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.ingest.cameras.still_scene import (
     N_FRAMES,
@@ -31,7 +31,6 @@ from neeco.ingest.shaft.video_instruments import find_in_video
 from neeco.ingest.timing.episodes import Episodes
 from neeco.ingest.timing.reading import require_lens
 from neeco.ingest.world import (
-    NAME_TISSUES,
     World,
     longest_lag,
     note_motion_contradiction,
@@ -135,8 +134,7 @@ def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgre
         if share is not None and share < SAME_PLACE:
             raise NeecoError(
                 f"{data.parts[episode].recording.path}: {name} shows another place than {before}: {share:.0%} of "
-                f"the background is where it was; where that is another tissue, or the scope stands elsewhere, "
-                f"{NAME_TISSUES}"
+                f"the background is where it was; ingest each place alone; of several tissues, {SEPARATE_TISSUES}"
             )
         if share is not None and share < MOSTLY_SIMILAR:
             data.notes.add(

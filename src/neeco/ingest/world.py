@@ -18,8 +18,6 @@ from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.shaft.from_video import FoundShaft
 from neeco.ingest.timing.episodes import Episodes, States
 
-NAME_TISSUES = "state in every recording over which `tissue` it was taken"  # of recordings that show different places
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class World:

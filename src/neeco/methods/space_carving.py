@@ -10,7 +10,6 @@ the shaft's axis (which need not be the sensor's z), the tip, and seeds for the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -87,15 +86,6 @@ class Evidence:
     def device(self) -> torch.device:
         """Device of all tensors."""
         return self.hits.device
-
-    @cached_property
-    def worlds(self) -> tuple[Tensor, ...]:
-        """Frame indices [F_t] of each tissue, in whose world their poses are given; one group where there is one."""
-        tissues = [frame.state.tissue for frame in self.frames]
-        return tuple(
-            torch.tensor([row for row, other in enumerate(tissues) if other == tissue], device=self.device)
-            for tissue in dict.fromkeys(tissues)
-        )
 
     def subset(self, index: Tensor) -> Evidence:
         """Return the evidence of the frames `index` [M]."""
@@ -232,19 +222,11 @@ def posed_views(evidence: Evidence, name: str, settings: CarvingSettings, moved:
     own = own if moved is None else own @ moved
     cameras = evidence.camera_from_world.double()
     poses = torch.linalg.inv(cameras) @ own.double()
+    # uneven shifts, so that periodic motion does not come out the same
     count = settings.pose_shifts
-    exchanged = [(cameras @ _rolled(poses, k, count, evidence.worlds)).float() for k in range(1, count + 1)]
-    return PosedViews(evidence, own, torch.stack(exchanged), settings.motion_ratio)
-
-
-def _rolled(poses: Tensor, number: int, count: int, worlds: Sequence[Tensor]) -> Tensor:
-    """Return poses [F, 4, 4] shifted among the frames of each world, in one of `count` ways."""
-    rolled = poses.clone()
-    for rows in worlds:
-        # uneven shifts, so that periodic motion does not come out the same
-        shift = round(len(rows) * (number + 0.1 * (number % 2)) / (count + 1))
-        rolled[rows] = poses[rows].roll(shift, 0)
-    return rolled
+    shifts = [round(len(poses) * (k + 0.1 * (k % 2)) / (count + 1)) for k in range(1, count + 1)]
+    exchanged = torch.stack([(cameras @ poses.roll(shift, 0)).float() for shift in shifts])
+    return PosedViews(evidence, own, exchanged, settings.motion_ratio)
 
 
 def carved_shape(session: GaussianSession, evidence: Evidence, name: str, generator: torch.Generator) -> CarvedShape:

@@ -23,7 +23,6 @@ class Static(BreathingTissue, Deformation):
     """The canonical Gaussians as they are, in every state; training may let them breathe to see what else moves."""
 
     method = "3dgs"
-    learns_tissues = True
     training_defaults: ClassVar[Mapping[str, Any]] = {**PLAIN_TRAINING, "ssim_weight": 0.2}
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:

@@ -55,8 +55,7 @@ def fit_tissue(
     deformation = Static()
     if breathing is not None:
         deformation.start_breathing(breathing)
-    recorded = Recorded(tissues=scene.recorded.tissues)
-    tissue = GaussianScene(Static.method, canonical, deformation, (), recorded, scene.center)
+    tissue = GaussianScene(Static.method, canonical, deformation, (), Recorded(), scene.center)
     tissue.background = scene.background  # or the background of transparent images would be evidence
     short = replace(
         config,

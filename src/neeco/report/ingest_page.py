@@ -22,10 +22,8 @@ from neeco.files import finite
 from neeco.ingest.assessment import VERDICTS, Assessment, assess_ingest, clock_cost_mm, rms
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recording.compatibility import file_name
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.result import IngestResult
-from neeco.ingest.tissues import ingest_tissues
 from neeco.report import ingest_figures as figures
 from neeco.report.charts import residual_chart
 from neeco.report.coverage import SPLIT_COLORS, degrees_of_freedom, extrapolations, histogram, unvisited
@@ -36,22 +34,20 @@ PAGE = "ingest.html"
 
 @dataclass(frozen=True)
 class Ingested:
-    """Result of `ingest`: the capture in folder `output`, and its verdict.
+    """Result of `ingest`: the capture in folder `output`, the report on it, and the verdict.
 
-    The report and the verdict on every tissue are by its name, "" where recordings name none; a folder converted from
-    another format has none, but `notes` on what it lacks."""
+    A folder converted from another format has neither, but `notes` on what it lacks."""
 
     output: Path
-    results: dict[str, IngestResult] = field(default_factory=dict)
-    verdicts: dict[str, Assessment] = field(default_factory=dict)
+    result: IngestResult | None = None
+    assessment: Assessment | None = None
     problems: list[Problem] = field(default_factory=list)  # found by `check`
     notes: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> str | None:
-        """ "good", "usable" or "doubtful", the worst of the tissues' verdicts; None for a converted folder."""
-        found = {VERDICTS[verdict.level] for verdict in self.verdicts.values()}
-        return next((verdict for verdict in reversed(VERDICTS.values()) if verdict in found), None)
+        """ "good", "usable" or "doubtful"; None for a converted folder."""
+        return None if self.assessment is None else VERDICTS[self.assessment.level]
 
     @cached_property
     def capture(self) -> Capture:
@@ -62,60 +58,45 @@ class Ingested:
         return f"Ingested({str(self.output)!r}, verdict={self.verdict!r})"
 
     def as_json(self) -> dict[str, Any]:
-        """Return numbers and verdicts for scripts."""
-        numbers = {name: result.as_json() | self.verdicts[name].as_json() for name, result in self.results.items()}
-        found: dict[str, Any] = finite(numbers)
-        return dict(found.get("", {"tissues": found}))
+        """Return numbers and the verdict for scripts."""
+        if self.result is None or self.assessment is None:
+            return {}
+        numbers: dict[str, Any] = finite(self.result.as_json() | self.assessment.as_json())
+        return numbers
 
     def lines(self) -> list[str]:
         """Return what was found, where it lies and how good it is, for a terminal."""
-        shown = []
-        for tissue, result in self.results.items():
-            shown += [f"tissue {tissue}:"] if tissue else []
-            shown += result.lines()
+        shown = [] if self.result is None else self.result.lines()
         shown += [f"wrong: {problem}" for problem in errors_only(self.problems)]
         shown.append(f"capture: {self.output}  ({counted(len(self.problems), 'remark')} by `neeco check`)")
-        shown.append(f"page: {', '.join(str(self.output / page_of(tissue)) for tissue in self.results)}")
-        verdicts: list[str] = []
-        for tissue, verdict in self.verdicts.items():
-            first, *others = verdict.lines()
-            of = f"{tissue}: " if tissue else ""
-            verdicts += [f"verdict: {of}{first}", *others, f"{of}{verdict.conclusion}"]
-        stated = " ".join(verdicts).casefold()
+        verdict: list[str] = []
+        if self.assessment is not None:
+            shown.append(f"page: {self.output / PAGE}")
+            first, *others = self.assessment.lines()
+            verdict = [f"verdict: {first}", *others, self.assessment.conclusion]
+        stated = " ".join(verdict).casefold()
 
         def repeats(line: str) -> bool:
             kind, _, words = line.partition(": ")
             return kind in ("note", "wrong") and words.rstrip(".").casefold() in stated
 
-        return [line for line in shown if not repeats(line)] + verdicts
-
-
-def page_of(tissue: str) -> str:
-    """Return the file name of the page about one of several tissues, or about the only one, which has no name."""
-    return f"{Path(PAGE).stem}_{file_name(tissue)}.html" if tissue else PAGE
+        return [line for line in shown if not repeats(line)] + verdict
 
 
 def ingest_and_report(recordings: Sequence[Recording], output: Path, progress: StageProgress) -> Ingested:
-    """Make the capture `output` from recordings, with a page on each tissue in it. Raises NeecoError."""
-    several = any(recording.tissue for recording in recordings)
-    problems: list[Problem] = []
-    verdicts: dict[str, Assessment] = {}
+    """Make the capture `output` from recordings, with a page on it inside. Raises NeecoError."""
+    done: list[Ingested] = []
 
-    def complete(results: dict[str, IngestResult], folder: Path) -> None:
+    def complete(result: IngestResult, folder: Path) -> None:
         progress("writing the page", 0, 0)
         checked = inspect_capture(folder)
-        problems.extend(checked.problems)
         capture = checked.capture or read_capture(folder)
-        for tissue, result in results.items():
-            own = capture.over(tissue) if tissue else capture
-            verdicts[tissue] = assess_ingest(result, own, problems)
-            write_ingest_page(result, verdicts[tissue], folder / page_of(tissue), own)
+        assessment = assess_ingest(result, capture, checked.problems)
+        write_ingest_page(result, assessment, folder / PAGE, capture)
+        done.append(Ingested(output, result, assessment, checked.problems))
 
-    if several:
-        results = ingest_tissues(recordings, output, progress, complete)
-    else:
-        results = {"": ingest(recordings, output, progress, lambda result, folder: complete({"": result}, folder))}
-    return Ingested(output, results, verdicts, problems)
+    ingest(recordings, output, progress, complete)
+    return done[0]
 
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")

@@ -16,7 +16,6 @@ from torch import Tensor
 from neeco.raster.reference import SH_C0
 
 SH_COEFFICIENTS = 16  # degree 3
-TISSUE = "tissue"  # extra [N]: index of the tissue, of several, that a Gaussian of body 0 belongs to
 
 
 @dataclass(frozen=True)
@@ -57,11 +56,6 @@ class CanonicalGaussians:
     def of_instruments(self) -> Tensor:
         """Rows of any instrument, [N] bool; do not modify."""
         return self.bodies > 0
-
-    def of_tissue(self, index: int) -> Tensor:
-        """Return the rows of one of several tissues, [N] bool; of all tissue where there is one."""
-        tissue = self.bodies == 0
-        return tissue & (self.extras[TISSUE] == index) if TISSUE in self.extras else tissue
 
     def tensors(self) -> dict[str, Tensor]:
         """Return every learned tensor by name; extras as `extras.NAME`."""
@@ -134,8 +128,6 @@ def neighbour_spacing(positions: np.ndarray) -> Tensor:
 
 
 def join_bodies(bodies: list[CanonicalGaussians]) -> CanonicalGaussians:
-    """Join single bodies, in order. All must have the same extras; only the first may have `TISSUE`."""
-    if TISSUE in bodies[0].extras:
-        bodies = [bodies[0], *(body.with_extras(**{TISSUE: body.means.new_zeros(len(body))}) for body in bodies[1:])]
+    """Join single bodies, in order. All must have the same extras."""
     tensors = {name: torch.cat([body.tensors()[name] for body in bodies]) for name in bodies[0].tensors()}
     return CanonicalGaussians.from_tensors(tensors, tuple(len(body) for body in bodies))

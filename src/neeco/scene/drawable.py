@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.capture.model import Camera, Capture, Frame, Instrument, InstrumentState, RecordedStates, State, Tissue
+from neeco.capture.model import Camera, Capture, Frame, Instrument, InstrumentState, RecordedStates, State
 from neeco.geometry.lens import Lens
 from neeco.raster.types import Rendering
 
@@ -45,7 +45,6 @@ class Recorded:
     lens: Lens | None = None  # whose distortion was removed from the images; None: not known
     scale: float = 1.0  # of the cameras' images, at which the scene was learned
     still: bool = False  # whether the camera did not move
-    tissues: tuple[str, ...] = ()  # names, where several were recorded, each in its own world
 
     @classmethod
     def of(
@@ -56,7 +55,6 @@ class Recorded:
         lens: Lens | None = None,
         scale: float = 1.0,
         still: bool = False,
-        tissues: Sequence[Tissue] = (),
     ) -> Recorded:
         """Return the recording of `instruments` in `frames`: only these, and of each only its named joints."""
         states = []
@@ -66,29 +64,18 @@ class Recorded:
                 given = frame.state.instruments[instrument.name]
                 joints = {joint: given.joints[joint] for joint in instrument.joints}
                 chosen[instrument.name] = InstrumentState(given.pose, joints)
-            states.append(State(chosen, frame.state.time, frame.state.tissue))
+            states.append(State(chosen, frame.state.time))
         names, splits = tuple(frame.name for frame in frames), tuple(frame.split for frame in frames)
-        cameras, named = tuple(frame.camera for frame in frames), tuple(tissue.name for tissue in tissues)
-        return cls(names, splits, tuple(states), cameras, lens=lens, scale=scale, still=still, tissues=named)
-
-    def over(self, tissue: str) -> Recorded:
-        """Return the training frames of one of several tissues."""
-        rows = [row for row, state in enumerate(self.states) if state.tissue == tissue]
-        columns = ("names", "splits", "states", "cameras")
-        chosen: dict[str, Any] = {name: tuple(getattr(self, name)[row] for row in rows) for name in columns}
-        return replace(self, **chosen)
-
-    def by_tissue(self) -> tuple[Recorded, ...]:
-        """Return the training frames of each tissue; all of them where there is one."""
-        return tuple(self.over(tissue) for tissue in self.tissues) or (self,)
+        cameras = tuple(frame.camera for frame in frames)
+        return cls(names, splits, tuple(states), cameras, lens=lens, scale=scale, still=still)
 
     def as_fitted(self, capture: Capture) -> Capture:
         """Return `capture`, which the scene learned from, with the states of training frames as fitted to their images,
         where they were."""
-        fitted = {(name, state.tissue): state for name, state in zip(self.names, self.states, strict=True)}
+        fitted = dict(zip(self.names, self.states, strict=True))
         frames = []
         for frame in capture.frames:
-            state = fitted.get((frame.name, frame.state.tissue)) if frame.split == "train" else None
+            state = fitted.get(frame.name) if frame.split == "train" else None
             if state is not None:
                 instruments = {**frame.state.instruments, **state.instruments}
                 frame = replace(frame, state=replace(frame.state, instruments=instruments))
@@ -106,16 +93,12 @@ class Recorded:
         ]
         if not found:
             return capture
-        worlds = {tissue: self.over(tissue) for tissue in self.tissues}
-        frames = [
-            replace(frame, state=worlds.get(frame.state.tissue or "", self).with_unrecorded(frame.state, found))
-            for frame in capture.frames
-        ]
+        frames = [replace(frame, state=self.with_unrecorded(frame.state, found)) for frame in capture.frames]
         return replace(capture, frames=tuple(frames))
 
     def with_unrecorded(self, state: State, instruments: Sequence[Instrument]) -> State:
         """Return `state` with the unrecorded joints of `instruments`, interpolated from the training frames nearest to
-        it by pose and time, all of one tissue."""
+        it by pose and time."""
         if not any(item.unrecorded for item in instruments) or not self.states:
             return state
         filled = dict(state.instruments)

@@ -5,11 +5,9 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from functools import partial
 from typing import Any, TypeGuard
 
@@ -22,7 +20,7 @@ from neeco.geometry.rotations import rigid_from_vector
 from neeco.raster import rasterize
 from neeco.raster.devices import CachedPredicate
 from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
-from neeco.scene.canonical import SH_COEFFICIENTS, TISSUE, CanonicalGaussians
+from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
 from neeco.scene.deformation import UNPERTURBED, Deformation, Deltas, Perturbation
 from neeco.scene.drawable import ArticulatedMotion, DrawableScene, Recorded, Skeleton
 from neeco.scene.method import Stored
@@ -45,8 +43,7 @@ class GaussianScene(nn.Module):
     """A learned scene of Gaussians: `at` poses them in a state, whatever the method; `render` renders them.
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
-    in mm, log scale about `center`), applied to every instrument pose; zero unless refined. Several tissues have one
-    each, [T, 7], always refined: an instrument's shape absorbs the constant error of one world, but not of several.
+    in mm, log scale about `center`), applied to every instrument pose; zero unless refined.
     `base_corrections` [I, 6] correct each instrument's poses before that (rotation vector in rad about `center`,
     translation in mm): the error of its robot's base, zero unless found from the images. Before both,
     `state_corrections` correct poses and readings by what depends on the state.
@@ -79,9 +76,9 @@ class GaussianScene(nn.Module):
         self.background = 0.0
         self.diagnostics: dict[str, Any] = {}
         device = canonical.means.device
-        self.register_buffer("center", center.float().to(device))  # [3] mm, middle of the tissue; [T, 3] of several
+        self.register_buffer("center", center.float().to(device))  # [3] mm, middle of the tissue
         zeros = partial(torch.zeros, device=device)
-        self.registration = nn.Parameter(zeros(*center.shape[:-1], 7))
+        self.registration = nn.Parameter(zeros(7))
         self.base_corrections = nn.Parameter(zeros(len(instruments), 6))
         self.state_corrections = StateCorrections(instruments, device)
         self.falloff = nn.Parameter(zeros(2))
@@ -122,10 +119,7 @@ class GaussianScene(nn.Module):
             {name.removeprefix(prefix): t for name, t in stored.tensors.items() if name.startswith(prefix)},
             _counts(header["counts"], len(stored.instruments)),
         )
-        tissues = len(stored.recorded.tissues)
-        if tissues > 1 and not bool(torch.isin(canonical.extras[TISSUE], torch.arange(float(tissues))).all()):
-            raise ValueError("its Gaussians are of tissues that it does not name")
-        center = canonical.means.new_zeros((tissues, 3) if tissues > 1 else 3)
+        center = canonical.means.new_zeros(3)
         scene = cls(header["method"], canonical, deformation, stored.instruments, stored.recorded, center)
         scene.sh_degree = int(header["sh_degree"])
         if scene.sh_degree < 0 or (scene.sh_degree + 1) ** 2 - 1 > canonical.sh_rest.shape[1]:
@@ -139,55 +133,22 @@ class GaussianScene(nn.Module):
     def at(self, state: State, perturbation: Perturbation = UNPERTURBED) -> Gaussians:
         """Return the Gaussians posed in `state`, float32. Gradients reach instrument poses that require them.
 
-        Gaussians of other tissues than the state's have opacity 0. Raises NeecoError when the state lacks an instrument
-        or joint that the scene has, or names no tissue of it where there are several.
+        Raises NeecoError when the state lacks an instrument or joint that the scene has.
         """
-        canonical, shown = self.canonical, self._shown(state)
+        canonical = self.canonical
         posed = self.deformation.pose(canonical, self.registered(state), perturbation)
-        opacities = torch.sigmoid(canonical.opacity_logits)
         tissue, instruments = canonical.counts[0], len(canonical) - canonical.counts[0]
         falloff = torch.cat([self.falloff[:1].expand(tissue), self.falloff[1:].expand(instruments)])
         return Gaussians(
             means=posed.means,
             quats=posed.quats,
             scales=posed.scales,
-            opacities=opacities if shown is None else opacities * shown,
+            opacities=torch.sigmoid(canonical.opacity_logits),
             sh=canonical.spherical_harmonics(self.sh_degree),
             sh_frames=posed.sh_frames,
             headlight=Headlight(falloff, self.vignette, self._shadow()),
             background=canonical.means.new_full((3,), self.background) if self.background else None,
         )
-
-    def _shown(self, state: State) -> Tensor | None:
-        """Return 0 for Gaussians of other tissues than the state's, else 1, [N] float; None: there is one tissue."""
-        index, canonical = self._tissue_index(state), self.canonical
-        if index is None:
-            return None
-        return (canonical.of_tissue(index) | canonical.of_instruments).to(canonical.means.dtype)
-
-    def _tissue_index(self, state: State) -> int | None:
-        """Return the index of the state's tissue; None: there is one. Raises NeecoError for an unknown name."""
-        names = self.recorded.tissues
-        if state.tissue not in (names or (None,)) and (len(names) > 1 or state.tissue is not None):
-            known = f"name one of {', '.join(names)}" if names else "it has one, without a name"
-            raise NeecoError(f"state: tissue: {state.tissue!r} is not in the scene; {known}")
-        return names.index(str(state.tissue)) if len(names) > 1 else None
-
-    def over(self, tissue: str) -> GaussianScene:
-        """Return the scene of one of several tissues, with the frames recorded over it."""
-        index = self.recorded.tissues.index(tissue)
-        chosen = self.canonical.of_tissue(index) | self.canonical.of_instruments
-        counts = (int(self.canonical.of_tissue(index).sum()), *self.canonical.counts[1:])
-        alone = copy.copy(self)
-        alone._buffers, alone._parameters = dict(self._buffers), dict(self._parameters)
-        if self.center.dim() > 1:
-            alone.center = self.center[index]
-            alone.registration = nn.Parameter(self.registration[index].detach(), requires_grad=False)
-            alone._corrects = CachedPredicate(self._corrects.question)
-        canonical = self.canonical.map(lambda tensor: tensor[chosen], counts)
-        alone.canonical = replace(canonical, extras={name: t for name, t in canonical.extras.items() if name != TISSUE})
-        alone.recorded = replace(self.recorded.over(tissue), tissues=(tissue,))
-        return alone
 
     def visibility(self) -> Tensor:
         """Return the visibility [N, 12] of each Gaussian in the training frames (see `neeco.scene.visibility`),
@@ -227,9 +188,7 @@ class GaussianScene(nn.Module):
             bases = dict(zip((item.name for item in self.instruments), self.base_corrections, strict=True))
         if not state.instruments or not (corrects or bases):
             return state
-        index, center, moved = self._tissue_index(state), self.center, dict(state.instruments)
-        if index is not None:
-            registration, center = registration[index], center[index]
+        center, moved = self.center, dict(state.instruments)
         for name, given in state.instruments.items():
             pose = given.pose.to(center)
             if name in bases:
@@ -305,24 +264,6 @@ def require_gaussians(scene: DrawableScene, asked_by: str) -> GaussianScene:
             "such as kinematic"
         )
     return scene
-
-
-def over_one(scene: DrawableScene, tissue: str | None) -> DrawableScene:
-    """Return the scene over the tissue of this name, or the first of several. Raises NeecoError for an unknown name."""
-    names = scene.recorded.tissues
-    if tissue is not None and tissue not in names:
-        known = f"its tissues are {', '.join(names)}" if names else "it has one tissue, without a name"
-        raise NeecoError(f"--tissue: {tissue!r} is not in the scene; {known}")
-    return scene.over(tissue or names[0]) if is_gaussian(scene) and len(names) > 1 else scene
-
-
-def one_tissue(scene: DrawableScene, asked_by: str) -> None:
-    """Raise NeecoError, in the words of the option or verb `asked_by`, for a scene of several tissues."""
-    if len(scene.recorded.tissues) > 1:
-        raise NeecoError(
-            f"{asked_by}: the scene has several tissues ({', '.join(scene.recorded.tissues)}), and this takes one; use "
-            "a run of a capture of one"
-        )
 
 
 def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:

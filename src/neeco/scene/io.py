@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neeco import __version__
 from neeco.capture.documents import Node, RaisingReport
-from neeco.capture.model import Camera, Instrument, InstrumentState, State, share_lamps
+from neeco.capture.model import SEPARATE_TISSUES, Camera, Instrument, InstrumentState, State, share_lamps
 from neeco.capture.readers import kinematics_of
 from neeco.capture.readers.cameras import parse_lens
 from neeco.errors import NeecoError
@@ -85,6 +85,8 @@ def load_scene(path: Path) -> DrawableScene:
         raise NeecoError(f"{path}: not a readable neeco scene (its header is no object); train again")
     if header.get("schema") not in (SCHEMA, OLD_SCHEMA):
         raise NeecoError(f"{path}: schema {header.get('schema')!r}, this version reads {SCHEMA!r}; train again")
+    if isinstance(tissues := header.get("tissues"), list) and len(tissues) > 1:
+        raise NeecoError(f"{path}: tissues: a scene has one tissue, and this {len(tissues)}; {SEPARATE_TISSUES}")
     try:
         return unpack_scene(tensors, header)
     except NeecoError as error:
@@ -136,10 +138,6 @@ def pack_scene(scene: DrawableScene) -> tuple[dict[str, Tensor], dict[str, Any]]
         header["scale"] = recorded.scale
     if recorded.still:
         header["still"] = True
-    if recorded.tissues:
-        header["tissues"] = list(recorded.tissues)
-        for entry, state in zip(header["recorded"], recorded.states, strict=True):
-            entry["tissue"] = state.tissue
     header["deformation"] = plain(scene.settings)
     own_tensors, own_fields = scene.pack()
     tensors, header = tensors | own_tensors, header | own_fields
@@ -186,9 +184,6 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
     """Return the instruments and the training frames. Raises ValueError for impossible values."""
     instruments = tuple(_instrument(entry) for entry in header["instruments"])
     states, cameras = [], []
-    tissues = tuple(header.get("tissues", ()))
-    if len(set(tissues)) < len(tissues) or not all(isinstance(name, str) for name in tissues):
-        raise ValueError("its tissues are not names, each given once")
     for index, entry in enumerate(header["recorded"]):
         moved = {
             instrument.name: InstrumentState(
@@ -197,7 +192,7 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
             )
             for k, instrument in enumerate(instruments)
         }
-        states.append(State(moved, _number(entry["time"]), _one_of(entry["tissue"], tissues) if tissues else None))
+        states.append(State(moved, _number(entry["time"])))
         pose = _pose(tensors["recorded.cameras"][index], f"camera in frame {index}")
         cameras.append(_camera(pose, dict(zip(INTRINSICS, map(_number, entry["intrinsics"]), strict=True))))
     names, splits = (tuple(entry[key] for entry in header["recorded"]) for key in ("name", "split"))
@@ -206,16 +201,8 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
     if not 0 < scale <= 1:
         raise ValueError(f"its scale is {scale}, not a share of the images' size")
     still = header.get("still") is True
-    lit = share_lamps(cameras, states) if still else tuple(cameras)
-    return instruments, Recorded(
-        names, splits, tuple(states), lit, lens=lens, scale=scale, still=still, tissues=tissues
-    )
-
-
-def _one_of(name: Any, tissues: Sequence[str]) -> str:
-    if name not in tissues:
-        raise ValueError(f"a recorded frame shows {name!r}, which is none of its tissues")
-    return name
+    lit = share_lamps(cameras) if still else tuple(cameras)
+    return instruments, Recorded(names, splits, tuple(states), lit, lens=lens, scale=scale, still=still)
 
 
 def _described(instrument: Instrument) -> dict[str, Any]:

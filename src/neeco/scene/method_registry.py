@@ -90,6 +90,4 @@ def unmet_need(method: str, capture: Capture) -> str | None:
     if kind.needs_instruments and not capture.instruments:
         return "instrument states"
     times = {frame.state.time for frame in capture.split("train")} if capture.timed else set()
-    if kind.needs_times and len(times) < 2:
-        return "times of its frames"
-    return "one tissue for all frames" if len(capture.tissues) > 1 and not kind.learns_tissues else None
+    return "times of its frames" if kind.needs_times and len(times) < 2 else None

@@ -25,7 +25,7 @@ from neeco.raster import rasterize
 from neeco.raster.devices import constant
 from neeco.raster.native import all_run_native, native
 from neeco.raster.types import Gaussians
-from neeco.scene.canonical import TISSUE, CanonicalGaussians, seed_gaussians
+from neeco.scene.canonical import CanonicalGaussians, seed_gaussians
 from neeco.scene.drawable import Recorded
 
 # per-Gaussian extras, under the names they have in files
@@ -139,16 +139,14 @@ def outside_all_views(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 
 @torch.no_grad()
-def extrapolate_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera], tissue: int = 0) -> CanonicalGaussians:
-    """Return canonical Gaussians with tissue (body 0; of several the one of this index, observed by `cameras`)
-    extrapolated by MAX_DISTANCE beyond the observed border, in the mean depth and colour of its neighbourhood;
-    unchanged without observed tissue."""
+def extrapolate_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> CanonicalGaussians:
+    """Return canonical Gaussians with tissue (body 0) extrapolated by MAX_DISTANCE beyond the border of what `cameras`
+    observed, in the mean depth and colour of its neighbourhood; unchanged without observed tissue."""
     grid = _Grid(_middle_camera(cameras))
     rows = canonical.body(0)
     means, colors = canonical.means[rows], canonical.sh_dc[rows][:, 0]  # [T, 3] both
     cells, depths = grid.cells(means)
     weights = torch.sigmoid(canonical.opacity_logits[rows]).double() * grid.holds(cells)
-    weights *= canonical.of_tissue(tissue)[rows]
     weights *= (depths > grid.camera.near) & (count_views(means, cameras) >= MIN_FRAME_SHARE * len(cameras))
     known = grid.sums(cells, weights, torch.cat([1 / depths[:, None], colors], 1).double())  # [rows, columns, 1 + 4]
     if not known[..., 0].any():
@@ -160,7 +158,7 @@ def extrapolate_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera],
     chosen = outside & torch.from_numpy(distance < MAX_DISTANCE * grid.camera.width)
     points, colors = positions[chosen], filled[chosen][:, 1:]
     added = seed_gaussians(points, colors, grid.spacing(points), opacity=OPACITY)
-    return _append_tissue(canonical, replace(added, sh_dc=colors[:, None].clone()), tissue)
+    return _append_tissue(canonical, replace(added, sh_dc=colors[:, None].clone()))
 
 
 @dataclass(frozen=True)
@@ -237,13 +235,10 @@ def _filled(known: np.ndarray) -> np.ndarray:
     return gaussian_filter(found, (2.0, 2.0, 0), mode="nearest")
 
 
-def _append_tissue(canonical: CanonicalGaussians, added: CanonicalGaussians, tissue: int) -> CanonicalGaussians:
-    """Return `canonical` with `added` at the end of body 0, marked as extrapolated and as belonging to the tissue."""
-    unmarked = canonical.means.new_zeros(len(canonical))
-    marked = canonical.with_extras(**{EXTRAPOLATED: canonical.extras.get(EXTRAPOLATED, unmarked)})
+def _append_tissue(canonical: CanonicalGaussians, added: CanonicalGaussians) -> CanonicalGaussians:
+    """Return `canonical` with `added` at the end of body 0, marked as extrapolated."""
+    marked = canonical.with_extras(**{EXTRAPOLATED: canonical.means.new_zeros(len(canonical))})
     blank = {name: tensor.new_zeros(len(added), *tensor.shape[1:]) for name, tensor in marked.extras.items()}
-    if TISSUE in blank:
-        blank[TISSUE] += tissue
     added = added.with_extras(**(blank | {EXTRAPOLATED: added.means.new_ones(len(added))}))
     split, new = canonical.counts[0], added.tensors()
     joined = {n: torch.cat([tensor[:split], new[n], tensor[split:]]) for n, tensor in marked.tensors().items()}

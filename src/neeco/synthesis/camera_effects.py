@@ -249,12 +249,11 @@ class RecordedMotion:
     """Samples motions from the recorded frames whose states are most similar to the given one."""
 
     def __init__(self, recorded: Recorded) -> None:
-        known = recorded.states
-        order = sorted(range(len(known)), key=lambda k: (known[k].tissue or "", known[k].time))
+        order = sorted(range(len(recorded.states)), key=lambda k: recorded.states[k].time)
         self._motions, states = [], []
         for first, second in pairwise(order):
             a, b = recorded.states[first], recorded.states[second]
-            if a.tissue == b.tissue and 0 < b.time - a.time <= MAX_GAP_S and set(a.instruments) == set(b.instruments):
+            if 0 < b.time - a.time <= MAX_GAP_S and set(a.instruments) == set(b.instruments):
                 self._motions.append(motion_between(a, recorded.cameras[first], b, recorded.cameras[second]))
                 states.append(a)
         self._frames = SimilarFrames(states, len(states), joints=True)

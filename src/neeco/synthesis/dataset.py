@@ -127,8 +127,6 @@ def synthesize(
         )
     generator = SampleGenerator.of(scene, settings, instrument_scenes)
     info["tissue_tolerance_mm"] = generator.acceptance.tolerance_mm
-    if len(scene.recorded.tissues) > 1:
-        info["tissues"] = list(scene.recorded.tissues)
     if generator.gains:
         info["color_gains"] = [[round(value, 4) for value in gain] for gain in generator.gains]
     folder = DataSetFolder(

@@ -39,7 +39,7 @@ from neeco.synthesis.camera_effects import (
 )
 from neeco.synthesis.cameras import RECORDED_CAMERAS, DrawnCameras
 from neeco.synthesis.mixing import MixedSampler, Mixture
-from neeco.synthesis.samplers import Sampler, TissueSampler, make_sampler
+from neeco.synthesis.samplers import Sampler, make_sampler
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers.folder import Encoded, Record, encoded_sample, skipped_sample
 
@@ -124,7 +124,7 @@ class SampleGenerator:
 
     scene: GaussianScene
     labeller: Labeller
-    sampler: Sampler | TissueSampler | MixedSampler
+    sampler: Sampler | MixedSampler
     acceptance: Acceptance
     settings: Settings
     effects: CameraEffects | None = None
@@ -140,7 +140,7 @@ class SampleGenerator:
         """Return the generator that `settings` describe, of `scene` or of its tissue under the instruments of
         `instrument_scenes`. Raises NeecoError where the scenes do not support them."""
         cameras = DrawnCameras.of(settings, scene.recorded, scene.recorded.cameras)
-        sampler: Sampler | TissueSampler | MixedSampler
+        sampler: Sampler | MixedSampler
         groups: tuple[frozenset[str], ...] = ()
         gains: tuple[tuple[float, float, float], ...] = ()
         tissue = scene

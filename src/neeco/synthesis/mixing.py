@@ -28,9 +28,9 @@ from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies
 from neeco.scene.deformation import Deformation
 from neeco.scene.drawable import Recorded
-from neeco.scene.gaussian_scene import GaussianScene, one_tissue
+from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.visibility import VISIBILITY
-from neeco.synthesis.samplers import Sampler, TissueSampler, make_sampler
+from neeco.synthesis.samplers import Sampler, make_sampler
 
 if TYPE_CHECKING:
     from neeco.synthesis.settings import Settings
@@ -55,13 +55,7 @@ class Mixture:
 
     @classmethod
     def of(cls, tissue: GaussianScene, instrument_scenes: Sequence[GaussianScene]) -> Mixture:
-        """Instruments recorded over several tissues are placed as over the first. Raises NeecoError where a scene's
-        instruments cannot be taken out of it, or two have the same name."""
-        one_tissue(tissue, "--tissue")
-        instrument_scenes = [
-            scene.over(scene.recorded.tissues[0]) if len(scene.recorded.tissues) > 1 else scene
-            for scene in instrument_scenes
-        ]
+        """Raises NeecoError where a scene's instruments cannot be taken out of it, or two have the same name."""
         for scene in (tissue, *instrument_scenes):
             if not scene.deformation.separates_instruments or scene.method != tissue.method:
                 raise NeecoError(
@@ -153,7 +147,7 @@ class MixedSampler:
     scene draws."""
 
     mixture: Mixture
-    samplers: tuple[Sampler | TissueSampler, ...]
+    samplers: tuple[Sampler, ...]
     prescribed: bool = False
 
     def fixed(self, index: int) -> bool:

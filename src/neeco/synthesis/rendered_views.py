@@ -75,7 +75,7 @@ def state_views(scene: DrawableScene, path: Path) -> list[View]:
     first = scene.recorded.cameras[0]
     views = []
     instruments = scene.recorded.with_limits(scene.instruments)
-    for k, line in enumerate(read_states(path, instruments, scene.recorded.tissues)):
+    for k, line in enumerate(read_states(path, instruments)):
         camera = first if line.world_from_camera is None else moved_camera(first, line.world_from_camera)
         views.append(View(f"{k:06d}", line.state, camera))
     return views

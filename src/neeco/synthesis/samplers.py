@@ -6,7 +6,7 @@ Views: recorded cameras, cameras near them, cameras in orbit about the tissue.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -164,48 +164,24 @@ class Sampler:
         return state, camera
 
 
-@dataclass(frozen=True)
-class TissueSampler:
-    """Samples (state, camera) of image `index` over several tissues in turn, by the sampler of each recording."""
-
-    samplers: tuple[Sampler, ...]
-
-    @property
-    def prescribed(self) -> bool:
-        """See `Sampler.prescribed`."""
-        return self.samplers[0].prescribed
-
-    def fixed(self, index: int) -> bool:
-        """Return False: no camera is given where states are sampled."""
-        return False
-
-    def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
-        """Return the next (state, camera) for image `index`."""
-        number, turn = divmod(index, len(self.samplers))
-        return self.samplers[turn](number, rng)
-
-
-@dataclass(frozen=True)
-class TissueViews:
-    """The view of a state by the sampler of the tissue that it names."""
-
-    by_tissue: Mapping[str | None, ViewSampler]
-
-    def __call__(self, state: State, rng: Generator) -> Camera:
-        return self.by_tissue[state.tissue](state, rng)
-
-
-def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views, count: int) -> Sampler | TissueSampler:
-    """The sampler named by `states` (interpolate, extrapolate, grid, path:FILE or FILE) and `views`, over each of the
-    scene's tissues. Raises NeecoError."""
-    tissues = scene.recorded.tissues
-    if len(tissues) < 2:
-        return _sampler(scene, states, margin, _view_sampler(scene, views), count)
-    alone = {tissue: scene.over(tissue) for tissue in tissues}
-    seen: dict[str | None, ViewSampler] = {tissue: _view_sampler(own, views) for tissue, own in alone.items()}
-    if states not in SAMPLERS:
-        return _sampler(scene, states, margin, TissueViews(seen), count)
-    return TissueSampler(tuple(_sampler(own, states, margin, seen[tissue], count) for tissue, own in alone.items()))
+def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views, count: int) -> Sampler:
+    """The sampler named by `states` (interpolate, extrapolate, grid, path:FILE or FILE) and `views`. Raises
+    NeecoError."""
+    view_sampler = _view_sampler(scene, views)
+    if states == "interpolate":
+        return Sampler(scene, InterpolatedStates(scene.recorded.states), view_sampler)
+    if states == "extrapolate":
+        return Sampler(scene, ExtrapolatedStates(scene.recorded.states, scene.instruments, margin), view_sampler)
+    if states == "grid":
+        return Sampler(scene, GridStates(scene.recorded.states, instrument_axes(scene)), view_sampler)
+    lines = read_states(states_file(states), scene.recorded.with_limits(scene.instruments))
+    if states.startswith(PATH_PREFIX):
+        return Sampler(scene, PathStates([line.state for line in lines], count), view_sampler)
+    intrinsics = scene.recorded.cameras[0]
+    cameras = tuple(
+        None if line.world_from_camera is None else moved_camera(intrinsics, line.world_from_camera) for line in lines
+    )
+    return Sampler(scene, ListedStates([line.state for line in lines]), view_sampler, cameras)
 
 
 def _view_sampler(scene: GaussianScene, views: Views) -> ViewSampler:
@@ -221,23 +197,6 @@ def _view_sampler(scene: GaussianScene, views: Views) -> ViewSampler:
     elif views == "orbit":
         view_sampler = OrbitViews(recorded, surface_centre(scene))
     return view_sampler
-
-
-def _sampler(scene: GaussianScene, states: str, margin: float, view_sampler: ViewSampler, count: int) -> Sampler:
-    if states == "interpolate":
-        return Sampler(scene, InterpolatedStates(scene.recorded.states), view_sampler)
-    if states == "extrapolate":
-        return Sampler(scene, ExtrapolatedStates(scene.recorded.states, scene.instruments, margin), view_sampler)
-    if states == "grid":
-        return Sampler(scene, GridStates(scene.recorded.states, instrument_axes(scene)), view_sampler)
-    lines = read_states(states_file(states), scene.recorded.with_limits(scene.instruments), scene.recorded.tissues)
-    if states.startswith(PATH_PREFIX):
-        return Sampler(scene, PathStates([line.state for line in lines], count), view_sampler)
-    intrinsics = scene.recorded.cameras[0]
-    cameras = tuple(
-        None if line.world_from_camera is None else moved_camera(intrinsics, line.world_from_camera) for line in lines
-    )
-    return Sampler(scene, ListedStates([line.state for line in lines]), view_sampler, cameras)
 
 
 def states_file(states: str) -> Path:

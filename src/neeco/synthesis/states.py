@@ -84,7 +84,7 @@ def interpolate_state(first: State, second: State, weight: float) -> State:
         instruments[name] = InstrumentState(
             torch.from_numpy(interpolate_pose(to_numpy(a.pose), to_numpy(b.pose), weight)), joints
         )
-    return State(instruments, (1 - weight) * first.time + weight * second.time, first.tissue)
+    return State(instruments, (1 - weight) * first.time + weight * second.time)
 
 
 def joint_ranges(states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
@@ -218,8 +218,6 @@ class PathStates:
     def __init__(self, keys: Sequence[State], count: int) -> None:
         if len(keys) < 2:
             raise NeecoError(f"--states path: {len(keys)} key state(s); a path needs at least two")
-        if len(tissues := {key.tissue or "" for key in keys}) > 1:
-            raise NeecoError(f"--states path: its states are over {' and '.join(sorted(tissues))}; a path is over one")
         self.keys, self.count = list(keys), count
 
     def place(self, index: int) -> tuple[int, float]:

@@ -368,11 +368,8 @@ class StoredImages(Dataset[Sample]):
             part_names=self.part_names,
             keypoint_names=self.keypoint_names,
         )
-        state = State(
-            {i["name"]: InstrumentState(i["pose"], i["joints"]) for i in record["instruments"]},
-            record["time"],
-            record.get("tissue"),
-        )
+        instruments = {i["name"]: InstrumentState(i["pose"], i["joints"]) for i in record["instruments"]}
+        state = State(instruments, record["time"])
         world_from_camera = torch.from_numpy(swap_camera_axes(np.array(record["camera"], np.float64)))
         place = Node(
             {"w": size[0], "h": size[1]} | record["intrinsics"], str(self.folder / "states.jsonl"), "", RaisingReport()

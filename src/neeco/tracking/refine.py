@@ -22,7 +22,6 @@ from neeco.errors import NeecoError
 from neeco.files import own_folder, read_begun, read_bytes, read_json, require_same, write_json
 from neeco.fitting.state_fitter import loose_prior
 from neeco.scene import GaussianScene
-from neeco.scene.gaussian_scene import one_tissue
 from neeco.settings import with_fields
 from neeco.tracking.parameters import fitter_of
 from neeco.tracking.track import INFO
@@ -65,7 +64,6 @@ def refine_run(
         require_same(str(output / BEGUN), ((key, begun.get(key), value) for key, value in info.items()))
     if not (folder / "transforms.json").exists():
         scene, own = run.scene, run.capture()
-        one_tissue(scene, "refine")
         own, frames = without_twice(own, [frame for path in tracked for frame in _tracked_frames(path, scene)])
         if not frames:
             raise NeecoError(f"{tracked[0]}: every frame is one that the run was trained on; track other footage")

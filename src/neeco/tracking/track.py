@@ -26,7 +26,6 @@ from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, own_folder, read_begun, read_json, require_same, write_json
 from neeco.scene import Recorded
-from neeco.scene.gaussian_scene import one_tissue
 from neeco.scene.io import load_gaussians, save_scene
 from neeco.tracking.follow import SEARCH_ROLLS_EVERY, Follower, Step
 from neeco.tracking.footage_scene import adapted, over_tissue
@@ -123,9 +122,6 @@ def track_footage(
     if not 0 <= min_trust <= 1:
         raise NeecoError(f"--min-trust: {min_trust} is not a share; give 0 to 1")
     scene = run.scene
-    one_tissue(scene, "track")
-    if footage.tissues:
-        raise NeecoError(f"{footage.root}: tissues: footage is of one; track each tissue's by itself")
     parameters = TrackedParameters.of(scene)
     frames = sorted(footage.frames, key=lambda frame: frame.state.time)
     given = _first_state(footage, frames[0], scene) if start == "first" else None

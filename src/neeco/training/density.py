@@ -11,7 +11,7 @@ from torch import Tensor
 from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster.devices import constant
 from neeco.raster.optimizer import Adam
-from neeco.scene.canonical import TISSUE, CanonicalGaussians
+from neeco.scene.canonical import CanonicalGaussians
 from neeco.training.config import DensityConfig
 
 
@@ -47,7 +47,7 @@ def control_density(
     unsupported: Tensor | None = None,
 ) -> CanonicalGaussians:
     """Prune transparent and `unsupported` [N] bool Gaussians, clone small and split large ones whose gradient exceeds
-    `threshold`, strongest first. Each body has at most its `max_gaussians`, each of several tissues those of body 0.
+    `threshold`, strongest first. Each body has at most its `max_gaussians`.
 
     Gaussians up to `dense_size` mm are cloned, larger ones split. `threshold` = inf only prunes. Adam's moments follow
     their rows; new rows start at zero.
@@ -59,10 +59,8 @@ def control_density(
     if unsupported is not None:
         keep &= ~unsupported
     grow = keep & (gradients > threshold)
-    tissues = int(canonical.extras[TISSUE].max()) + 1 if TISSUE in canonical.extras else 1
-    limited = [(canonical.of_tissue(tissue), max_gaussians[0]) for tissue in range(tissues)]
-    limited += [(bodies == body, limit) for body, limit in enumerate(max_gaussians) if body > 0]
-    for rows, limit in limited:
+    for body, limit in enumerate(max_gaussians):
+        rows = bodies == body
         room = max(0, limit - int((keep & rows).sum()))
         wanted = torch.nonzero(grow & rows)[:, 0]
         if len(wanted) > room:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ import torch
 from neeco.capture.images import has_alpha
 from neeco.capture.model import Capture, Frame, Instrument, PointCloud
 from neeco.errors import NeecoError
-from neeco.scene.canonical import TISSUE, CanonicalGaussians, neighbour_spacing, seed_gaussians
+from neeco.scene.canonical import neighbour_spacing, seed_gaussians
 from neeco.scene.drawable import DrawableScene, Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.method_registry import make_deformation, method_class
@@ -61,32 +60,16 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
         lens=capture.lens,
         scale=config.scale,
         still=capture.still,
-        tissues=capture.tissues,
     )
-    worlds = [tissue.points for tissue in capture.tissues] or [capture.points]
-    clouds = [_thinned_points(points, frames, config) for points in worlds]
-    tissue = _seed_tissue(clouds)
+    positions, colors = _thinned_points(capture.points, frames, config)
+    tissue = seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
     deformation = make_deformation(config.method, instruments, config.deformation)
     deformation.fit_ranges(list(recorded.states), tissue.means)
-    centers = torch.from_numpy(np.stack([np.median(positions, 0) for positions, _ in clouds]))
-    center = centers if len(centers) > 1 else centers[0]
+    center = torch.from_numpy(np.median(positions, 0))
     tissue = tissue.with_extras(**deformation.initial_extras(tissue))
     scene = GaussianScene(config.method, tissue, deformation, instruments, recorded, center)
     scene.background = background
     return scene
-
-
-def _seed_tissue(clouds: Sequence[tuple[np.ndarray, np.ndarray]]) -> CanonicalGaussians:
-    """Return the first Gaussians of all tissues in one body, from positions [P, 3] mm and colours [P, 3] of each."""
-    seeded = [
-        seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
-        for positions, colors in clouds
-    ]
-    if len(seeded) == 1:
-        return seeded[0]
-    marked = [one.with_extras(**{TISSUE: one.means.new_full((len(one),), index)}) for index, one in enumerate(seeded)]
-    tensors = {name: torch.cat([one.tensors()[name] for one in marked]) for name in marked[0].tensors()}
-    return CanonicalGaussians.from_tensors(tensors, (sum(len(one) for one in marked),))
 
 
 def _thinned_points(

@@ -99,8 +99,7 @@ class GaussianSession(GaussianTraining):
         """Make the scene's tensors leaves of autograd and clear the statistics, once the canonical Gaussians exist."""
         scene = self.scene
         scene.requires_grad_(True)
-        several = scene.registration.dim() > 1 and bool(scene.instruments)
-        scene.registration.requires_grad_(self.config.refine.registration or several)
+        scene.registration.requires_grad_(self.config.refine.registration)
         scene.base_corrections.requires_grad_(False)  # found before the first step: gradients hardly move them
         self.begin_statistics()
 
@@ -286,24 +285,11 @@ class GaussianSession(GaussianTraining):
                 threshold=self.resolution.threshold_at(progress, settings.threshold) if grows else math.inf,
                 generator=self.generator,
                 config=config.density,
-                unsupported=self._unsupported(),
+                unsupported=scene.deformation.prune_mask(scene.canonical, [camera for _, camera in self.given]),
             )
             self.begin_statistics()
         if settings.opacity_reset and self._due(settings.opacity_reset) and progress < config.growth_stop:
             reset_opacity(scene.canonical, self.adam, config.density.reset_opacity)
-
-    def _unsupported(self) -> Tensor | None:
-        """Return [N] bool: Gaussians that the method prunes whatever their opacity, of each tissue by the cameras that
-        observe it; None: none."""
-        canonical, names = self.scene.canonical, self.scene.recorded.tissues
-        found: Tensor | None = None
-        for index, name in enumerate(names or (None,)):
-            cameras = [camera for state, camera in self.given if state.tissue == name]
-            mask = self.scene.deformation.prune_mask(canonical, cameras)
-            if mask is not None and len(names) > 1:
-                mask = mask & canonical.of_tissue(index)
-            found = mask if found is None or mask is None else found | mask
-        return found
 
     def _due(self, interval: int) -> bool:
         """Return whether this step reached a multiple of `interval` iterations."""
@@ -367,8 +353,7 @@ class GaussianSession(GaussianTraining):
         scene.diagnostics["phase_2_began"] = self.schedule.phase_started
         scene.diagnostics["phase_2_forced"] = self.schedule.forced
         shares = self.refinement.prior_shares()  # before what states predict is taken out of the corrections
-        if len(scene.recorded.tissues) < 2:  # corrections are relative to their mean over one tissue
-            self._predict_states()
+        self._predict_states()
         self.refinement.scale_deviations(shares)
         scene.deformation.finish(self)
         if scene.instruments:
@@ -398,11 +383,8 @@ def new_session(
 ) -> GaussianSession:
     """Return a session at iteration 0, on the device of the views; `start` it before the first step."""
     generator = torch.Generator(views.device).manual_seed(config.seed)
-    centers, tissues = scene.center.cpu().view(-1, 3), scene.recorded.tissues
-    distances = []
-    for frame in views.frames:
-        center = centers[tissues.index(frame.state.tissue) if len(centers) > 1 else 0]
-        distances.append(float((frame.camera.world_from_camera[:3, 3].float() - center).norm()))
+    center = scene.center.cpu()
+    distances = [float((frame.camera.world_from_camera[:3, 3].float() - center).norm()) for frame in views.frames]
     extent = 0.5 * float(np.median(distances))
     return GaussianSession(
         scene=scene,

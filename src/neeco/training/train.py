@@ -187,9 +187,8 @@ def _size_note(frames: tuple[Frame, ...], config: TrainConfig) -> str:
     tissue, instrument = config.gaussian_limits(pixels)
     stored, working = 1.5 * 3 * pixels * len(frames), PIXEL_BYTES * pixels  # full images and those half their size
     width, height = round(config.scale * camera.width), round(config.scale * camera.height)
-    each = "each " if len({frame.state.tissue for frame in frames}) > 1 else ""
     return (
-        f"{len(frames)} images of {width}x{height}; at most {tissue} Gaussians of {each}tissue and {instrument} of "
+        f"{len(frames)} images of {width}x{height}; at most {tissue} Gaussians of tissue and {instrument} of "
         f"each instrument; about {(BASE_BYTES + stored + working) / 1e9:.1f} GB of memory"
     )
 
@@ -200,13 +199,7 @@ def _training_frames(capture: Capture, path: Path, config: TrainConfig) -> tuple
         raise NeecoError(
             f"{path}: instruments: no states are recorded; method {config.method} needs them, 3dgs does not"
         )
-    if len(capture.tissues) > 1:
-        names = ", ".join(tissue.name for tissue in capture.tissues)
-        if not method_class(config.method).learns_tissues:
-            raise NeecoError(
-                f"{path}: tissues: there are several ({names}); method {config.method} learns one, kinematic several"
-            )
-    elif unmet_need(config.method, capture):
+    if unmet_need(config.method, capture):
         raise NeecoError(
             f"{path}: time: the recording does not say when frames were taken; method {config.method} needs it (give "
             "each frame its `time` in seconds), 3dgs does not"

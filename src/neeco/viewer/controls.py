@@ -90,7 +90,7 @@ def interpolated_state(states: Sequence[State], frame: float) -> State:
         pose = interpolate_pose(to_numpy(one.pose), to_numpy(two.pose), share)
         joints = {joint: (1 - share) * value + share * two.joints[joint] for joint, value in one.joints.items()}
         moved[name] = InstrumentState(torch.from_numpy(pose), joints)
-    return State(moved, (1 - share) * start.time + share * end.time, start.tissue)
+    return State(moved, (1 - share) * start.time + share * end.time)
 
 
 def shafts_of(scene: DrawableScene) -> dict[str, Shaft]:

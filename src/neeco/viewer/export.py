@@ -33,7 +33,7 @@ from neeco.labels.labellers import threshold_of
 from neeco.raster.reference import SH_C0
 from neeco.scene import DrawableScene, GaussianScene
 from neeco.scene.drawable import ArticulatedMotion
-from neeco.scene.gaussian_scene import over_one, require_gaussians
+from neeco.scene.gaussian_scene import require_gaussians
 from neeco.training.run import TrainedRun, load_run
 from neeco.viewer.controls import shafts_of, slider_ranges
 
@@ -54,22 +54,18 @@ SCORES = (
 )
 
 
-def export_page(run: Path, output: Path, sh_degree: int, device: torch.device, tissue: str | None = None) -> str:
+def export_page(run: Path, output: Path, sh_degree: int, device: torch.device) -> str:
     """Write the page of a run to `output`; returns a line that says what was written.
 
-    sh_degree: of the spherical harmonics that are kept, 0 to 3; tissue: which of several, None: the first. Raises
-    NeecoError for a run that is unfinished or whose method asks a network for every state, and where the file cannot be
-    written.
+    sh_degree: of the spherical harmonics that are kept, 0 to 3. Raises NeecoError for a run that is unfinished or whose
+    method asks a network for every state, and where the file cannot be written.
     """
     if not 0 <= sh_degree <= MAX_DEGREE:
         raise NeecoError(f"--sh: {sh_degree} is no degree of harmonics; give 0 to {MAX_DEGREE}")
     trained = load_run(run, device)
-    page = page_of_run(trained, sh_degree, tissue)
+    page = page_of_run(trained, sh_degree)
     write_text(Path(output), page)
-    shown = over_one(trained.scene, tissue)
-    names = trained.scene.recorded.tissues
-    over = f" over {shown.recorded.tissues[0]} (of {', '.join(names)})" if len(names) > 1 else ""
-    return f"{output}: {len(page) / 1e6:.2f} MB, {shown.num_gaussians:,} Gaussians{over}; open it in any browser"
+    return f"{output}: {len(page) / 1e6:.2f} MB, {trained.scene.num_gaussians:,} Gaussians; open it in any browser"
 
 
 def embedded_page(run: TrainedRun) -> str | None:
@@ -77,20 +73,17 @@ def embedded_page(run: TrainedRun) -> str | None:
     return None if why_not(run.scene) else page_of_run(run, EMBEDDED_DEGREE)
 
 
-def page_of_run(run: TrainedRun, sh_degree: int, tissue: str | None = None) -> str:
-    """The page of a run over one tissue (None: the first), harmonics up to `sh_degree`. Raises NeecoError where
-    a page cannot hold it (`why_not`)."""
+def page_of_run(run: TrainedRun, sh_degree: int) -> str:
+    """The page of a run, harmonics up to `sh_degree`. Raises NeecoError where a page cannot hold it (`why_not`)."""
     if refusal := why_not(run.scene):
         raise NeecoError(f"--export: {refusal}")
-    scene = require_gaussians(over_one(run.scene, tissue), "--export")
+    scene = require_gaussians(run.scene, "--export")
     facts = [
         ("capture", Path(run.config["capture"]).name),
         ("method", scene.method),
         ("Gaussians", f"{len(scene.canonical):,}"),
         ("frames trained on", str(len(scene.recorded.names))),
     ]
-    if len(names := run.scene.recorded.tissues) > 1:
-        facts.append(("tissue", f"{scene.recorded.tissues[0]}, of {', '.join(names)}"))
     iterations = scene.diagnostics.get("iterations")
     if isinstance(iterations, int):
         facts.append(("iterations", f"{iterations:,}"))

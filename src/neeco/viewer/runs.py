@@ -25,7 +25,7 @@ from neeco.evaluation.mask_metrics import iou
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.scene.drawable import DrawableScene, Recorded
-from neeco.scene.gaussian_scene import is_gaussian, over_one
+from neeco.scene.gaussian_scene import is_gaussian
 from neeco.scene.io import load_scene
 from neeco.training.run import checkpoint_path, read_checkpoint, read_config
 from neeco.viewer.controls import Shaft, shafts_of
@@ -58,7 +58,6 @@ class LoadedRun:
     shafts: dict[str, Shaft]
     iteration: int | None  # that training had reached; None: it has finished
     trouble: str = ""  # why the capture is not at hand
-    tissues: tuple[str, ...] = ()  # of several that the run has, of which the scene is over one
 
     @cached_property
     def labels(self) -> Tensor | None:
@@ -87,10 +86,9 @@ class LoadedRun:
 class WatchedRun:
     """Reads a run folder, and again when it has changed. Any thread may ask for what was read last."""
 
-    def __init__(self, path: Path, device: torch.device | None = None, tissue: str | None = None) -> None:
-        """tissue: which of several is looked at; None: the first. Raises NeecoError where `path` holds no scene,
-        finished or not."""
-        self.path, self.device, self.tissue = Path(path), device, tissue
+    def __init__(self, path: Path, device: torch.device | None = None) -> None:
+        """Raises NeecoError where `path` holds no scene, finished or not."""
+        self.path, self.device = Path(path), device
         self._refreshing = threading.Lock()
         self._stamp = self._current_stamp()
         self.loaded = self._load()  # replaced as a whole: a reader never sees half of a change
@@ -142,9 +140,6 @@ class WatchedRun:
         capture, trouble = _read_capture_of(config)
         if capture is not None:
             capture = scene.recorded.completed(capture, scene.instruments)
-        tissues, scene = scene.recorded.tissues, over_one(scene, self.tissue)
-        if capture is not None and len(tissues) > 1:
-            capture = capture.over(scene.recorded.tissues[0])
         if not scene.recorded.states and capture is None:
             raise NeecoError(f"{self.path}: the scene remembers no frames, and its capture is gone; train again")
         frames = () if capture is None else capture.frames
@@ -163,7 +158,6 @@ class WatchedRun:
             shafts=shafts_of(scene),
             iteration=iteration,
             trouble=trouble,
-            tissues=tissues,
         )
 
 
@@ -277,9 +271,9 @@ def spread_order(count: int) -> list[int]:
 class ViewedRun(WatchedRun):
     """The run that all browsers of a server share, and what is known of its frames. Any thread may use it."""
 
-    def __init__(self, path: Path, device: torch.device | None = None, tissue: str | None = None) -> None:
+    def __init__(self, path: Path, device: torch.device | None = None) -> None:
         """Raises NeecoError for a run folder without a scene."""
-        super().__init__(path, device, tissue)
+        super().__init__(path, device)
         self.distance = self.loaded.distance  # mm
         self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
         self.timeline = Timeline(self.loaded)

@@ -59,7 +59,7 @@ class SavedStates:
         """Read the saved states, checked against the scene. Raises NeecoError."""
         if not self.states_path.exists():
             return []
-        return read_states(self.states_path, loaded.scene.instruments, loaded.scene.recorded.tissues)
+        return read_states(self.states_path, loaded.scene.instruments)
 
     def save_image(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> Path:
         """Write one labelled image as `synthesize` does, of the recorded cameras' intrinsics, as large as was asked;

@@ -87,12 +87,10 @@ class ViewerServer(ViserPage):
         port: int = PORT,
         device: torch.device | None = None,
         size: SizeSettings = RECORDED_SIZE,
-        tissue: str | None = None,
     ) -> None:
-        """port: or the next that is free. size: of saved images, and sharp pictures are as high. tissue: which of
-        several is shown; None: the first. Raises NeecoError."""
+        """port: or the next that is free. size: of saved images, and sharp pictures are as high. Raises NeecoError."""
         require_viser()
-        self.run = ViewedRun(run, device, tissue)
+        self.run = ViewedRun(run, device)
         cameras = self.run.loaded.recorded.cameras
         height = size.of(cameras[0].width, cameras[0].height)[1]
         self._sharp_px = None if size == RECORDED_SIZE else height

@@ -60,7 +60,7 @@ def exported_state(scene: GaussianScene, frame: int, states: Path | None) -> tup
     if states is None:
         return state, camera
     instruments = scene.recorded.with_limits(scene.instruments)
-    line = read_states(states, instruments, scene.recorded.tissues)[0]
+    line = read_states(states, instruments)[0]
     if line.world_from_camera is not None:
         camera = replace(camera, world_from_camera=torch.from_numpy(line.world_from_camera))
     return line.state, camera
@@ -68,9 +68,7 @@ def exported_state(scene: GaussianScene, frame: int, states: Path | None) -> tup
 
 @torch.no_grad()
 def splats_of(scene: GaussianScene, state: State, camera: Camera) -> Splats:
-    """The scene in `state`, over its tissue, lit as `camera` has it."""
-    if state.tissue is not None and len(scene.recorded.tissues) > 1:
-        scene = scene.over(state.tissue)
+    """The scene in `state`, lit as `camera` has it."""
     posed = shadowed(scene.at(state), camera, depth_maps)
     sh = _in_world(posed)
     if posed.headlight is not None:

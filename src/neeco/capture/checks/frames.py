@@ -40,16 +40,11 @@ def check_frames(parsed: Parsed) -> None:
     elif counts["train"] < FEW_TRAIN_FRAMES:
         message = f"few frames: {counts['train']} to train on, fewer than {FEW_TRAIN_FRAMES} give a poor scene"
         frames.warning(message, "record more if you can")
-    for part in parsed.by_tissue() if parsed.still else ():
-        cameras = [frame.camera.world_from_camera.double() for frame in part.with_cameras().frames]
+    if parsed.still:
+        cameras = [frame.camera.world_from_camera.double() for frame in parsed.with_cameras().frames]
         if (count := len({tuple(pose.numpy().round(6).ravel().tolist()) for pose in cameras})) > MAX_STILL_CAMERAS:
             message = f"is 'still', but the frames have {count} different cameras"
             parsed.header("camera_motion").error(message, "write 'moving', or correct transform_matrix")
-    trained = Counter(frame.state.tissue for frame in parsed.frames if frame.split == "train")
-    for tissue in parsed.tissues:
-        if not trained[tissue.name]:
-            message = f"no frame of split 'train' shows {printable(tissue.name)}"
-            parsed.header("tissues").error(message, "give it training frames, or leave it out")
     if not counts["test"]:
         frames.warning("split 'test' is empty", "without it nothing tells how good the scene is")
     _check_times(parsed)
@@ -63,7 +58,7 @@ def check_frames(parsed: Parsed) -> None:
 
 def _check_times(parsed: Parsed) -> None:
     frames = parsed.header("frames")
-    latest: dict[tuple[str, str | None], float] = {}
+    latest: dict[str, float] = {}
     backwards = []
     instants: dict[tuple[object, ...], Camera] = {}
     for frame, place in zip(parsed.frames, parsed.places, strict=True):
@@ -72,9 +67,9 @@ def _check_times(parsed: Parsed) -> None:
         views = [(one.fx, one.fy, one.cx, one.cy, one.world_from_camera.tolist()) for one in (first, frame.camera)]
         if first is not frame.camera and views[0] != views[1]:
             continue  # another camera at the same instant
-        if time < latest.get((place.file, frame.state.tissue), time):
+        if time < latest.get(place.file, time):
             backwards.append(place)
-        latest[place.file, frame.state.tissue] = time
+        latest[place.file] = time
     if not parsed.timed:
         frames.warning("not every frame has a time; the order stands in", "add `time` in seconds")
     elif len(instants) > 1 and len({frame.state.time for frame in parsed.frames}) == 1:
@@ -103,12 +98,9 @@ def check_image_files(parsed: Parsed, pictures: Pictures, compared: Mapping[Path
 
     pictures: receives what other checks compare; compared: the sizes of these, by the image.
     """
-    clouds = {tissue.name: measured_sample(tissue.points) for tissue in parsed.tissues}
-    shared = measured_sample(parsed.points)
-    points = [clouds.get(str(frame.state.tissue), shared) for frame in parsed.frames]
     cameras = [None if row in parsed.without_camera else frame.camera for row, frame in enumerate(parsed.frames)]
     sizes = [compared.get(frame.image_path, ()) for frame in parsed.frames]
-    decoded = in_threads(partial(_decode, pictures), parsed.frames, cameras, points, sizes)
+    decoded = in_threads(partial(_decode, pictures, measured_sample(parsed.points)), parsed.frames, cameras, sizes)
     # the reader may have reported an image whose size it wanted to know
     reported = [place.child("file_path").reported for place in parsed.places]
     first: dict[bytes, int] = {}
@@ -131,7 +123,7 @@ def check_image_files(parsed: Parsed, pictures: Pictures, compared: Mapping[Path
 
 
 def _decode(
-    pictures: Pictures, frame: Frame, camera: Camera | None, points: np.ndarray, sizes: Collection[Size]
+    pictures: Pictures, points: np.ndarray, frame: Frame, camera: Camera | None, sizes: Collection[Size]
 ) -> _Decoded:
     """Decode a frame's image and mask, keep them reduced to some sizes, and measure what the mask hides. Errors name
     files without their folders."""

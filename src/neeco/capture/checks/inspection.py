@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +34,9 @@ class CaptureSummary:
     joints: dict[str, tuple[float, float]]  # "instrument.joint" -> lowest and highest value, rad
     travel_mm: dict[str, float]  # instrument -> diagonal of the box its origin moves in
     still: bool = False  # the scope stood still
-    tissues: dict[str, int] = field(default_factory=dict)  # of several: name -> frames
 
     def as_json(self) -> dict[str, Any]:
-        return {key: value for key, value in asdict(self).items() if key != "tissues" or value}
+        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -85,26 +84,23 @@ def inspect_capture(
         report.error(transforms, "frames", "holds no usable frame", "list images and their cameras there")
     capture = None if errors_only(report.problems) else capture_of(parsed)
     if parsed.frames:
-        parts, pictures = parsed.by_tissue(), Pictures()
+        pictures = Pictures()
         check_frames(parsed)
-        check_image_files(parsed, pictures, _compared(parts) if motion else {})
+        check_image_files(parsed, pictures, _compared(parsed) if motion else {})
         check_states(parsed)
         if truth:
             check_truth(parsed, report)
-        verdicts = [check_placement(part, pictures) for part in parts]
-        if motion and not errors_only(report.problems):
-            for part, known in zip(parts, verdicts, strict=True):
-                if check_colors(part, pictures):  # else motion in them proves nothing
-                    check_motion(part, known, pictures)
+        known = check_placement(parsed, pictures)
+        if motion and not errors_only(report.problems) and check_colors(parsed, pictures):
+            check_motion(parsed, known, pictures)  # motion in images that check_colors refuses proves nothing
     return Checked(condensed(report.problems), _summary(parsed), capture)
 
 
-def _compared(parts: list[Parsed]) -> dict[Path, set[Size]]:
+def _compared(parsed: Parsed) -> dict[Path, set[Size]]:
     """Sizes of the images that colours and motion are compared in, by the file."""
     sizes: dict[Path, set[Size]] = {}
-    for part in parts:
-        for frame, size in (*colors.compared_pictures(part), *motion_evidence.compared_pictures(part)):
-            sizes.setdefault(frame.image_path, set()).add(size)
+    for frame, size in (*colors.compared_pictures(parsed), *motion_evidence.compared_pictures(parsed)):
+        sizes.setdefault(frame.image_path, set()).add(size)
     return sizes
 
 
@@ -115,29 +111,21 @@ def _summary(parsed: Parsed) -> CaptureSummary:
         states = [state for _, state in parsed.states_of(instrument.name)]
         if not states:
             continue
-        # poses in the worlds of two tissues have no distance
-        travel[instrument.name] = round(max(_travel(part, instrument.name) for part in parsed.by_tissue()), 3)
+        origins = np.stack([state.pose[:3, 3].numpy() for state in states])
+        travel[instrument.name] = round(float(np.linalg.norm(np.ptp(origins, axis=0))), 3)
         for joint in instrument.joints:
             values = [state.joints[joint] for state in states if joint in state.joints]
             if values:
                 joints[f"{instrument.name}.{key_name(joint)}"] = (min(values), max(values))
-    clouds = [part.points for part in parsed.by_tissue() if part.points is not None and part.points.measured]
-    shown = Counter(frame.state.tissue for frame in parsed.frames)
+    points = parsed.points
     return CaptureSummary(
         splits=dict(Counter(frame.split for frame in parsed.frames)),
-        points=sum(len(cloud.positions) for cloud in clouds),
+        points=len(points.positions) if points is not None and points.measured else 0,
         registered=parsed.registered,
         joints=joints,
         travel_mm=travel,
         still=parsed.still,
-        tissues={tissue.name: shown[tissue.name] for tissue in parsed.tissues},
     )
-
-
-def _travel(parsed: Parsed, instrument: str) -> float:
-    """Diagonal, mm, of the box that an instrument's origin moves in."""
-    origins = [state.pose[:3, 3].numpy() for _, state in parsed.states_of(instrument)]
-    return float(np.linalg.norm(np.ptp(np.stack(origins), axis=0))) if origins else 0.0
 
 
 # Training frames -> label IoU on seen and on unseen states, of the capture that looks most like a real recording; the

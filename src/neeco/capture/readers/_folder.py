@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from neeco.capture.documents import Node, ProblemReport, errors_only
-from neeco.capture.model import Capture, Frame, Instrument, State, Tissue, share_lamps
-from neeco.capture.points import PointCloud, points_in_view
+from neeco.capture.model import Capture, Instrument, State, share_lamps
+from neeco.capture.points import points_in_view
 from neeco.capture.readers._colmap import find_models, parse_colmap
 from neeco.capture.readers._transforms import is_blender, load_document, parse_blender, parse_transforms
 from neeco.capture.readers.endonerf import is_endonerf_folder, parse_endonerf
@@ -52,13 +52,11 @@ def capture_of(parsed: Parsed) -> Capture:
     frames, instruments = tuple(parsed.frames), parsed.instruments
     for frame in frames:
         require_utf8(frame.image_path)
-    tissues = tuple(
-        Tissue(tissue.name, _points(tissue.points, [frame for frame in frames if frame.state.tissue == tissue.name]))
-        for tissue in parsed.tissues
-    )
-    points = PointCloud(measured=False) if tissues else _points(parsed.points, frames)
+    points = parsed.points
+    if points is None:
+        points = points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames]))
     if parsed.still:
-        lit = share_lamps([frame.camera for frame in frames], [frame.state for frame in frames])
+        lit = share_lamps([frame.camera for frame in frames])
         frames = tuple(replace(frame, camera=camera) for frame, camera in zip(frames, lit, strict=True))
     if any(item.unrecorded for item in instruments):
         frames = tuple(replace(frame, state=_with_unrecorded(frame.state, instruments)) for frame in frames)
@@ -77,15 +75,7 @@ def capture_of(parsed: Parsed) -> Capture:
         timed=parsed.timed,
         lens=parsed.lens,
         still=parsed.still,
-        tissues=tissues,
     )
-
-
-def _points(measured: PointCloud | None, frames: Sequence[Frame]) -> PointCloud:
-    """The points of one world, random ones in view of its frames where none were measured."""
-    if measured is not None or not frames:
-        return measured or PointCloud(measured=False)
-    return points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames]))
 
 
 def _with_unrecorded(state: State, instruments: Sequence[Instrument]) -> State:

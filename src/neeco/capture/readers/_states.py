@@ -1,8 +1,7 @@
 """Instrument states in JSON: those of a transforms file's frames, and files of one state a line.
 
 A line is `{"time": 0, "instruments": [{"name", "pose": 4x4, "joints": {name: rad}}], "camera": 4x4}`;
-`camera` (world_from_camera, OpenGL axes, as in transforms.json) and `time` may be left out, other keys are ignored;
-where a scene has several tissues, `"tissue"` names the state's.
+`camera` (world_from_camera, OpenGL axes, as in transforms.json) and `time` may be left out, other keys are ignored.
 """
 
 from __future__ import annotations
@@ -33,18 +32,16 @@ class StateLine:
     world_from_camera: np.ndarray | None  # [4, 4], OpenCV axes
 
 
-def read_states(path: Path, instruments: Sequence[Instrument], tissues: Sequence[str] = ()) -> list[StateLine]:
-    """Read and check a file of states against the scene's instruments and, where it has several, tissues.
+def read_states(path: Path, instruments: Sequence[Instrument]) -> list[StateLine]:
+    """Read and check a file of states against the scene's instruments.
 
-    Raises NeecoError naming file, line and field: unreadable, not JSON, an instrument, joint or tissue missing or
-    unknown, a pose that is not rigid, a joint outside its limits.
+    Raises NeecoError naming file, line and field: unreadable, not JSON, an instrument or joint missing or unknown, a
+    pose that is not rigid, a joint outside its limits.
     """
     missing = "no such file; give a file of states"
     lines = read_text(Path(path), "one JSON object per line", missing).split("\n")
     states = [
-        _parse_line(line, f"{path}: line {number}", instruments, tissues)
-        for number, line in enumerate(lines, 1)
-        if line.strip()
+        _parse_line(line, f"{path}: line {number}", instruments) for number, line in enumerate(lines, 1) if line.strip()
     ]
     if not states:
         raise NeecoError(f"{path}: no states in it; give one JSON object per line")
@@ -205,7 +202,7 @@ def _joint_nodes(item: Node) -> dict[str, Node] | None:
     return {name: node.child(name) for name in node.value} if node.is_object() else None
 
 
-def _parse_line(text: str, where: str, instruments: Sequence[Instrument], tissues: Sequence[str]) -> StateLine:
+def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> StateLine:
     try:
         value = json.loads(text, object_pairs_hook=distinct_keys)
     except RepeatedKeyError as error:
@@ -239,12 +236,7 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument], tissue
         )
         for name, item in known.items()
     }
-    tissue = node.child("tissue")
-    if tissues and tissue.value not in tissues:
-        what = "missing" if tissue.value is None else f"{printable(tissue.value)} is not in the scene"
-        tissue.error(what, f"name one of its tissues: {', '.join(tissues)}")
-    state = State(states, time or 0.0, tissue.value if tissues else None)
-    return StateLine(state, None if pose is None else swap_camera_axes(pose))
+    return StateLine(State(states, time or 0.0), None if pose is None else swap_camera_axes(pose))
 
 
 def _check_joints(item: Node, instrument: Instrument) -> None:

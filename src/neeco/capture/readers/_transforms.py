@@ -12,19 +12,11 @@ import torch
 
 from neeco.capture.documents import Node, ProblemReport, printable
 from neeco.capture.images import EXTENSIONS
-from neeco.capture.model import SCHEMA, TEST_EVERY, Frame, Instrument, State
-from neeco.capture.points import PointCloud, random_points, read_ply
+from neeco.capture.model import SCHEMA, SEPARATE_TISSUES, TEST_EVERY, Frame, Instrument, State
+from neeco.capture.points import random_points, read_ply
 from neeco.capture.readers._states import all_instruments, declared_instruments, parse_instruments
 from neeco.capture.readers.cameras import CameraFields, parse_lens, placeholder_camera
-from neeco.capture.readers.parsed import (
-    NOWHERE,
-    Parsed,
-    ParsedTissue,
-    inside,
-    instants,
-    missing_file,
-    relative_name,
-)
+from neeco.capture.readers.parsed import NOWHERE, Parsed, inside, instants, missing_file, relative_name
 from neeco.errors import NeecoError
 from neeco.files import read_json
 from neeco.geometry.conventions import swap_camera_axes
@@ -54,8 +46,10 @@ def parse_transforms(
     """Read the transforms file in `folder` of the capture at `root`, given its content. Relative paths start at the
     file. as_source: see `Parsed`."""
     parsed = Parsed(root, as_source=as_source)
+    if document.has("tissues"):
+        document.child("tissues").error("a capture has one tissue", SEPARATE_TISSUES)
+        return parsed
     _parse_header(document, parsed)
-    _parse_tissues(document, folder, parsed)
     _parse_frames(document, folder, parsed, background)
     parsed = _by_name(parsed)
     _parse_points(document, folder, parsed)
@@ -191,7 +185,7 @@ def _parse_frames(
             node.child("time").error(*fault)
             time = None
         timed += node.has("time")
-        instruments, tissue = parse_instruments(node), _tissue_of(node, parsed)
+        instruments = parse_instruments(node)
         if image_path is None:
             continue
         camera = CameraFields(node, header.document, image_path, parsed).camera()
@@ -203,7 +197,7 @@ def _parse_frames(
         if pose is not None:
             opencv = torch.from_numpy(swap_camera_axes(pose)).to(torch.float32)
             camera = replace(camera, world_from_camera=opencv)
-        parsed.frames.append(Frame(image_path, camera, State(instruments, time, tissue), name, mask_path, background))
+        parsed.frames.append(Frame(image_path, camera, State(instruments, time), name, mask_path, background))
         parsed.places.append(node)
     header.pass_on()
     if nodes.value == []:
@@ -214,60 +208,22 @@ def _parse_frames(
             parsed.frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
 
 
-def _parse_tissues(document: Node, folder: Path, parsed: Parsed) -> None:
-    """Read the names of several tissues and the points of each, if the file lists any."""
-    if not document.has("tissues"):
-        return
-    if document.child("tissues").value == []:
-        document.child("tissues").error("is empty", "list the tissues there, or leave it out where there is one")
-    if document.has("ply_file_path"):
-        document.child("ply_file_path").error("is of no tissue", "name a file of points in each of the tissues")
-    for item in document.child("tissues").items():
-        if not item.is_object():
-            continue
-        place = item.child("name")
-        name = place.text("give every tissue a name")
-        if name in [tissue.name for tissue in parsed.tissues]:
-            place.error(f"{printable(name)} comes twice", "give every tissue its own name")
-        elif name is not None:
-            parsed.tissues.append(ParsedTissue(name, *_points_of(item, folder, parsed.root)))
-
-
-def _tissue_of(frame: Node, parsed: Parsed) -> str | None:
-    """The tissue that a frame shows, of those listed; None where there is one, or, reported, it names none of them."""
-    names, place = [tissue.name for tissue in parsed.tissues], frame.child("tissue")
-    if names and not frame.has("tissue"):
-        place.error("is missing", f"name one of the file's tissues: {', '.join(names)}")
-    elif frame.has("tissue") and (place.text() is not None) and place.value not in names:
-        listed = f"the file's tissues are {', '.join(names)}" if names else "the file lists no tissues"
-        place.error(f"{printable(place.value)} is unknown: {listed}", "correct it, or list it in `tissues`")
-    return place.value if place.value in names else None
-
-
 def _parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
     """Read the point cloud that `ply_file_path` names, if it names one."""
-    if not parsed.tissues:
-        parsed.points, parsed.points_place = _points_of(document, folder, parsed.root)
-
-
-def _points_of(node: Node, folder: Path, root: Path) -> tuple[PointCloud | None, Node]:
-    """The point cloud that an object's `ply_file_path` names, None where it names none that can be used, and its
-    place."""
-    place = node.child("ply_file_path")
-    path = _file(place, folder, root) if node.has("ply_file_path") else None
+    parsed.points_place = document.child("ply_file_path")
+    path = _file(parsed.points_place, folder, parsed.root) if document.has("ply_file_path") else None
     if path is None:
-        return None, place
-    name = relative_name(path, root)
-    place = Node(None, name, "vertex", node.report)
+        return
+    name = relative_name(path, parsed.root)
+    parsed.points_place = Node(None, name, "vertex", document.report)
     try:
-        points = read_ply(path)
+        parsed.points = read_ply(path)
     except NeecoError as error:
-        node.report.error(name, "", str(error).removeprefix(f"{path}: "))
-        return None, place
-    if bad := int((~np.isfinite(points.positions).all(axis=1)).sum()):
-        place.error(f"{bad} points are NaN or infinite", "remove them from the file")
-        return None, place
-    return points, place
+        document.report.error(name, "", str(error).removeprefix(f"{path}: "))
+        return
+    if bad := int((~np.isfinite(parsed.points.positions).all(axis=1)).sum()):
+        parsed.points_place.error(f"{bad} points are NaN or infinite", "remove them from the file")
+        parsed.points = None
 
 
 class _Splits:

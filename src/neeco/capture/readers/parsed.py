@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from neeco.capture.documents import Node, Problem, key_name, printable
+from neeco.capture.documents import Node, Problem, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, Instrument, InstrumentState
 from neeco.capture.points import PointCloud
@@ -21,15 +21,6 @@ from neeco.placeholders import placeholder
 from neeco.plausible import Fault
 
 NOWHERE = "put it there or correct the path"
-
-
-@dataclass(frozen=True)
-class ParsedTissue:
-    """One of several tissues, as far as it could be read."""
-
-    name: str
-    points: PointCloud | None  # None: none named
-    place: Node  # of the points
 
 
 @dataclass(kw_only=True)
@@ -52,8 +43,6 @@ class Parsed:
     says_units: bool = False  # the file names its unit of length
     lens: Lens | None = None  # through which it was recorded
     still: bool = False  # its cameras stood still
-    tissues: list[ParsedTissue] = field(default_factory=list)
-    over: str | None = None  # which of several tissues all of it is of
     is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
     without_camera: set[int] = field(default_factory=set)  # frames with a placeholder, as their camera is wrong
     as_source: bool = False
@@ -61,23 +50,11 @@ class Parsed:
 
     def header(self, field: str) -> Node:
         """The place `field` of the file that describes the first frame."""
-        field = field if self.over is None else f"{field} over {key_name(self.over)}"
         return Node(None, self.places[0].file, field, self.places[0].report)
 
     def with_cameras(self) -> Parsed:
         """The same without the frames whose camera is a placeholder."""
         return self.of_rows([row for row in range(len(self.frames)) if row not in self.without_camera])
-
-    def by_tissue(self) -> list[Parsed]:
-        """The parts of several tissues that have frames, each with a world of its own; the whole where there is one."""
-        if not self.tissues:
-            return [self]
-        parts = []
-        for tissue in self.tissues:
-            rows = [row for row, frame in enumerate(self.frames) if frame.state.tissue == tissue.name]
-            part = replace(self.of_rows(rows), tissues=[], over=tissue.name)
-            parts += [replace(part, points=tissue.points, points_place=tissue.place)] if rows else []
-        return parts
 
     def of_rows(self, rows: Sequence[int]) -> Parsed:
         """Return the same with the frames of these rows, in their order."""

@@ -70,7 +70,8 @@ def episode_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
     names: list[str] = []
     for recording in recordings:
         of_file = recording.path.stem if len(stems) > 1 else recording.path.resolve().parent.name
-        name = file_name(recording.episode or of_file) or "recording"
+        # with only the characters that file names in a capture have
+        name = re.sub(r"[^A-Za-z0-9.-]+", "_", recording.episode or of_file).strip("_.") or "recording"
         number = 2
         while name in names:
             name, number = f"{name.removesuffix(f'_{number - 1}')}_{number}", number + 1
@@ -78,13 +79,8 @@ def episode_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def file_name(text: str) -> str:
-    """Return a text with only the characters that file names in a capture have."""
-    return re.sub(r"[^A-Za-z0-9.-]+", "_", text).strip("_.")
-
-
-def check_recordings(recordings: Sequence[Recording], *, tissues: bool = False) -> None:
-    """Raise NeecoError for recordings that one capture cannot hold. tissues: each may be of another one."""
+def check_recordings(recordings: Sequence[Recording]) -> None:
+    """Raise NeecoError for recordings that one capture cannot hold."""
     first = recordings[0]
     lens, where = first.read_lens()
     for other in recordings[1:]:
@@ -98,16 +94,11 @@ def check_recordings(recordings: Sequence[Recording], *, tissues: bool = False) 
         if names != [item.name for item in first.instruments]:
             raise refusal(other, f"instruments: {', '.join(names) or 'none'} are not those", first)
         for mine, theirs in zip(other.instruments, first.instruments, strict=True):
-            if fault := _difference(mine, theirs, tissues):
+            if fault := _difference(mine, theirs):
                 raise refusal(other, f"instruments: {mine.name}: {fault} not as", first)
-        check_shared_settings(other, first)
-
-
-def check_shared_settings(other: Recording, first: Recording) -> None:
-    """Raise NeecoError where a recording states a setting of the whole capture otherwise than the first."""
-    for key, default in (("frames", None), ("splits", None), ("settings", IngestSettings())):
-        if getattr(other, key) not in (default, getattr(first, key)):
-            raise refusal(other, f"{key}: differs from that", first)
+        for key, default in (("frames", None), ("splits", None), ("settings", IngestSettings())):
+            if getattr(other, key) not in (default, getattr(first, key)):
+                raise refusal(other, f"{key}: differs from that", first)
 
 
 def refusal(other: Recording, what: str, first: Recording) -> NeecoError:
@@ -116,7 +107,7 @@ def refusal(other: Recording, what: str, first: Recording) -> NeecoError:
     )
 
 
-def _difference(mine: InstrumentLogs, theirs: InstrumentLogs, tissues: bool) -> str | None:
+def _difference(mine: InstrumentLogs, theirs: InstrumentLogs) -> str | None:
     """Return in words what a capture states once and two recordings of an instrument state differently, if anything."""
     if (mine.poses is None) != (theirs.poses is None) or mine.from_video != theirs.from_video:
         return "poses are"
@@ -129,6 +120,6 @@ def _difference(mine: InstrumentLogs, theirs: InstrumentLogs, tissues: bool) -> 
         return "limits of its joints are"
     if mine.kinematics != theirs.kinematics:
         return "kinematics are"
-    if not tissues and not same_base(mine.base, theirs.base):
+    if not same_base(mine.base, theirs.base):
         return "the place of its base is"
     return None

@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar
 
 from neeco.capture.documents import Node, as_float, printable
 from neeco.capture.kinematics import KinematicTree
+from neeco.capture.model import SEPARATE_TISSUES
 from neeco.capture.readers import read_dvrk_tool, read_urdf
 from neeco.capture.readers.dvrk import READINGS as DVRK_READINGS
 from neeco.capture.readers.kinematics import parse_kinematics
@@ -65,6 +66,8 @@ def read_recording(path: Path) -> Recording:
     if document is None:
         raise NeecoError(f"{path}: the file is empty; {advice}")
     with faults_in(path):
+        if isinstance(document, dict) and "tissue" in document:
+            raise Fault("tissue", f"a capture has one tissue; leave the key out, or {SEPARATE_TISSUES}")
         return read_section(RecordingSection, node_of(document, path)).recording(path)
 
 
@@ -339,7 +342,6 @@ class RecordingSection(FramesSection, BasesSection):
     camera: Annotated[str, word((STILL, MOVING), "says nothing of a scope", f"write {STILL} or {MOVING}")] | None = None
     stereo: StereoSection | None = None
     episodes: Annotated[tuple[int, ...], _episodes] = ()
-    tissue: str | None = None
     intrinsics: Annotated[Any, _intrinsics] = None
     instruments: Annotated[tuple[InstrumentSection, ...], list_of(InstrumentSection)] = ()
     laparoscope: PoseSection | None = None
@@ -375,7 +377,7 @@ class RecordingSection(FramesSection, BasesSection):
         found = Recording(
             path, self.source, intrinsics=self.intrinsics, instruments=instruments, laparoscope=scope, sync=sync,
             frames=self.frames, splits=self.splits, notes=notes, settings=self.settings, camera=self.camera,
-            stereo=stereo, episodes=self.episodes, tissue=self.tissue,
+            stereo=stereo, episodes=self.episodes,
         )  # fmt: skip
         _check_one_clock(found)
         return found

@@ -22,7 +22,6 @@ from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.sections import Fault, columns, integer, number, ranges
 
 STILL, MOVING = "still", "moving"  # what `camera` may say of a scope
-EACH = "each"  # what `tissue` says where every recording has a world of its own
 MIN_FRAMES = 10  # from which cameras can be found
 MAX_SHAFT_MM = 40.0  # diameter
 MAX_EPISODES = 500  # of one capture
@@ -157,7 +156,7 @@ class Recording:
     file, (fl_x, fl_y, cx, cy) px or None (the file's own, else estimated); sync: t_log = t_video + offset s of each
     clock that is known; frames: how many to keep; camera: STILL, MOVING or None (to be detected); episodes: by number,
     those of its data set that are meant instead of the one that its streams name; episode: what this one of several is
-    called, where the file names it; tissue: of several, the one it was taken over, EACH: one of its own."""
+    called, where the file names it."""
 
     path: Path
     source: VideoFile | ImageFolder
@@ -174,7 +173,6 @@ class Recording:
     stereo: StereoPartner | None = None
     episodes: tuple[int, ...] = ()
     episode: str = ""
-    tissue: str | None = None
 
     @property
     def video(self) -> Path | None:

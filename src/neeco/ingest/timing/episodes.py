@@ -19,7 +19,6 @@ from neeco.errors import NeecoError
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import PoseLog, ReadingLog
-from neeco.ingest.recording.compatibility import file_name
 from neeco.ingest.recording.model import InstrumentLogs, Recording
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, ClockOffset
 
@@ -109,12 +108,11 @@ class Episode:
 
 @dataclass(frozen=True, eq=False)
 class Episodes:
-    """All recordings of one world on the joint timeline. video: the frames of all; tissue: the world's, of several."""
+    """All recordings on the joint timeline. video: the frames of all."""
 
     parts: tuple[Episode, ...]
     video: VideoSource
     notes: Notes
-    tissue: str | None = None
     world_from_base: Mapping[str, np.ndarray] = field(default_factory=dict)  # [4, 4] mm of logs in another frame
     # by instrument found in the video: times [N] s of the joint timeline, poses [N, 4, 4]
     video_poses: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
@@ -153,11 +151,10 @@ class Episodes:
 
     def frame_name(self, frame: int) -> str:
         """Return the name of a frame's image in the capture; of several episodes, it begins with the episode's."""
-        of = "" if self.tissue is None else file_name(self.tissue) + "_"
         if self.single:
-            return f"{of}{frame:06d}"
+            return f"{frame:06d}"
         part = self.parts[int(self.episode_of(np.array([frame]))[0])]
-        return f"{of}{part.name}_{frame - part.first_frame:06d}"
+        return f"{part.name}_{frame - part.first_frame:06d}"
 
     def with_base(self, name: str, world_from_base: np.ndarray) -> Episodes:
         """Return the episodes with the base [4, 4] mm of an instrument's log."""

@@ -24,7 +24,7 @@ SAME_FOCAL = 0.02  # of a focal length, between calibrations of one lens
 MIN_SIDE_PX = 32  # smaller frames have too few features to find cameras
 
 
-def read_episodes(recordings: Sequence[Recording], tissue: str | None = None) -> Episodes:
+def read_episodes(recordings: Sequence[Recording]) -> Episodes:
     """Read logs and videos, and put them on one timeline, with the clocks that are given.
 
     Raises NeecoError for recordings that cannot be used, or that one capture cannot hold.
@@ -39,19 +39,19 @@ def read_episodes(recordings: Sequence[Recording], tissue: str | None = None) ->
             start = before.start_s + before.times[-1] + PAUSE_S - part.times[0]
             part = replace(part, start_s=start, first_frame=before.first_frame + len(before.times))
         parts.append(part)
-    check_episodes(parts)
+    _check_episodes(parts)
     _check_split_names(recordings[0], names)
-    return Episodes(tuple(parts), parts[0].video if len(parts) == 1 else _joined_video(parts), notes, tissue)
+    return Episodes(tuple(parts), parts[0].video if len(parts) == 1 else _joined_video(parts), notes)
 
 
-def check_episodes(parts: Sequence[Episode], *, tissues: bool = False) -> None:
-    """Raise NeecoError for recordings that one capture cannot hold. tissues: each may be of another one."""
+def _check_episodes(parts: Sequence[Episode]) -> None:
+    """Raise NeecoError for recordings that one capture cannot hold."""
     first = parts[0]
     for part in parts[1:]:
         if part.video.size != first.video.size:
             sizes = [f"{width}x{height}" for width, height in (part.video.size, first.video.size)]
             raise refusal(part.recording, f"images: are {sizes[0]}, not {sizes[1]} as", first.recording)
-    check_recordings([part.recording for part in parts], tissues=tissues)
+    check_recordings([part.recording for part in parts])
     for part in parts[1:]:
         for name, log in part.poses.items():
             if log.frame != first.poses[name].frame:

@@ -106,7 +106,6 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
     method = "kinematic"
     Settings = KinematicSettings
     separates_instruments = True
-    learns_tissues = True
     enough_frames = 60
     training_defaults: ClassVar[Mapping[str, Any]] = {
         **PLAIN_TRAINING,
@@ -329,8 +328,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         if self.breathing is not None:
             scene.diagnostics["breathing"] |= self.breathing.describe(scene.recorded.cameras)
         if self.settings.extrapolate_tissue:
-            for index, recorded in enumerate(scene.recorded.by_tissue()):
-                scene.canonical = extrapolate_tissue(scene.canonical, recorded.cameras, index)
+            scene.canonical = extrapolate_tissue(scene.canonical, scene.recorded.cameras)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         scale = self.settings.rate_scale * floored_decay(progress)

@@ -131,9 +131,6 @@ def _learn_breathing(session: GaussianSession, breathes: BreathingTissue, tissue
     """Return `tissue`, a fit of still tissue, or, where it breathes, a new fit with the breathing that was found, from
     which `breathes` then starts."""
     scene, views, config = session.scene, session.views, session.config
-    if len(scene.recorded.tissues) > 1:
-        session.report("several tissues: breathing is not searched for")
-        return tissue
     begun = find_breathing(tissue, views)
     if begun is None:
         return tissue

@@ -143,7 +143,7 @@ def correct_poses(
         doubt = doubt if other is not None and other.cost < found.cost else None
     if doubt is not None:
         note_doubt(session, name, doubt)
-    if doubt is not None or found is None or not found.needed or len(scene.recorded.tissues) > 1:
+    if doubt is not None or found is None or not found.needed:
         return False
     base = found.about(scene.center)
     with torch.no_grad():

@@ -32,7 +32,7 @@ def register_states(session: GaussianSession, articulations: Sequence[object]) -
         return None
     (instrument,) = scene.instruments
     tree = instrument.kinematics
-    sizes = {(frame.camera.width, frame.camera.height, frame.state.tissue) for frame in frames}
+    sizes = {(frame.camera.width, frame.camera.height) for frame in frames}
     count = len(refinement.frames_of_instant)
     if not all(frame.camera.is_pinhole for frame in frames):
         return None

@@ -89,7 +89,7 @@ def _masks(images: WrittenImages, folder: Path, record: Record) -> list[dict[str
     fx, fy, cx, cy = (record["intrinsics"][key] for key in INTRINSICS)
     pose = swap_camera_axes(np.array(record["camera"]))
     camera = Camera(pose, fx, fy, cx, cy, width=width, height=height)
-    extended = extended_silhouettes(images.scene, labeller, State(given, record["time"], record.get("tissue")), camera)
+    extended = extended_silhouettes(images.scene, labeller, State(given, record["time"]), camera)
     infos = []
     for place, label in enumerate(record["labels"]):
         ids = [k for k, (owner, _) in enumerate(labeller.names, 1) if owner == label["instrument"]]
