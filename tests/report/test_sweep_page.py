@@ -45,7 +45,7 @@ def rows_of(plan: SweepPlan) -> list[dict]:
     rows = []
     for seed in (0, 1):
         for name, psnr in {"kinematic": 24.0, "3dgs": 20.0, "lost": None}.items():
-            folder = plan.run_folder(name, seed)
+            folder = plan.request.run_folder(name, seed)
             folder.mkdir(parents=True, exist_ok=True)
             scores = {"error": REASON} if psnr is None else {"psnr": psnr + 0.4 * seed, "iterations": 60, "error": None}
             rows += [{"configuration": name, "seed": seed, "split": split} | scores for split in plan.splits]

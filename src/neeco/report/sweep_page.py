@@ -44,18 +44,17 @@ def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
         sections += [Section(title="The same frame by every configuration", text=text), *pictures]
     if failed := failures(rows):
         sections.append(Section(title="What failed", notes=failed))
-    made = [(name, item.method, " ".join(item.settings)) for name, item in study.configurations.items()]
     shared = " ".join((*study.settings, *plan.request.set))
     facts = [
         ("capture", str(capture.root.absolute())),
         ("frames", split_counts(capture)),
         ("length", length_words(study)),
+        *((name, " ".join((str(item.method), *item.settings))) for name, item in study.configurations.items()),
         *([("settings of all", shared)] if shared else []),
         ("machine", computer),
         ("rasteriser", plan.machine["backend"]),
     ]
-    head = ("configuration", "method", "settings")
-    sections.append(Section(title="How it was made", head=head, rows=made, facts=facts))
+    sections.append(Section(title="How it was made", facts=facts))
     frames = len(capture.split("train"))
     intro = f"Trained on the same {frames} frames, {length_words(study)}; scored on images that no run learned from."
     return write_page(
@@ -79,7 +78,7 @@ def _curves(plan: SweepPlan, table: Table, split: str) -> list[Figure]:
     names = [row.label or name for name, row in table.rows.items()]
     series = []
     for order, name in enumerate(table.rows):
-        files = [plan.run_folder(name, seed) / CURVE_FILE for seed in range(plan.study.seeds)]
+        files = [plan.request.run_folder(name, seed) / CURVE_FILE for seed in range(plan.study.seeds)]
         rows = [[row for row in read_rows(file, CURVE_ROW) if row["split"] == split] for file in files]
         lines = [
             tuple((row[key] * scale, row["psnr"]) for row in run if row["psnr"] is not None) for run in rows if run
@@ -101,7 +100,7 @@ def _pictures(plan: SweepPlan, rows: Rows) -> list[Section]:
         images.append([Images("recorded image", (jpeg(recorded), *outline), f"recorded image, frame {frame.name}")])
     seeds = {row["configuration"]: row["seed"] for row in reversed(rows) if not row.get("error")}
     for name in (name for name in plan.study.configurations if name in seeds):
-        with open_run(plan.run_folder(name, seeds[name])) as run:
+        with open_run(plan.request.run_folder(name, seeds[name])) as run:
             shown = replace(plan.capture, frames=tuple(frames))
             completed = run.scene.recorded.completed(shown, run.scene.instruments)
             for frame, row in zip(completed.frames, images, strict=True):

@@ -67,6 +67,10 @@ class SweepRequest:
     """Folder with alexnet.safetensors and/or vgg16.safetensors. Default: that of NEECO_LPIPS_WEIGHTS."""
     device: Device = "auto"
 
+    def run_folder(self, name: str, seed: int) -> Path:
+        """Return the run folder of a configuration and seed."""
+        return self.output / "runs" / f"{name}-seed{seed}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Configuration:

@@ -48,10 +48,6 @@ class SweepPlan:
     machine: dict[str, Any]
     notes: tuple[str, ...]
 
-    def run_folder(self, name: str, seed: int) -> Path:
-        """Return the run folder of one job."""
-        return self.request.output / "runs" / f"{name}-seed{seed}"
-
 
 def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) -> SweepPlan:
     """Check everything that can be known before the work. source: the study's file, for messages. Raises NeecoError for
@@ -69,27 +65,16 @@ def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) 
         if need := unmet_need(config.method, capture):
             raise NeecoError(f"{place}{name}: needs {need}, which {request.capture} has not; leave it out")
     splits = held_out_splits(capture, request.splits)
-    notes = (
-        []
-        if find_lpips(request.lpips_weights)
-        else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]
-    )
+    notes = []
+    if not find_lpips(request.lpips_weights):
+        notes.append(f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}")
     if study.seeds == 1:
         notes.append("no ± is given: one seed has no standard deviation; give --seeds 2 or more")
-    plan = SweepPlan(
-        request=request,
-        study=study,
-        capture=capture,
-        splits=splits,
-        jobs=(),
-        machine=machine(device, request.workers),
-        notes=tuple(notes),
-    )
     jobs = tuple(
         TrainingJob(
             name=name,
             capture=request.capture,
-            folder=plan.run_folder(name, seed),
+            folder=request.run_folder(name, seed),
             config=dataclasses.replace(config, seed=seed),
             clock="wall" if study.cpu_minutes is None else "processor",
             splits=request.splits,
@@ -107,7 +92,10 @@ def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) 
     for job in jobs:
         job.check()
         require_same_capture(job.folder, capture.root, digest)
-    return dataclasses.replace(plan, jobs=jobs)
+    facts = machine(device, request.workers)
+    return SweepPlan(
+        request=request, study=study, capture=capture, splits=splits, jobs=jobs, machine=facts, notes=tuple(notes)
+    )
 
 
 def run_sweep(plan: SweepPlan, progress: Callable[[JobEvent], None] | None = None) -> Rows:
