@@ -182,6 +182,8 @@ def smaller(line: str) -> str:
         line += " --max-tissue-gaussians 1500"
     if verb in ("ablate", "sweep"):
         line += "".join(f" {option}" for option in SMALL_SWEEP if option.split("=")[0] not in line)
+    if verb == "ablate":
+        line += " --set deformation.width=8 --set deformation.depth=2"
     if verb == "downstream":
         line += "".join(f" {option} {value}" for option, value in SMALL_STUDY.items() if option not in words)
     if verb == "synthesize" and "--count" not in words:

@@ -139,7 +139,7 @@ class Study:
         if not self.configurations:
             raise NeecoError("configurations: none is given; name at least one, with its method")
         for name in self.configurations:
-            if not name or name.startswith(".") or {*name} & {"/", "\\"}:
+            if not name or name.startswith(".") or {*name} & {"/", "\\", "\0"}:
                 raise NeecoError(f"configurations: {name!r} names no folder; leave out / and \\ and a dot at its start")
             self.length_of(name)
         if self.seeds < 1:
