@@ -141,12 +141,12 @@ def import_modules() -> None:
         importlib.import_module(f"neeco.cli.{verb}")
     for module in (
         "rich.progress",
-        "neeco.studies.comparison",
+        "neeco.studies.sweep",
         "neeco.studies.downstream.experiment",
         "neeco.ingest.pipeline",
         "neeco.ingest.convert",
         "neeco.report.run_page",
-        "neeco.report.study_pages",
+        "neeco.report.sweep_page",
         "neeco.report.downstream_page",
         "neeco.report.ingest_page",
         "neeco.synthesis.annotated",

@@ -51,7 +51,7 @@ from neeco.raster.triton import ready
 from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.studies.machine import machine
-from neeco.studies.training_job import Budget, TrainingJob
+from neeco.studies.training_job import TrainingJob
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 from neeco.training.config import training_config
@@ -228,14 +228,12 @@ def train_both(
     rows = []
     for where in dict.fromkeys((str(device), "cpu")):
         with tempfile.TemporaryDirectory() as folder:
-            config = training_config("kinematic", {}, settings)
+            config = training_config("kinematic", {"iterations": iterations}, settings)
             job = TrainingJob(
                 name="kinematic",
-                seed=0,
                 capture=capture,
                 folder=Path(folder) / "run",
                 config=config,
-                budget=Budget(None, iterations),
                 device=where,
             )
             done = job.run()

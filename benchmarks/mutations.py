@@ -209,7 +209,7 @@ CASES: dict[str, Case] = {
     ),
     "compare": Case(
         (
-            "compared/comparison.json",
+            "compared/sweep.json",
             "compared/runs/*/*.json",
             "compared/runs/*/*.jsonl",
             "compared/runs/*/*.yaml",

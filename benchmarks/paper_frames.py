@@ -39,10 +39,12 @@ from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.files import write_json
-from neeco.studies.comparison import COMPARISON_FILE, SPLIT_COLUMNS, job_folder, read_comparison
+from neeco.files import read_json, write_json
+from neeco.studies.configurations import SCORES
 from neeco.studies.study import spread
+from neeco.studies.sweep import SWEEP_FILE
 from neeco.studies.tables import Column, SummaryRow, markdown_table, summary_table
+from neeco.studies.training_job import JOB_FILE
 from neeco.training.run import read_config
 
 OUTPUT_FILE = "paper_frames.json"
@@ -55,7 +57,7 @@ SUBJECT = "nps"  # whom the paper has before all others
 COMPARED = {"psnr": "PSNR", "psnr_instrument": "PSNR instrument"}
 RESAMPLES = 10_000
 SCANNED = Column("scanned_iou", "IoU, best thresholds", 3, "high")
-COLUMNS = (*SPLIT_COLUMNS, SCANNED)
+COLUMNS = (*(column for column in SCORES if column.key != "mask_dice"), SCANNED)
 KEYS = ("frames", "states", "method")
 COLORS = {  # further runs take those that are left
     name: METHOD_COLORS[name.removesuffix("+dta")]
@@ -91,12 +93,14 @@ class Entry:
 
 def finished_runs(folder: Path) -> list[tuple[str, Path]]:
     """(name, run folder) of a comparison's finished runs. Raises NeecoError when there are none."""
-    comparison = read_comparison(folder)
-    named = [(name, job_folder(folder, name, seed)) for seed in comparison.seeds for name in comparison.trained]
-    done = [(name, run) for name, run in named if (run / EVALUATION_FILE).is_file()]
-    if not done:
-        raise NeecoError(f"{folder}: none of its {len(named)} runs has finished; compare on")
-    return done
+    if not (folder / SWEEP_FILE).is_file():
+        raise NeecoError(f"{folder / SWEEP_FILE}: no such file; name the output of `neeco compare`")
+    runs = [
+        file.parent for file in sorted(folder.glob(f"runs/*/{JOB_FILE}")) if (file.parent / EVALUATION_FILE).is_file()
+    ]
+    if not runs:
+        raise NeecoError(f"{folder}: none of its runs has finished; compare on")
+    return [(read_json(run / JOB_FILE)["name"], run) for run in runs]
 
 
 @cache
@@ -259,7 +263,7 @@ def curves(summary: Sequence[dict[str, Any]]) -> Figure:
 
 def run_labels(args: argparse.Namespace) -> None:
     for given in args.runs:
-        compared = (given / COMPARISON_FILE).exists()
+        compared = (given / SWEEP_FILE).exists()
         for folder in [run for _, run in finished_runs(given)] if compared else [given]:
             found = label_scan(folder)
             if found is None:

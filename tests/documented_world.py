@@ -165,6 +165,11 @@ class DocumentedWorld:
             source = self.images()
         elif name in MASKS:
             source = self.masks()
+        elif name == "STUDY.yaml":
+            place.write_text(STUDY, encoding="utf-8")
+            return True
+        elif name == "examples/network.yaml":
+            source = ROOT / name
         elif name == "effects.yaml":
             source = ROOT / "examples" / "effects.yaml"
         elif name in ("states.jsonl", "path.jsonl"):
@@ -260,6 +265,7 @@ def write_rows(path: Path, header: Iterable[str], rows: Iterable[Iterable[float]
         writer.writerows([[f"{value:.6f}" for value in row] for row in rows])
 
 
+STUDY = "iterations: 40\nconfigurations: {a: {method: 3dgs}, b: {like: a, settings: [ssim_weight=0.3]}}\n"
 LOGS = {"video.mp4", "VIDEO", "instrument.csv", "camera.csv", "jaw.csv", "jaw_calibration.csv", "scope.yaml"}
 # folder of a recording -> when the instrument's motion begins (s), seed of the tissue
 RECORDINGS = {

@@ -171,12 +171,19 @@ def _tuple(converter: Any, value: Any, kind: Any) -> Any:
 
 def _problems(error: BaseException, where: str, owner: str) -> Iterator[str]:
     """Yield the messages of a structuring error, field by field."""
-    from cattrs.errors import AttributeValidationNote, BaseValidationError, ForbiddenExtraKeysError
+    from cattrs.errors import (
+        AttributeValidationNote,
+        BaseValidationError,
+        ForbiddenExtraKeysError,
+        IterableValidationNote,
+    )
 
     if isinstance(error, BaseValidationError):
         for inner in error.exceptions:
-            notes = [note for note in getattr(inner, "__notes__", []) if isinstance(note, AttributeValidationNote)]
-            yield from _problems(inner, _dotted(where, *(note.name for note in notes)), owner)
+            notes = getattr(inner, "__notes__", [])
+            names = [note.name for note in notes if isinstance(note, AttributeValidationNote)]
+            names += [str(note.index) for note in notes if isinstance(note, IterableValidationNote)]
+            yield from _problems(inner, _dotted(where, *names), owner)
     elif isinstance(error, ForbiddenExtraKeysError):
         known = [field.name for field in dataclasses.fields(error.cl)]
         for name in sorted(error.extra_fields):

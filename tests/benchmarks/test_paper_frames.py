@@ -19,8 +19,8 @@ from rod_world import CAMERA, make_scene, rod_state
 from neeco.capture.writer import write_capture
 from neeco.labels.labellers import DeltaThresholds
 from neeco.scene.deformation import Deltas
-from neeco.studies.comparison import ComparisonSpec, compare, plan_comparison
-from neeco.studies.training_job import Budget
+from neeco.studies.configurations import Configuration, Study, SweepRequest
+from neeco.studies.sweep import plan_sweep, run_sweep
 
 SMALL = ("deformation.width=8", "deformation.depth=2", "deformation.warm_up=0")
 
@@ -41,19 +41,12 @@ def compared(benchmarks: ModuleType, world: ModuleType, tmp_path_factory: pytest
     folder = tmp_path_factory.mktemp("paper")
     splits = ("train",) * 4 + ("test", "unseen", "train", "test")
     write_capture(world.make_capture(folder / "capture", world.TinyScene(), splits), folder / "capture")
-    methods = ("3dgs", "nps")
-    spec = ComparisonSpec(
-        capture=folder / "capture",
-        output=folder / "c5",
-        methods=methods,
-        budget=Budget(None, 8),
-        assignments=SMALL,
-        device="cpu",
-    )
+    study = Study(configurations={name: Configuration(method=name) for name in ("3dgs", "nps")}, iterations=8)
+    request = SweepRequest(capture=folder / "capture", output=folder / "c5", set=SMALL, device="cpu")
     with pytest.MonkeyPatch.context() as patched:
         patched.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
-        compare(plan_comparison(spec))
-    return spec.output
+        run_sweep(plan_sweep(request, study))
+    return request.output
 
 
 def separable(scans: ModuleType, origin: str) -> list:
@@ -189,9 +182,9 @@ def test_what_is_missing_or_unfinished_ends_in_one_line(
     other_table = tmp_path / "other.md"
     other_table.write_text("| frames | dB |\n|---|---|\n| 75 | 20 |\n")
     for words, said in (
-        (["tables", str(tmp_path / "nowhere")], "comparison.json"),
-        (["tables", str(unfinished)], "none of its 2 runs has finished"),
-        (["labels", str(unfinished)], "none of its 2 runs has finished"),
+        (["tables", str(tmp_path / "nowhere")], "sweep.json"),
+        (["tables", str(unfinished)], "none of its runs has finished"),
+        (["labels", str(unfinished)], "none of its runs has finished"),
         (["labels", str(unfinished / "runs" / "nps-seed0")], "has no evaluation.json"),
         (["labels", str(tmp_path / "nowhere")], "no such run folder"),
         (["tables", str(compared), "--run", "nps"], "expected NAME=FOLDER"),

@@ -29,6 +29,7 @@ WITH_BAD_PATH = {
     "score-masks": [MISSING, MISSING],
     "downstream": [MISSING, "--output", "taught"],
     "ablate": [MISSING, "--output", "ablated"],
+    "sweep": [MISSING, MISSING, "--output", "swept"],
     "view": [MISSING, "--export", "page.html"],
     "export": [MISSING],
     "demo": ["--output", "taken"],

@@ -23,9 +23,6 @@ from neeco.cli import VERBS, main
 
 # What stands for "…" and for the parts of a synopsis, by the words before it.
 IN_FULL = {
-    "ablate CAPTURE --output DIR [--tables": (
-        "ablate CAPTURE --output DIR --tables shadow --iterations 40 --kinematic-iterations 40"
-    ),
     "evaluate RUN [--splits": "evaluate RUN --splits test unseen --align --json FILE.json",
     "score-masks PREDICTED TRUTH [": ("score-masks PREDICTED TRUTH --splits test unseen --components --json FILE.json"),
     "compare CAPTURE …": "compare CAPTURE --methods 3dgs kinematic --iterations 40 --output cmp",
@@ -86,7 +83,7 @@ score-masks PREDICTED TRUTH --classes shaft=1 wrist=2 jaws=3 jaws=4 --truth-clas
 downstream CAPTURE --sets few=dataset:2 many=dataset:4 --frame-selection spread --steps 1 --batch 2 --output OUT
 downstream CAPTURE --sets few=dataset:2 --frame-selection first --classes parts --output OUT --workers 1
 downstream CAPTURE --sets few=dataset:2 --backgrounds PLATES --output OUT
-ablate CAPTURE --output DIR --tables shadow --iterations 40 --seed 2 --workers 2
+sweep CAPTURE STUDY.yaml --splits unseen --output DIR
 """
 # Options of `neeco` that no test can run to the end here: what they need.
 ELSEWHERE = {
@@ -112,7 +109,7 @@ OTHER_PROGRAMS = {
 }
 SMALLER = (
     (r"--count \d{2,}", "--count 2"),
-    (r"--(kinematic-)?iterations [\dN]+", r"--\g<1>iterations 40"),
+    (r"--iterations [\dN]+", "--iterations 40"),
     (r"--cpu-minutes [\d.]+|--minutes [\d.]+", "--iterations 40"),
     (r"--seeds \d+", "--seeds 1"),
     (r"--seed N", "--seed 1"),
@@ -129,6 +126,7 @@ SMALLER = (
     (r"--min-trust \S+", "--min-trust 0"),  # of a run of 150 iterations
 )
 TRAINING = {"train": "--iterations 40", "demo": "--minutes 0.05"}  # `refine` trains as its run was
+SMALL_SWEEP = ("--iterations 40", "--set max_tissue_gaussians=1500", "--set initial_points=400")
 SMALL_STUDY = {"--folds": 1, "--steps": 1, "--size": 48, "--batch": 2, "--num-real": 2, "--device": "cpu"}
 
 
@@ -181,6 +179,10 @@ def smaller(line: str) -> str:
         line += " --set deformation.carving.tissue_steps=50"
     if verb == "train" and "--max-tissue-gaussians" not in words and "--help" not in words:
         line += " --max-tissue-gaussians 1500"
+    if verb in ("ablate", "sweep"):
+        line += "".join(f" {option}" for option in SMALL_SWEEP if option.split("=")[0] not in line)
+    if verb == "ablate":
+        line += " --set deformation.width=8 --set deformation.depth=2"
     if verb == "downstream":
         line += "".join(f" {option} {value}" for option, value in SMALL_STUDY.items() if option not in words)
     if verb == "synthesize" and "--count" not in words:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from neeco.studies.training_job import Budget, TrainingJob
+from neeco.studies.training_job import TrainingJob
 from neeco.training.config import training_config
 
 
@@ -34,13 +34,11 @@ def capture(unchanged_capture: Path, tmp_path: Path) -> Path:
 
 
 def short_job(capture: Path, runs: Path, name: str = "3dgs", seed: int = 0, **changes) -> TrainingJob:
-    """A short job of static 3DGS; keywords change it."""
+    """A short job of static 3DGS; keywords change it, values and settings those of its config."""
     folder = changes.pop("folder", runs / f"{name}-seed{seed}")
-    config = changes.pop("config", training_config("3dgs", {}))
-    budget = changes.pop("budget", Budget(None, 12))
-    return TrainingJob(
-        name=name, seed=seed, capture=capture, folder=folder, config=config, budget=budget, device="cpu", **changes
-    )
+    values = {"iterations": 12, "seed": seed} | changes.pop("values", {})
+    config = training_config(changes.pop("method", name), values, changes.pop("settings", ()))
+    return TrainingJob(name=name, capture=capture, folder=folder, config=config, device="cpu", **changes)
 
 
 @pytest.fixture

@@ -24,18 +24,18 @@ from worker_tasks import seen_gpu
 from neeco import workers
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
+from neeco.scene.training_session import UNLIMITED
 from neeco.settings import with_fields
 from neeco.studies import study
 from neeco.studies import training_job as module
-from neeco.studies.machine import peak_memory_mb, reset_peak_memory, threads_per_worker
+from neeco.studies.machine import threads_per_worker
 from neeco.studies.study import check_workers, run_jobs
-from neeco.studies.training_job import UNLIMITED, Budget, HeldOutFrames
+from neeco.studies.training_job import Curve, phase_1_psnr, psnr_at
 from neeco.training import train as train_module
-from neeco.training.config import training_config
 from neeco.training.run import checkpoint_path, write_config
 from neeco.training.session import GaussianSession
 
-TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb")
+TIMES = ("seconds", "fps")
 
 
 def without_times(value):
@@ -54,11 +54,9 @@ def test_a_job_leaves_a_run_its_curve_and_its_numbers(make_job) -> None:
     reported: list[tuple[str, float]] = []
     result = job.run(lambda stage, share, text: reported.append((stage, share)))
     assert result == json.loads((job.folder / "job.json").read_text())
-    assert result["schema"] == "neeco-job/1"
+    assert result["schema"] == "neeco-job/2"
     assert (result["name"], result["method"], result["seed"], result["iterations"]) == ("3dgs", "3dgs", 0, 12)
-    assert result["budget"] == {"minutes": None, "iterations": 12, "clock": "wall"}
     assert result["seconds"] > 0
-    assert result["processor_seconds"] > 0
     assert result["num_gaussians"] > 50
     assert list(result["splits"]) == ["test", "unseen"]
     assert result["splits"]["test"]["frames"] == 2
@@ -68,9 +66,10 @@ def test_a_job_leaves_a_run_its_curve_and_its_numbers(make_job) -> None:
     assert {"config.yaml", "scene.safetensors", "evaluation.json"} <= {path.name for path in job.folder.iterdir()}
     rows = curve_of(job)
     assert {row["split"] for row in rows} == {"test", "unseen"}
-    assert [row["iteration"] for row in rows if row["split"] == "test"] == [1, 2, 3, 4, 5, 6, 8, 9, 10, 11, 12]
+    assert [row["iteration"] for row in rows if row["split"] == "test"] == [2, 3, 4, 5, 6, 8, 9, 10, 11, 12]
     final = next(row["psnr"] for row in rows if row["iteration"] == 12 and row["split"] == "test")
     assert final == pytest.approx(result["splits"]["test"]["psnr"], abs=1e-3)  # every frame is in the curve here
+    assert result["splits"]["test"]["psnr_at_40"] == next(row["psnr"] for row in rows if row["iteration"] == 5)
 
 
 def result_of(job) -> dict:
@@ -86,17 +85,17 @@ def test_a_finished_job_is_not_done_again(finished_job, make_job, monkeypatch: p
 
 
 def test_a_begun_run_keeps_what_its_processor_decided(make_job) -> None:
-    job = make_job(config=training_config("nps", {}))
+    job = make_job("nps")
     for half in (True, False):  # one of them is not what this processor would decide
-        write_config(job.folder, job.capture, with_fields(job.train_config, {"deformation.half": half}), "")
+        write_config(job.folder, job.capture, with_fields(job.config, {"deformation.half": half}), "")
         job.check()
     with pytest.raises(NeecoError, match="deformation: begun with"):
-        make_job(config=training_config("nps", {}, ["deformation.half=true"])).check()
+        make_job("nps", settings=["deformation.half=true"]).check()
 
 
 def test_a_finished_job_of_a_methods_former_name_is_not_done_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = training_config("nps", {}, ["deformation.width=16", "deformation.depth=2"])
-    job = make_job(config=small)
+    small = ["deformation.width=16", "deformation.depth=2"]
+    job = make_job("nps", settings=small)
     first = job.run()
     for name in ("job.json", "config.yaml"):  # as version 0.2 wrote them
         text = (job.folder / name).read_text()
@@ -106,7 +105,7 @@ def test_a_finished_job_of_a_methods_former_name_is_not_done_again(make_job, mon
         )
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
     with pytest.warns(FutureWarning, match="method neeco is now called nps"):
-        assert make_job(config=small).run() == first | {"method": "neeco"}
+        assert make_job("nps", settings=small).run() == first | {"name": "nps", "method": "neeco"}
 
 
 def test_the_numbers_of_a_capture_that_changed_are_not_given_again(finished_job) -> None:
@@ -160,18 +159,13 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
     ("name", "change", "reported"),
     [
         ("job.json", {"splits": {"test": {"psnr": "good"}}}, "splits: test: psnr: is not as neeco writes it"),
-        ("job.json", {"budget": None}, "budget: is not as neeco writes it"),
-        ("begun.json", {"seconds": []}, "seconds: is not as neeco writes it"),
-        ("begun.json", {"budget": {}}, "budget: minutes is missing"),
-        ("begun.json", {"budget": {"minutes": None, "iterations": None, "clock": "wall"}}, "budget: give minutes or"),
+        ("job.json", {"seconds": []}, "seconds: is not as neeco writes it"),
     ],
 )
 def test_a_damaged_job_is_reported_by_file_and_field(name: str, change: dict, reported: str, finished_job) -> None:
     job = finished_job
     file = job.folder / name
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
-    if name == "begun.json":
-        (job.folder / "job.json").unlink()
     with pytest.raises(NeecoError, match=f"{name}: {reported}.*remove that run's folder"):
         job.run()
 
@@ -186,8 +180,8 @@ def test_a_damaged_curve_is_reported_by_its_line(finished_job) -> None:
 
 
 def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = training_config("3dgs", {}, ["checkpoint_interval=5"])
-    whole, cut = (make_job(folder=tmp_path / name, config=config) for name in ("whole", "cut"))
+    settings = ["checkpoint_interval=5"]
+    whole, cut = (make_job(folder=tmp_path / name, settings=settings) for name in ("whole", "cut"))
     expected = whole.run()
     step = GaussianSession.step
 
@@ -206,7 +200,7 @@ def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch
 def test_kinematic_finishes_where_no_wrist_is_found(make_job) -> None:
     from neeco.training.run import load_run
 
-    job = make_job("kinematic", config=training_config("kinematic", {}))  # the bar has no joint to find a wrist by
+    job = make_job("kinematic")  # the bar has no joint to find a wrist by
     result = job.run()
     assert float(load_run(job.folder).scene.deformation.articulations[0].wrist_start) == float("-inf")
     assert result["splits"]["test"]["psnr"] > 5
@@ -214,31 +208,26 @@ def test_kinematic_finishes_where_no_wrist_is_found(make_job) -> None:
 
 def test_drawing_the_curve_changes_no_bit_of_the_scene(trained_job, tmp_path) -> None:
     job = trained_job
-    plain = train_module.train(job.capture, tmp_path / "plain", job.train_config)
+    plain = train_module.train(job.capture, tmp_path / "plain", job.config)
     assert (plain / "scene.safetensors").read_bytes() == (job.folder / "scene.safetensors").read_bytes()
 
 
 def test_minutes_end_a_run_whatever_its_iterations(make_job) -> None:
-    config = training_config("3dgs", {"iterations": 2})
-    job = make_job(config=config, budget=Budget(0.005, None, "processor"))
-    assert job.train_config.iterations == UNLIMITED
-    result = job.run()
+    result = make_job(values={"iterations": UNLIMITED, "minutes": 0.005}, clock="processor").run()
     assert result["iterations"] > 2
-    assert result["processor_seconds"] == pytest.approx(0.3, abs=0.25)
+    assert result["seconds"] == pytest.approx(0.3, abs=0.25)
 
 
 def test_time_of_drawing_the_curve_is_not_counted(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
-    from neeco.studies.training_job import HeldOutFrames
+    score = Curve.score
 
-    score = HeldOutFrames.score
-
-    def slow(self, scene):
+    def slow(self, scene, split):
         time.sleep(0.1)
-        return score(self, scene)
+        return score(self, scene, split)
 
-    monkeypatch.setattr(HeldOutFrames, "score", slow)
+    monkeypatch.setattr(Curve, "score", slow)
     result = make_job().run()
-    assert result["seconds"] < 1.0  # eleven drawings took 1.1 s
+    assert result["seconds"] < 1.0  # ten moments of two splits took 2 s
 
 
 def test_one_failing_job_leaves_the_others_alone(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,15 +264,8 @@ def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytes
 @pytest.mark.parametrize(
     ("changes", "reported"),
     [
-        ({"budget": Budget(None, 13)}, "budget: begun with 12 iterations, now 13 iterations"),
-        (
-            {"budget": Budget(None, 12, "processor")},
-            "budget: begun with 12 iterations, now 12 iterations, CPU time",
-        ),
-        (
-            {"config": training_config("3dgs", {"max_tissue_gaussians": 99})},
-            "max_tissue_gaussians: begun with None, now 99",
-        ),
+        ({"values": {"iterations": 13}}, "iterations: begun with 12, now 13"),
+        ({"values": {"max_tissue_gaussians": 99}}, "max_tissue_gaussians: begun with None, now 99"),
     ],
 )
 @pytest.mark.usefixtures("finished_job")
@@ -296,22 +278,6 @@ def test_a_folder_of_another_job_is_refused_before_any_work(make_job, changes, r
 def test_a_run_of_another_capture_is_refused(finished_job, tmp_path) -> None:
     with pytest.raises(NeecoError, match="capture: begun with"):
         run_jobs([replace(finished_job, capture=tmp_path / "other")])
-
-
-@pytest.mark.parametrize(
-    ("budget", "reported"),
-    [
-        (Budget(None, None), "give minutes or iterations"),
-        (Budget(1.0, 5), "one of them"),
-        (Budget(0.0, None), "more than 0"),
-        (Budget(float("inf"), None), "more than 0"),
-        (Budget(None, 0), "at least 1"),
-        (Budget(1.0, None, "sun"), "clock 'sun' is unknown"),  # type: ignore[arg-type]
-    ],
-)
-def test_budgets_that_cannot_be_spent_are_refused(budget: Budget, reported: str, make_job) -> None:
-    with pytest.raises(NeecoError, match=reported):
-        run_jobs([make_job(budget=budget)])
 
 
 def test_a_cluster_without_ray_is_refused_with_the_remedy(make_job, monkeypatch) -> None:
@@ -405,22 +371,6 @@ def test_workers_share_the_cores() -> None:
     assert [threads_per_worker(workers, 8) for workers in (1, 2, 3, 16)] == [8, 4, 2, 1]
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux has a mark that can be reset")
-def test_peak_memory_is_of_the_work_since_the_reset() -> None:
-    assert reset_peak_memory()
-    before = peak_memory_mb()
-    block = bytearray(b"x" * (64 << 20))
-    during = peak_memory_mb()
-    del block
-    assert reset_peak_memory()
-    after = peak_memory_mb()
-    assert before is not None
-    assert during is not None
-    assert after is not None
-    assert during > before + 50
-    assert after < during - 50
-
-
 def test_workers_give_the_same_numbers(make_job, tmp_path) -> None:
     here = [make_job(seed=seed, folder=tmp_path / "here" / str(seed)) for seed in (0, 1)]
     there = [make_job(seed=seed, folder=tmp_path / "there" / str(seed)) for seed in (0, 1)]
@@ -432,10 +382,8 @@ def test_workers_give_the_same_numbers(make_job, tmp_path) -> None:
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers in /proc")
 @pytest.mark.parametrize("where", ["this machine", "a cluster"])
 def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(where, make_job, tmp_path, monkeypatch) -> None:
-    config, budget = replace(training_config("3dgs", {}), checkpoint_interval=20), Budget(None, 300)
-    here, there = (
-        make_job(config=config, budget=budget, folder=tmp_path / place / "run") for place in ("here", "there")
-    )
+    values = {"checkpoint_interval": 20, "iterations": 300}
+    here, there = (make_job(values=values, folder=tmp_path / place / "run") for place in ("here", "there"))
     expected = without_times(run_jobs([here]))
     events, killed = [], []
     with contextlib.ExitStack() as stack:
@@ -455,8 +403,8 @@ def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(where, make_jo
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="a worker's checkpoint is waited for")
 def test_interrupted_workers_leave_their_checkpoints(make_job, tmp_path, monkeypatch) -> None:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    config, budget = replace(training_config("3dgs", {}), checkpoint_interval=10**6), Budget(None, 5000)
-    jobs = [make_job(seed=seed, config=config, budget=budget, folder=tmp_path / str(seed)) for seed in (0, 1)]
+    values = {"checkpoint_interval": 10**6, "iterations": 5000}
+    jobs = [make_job(seed=seed, values=values, folder=tmp_path / str(seed)) for seed in (0, 1)]
 
     def interrupt() -> None:
         while not all((job.folder / "metrics.jsonl").exists() for job in jobs):
@@ -504,7 +452,24 @@ def kill_when(file: Path, processes: Callable[[], list[int]], killed: list[int])
 
 
 def test_a_field_which_draws_slowly_is_drawn_less_often_for_its_curve(capture: Path) -> None:
-    gaussians, field = (HeldOutFrames(read_capture(capture), ("train",), field=kind) for kind in (False, True))
+    made = read_capture(capture)
+    gaussians, field = (Curve(capture / "curve.jsonl", made, ("train",), field=kind) for kind in (False, True))
     assert len(field.frames["train"]) < len(gaussians.frames["train"])
     assert len(field.shares) < len(gaussians.shares)
     assert field.shares[-1] == gaussians.shares[-1] == 1  # both end with the finished scene
+
+
+def test_the_late_part_of_phase_1_counts(tmp_path: Path) -> None:
+    rows = [{"iteration": i, "phase": 1 + (i > 400), "psnr": i / 100} for i in range(50, 1001, 50)]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert phase_1_psnr(tmp_path) == pytest.approx((3.5 + 4.0) / 2)
+    (tmp_path / "metrics.jsonl").write_text(json.dumps(rows[-1]) + "\n")
+    assert phase_1_psnr(tmp_path) is None  # phase 1 ended before the first row
+    assert phase_1_psnr(tmp_path / "none") is None
+
+
+def test_psnr_at_a_share_of_the_run_is_the_nearest_row_of_its_split() -> None:
+    curve = [{"split": "test", "progress": p, "psnr": 100 * p} for p in (0.1, 0.2017, 1.0)]
+    curve.append({"split": "unseen", "progress": 0.2, "psnr": 1.0})
+    assert psnr_at(curve, "test", 0.2) == pytest.approx(20.17)
+    assert psnr_at(curve, "test", 0.4) is None

@@ -30,7 +30,8 @@ VERBS = {
     "train": "Learn a scene from a capture.",
     "evaluate": "Score a run: images, masks, parts, speed; writes a report.",
     "render": "Render frames of a capture, or states from a file, with part ids and masks.",
-    "compare": "Train and score several methods under the same budget; tables and a report.",
+    "sweep": "Train and score configurations of methods, each with several seeds; tables and a report.",
+    "compare": "Train and score several methods, equally long; a sweep.",
     "score-masks": "Score a folder of masks from any source against the truth.",
     "view": "Show a run interactively, in a browser or as one file.",
     "export": "Write a scene in one state for other viewers of Gaussians (PLY, SPZ, OpenUSD).",
@@ -39,7 +40,7 @@ VERBS = {
     "track": "Find instruments in footage that has no states, by their learned scene.",
     "refine": "Train a run again, with frames that were tracked by it.",
     "downstream": "Train detectors and segmenters on synthetic images; test them on recorded frames.",
-    "ablate": "Remove parts of the methods one by one; the paper's tables and ours.",
+    "ablate": "Remove parts of the methods one by one, for the paper's tables and ours; a sweep.",
 }
 
 DESCRIPTION = """Labelled images of surgical instruments in states nobody recorded.

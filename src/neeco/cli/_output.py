@@ -9,7 +9,7 @@ import os
 import re
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
@@ -104,9 +104,7 @@ def _piece(
 
 
 def print_outcome(
-    output: Path,
-    stem: str,
-    page: Path,
+    files: Mapping[str, Path | str],
     tables: Sequence[ResultTable],
     *,
     sentences: Sequence[str] = (),
@@ -114,7 +112,7 @@ def print_outcome(
     failed: Sequence[str],
     runs: str,
 ) -> int:
-    """Print tables, sentences, notes, the files named by `stem` and the report; returns 1 when any of `runs` (`3 runs`)
+    """Print tables, sentences, notes and where the files lie, by what they are; returns 1 when any of `runs` (`3 runs`)
     failed, and prints the first failure."""
     console = whole_lines()
     for table in tables:
@@ -124,9 +122,8 @@ def print_outcome(
         console.print(sentence, markup=False, highlight=False)
     for note in notes:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
-    for what, name in (("tables", f"{stem}.md, .csv, .tex"), ("all numbers", f"{stem}.json, data/")):
-        console.print(f"{what}: {output}/: {name}", markup=False, highlight=False, soft_wrap=True)
-    console.print(f"report: {page}", markup=False, highlight=False, soft_wrap=True)
+    for what, place in files.items():
+        console.print(f"{what}: {place}", markup=False, highlight=False, soft_wrap=True)
     if not failed:
         return 0
     more = f" (and {len(failed) - 1} more, listed above)" if len(failed) > 1 else ""

@@ -1,42 +1,24 @@
-"""`neeco ablate`: the contribution of each part of the methods."""
+"""`neeco ablate`: the study of what each part of the methods contributes."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
-from rich.console import Console
-
-from neeco.cli._output import fitted, whole_lines
-from neeco.studies.ablations import AblationPlan
-
-if TYPE_CHECKING:
-    from neeco.studies.ablation_study import AblationResult
+from neeco.cli.sweep import run_study
+from neeco.studies.configurations import SweepRequest, ablations
 
 
-def run(plan: AblationPlan) -> int:
-    """Run the ablations with a progress bar, write all files, print the verdicts."""
-    from neeco.cli._progress import Bars
-    from neeco.report.study_pages import write_ablation_report
-    from neeco.studies.ablation_study import run_ablations
+@dataclass(frozen=True, kw_only=True)
+class Ablate(SweepRequest):
+    """Take parts of the methods away one by one, as the paper does and beyond; writes tables and a report.
 
-    with Bars() as bars:
-        ablation = run_ablations(plan, bars.job)
-    page = write_ablation_report(plan.output, ablation)
-    print_tables(whole_lines(), ablation)
-    for line in (f"tables: {plan.output}/tables/: NAME.csv, .md, .tex", f"report: {page}"):
-        print(line)
-    return 1 if ablation.failures else 0
+    Interrupted, the same command goes on where it stopped.
+    """
+
+    tables: tuple[str, ...] = ("density", "sh-compensation", "uniform-motion", "kinematic")
+    """Which to make: the paper's density, sh-compensation and uniform-motion, and kinematic without its parts."""
 
 
-def print_tables(console: Console, ablation: AblationResult) -> None:
-    """Print how many of the paper's directions hold, our tables in full, then the notes."""
-    from neeco.studies.ablation_tables import agreement, grid
-
-    for table in ablation.tables:
-        if table.judged:
-            console.print(f"{table.title}: {agreement(table)}", markup=False, highlight=False)
-            continue
-        for piece in fitted(grid(table), console.width):
-            console.print(piece)
-    for note in ablation.notes:
-        console.print(f"note: {note}", style="dim", markup=False, highlight=False)
+def run(args: Ablate) -> int:
+    """Run the packaged study with the chosen tables."""
+    return run_study(args, ablations().only(args.tables))

@@ -83,10 +83,9 @@ def run(args: Downstream) -> int:
         bars.stage("report", 0, 1)
         page = write_downstream_report(args.output, experiment, plan.capture)
         bars.stage("report", 1, 1)
+    files = {"tables": "downstream.md, .csv, .tex", "all numbers": "downstream.json, data/"}
     return print_outcome(
-        args.output,
-        "downstream",
-        page,
+        {what: f"{args.output}/: {names}" for what, names in files.items()} | {"report": page},
         tables_of(experiment),
         sentences=experiment["answers"],
         notes=experiment["notes"],

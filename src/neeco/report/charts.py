@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import matplotlib
@@ -226,16 +225,6 @@ def legend(names: Sequence[str], shown: Sequence[str]) -> list[tuple[str, Markup
             axes.set(xlim=(0, 46), ylim=(0, 14))
             entries.append((name, inline_svg(axes, f"line of {name}")))
     return entries
-
-
-def binned(points: Sequence[Point], edges: Sequence[float]) -> tuple[Point, ...]:
-    """Mean of the points between every two `edges` (the last bin takes its upper edge too); empty bins are left out."""
-    means = []
-    for low, high in pairwise(edges):
-        inside = [(x, y) for x, y in points if low <= x < high or x == high == edges[-1]]
-        if inside:
-            means.append((sum(x for x, _ in inside) / len(inside), sum(y for _, y in inside) / len(inside)))
-    return tuple(means)
 
 
 def draw_dots(axes: Axes, places: np.ndarray, **style: Any) -> None:

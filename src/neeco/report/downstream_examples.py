@@ -15,7 +15,7 @@ from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline,
 from neeco.evaluation.mask_metrics import box_ious
 from neeco.files import read_json
 from neeco.report.page import MAX_WIDTH, jpeg
-from neeco.report.study_pages import Images, Section
+from neeco.report.sections import Images, Section
 from neeco.studies.downstream.conditions import BASELINES, PERMUTED, REAL
 from neeco.studies.downstream.job import MASK_PREFIX, PREDICTIONS_FILE, job_folder, predictions_folder, test_samples
 from neeco.studies.downstream.results import MAIN, main_differences, models_and_splits, title_of

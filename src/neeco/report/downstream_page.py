@@ -18,7 +18,7 @@ from neeco.files import write_text
 from neeco.report.charts import PALETTE, Level, Series, inline_svg, legend, line_chart, new_axes, page_style
 from neeco.report.downstream_examples import example_sections
 from neeco.report.page import REPORT_FILE, split_counts, write_page
-from neeco.report.study_pages import Figure, Section
+from neeco.report.sections import Figure, Section
 from neeco.studies.downstream.conditions import PASTE, PERMUTED, REAL
 from neeco.studies.downstream.intervals import CONFIDENCE, Scores, arms_of
 from neeco.studies.downstream.results import (

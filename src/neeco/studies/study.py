@@ -1,13 +1,8 @@
-"""The engine of every study (`compare`, `ablate`, `downstream`): jobs that stand on their own and can be resumed.
+"""The engine of every study (`sweep`, `downstream`): jobs that stand on their own and can be resumed.
 
 A study is a list of jobs (`Job`), each with a folder of its own, and one JSON file that is valid at every moment.
-
-- `check_output` checks that the output folder is free, or holds the same study begun earlier.
-- `run_jobs` runs all jobs, in this process or in workers, and returns their results in order; `run_and_record` also
-  writes the JSON file after each job. A job that fails does not stop the others: its result has an "error".
-- `spread` is mean, standard deviation and count over repetitions (seeds, folds).
-
-Results become tables in `neeco.studies.tables` and a page in `neeco.report.study_pages`.
+`check_output` checks that the output folder is free, or holds the same study begun earlier; `run_jobs` runs all jobs,
+in this process or in workers. A job that fails does not stop the others: its result has an "error".
 """
 
 from __future__ import annotations
@@ -20,6 +15,7 @@ import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import torch
@@ -99,54 +95,42 @@ def check_output(output: Path, file: str, schema: str, capture: Path, noun: str)
     return stored
 
 
-def run_and_record(
-    jobs: Sequence[Job],
-    workers: int,
-    record: Callable[[list[Result]], None],
-    finished: Mapping[int, Result],
-    progress: Callable[[JobEvent], None] | None = None,
-    captures: Mapping[Path, Capture] | None = None,
-    light: bool = False,
-) -> list[Result]:
-    """`run_jobs`; after each job `record` gets all results known by then, in the order of the jobs.
-
-    finished: results of earlier starts, by the job's place.
-    """
-    known = dict(finished)
-
-    def watch(event: JobEvent) -> None:
-        if event.result is not None:
-            known[event.index] = event.result
-            record([known[index] for index in sorted(known)])
-        if progress:
-            progress(event)
-
-    return run_jobs(jobs, workers, watch, captures, light)
-
-
 def run_jobs(
     jobs: Sequence[Job],
     workers: int = 1,
+    record: Callable[[list[Result]], object] | None = None,
+    finished: Mapping[int, Result] = MappingProxyType({}),
     progress: Callable[[JobEvent], None] | None = None,
-    captures: Mapping[Path, Capture] | None = None,
+    captures: Mapping[Path, Capture] = MappingProxyType({}),
+    *,
     light: bool = False,
 ) -> list[Result]:
     """Run every job and return their results, in their order.
 
     workers 1: in this process, one after another; more, or where RAY_ADDRESS names a cluster: so many at once in
     processes of their own (so that a script needs `if __name__ == "__main__"`), a job whose worker dies again from its
-    checkpoint. captures: those of the jobs that are read already, by path, for this process; jobs read the others.
-    light: small jobs, which workers do one after another, sharing the GPUs. A failed job writes no job.json, so that
-    the next start tries again. Raises NeecoError before any work when a job's folder is another job's or the cluster
-    does not answer, and KeyboardInterrupt saying which job was stopped.
+    checkpoint. record: gets all results known after each job; finished: those of earlier starts, by the job's place.
+    captures: those of the jobs that are read already, by path, for this process; jobs read the others. light: small
+    jobs, which workers do one after another, sharing the GPUs. A failed job writes no job.json, so that the next start
+    tries again. Raises NeecoError before any work when a job's folder is another job's or the cluster does not answer,
+    and KeyboardInterrupt saying which job was stopped.
     """
     check_workers(workers, _device_of(jobs), light)
-    report = progress or (lambda event: None)
+    known = dict(finished)
+
+    def report(event: JobEvent) -> None:
+        if event.result is not None:
+            known[event.index] = event.result
+            if record:
+                record([known[index] for index in sorted(known)])
+        if progress:
+            progress(event)
+
     for job in jobs:
         job.check()
     if workers > 1 or address():
         return _run_in_workers(jobs, workers, report, light)
-    return [_run_here(place, jobs, (captures or {}).get(job.capture), report) for place, job in enumerate(jobs)]
+    return [_run_here(place, jobs, captures.get(job.capture), report) for place, job in enumerate(jobs)]
 
 
 def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:

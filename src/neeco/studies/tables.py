@@ -1,33 +1,16 @@
-"""Result tables of every study: CSV by pandas, and one kind of table for the terminal, pages, Markdown and LaTeX.
+"""Result tables of every study: CSV by pandas, and one kind of table for the terminal, pages and Markdown.
 
 `csv_text` writes rows of numbers in full. `summary_table` makes a `ResultTable` of means and standard deviations,
-rounded, the best of each column marked; `markdown_document` and `latex_document` write several, and `write_files` all
-tables of a study.
+rounded, the best of each column marked; `markdown_document` writes several.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
-from neeco.files import write_text
-
 UNKNOWN = "-"
-LATEX_SPECIAL = {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    **{character: "\\" + character for character in "&%$#_{}"},
-    "±": r"$\pm$",
-    "↑": r"$\uparrow$",
-    "↓": r"$\downarrow$",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-}
 Better = Literal["high", "low", None]
 
 
@@ -134,19 +117,9 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
     )
 
 
-def summary_csv(keys: Sequence[str], metrics: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """CSV of rows with `keys` and a `study.spread` by metric, as METRIC_mean, METRIC_std and METRIC_n."""
-    parts = ("mean", "std", "n")
-    flat = [
-        {**row, **{f"{metric}_{part}": row[metric][part] for metric in metrics if metric in row for part in parts}}
-        for row in rows
-    ]
-    return csv_text([*keys, *(f"{metric}_{part}" for metric in metrics for part in parts)], flat)
-
-
 def markdown_table(table: ResultTable) -> list[str]:
     """The table's lines in Markdown under its title; the best of a column is bold."""
-    headings, rows = _texts(table, markdown_escape, "**{}**", "failed: {}")
+    headings, rows = cell_texts(table, markdown_escape, "**{}**", "failed: {}")
     rule = "|" + "---|" * len(table.keys) + "---:|" * (len(headings) - len(table.keys))
     lines = [f"| {' | '.join(texts)} |" for texts in (headings, *rows)]
     return [f"## {markdown_escape(table.title)}", "", lines[0], rule, *lines[1:]]
@@ -172,31 +145,7 @@ def markdown_escape(text: str) -> str:
     return text
 
 
-def latex_table(table: ResultTable, caption: str) -> str:
-    """The table in LaTeX for the package booktabs; the best of a column is bold."""
-    import pandas
-
-    headings, rows = _texts(table, latex_escape, r"\textbf{{{}}}", "failed")
-    columns = "l" * len(table.keys) + "r" * (len(headings) - len(table.keys))
-    style = pandas.DataFrame(rows, columns=headings).style.hide(axis="index")
-    caption = latex_escape(caption)
-    return str(style.to_latex(hrules=True, position_float="centering", caption=caption, column_format=columns))
-
-
-def latex_document(caption: str, tables: Sequence[ResultTable], lead: Sequence[str], notes: Sequence[str]) -> str:
-    """LaTeX tables for the package booktabs. caption: with {} for a table's title; lead, notes: comments."""
-    comments = [["% " + " ".join(text.split()) for text in texts] for texts in (lead, notes)]
-    parts = ["% \\usepackage{booktabs}", *comments[0], ""]
-    parts += [latex_table(table, caption.replace("{}", table.title)) for table in tables]
-    return "\n".join([*parts, *comments[1]]).rstrip() + "\n"
-
-
-def latex_escape(text: str) -> str:
-    """`text` so that LaTeX prints it as it stands."""
-    return "".join(LATEX_SPECIAL.get(character, character) for character in text)
-
-
-def _texts(
+def cell_texts(
     table: ResultTable, escape: Callable[[str], str], bold: str, failed: str
 ) -> tuple[list[str], list[list[str]]]:
     """Headings and rows as texts; bold, failed: the markup of a best entry and of a row without numbers, with {}."""
@@ -212,12 +161,3 @@ def _texts(
     headings = [escape(text) for text in (*table.keys, *(column.heading for column in table.columns))]
     width = max(map(len, [headings, *rows]))  # no run has a number: the reasons have a column without heading
     return headings + [""] * (width - len(headings)), rows
-
-
-def write_files(
-    output: Path, stem: str, texts: Mapping[str, str], data: Mapping[str, str] = MappingProxyType({})
-) -> None:
-    """Write `texts` by suffix as STEM.csv, STEM.md and STEM.tex into `output`, and `data` by name into its data/."""
-    files = {output / f"{stem}.{suffix}": text for suffix, text in texts.items()}
-    for path, text in (files | {output / "data" / name: text for name, text in data.items()}).items():
-        write_text(path, text)

@@ -34,7 +34,7 @@ from neeco.studies.downstream.samples import (
     synthetic_samples,
 )
 from neeco.studies.machine import machine, threads_per_worker
-from neeco.studies.study import JobEvent, check_output, check_workers, run_and_record
+from neeco.studies.study import JobEvent, check_output, check_workers, run_jobs
 
 SCHEMA = "neeco-downstream/2"
 FILE = "downstream.json"
@@ -231,7 +231,7 @@ def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | 
                 written = time.monotonic()
 
         try:
-            results = run_and_record(jobs, plan.settings.workers, record, finished, progress, captures, light=True)
+            results = run_jobs(jobs, plan.settings.workers, record, finished, progress, captures, light=True)
         except KeyboardInterrupt:
             if known:
                 write_json(file, document(plan, known))

@@ -16,6 +16,7 @@ from neeco.errors import counted
 from neeco.studies.downstream.conditions import BASELINES, PERMUTED, REAL
 from neeco.studies.downstream.intervals import Arm, Scores, arms_of
 from neeco.studies.downstream.scores import BOX_SCORES, MASK_SCORES
+from neeco.studies.downstream.table_files import latex_document, summary_csv, write_files
 from neeco.studies.study import spread
 from neeco.studies.tables import (
     UNKNOWN,
@@ -25,11 +26,8 @@ from neeco.studies.tables import (
     Row,
     SummaryRow,
     csv_text,
-    latex_document,
     markdown_document,
-    summary_csv,
     summary_table,
-    write_files,
 )
 
 MAIN = {"masks": "iou", "boxes": "ap"}  # the score that models are compared by

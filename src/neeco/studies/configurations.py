@@ -1,0 +1,217 @@
+"""STUDY.yaml: the configurations of a sweep, and the tables that are read off its results. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from neeco.errors import NeecoError, nearest
+from neeco.files import parse_yaml, read_text
+from neeco.settings import Device, structure
+from neeco.studies.tables import Column
+
+SCORES = (  # of one split
+    Column("psnr", "PSNR", 2, "high"),
+    Column("ssim", "SSIM", 3, "high"),
+    Column("lpips", "LPIPS", 3, "low"),
+    Column("psnr_instrument", "PSNR instrument", 2, "high"),
+    Column("mask_iou", "label IoU", 3, "high"),
+    Column("mask_dice", "label Dice", 3, "high"),
+)
+MOMENTS = (
+    *(Column(f"psnr_at_{percent}", f"PSNR at {percent} %", 2, "high") for percent in (20, 40, 60)),
+    Column("phase_1_psnr", "phase-1 training PSNR", 2, "high"),
+)
+COSTS = (  # of a whole run
+    Column("iterations", "iterations"),
+    Column("seconds", "minutes", 2, None, 1 / 60),
+    Column("fps", "FPS", 1, "high"),
+    Column("num_gaussians", "Gaussians"),
+)
+MEASURES = {column.key: column for column in (*SCORES, *MOMENTS, *COSTS)}
+LENGTHS = ("iterations", "minutes", "cpu_minutes")
+EXAMPLE = "write it as docs/studies.md shows"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepRequest:
+    """Arguments that `sweep`, `compare` and `ablate` share."""
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """Capture folder."""
+    output: Path
+    """Folder to write; absent, empty, or of this study begun earlier."""
+    seeds: int | None = None
+    """How many seeds, from 0; with 2 or more the tables have standard deviations. Default: the study's, else 1."""
+    iterations: int | None = None
+    """Each run trains so many steps. Default: the study's."""
+    minutes: float | None = None
+    """Each run trains so long by the clock on the wall."""
+    cpu_minutes: float | None = None
+    """Each run trains so many minutes of CPU time, all threads together: fair on a machine that others use."""
+    splits: tuple[str, ...] | None = None
+    """Splits to score. Default: all but train."""
+    workers: int = 1
+    """Runs at once; each gets its share of the cores. RAY_ADDRESS names a Ray cluster (needs the extra `cluster`)."""
+    transforms: str = "transforms.json"
+    """Which transforms file of the capture to read."""
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """A field of every run's training config, as NAME=VALUE (e.g. max_tissue_gaussians=5000); repeatable."""
+    lpips_weights: Path | None = None
+    """Folder with alexnet.safetensors and/or vgg16.safetensors. Default: that of NEECO_LPIPS_WEIGHTS."""
+    device: Device = "auto"
+
+    def run_folder(self, name: str, seed: int) -> Path:
+        """Return the run folder of a configuration and seed."""
+        return self.output / "runs" / f"{name}-seed{seed}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Configuration:
+    """One way to train."""
+
+    method: str | None = None  # as for `neeco train --method`; METHOD+dta: with the paper's dynamic training adjustment
+    like: str | None = None  # another configuration, whose method, settings and iterations come first
+    settings: tuple[str, ...] = ()  # NAME=VALUE as for `neeco train --set`
+    iterations: int | None = None  # in place of the study's length
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableRow:
+    """One configuration in a table. `published`: numbers of others, one for each measure of the table, as far as known;
+    only the directions of their differences are compared with ours."""
+
+    label: str = ""  # "": the configuration's name
+    published: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Configurations in comparison. `reference`: the one that differences are taken to."""
+
+    title: str = ""
+    text: str = ""
+    reference: str | None = None
+    measures: tuple[str, ...] = tuple(column.key for column in SCORES)
+    rows: dict[str, TableRow] = field(default_factory=dict)  # by configuration
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Configurations x seeds. Every run is as long as `iterations`, `minutes` or `cpu_minutes` says, one of them."""
+
+    title: str = "Sweep"
+    configurations: dict[str, Configuration] = field(default_factory=dict)
+    seeds: int = 1  # how many, from 0
+    iterations: int | None = None
+    minutes: float | None = None  # by the clock on the wall
+    cpu_minutes: float | None = None  # CPU time of all threads of a run
+    settings: tuple[str, ...] = ()  # of all configurations; deformation.FIELD of those whose method has the field
+    even_db: float = 0.1  # smaller differences from a reference have no direction
+    tables: dict[str, Table] = field(default_factory=dict)  # none: one of all configurations
+
+    def prepared(self, request: SweepRequest) -> Study:
+        """Return the study as the request changes it, with configurations that are `like` none, and a table. Raises
+        NeecoError naming the field that cannot be used."""
+        study = self if request.seeds is None else replace(self, seeds=request.seeds)
+        alone = {name: study.unfolded(name) for name in study.configurations}
+        lengths = {key: getattr(request, key) for key in LENGTHS}
+        if any(value is not None for value in lengths.values()):
+            alone = {name: replace(item, iterations=None) for name, item in alone.items()}
+            study = replace(study, **lengths)
+        everybody = {name: TableRow() for name in alone}
+        tables = {
+            name: replace(table, title=table.title or name, rows=table.rows or everybody)
+            for name, table in (self.tables or {"results": Table(title=self.title)}).items()
+        }
+        study = replace(study, configurations=alone, tables=tables)
+        study.check()
+        return study
+
+    def check(self) -> None:
+        """Raises NeecoError naming the field that cannot be used."""
+        if not self.configurations:
+            raise NeecoError("configurations: none is given; name at least one, with its method")
+        for name in self.configurations:
+            if not name or name.startswith(".") or {*name} & {"/", "\\", "\0"}:
+                raise NeecoError(f"configurations: {name!r} names no folder; leave out / and \\ and a dot at its start")
+            self.length_of(name)
+        if self.seeds < 1:
+            raise NeecoError(f"seeds: {self.seeds} is none at all; give at least 1")
+        for name, table in self.tables.items():
+            for row, entry in table.rows.items():
+                require_known(f"tables.{name}.rows", row, self.configurations)
+                if len(entry.published) > len(table.measures):
+                    raise NeecoError(f"tables.{name}.rows.{row}.published: more numbers than measures; leave some out")
+            for measure in table.measures:
+                require_known(f"tables.{name}.measures", measure, MEASURES)
+            if table.reference is not None:
+                require_known(f"tables.{name}.reference", table.reference, table.rows)
+
+    def unfolded(self, name: str, *within: str) -> Configuration:
+        """Return a configuration with what it takes from the one that it is `like`. Raises NeecoError for a name that
+        is unknown or leads back to itself."""
+        found, place = self.configurations[name], f"configurations.{name}"
+        if found.like is not None:
+            require_known(f"{place}.like", found.like, self.configurations)
+            if found.like in (name, *within):
+                raise NeecoError(f"{place}.like: {found.like} is like {name} in turn; give one of them a method")
+            base = self.unfolded(found.like, name, *within)
+            settings, iterations = (*base.settings, *found.settings), found.iterations or base.iterations
+            found = Configuration(method=found.method or base.method, settings=settings, iterations=iterations)
+        if found.method is None:
+            raise NeecoError(f"{place}.method: none is given; choose one of `neeco train --help`")
+        return found
+
+    def length_of(self, name: str) -> tuple[str, float]:
+        """Return the length of a configuration's runs: one of LENGTHS, and how many. Raises NeecoError where there is
+        none, or several."""
+        own = self.configurations[name].iterations
+        given = {"iterations": own} if own is not None else {key: getattr(self, key) for key in LENGTHS}
+        found = [(key, value) for key, value in given.items() if value is not None]
+        if len(found) != 1:
+            what = f"{' and '.join(key for key, _ in found)} are given" if found else "no length of the runs is given"
+            raise NeecoError(f"{what}; all train equally long: give one of {', '.join(LENGTHS)} (try --minutes 5)")
+        key, value = found[0]
+        if not 0 < value < math.inf:
+            raise NeecoError(f"{key}: {value} is no time to train; give more than 0")
+        return key, value
+
+    def only(self, tables: Iterable[str]) -> Study:
+        """Return the study with these tables and the configurations that stand in them. Raises NeecoError for a name
+        that is unknown."""
+        for name in tables:
+            require_known("--tables", name, self.tables)
+        chosen = {name: self.tables[name] for name in tables}
+        needed = dict.fromkeys(row for table in chosen.values() for row in table.rows)
+        return replace(self, tables=chosen, configurations={name: self.unfolded(name) for name in needed})
+
+
+def read_study(file: Path) -> Study:
+    """Read STUDY.yaml. Raises NeecoError naming the file and the field that is unknown or does not fit."""
+    values = parse_yaml(file, read_text(file, "a study in YAML"), EXAMPLE)
+    if not isinstance(values, dict):
+        raise NeecoError(f"{file}: is no group of fields such as configurations; {EXAMPLE}")
+    try:
+        return structure(Study, values)
+    except NeecoError as error:
+        raise NeecoError(f"{file}: {error}") from None
+
+
+def ablations() -> Study:
+    """Return the study of `neeco ablate`."""
+    return read_study(Path(str(files("neeco.studies") / "ablations.yaml")))
+
+
+def require_known(place: str, name: str, known: Iterable[str]) -> None:
+    """Raise NeecoError naming `place` where `name` is none of `known`."""
+    if name not in known:
+        meant = nearest(name, known)
+        hint = "" if meant is None else f"; did you mean {meant}?"
+        raise NeecoError(f"{place}: {name!r} is unknown; choose of {', '.join(known)}{hint}")
