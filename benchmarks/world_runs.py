@@ -67,9 +67,9 @@ def mistaken_links(world: World) -> bool:
     return mistaken(world) and linked(world)
 
 
-def based(world: World) -> bool:
-    """States are a robot's, whose base is off, and links are stated."""
-    return world.states == "encoders" and linked(world)
+def misplaced(world: World) -> bool:
+    """Stated links of a wrist are off along the shaft."""
+    return linked(world) and world.kind == "wrist" and world.frame_off != 0
 
 
 @dataclass(frozen=True)
@@ -86,23 +86,15 @@ def _option(words: str, applies_to: Callable[[World], bool] = always) -> Mechani
 
 WITHOUT: dict[str, Mechanism] = {
     "silhouettes": Mechanism(f"{METHOD}m.observe_silhouettes = {NOTHING}"),
-    "interiors": Mechanism(f"{METHOD}m.fade_interior_tissue = {NOTHING}"),
     "states-before-training": Mechanism(f"{SEARCH}m.register_states = {NOTHING}", mistaken_links),
-    "pose-registration": Mechanism(f"{SEARCH}m.correct_poses = {NOTHING}", based),
-    "links-aligned": Mechanism(
-        f"{SEARCH}m.align_to_links = lambda session, links, evidence, name, shape, generator: shape", linked
-    ),
+    "pose-registration": Mechanism(f"{SEARCH}m.correct_poses = {NOTHING}", misplaced),
     "state-fits": Mechanism(f"{METHOD}m.fit_states = {NOTHING}", mistaken),
     "contradictions": Mechanism(
         PASSES
-        + "; ".join(
-            f"m.{name} = {NOTHING}"
-            for name in ("refit_outliers", "judge_again", "judge_held_back", "hold_back", "leave_out_unexplained")
-        ),
+        + "; ".join(f"m.{name} = {NOTHING}" for name in ("refit_outliers", "judge_again", "leave_out_unexplained")),
         mistaken,
     ),
     "judging-again": Mechanism(f"{PASSES}m.judge_again = {NOTHING}", mistaken),
-    "held-back": Mechanism(f"{PASSES}m.hold_back = m.judge_held_back = {NOTHING}", mistaken),
     "carving-again": Mechanism(f"{PASSES}m.carve_again = {NOTHING}", mistaken),
     "wrists-placed": Mechanism(f"{METHOD}m.place_wrists = {NOTHING}", jointed),
     "wrists-again": _option("deformation.refine_wrists=false", jointed),

@@ -106,6 +106,7 @@ class World:
     joints: bool  # whether they are logged
     stated: bool  # whether uncertainties are stated
     base: float  # error of a robot's base, times a usual one
+    frame_off: float  # mm along the shaft, of stated links in the tracked frame
     # how it is trained
     scale: float  # --scale
 
@@ -240,7 +241,7 @@ def draw_world(seed: int) -> World:
     count = int(rng.integers(1, 4))
     lamps = tuple(_lamp(rng) for _ in range(count))
     states = one_of(STATES, (0.25, 0.30, 0.20, 0.25))
-    return World(
+    world = World(
         seed=seed,
         size=one_of(SIZES, (0.4, 0.3, 0.2, 0.1)),
         kind=kind,
@@ -277,7 +278,9 @@ def draw_world(seed: int) -> World:
         stated=states == "independent" and bool(rng.random() < 0.4),
         scale=float(one_of((1.0, 0.5, 0.75), (0.8, 0.1, 0.1))),
         base=float(one_of((1.0, 4.0))) if states == "encoders" else 0.0,
+        frame_off=0.0,
     )
+    return replace(world, frame_off=float(one_of((0.0, -8.0, 8.0)))) if world.links == "off" else world
 
 
 def recoloured(tissue: Tissue, color: Triple, contrast: float, wet: float) -> Tissue:

@@ -58,10 +58,10 @@ def _jaws(
     return found
 
 
-def stated_kinematics(spec: SceneSpec, *, exact: bool = False) -> KinematicTree:
+def stated_kinematics(spec: SceneSpec, *, exact: bool = False, along_mm: float = 0.0) -> KinematicTree:
     """The links as a drawing of the instrument and a ruler on its sensor give them: axes turned by AXIS_ERROR and
     pivots shifted by PIVOT_ERROR mm, each some way of its own, unless `exact`, and encoders thought to be without an
-    offset."""
+    offset. All that the shaft carries is `along_mm` farther along it, as where the sensor was measured wrongly."""
     without = spec.encoders and replace(spec.encoders, offsets=(0.0,) * len(spec.encoders.offsets))
     right = true_kinematics(replace(spec, encoders=without))
     if exact:
@@ -69,6 +69,7 @@ def stated_kinematics(spec: SceneSpec, *, exact: bool = False) -> KinematicTree:
     generator = np.random.default_rng((spec.seed, 4))
     errors: dict[str, tuple[Array, Array]] = {}  # by parent: the links that it carries share an axis
     links = []
+    root, along = right.links[0].name, np.linalg.inv(spec.mount.mechanical_from_sensor())[:3, 2]
     for link in right.links:
         if link.type == FIXED:
             links.append(link)
@@ -77,7 +78,7 @@ def stated_kinematics(spec: SceneSpec, *, exact: bool = False) -> KinematicTree:
             errors[link.parent] = (_direction(generator, link.axis), _direction(generator, link.axis))
         turn, shift = errors[link.parent]
         origin = link.origin.copy()
-        origin[:3, 3] += PIVOT_ERROR * shift
+        origin[:3, 3] += PIVOT_ERROR * shift + (along_mm * along if link.parent == root else 0.0)
         axis = Rotation.from_rotvec(AXIS_ERROR * turn).apply(link.axis)
         links.append(replace(link, origin=origin.round(4), axis=axis))
     return KinematicTree(tuple(links))

@@ -155,7 +155,7 @@ def _as_stated(world: World, spec: SceneSpec, capture: Capture) -> Capture:
     keep = declared.joints if world.joints else {}
     tree = None
     if world.links != "none" and world.joints:
-        tree = stated_kinematics(spec, exact=world.links == "exact")
+        tree = stated_kinematics(spec, exact=world.links == "exact", along_mm=world.frame_off)
     declared = replace(declared, joints=dict(keep), kinematics=tree)
     frames = []
     for frame in capture.frames:

@@ -39,6 +39,7 @@ def test_all_that_can_be_drawn_is_drawn() -> None:
     ):  # fmt: skip
         assert {getattr(world, name) for world in worlds} == set(values), name
     assert {world.scale for world in worlds} == {1.0, 0.75, 0.5}
+    assert {world.frame_off for world in worlds if world.links == "off"} == {0.0, -8.0, 8.0}
     assert {world.base for world in worlds if world.states == "encoders"} == {1.0, 4.0}
 
 
@@ -116,4 +117,4 @@ def test_a_mechanism_is_left_out_where_it_applies() -> None:
     worlds = [draw_world(seed) for seed in range(60)]
     for name, mechanism in WITHOUT.items():
         assert any(mechanism.applies_to(world) for world in worlds), name
-    assert not any(WITHOUT["wrists-placed"].applies_to(world) for world in worlds if not world.joints)
+    assert not any(WITHOUT["frame-joints"].applies_to(world) for world in worlds if not world.joints)

@@ -25,13 +25,10 @@ from neeco.methods.kinematic import discovery
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.methods.kinematic.contradictions import (
     CONTRADICTING,
-    HELD_BACK,
     Misfits,
     fitted_anew,
     half_turned_state,
-    hold_back,
     judge_again,
-    judge_held_back,
     leave_out_unexplained,
     mirrored_state,
     refit_outliers,
@@ -140,7 +137,7 @@ def test_a_wrong_state_contradicts_the_others_and_is_found_from_one_of_theirs(tm
     states[3] = replace(TRUE[10], time=TRUE[3].time)
     session = session_of(tmp_path, states)
     search = search_of(session)
-    refit_outliers(search, LARGE, Misfits.of(search), large=False)
+    refit_outliers(search, LARGE, Misfits.of(search))
     assert session.scene.diagnostics[CONTRADICTING] == {"000003": "fitted anew"}
     found = session.refinement.state(3, states[3])
     assert session.refinement.layout.increments_between(TRUE[3], found)[3:6].norm() < 0.7
@@ -151,7 +148,7 @@ def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
     frame = session.full_views.frames[5]
     world.write_image(frame.image_path, torch.rand(64, 96, 3, generator=torch.Generator().manual_seed(0)))
     search = search_of(session)
-    refit_outliers(search, LARGE, Misfits.of(search), large=False)
+    refit_outliers(search, LARGE, Misfits.of(search))
     assert session.scene.diagnostics[CONTRADICTING] == {"000005": "left out"}
     assert session.refinement.weights.tolist() == [float(index != 5) for index in range(len(TRUE))]
 
@@ -159,9 +156,8 @@ def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
 def judged_by(
     search: StateSearch,
     explained: Callable[[State, State, StateFit], StateFit | None],
-    judge: Callable[[StateSearch], None] = judge_held_back,
 ) -> str | None:
-    """What becomes of frame 5, held back, if its fits with a prior about a state, from a start, are as `explained`."""
+    """What becomes of frame 5, judged again, if fits with a prior about a state, from a start, are as `explained`."""
 
     class Answering(Fitter[StateParameters]):
         def fit(
@@ -173,8 +169,8 @@ def judged_by(
 
     fitter = Answering(search.fitter.instruments, search.fitter.parameters, search.fitter.tissue)
     diagnostics = search.session.scene.diagnostics
-    diagnostics[HELD_BACK] = ["000005"]
-    judge(replace(search, fitter=fitter))
+    diagnostics[CONTRADICTING] = diagnostics.get(CONTRADICTING) or {"000005": "fitted anew"}
+    judge_again(replace(search, fitter=fitter))
     verdict: str | None = diagnostics.get(CONTRADICTING, {}).get("000005")
     return verdict
 
@@ -253,9 +249,8 @@ def test_an_instrument_outside_of_the_image_is_refuted_only_by_one_that_explains
     assert search.session.refinement.weights[5] == 1
 
 
-@pytest.mark.parametrize(("judge", "verdict"), [(judge_held_back, "left out"), (judge_again, None)])
 def test_no_frame_is_left_out_later_because_others_are_explained_ever_better(
-    judge: Callable[[StateSearch], None], verdict: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     search = search_of(session_of(tmp_path, TRUE))
     given, limits = search.session.recorded.states[5], replace(Misfits.of(search), limit=1.0, rejection_limit=4.0)
@@ -264,7 +259,7 @@ def test_no_frame_is_left_out_later_because_others_are_explained_ever_better(
     def explained(expected: State, start: State, found: StateFit) -> StateFit:
         return replace(found, misfit=5.0, gain=30.0) if expected is given else replace(found, misfit=4.5, gain=31.0)
 
-    assert judged_by(search, explained, judge) == verdict
+    assert judged_by(search, explained) != "left out"
 
 
 @pytest.mark.parametrize(("misfit", "included"), [(0.22, True), (0.4, False)])
@@ -310,29 +305,6 @@ def no_outliers(search: StateSearch) -> Misfits:
     return replace(Misfits.of(search), limit=1e3, rejection_limit=1e3)
 
 
-def test_a_mirrored_state_is_held_back_and_fitted_once_the_scene_went_on_without_it(tmp_path: Path) -> None:
-    """It looks so much like the right one that it is no outlier."""
-    right = driver_session(tmp_path)
-    true = right.recorded.states[4]
-    wrong = mirrored_state(search_of(right), 4, true)
-    session = driver_session(tmp_path, {4: wrong})
-    search, scene = search_of(session), session.scene
-    refit_outliers(search, LARGE, no_outliers(search), large=True)
-    held = scene.diagnostics[HELD_BACK]
-    assert "000004" in held
-    assert len(held) <= 4
-    assert session.refinement.weights.tolist() == [float(name not in held) for name in scene.recorded.names]
-    judge_held_back(search)
-    assert scene.diagnostics[CONTRADICTING] == {"000004": "fitted anew"}
-    assert HELD_BACK not in scene.diagnostics
-    assert bool((session.refinement.weights == 1).all())
-    found = session.refinement.state(4, wrong)
-    off = session.refinement.layout.increments_between(true, found)
-    assert off[3:6].norm() < 1.0
-    assert off[:3].norm().rad2deg() < 5
-    assert bool((off.abs() < 3 * session.refinement.deviations(4)).all())
-
-
 def test_a_state_fitted_anew_on_its_other_side_is_turned_back(tmp_path: Path) -> None:
     """Half a turn about the shaft moves no outline: jaws change places, and the wrist bends the other way."""
     session = driver_session(tmp_path)
@@ -345,36 +317,13 @@ def test_a_state_fitted_anew_on_its_other_side_is_turned_back(tmp_path: Path) ->
     assert bool((off.abs() < 3 * found.deviations).all())
 
 
-def test_the_scene_learns_no_longer_from_a_state_fitted_anew_until_it_is_judged(tmp_path: Path) -> None:
-    session = driver_session(tmp_path)
-    search, name = search_of(session), session.recorded.names[4]
-    session.scene.diagnostics[CONTRADICTING] = {name: "fitted anew"}
-    hold_back(search, no_outliers(search))
-    assert session.refinement.weights[4] == 0
-    judge_held_back(search)
-    assert session.refinement.weights[4] == 1
-    assert CONTRADICTING not in session.scene.diagnostics or name not in session.scene.diagnostics[CONTRADICTING]
-
-
 def test_states_with_usual_errors_are_not_taken_for_wrong_ones(tmp_path: Path) -> None:
     session = driver_session(tmp_path, scale=1.0)
-    names, search = session.recorded.names, search_of(session)
     session.refinement.weights[::3] = 0
-    session.scene.diagnostics[HELD_BACK] = list(names[::3])
-    judge_held_back(search)
-    assert CONTRADICTING not in session.scene.diagnostics
+    session.scene.diagnostics[CONTRADICTING] = dict.fromkeys(session.recorded.names[::3], "left out")
+    judge_again(search_of(session))
+    assert not session.scene.diagnostics[CONTRADICTING]
     assert bool((session.refinement.weights == 1).all())
-
-
-def test_frames_held_back_at_one_mark_are_not_forgotten_at_the_next(tmp_path: Path) -> None:
-    session = driver_session(tmp_path)
-    session.refinement.weights[7] = 0
-    session.scene.diagnostics[HELD_BACK] = ["000007"]
-    search = search_of(session)
-    hold_back(search, no_outliers(search))
-    assert session.scene.diagnostics[HELD_BACK][0] == "000007"
-    judge_held_back(search)
-    assert session.refinement.weights[7] == 1
 
 
 def test_a_state_is_judged_again_once_the_others_settled(tmp_path: Path) -> None:

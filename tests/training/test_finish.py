@@ -15,7 +15,6 @@ from neeco.methods.kinematic import wrist
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.kinematic.finish import conclude, extend_shaft, finalise_links, shaft_coverage
 from neeco.methods.kinematic.hinges import Hinges
-from neeco.methods.kinematic.interiors import fade_interior_tissue
 from neeco.methods.kinematic.wrist import color_boundary, measure_radius, place_wrists, refine_wrists
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
@@ -308,41 +307,3 @@ def test_a_scene_is_stored_with_its_links_settled(session: GaussianSession) -> N
     assert bool(beyond.any())
     assert not bool((links[beyond] == 0).any())
     assert torch.equal(settled.extras[LINK_LOGITS][: rows.start], logits[: rows.start])
-
-
-def test_tissue_is_never_inside_a_shaft(session: GaussianSession) -> None:
-    scene = session.scene
-    before = scene.canonical.opacity_logits.clone()
-    fade_interior_tissue(session, scene.deformation)
-    assert torch.equal(scene.canonical.opacity_logits, before)  # the wall is behind the shaft
-    pose = session.corrected(0)[0].instruments[scene.instruments[0].name].pose.float()
-    start, direction = hinges_of(session).shaft()
-    with torch.no_grad():
-        axis = pose[:3, :3] @ (start + (PIVOT_MM - 15) * direction) + pose[:3, 3]
-        scene.canonical.means[:12], scene.canonical.means[12] = axis, axis + 10 * pose[:3, 0]
-    fade_interior_tissue(session, scene.deformation)
-    assert torch.equal(scene.canonical.opacity_logits, before)  # the state of this one frame may be wrong
-    session.given = [session.given[0]] * len(session.given)
-    fade_interior_tissue(session, scene.deformation)
-    assert float(torch.sigmoid(scene.canonical.opacity_logits[:12]).max()) < 0.01
-    assert torch.equal(scene.canonical.opacity_logits[12:], before[12:])
-
-
-@pytest.mark.parametrize(("share", "kept"), [(1.0, False), (0.5, True)])
-def test_tissue_is_not_before_a_shaft_whenever_it_is_in_view(
-    session: GaussianSession, share: float, kept: bool
-) -> None:
-    """Elsewhere it is seen without the instrument, and hides it now and then."""
-    scene, count = session.scene, len(session.given)
-    state, camera = session.corrected(0)
-    pose, center = state.instruments[scene.instruments[0].name].pose.float(), camera.world_from_camera[:3, 3].float()
-    start, direction = hinges_of(session).shaft()
-    with torch.no_grad():
-        axis = pose[:3, :3] @ (start + (PIVOT_MM - 15) * direction) + pose[:3, 3]
-        scene.canonical.means[:12] = axis + 0.15 * (center - axis)
-    before = scene.canonical.opacity_logits.clone()
-    same = round(share * count)
-    session.given = [session.given[0]] * same + session.given[same:]
-    fade_interior_tissue(session, scene.deformation)
-    assert torch.equal(scene.canonical.opacity_logits[:12], before[:12]) == kept
-    assert torch.equal(scene.canonical.opacity_logits[12:], before[12:])

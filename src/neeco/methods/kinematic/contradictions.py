@@ -1,9 +1,8 @@
 """Single wrong states (mirrored, another moment's), found by what they leave unexplained of their image.
 
-Outliers are found at once. Where there are any, or all states have errors, others may be wrong, too, though they are
-explained as well as right ones: a mirrored state looks alike, and the scene has learned from it. Such frames are held
-back, and judged by a scene that went on learning without them. What seems wrong early may be a fault of the scene: once
-the others' states are fitted, all that contradict them, or may be wrong, are judged again.
+Outliers are found at once. Others may be wrong, too, though they are explained as well as right ones: a mirrored state
+looks alike, and the scene has learned from it. What seems wrong early may be a fault of the scene. So once the others'
+states are fitted, all that contradict them, or may be wrong, are judged again.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from neeco.methods.kinematic.state_search import LEVELS, STEPS, StateSearch
 from neeco.training.session import GaussianSession
 
 CONTRADICTING = "contradicting_states"  # of a scene's diagnostics: what became of each, by the frame's name
-HELD_BACK = "held_back"  # of a scene's diagnostics: names of frames that the scene does not learn from, to judge them
 OUTLYING = 3.0  # robust standard deviations of a log misfit above which a state is an outlier
 REJECTED = 6.0  # above which a frame that no state explains is left out
 BETTER = 0.7  # of a state's misfit: that of another one which refutes it
@@ -109,9 +107,8 @@ class Refitted:
 
 
 @torch.no_grad()
-def refit_outliers(search: StateSearch, scale: float, misfits: Misfits, *, large: bool) -> None:
+def refit_outliers(search: StateSearch, scale: float, misfits: Misfits) -> None:
     """Fit states that are outliers from other starts, or leave them out, and note them in the scene's diagnostics.
-    Where there are any, or all states have errors (`large`), hold back frames whose states may be wrong, too.
 
     scale: of the errors of all states (see `StateSearch.fitted`).
     """
@@ -123,27 +120,6 @@ def refit_outliers(search: StateSearch, scale: float, misfits: Misfits, *, large
             if own is None or own.misfit > misfits.limit:
                 found = _fits_from(search, index, _other_starts(search, index, others))
                 _judge(search, index, scale, own, found, misfits)
-    if contradicting_states(search.session) or large:
-        hold_back(search, misfits)
-
-
-def hold_back(search: StateSearch, misfits: Misfits) -> None:
-    """Let the scene no longer learn from frames whose states may be wrong, or were found so and fitted anew: it agrees
-    with what it learned from. Note their names in its diagnostics. Where links are not stated none is held back."""
-    session, noted = search.session, contradicting_states(search.session)
-    names = session.recorded.names
-    held = [index for index, name in enumerate(names) if search.linked and noted.get(name) == FITTED_ANEW]
-    held += _suspects(search, misfits)
-    session.refinement.weights[held] = 0
-    session.scene.diagnostics.setdefault(HELD_BACK, []).extend(names[index] for index in held)
-
-
-@torch.no_grad()
-def judge_held_back(search: StateSearch) -> None:
-    """Compare the states of frames that were held back, or left out, with others, by a scene that went on without them:
-    wrong ones are fitted anew, and right ones are used again."""
-    left_out = [name for name, verdict in contradicting_states(search.session).items() if verdict == LEFT_OUT]
-    _judge_frames(search, Misfits.of(search), left_out)
 
 
 @torch.no_grad()
@@ -151,16 +127,10 @@ def judge_again(search: StateSearch) -> None:
     """Compare states once more, when the states of the others are fitted: those that contradict the others, which are
     used again as recorded where they no longer do, and those that may be wrong. None is left out by its misfit alone:
     the limit sinks as all others are explained better."""
-    names, misfits = search.session.recorded.names, replace(Misfits.of(search), rejection_limit=math.inf)
-    suspects = [names[index] for index in _suspects(search, misfits)]
-    _judge_frames(search, misfits, [*contradicting_states(search.session), *suspects])
-
-
-def _judge_frames(search: StateSearch, misfits: Misfits, chosen: Sequence[str]) -> None:
-    """Judge the states of frames that are held back, and of those with the names `chosen`."""
     session, weights = search.session, search.session.refinement.weights
     names, noted = session.recorded.names, contradicting_states(session)
-    judged = {*session.scene.diagnostics.pop(HELD_BACK, []), *chosen}
+    misfits = replace(Misfits.of(search), rejection_limit=math.inf)
+    judged = {*noted, *(names[index] for index in _suspects(search, misfits))}
     others = _states_of(search, [index for index in range(len(names)) if weights[index] > 0])
     for index, name in enumerate(names):
         if name in judged:

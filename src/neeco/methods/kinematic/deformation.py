@@ -31,7 +31,6 @@ from neeco.methods.kinematic.discovery import find_instruments
 from neeco.methods.kinematic.finish import conclude
 from neeco.methods.kinematic.hinge_search import hinge_joints
 from neeco.methods.kinematic.hinges import Hinges
-from neeco.methods.kinematic.interiors import fade_interior_tissue
 from neeco.methods.kinematic.lamp_search import find_shadow
 from neeco.methods.kinematic.silhouette_evidence import OBSERVED_AT, observe_silhouettes
 from neeco.methods.kinematic.state_passes import MARKS, fit_states
@@ -316,13 +315,10 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         elif passed and self.settings.refine_wrists:
             with session.searching():
                 refine_wrists(session, self)
-        if passed:
-            fade_interior_tissue(session, self)
 
     def finish(self, training: GaussianTraining) -> None:
         session = gaussian_session(training)
         scene = session.scene
-        fade_interior_tissue(session, self)
         conclude(session, self)
         report_contradictions(session)
         if self.breathing is not None:

@@ -15,13 +15,10 @@ from neeco.capture.model import evenly_spaced
 from neeco.fitting.alignment import STATE_ERRORS
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.methods.kinematic.contradictions import (
-    HELD_BACK,
     Misfits,
     contradicting_states,
     fitted_anew,
-    hold_back,
     judge_again,
-    judge_held_back,
     leave_out_unexplained,
     refit_outliers,
 )
@@ -56,16 +53,14 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
         return
     if mark == JUDGED_AGAIN_AT and (STATE_ERRORS in scene.diagnostics or contradicting_states(session)):
         judge_again(StateSearch.of(session, articulated))
-    elif mark in CARVED_AT and HELD_BACK in scene.diagnostics:
-        judge_held_back(StateSearch.of(session, articulated))
     if mark in DECIDED_AT and STATE_ERRORS not in scene.diagnostics:
         search = StateSearch.of(session, articulated)
         if mark == DECIDED_AT[0]:
             misfits = Misfits.of(search)
             large = size_errors(search, misfits.outliers)
-            refit_outliers(search, SCALE if large else LARGE, misfits, large=large)
-        elif size_errors(search, ()):
-            hold_back(search, Misfits.of(search))
+            refit_outliers(search, SCALE if large else LARGE, misfits)
+        else:
+            size_errors(search, ())
     if STATE_ERRORS not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
         return
     search, last = StateSearch.of(session, articulated), mark == FITTED_AT[-1]
