@@ -88,6 +88,9 @@ WITHOUT: dict[str, Mechanism] = {
     "silhouettes": Mechanism(f"{METHOD}m.observe_silhouettes = {NOTHING}"),
     "states-before-training": Mechanism(f"{SEARCH}m.register_states = {NOTHING}", mistaken_links),
     "pose-registration": Mechanism(f"{SEARCH}m.correct_poses = {NOTHING}", misplaced),
+    "links-aligned": Mechanism(
+        f"{SEARCH}m.align_to_links = lambda session, links, evidence, name, shape, generator: shape", linked
+    ),
     "state-fits": Mechanism(f"{METHOD}m.fit_states = {NOTHING}", mistaken),
     "contradictions": Mechanism(
         PASSES

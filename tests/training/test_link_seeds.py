@@ -18,7 +18,7 @@ from neeco.capture.model import BaseUncertainty, Instrument, InstrumentState, St
 from neeco.fitting.refinement import RefineConfig, Refinement
 from neeco.geometry.rotations import rigid_from_vector, rotate_about
 from neeco.methods.kinematic.link_registration import base_root, correct_poses
-from neeco.methods.kinematic.link_search import readings_of, start_links
+from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve
 from neeco.scene.drawable import Recorded
@@ -125,6 +125,37 @@ def test_every_link_is_seeded_where_it_is(carved: tuple[Evidence, CarvedShape]) 
         inside = (along > near - 4) & (along < far + 4) & (away < 2 * RADIUS)
         assert float(inside.float().mean()) > (0.7 if k < 2 else 0.45), links.part_names[k]  # jaws are thin
         assert near - 4 < float(along.median()) < far + 4
+
+
+def test_a_carved_line_is_kept_where_the_links_agree_and_else_theirs_is_taken(
+    carved: tuple[Evidence, CarvedShape],
+) -> None:
+    evidence, shape = carved
+    links, kept, told = started(carved), session(evidence), session(evidence)
+    assert align_to_links(kept, links, evidence, "tool", shape, torch.Generator().manual_seed(0)).seeds is shape.seeds
+    astray = CarvedShape(**vars(shape) | {"instrument_from_shaft": torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))})
+    again = align_to_links(told, links, evidence, "tool", astray, torch.Generator().manual_seed(0))
+    assert told.said
+    assert not kept.said
+    assert float(again.instrument_from_shaft[2, 2]) > 0.99
+    assert again.near < -20 < PITCH_AT < again.tip
+    assert float(again.seeds[:, :2].norm(dim=1).median()) < 2 * RADIUS
+
+
+def test_a_shaft_that_leaves_no_evidence_is_seeded_about_the_stated_line(carved: tuple[Evidence, CarvedShape]) -> None:
+    """As where the tissue's fit absorbed a dark shaft that hardly moves."""
+    evidence, shape = replace(carved[0], hits=torch.zeros_like(carved[0].hits)), carved[1]
+    links, told = started(carved), session(evidence)
+    far = torch.eye(4)
+    far[0, 3] = 30.0
+    astray = replace(shape, instrument_from_shaft=far, radius=20.0)
+    again = align_to_links(told, links, evidence, "tool", astray, torch.Generator().manual_seed(0))
+    assert told.said
+    along, away = again.seeds[:, 2], again.seeds[:, :2].norm(dim=1)
+    assert float(along.max()) <= PITCH_AT
+    assert float(along.min()) < PITCH_AT - 20
+    assert float(away.max()) < 2 * RADIUS
+    assert again.radius < 2 * RADIUS
 
 
 def test_links_of_a_joint_that_nobody_recorded_are_seeded_on_their_sides(carved: tuple[Evidence, CarvedShape]) -> None:

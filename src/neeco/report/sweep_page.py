@@ -60,8 +60,8 @@ def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
     return write_page(
         plan.request.output / REPORT_FILE,
         "study.html",
-        title=f"{capture.root.name}: {study.title}",
-        name=capture.root.name,
+        title=f"{capture.root.absolute().name}: {study.title}",
+        name=capture.root.absolute().name,
         subtitle=study.title,
         stamps=[computer],
         intro=[intro],

@@ -36,6 +36,7 @@ COSTS = (  # of a whole run
 )
 MEASURES = {column.key: column for column in (*SCORES, *MOMENTS, *COSTS)}
 LENGTHS = ("iterations", "minutes", "cpu_minutes")
+MAX_NAME_BYTES = 200  # of a configuration: its folder's name has more, and file systems take 255
 EXAMPLE = "write it as docs/studies.md shows"
 
 
@@ -141,6 +142,8 @@ class Study:
         for name in self.configurations:
             if not name or name.startswith(".") or {*name} & {"/", "\\", "\0"}:
                 raise NeecoError(f"configurations: {name!r} names no folder; leave out / and \\ and a dot at its start")
+            if not name.isprintable() or name != name.strip() or len(name.encode()) > MAX_NAME_BYTES:
+                raise NeecoError(f"configurations: {name[:40]!r} names no folder; give a short name in one line")
             self.length_of(name)
         if self.seeds < 1:
             raise NeecoError(f"seeds: {self.seeds} is none at all; give at least 1")
@@ -163,9 +166,12 @@ class Study:
             if found.like in (name, *within):
                 raise NeecoError(f"{place}.like: {found.like} is like {name} in turn; give one of them a method")
             base = self.unfolded(found.like, name, *within)
-            settings, iterations = (*base.settings, *found.settings), found.iterations or base.iterations
+            settings, iterations = (
+                (*base.settings, *found.settings),
+                base.iterations if found.iterations is None else found.iterations,
+            )
             found = Configuration(method=found.method or base.method, settings=settings, iterations=iterations)
-        if found.method is None:
+        if not found.method:
             raise NeecoError(f"{place}.method: none is given; choose one of `neeco train --help`")
         return found
 

@@ -82,6 +82,7 @@ def _differences(title: str, table: Table, numbers: Numbers, reasons: Mapping[st
         titles = [f"{column.title}: published", "ours", "agrees"] if published else [column.title]
         columns += [Column(column.key, text) for text in titles]
         base = numbers[reference][column.key]["mean"]
+        limit = even if "psnr" in column.key else 0.0  # which is in dB
         for name in table.rows:
             mean, std = (numbers[name][column.key][part] for part in ("mean", "std"))
             change = None if name == reference or mean is None or base is None else mean - base
@@ -91,7 +92,7 @@ def _differences(title: str, table: Table, numbers: Numbers, reasons: Mapping[st
             words = [text]
             if published:
                 both = name != reference and {name, reference} <= published.keys()
-                agrees = direction(change, published[name] - published[reference], even) if both else ""
+                agrees = direction(change, published[name] - published[reference], limit) if both else ""
                 words = [column.written(published[name]) if name in published else UNKNOWN, text, agrees]
             cells[name] += map(Cell, words)
     rows = tuple(

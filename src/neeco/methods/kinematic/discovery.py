@@ -15,7 +15,7 @@ from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstrum
 from neeco.methods.kinematic.hinge_search import start_hinges
 from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.link_registration import correct_poses
-from neeco.methods.kinematic.link_search import readings_of, start_links
+from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.state_registration import corrected_evidence, register_states
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import Evidence, carve_along, carved_shape, frame_along, pad_and_stack
@@ -97,12 +97,14 @@ def _with_instruments(
         shape = carved_shape(session, evidence, instrument.name, generator)
         articulation = articulated.articulations[index]
         if isinstance(articulation, StatedLinks):
+            shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
             articulation.radius.fill_(shape.radius)
             readings = readings_of(session, evidence, instrument.name)
             if learned is None and correct_poses(session, articulation, evidence, instrument, shape, readings):
                 corrected = (replace(frame, state=scene.registered(frame.state)) for frame in recorded.frames)
                 evidence = replace(recorded, frames=tuple(corrected))
                 shape = carved_shape(session, evidence, instrument.name, generator)
+                shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
         elif learned is not None:  # carving few frames anew may take the rear end for the jaws
             base, settings = frame_along(*learned[index][0]), session.config.deformation.carving
             shape = carve_along(evidence, instrument.name, base, shape.level, generator, settings) or shape

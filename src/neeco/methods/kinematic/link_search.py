@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 
@@ -18,6 +19,8 @@ from neeco.methods.space_carving import (
     Evidence,
     PosedViews,
     camera_from_instrument,
+    carve_along,
+    frame_along,
     posed_views,
     score_points,
 )
@@ -29,7 +32,14 @@ REACH_RADII = 7.0  # shaft radii beyond its pivot within which an end link is se
 MARGIN_RADII = 2.0  # shaft radii about the pivots beyond it within which another link is searched
 CANDIDATES_PER_SEED = 20
 EVIDENCE_TOLERANCE = 0.03  # by which the evidence of another link may be larger
+# tolerances within which a carved shaft agrees with the line of the links at rest
+MIN_COSINE = 0.85
+MAX_OFFSET_RADII, MAX_OFFSET_MM = 1.5, 4.0
 MIN_RELATIVE_LEVEL = 0.85  # of the best evidence of a link's points: stated axes may be off, and all points with them
+MIN_RADIUS_RATIO = 0.33  # of the shaft's radius to the distance between the first two pivots
+MAX_SHAFT_RADIUS_MM = 6.5  # of instruments that pass a trocar
+MIN_EVIDENT_RADII = 3.0  # shaft radii behind the first pivot: with less evidence, the shaft is seeded about its line
+SHAFT_LENGTH = 0.3  # of the distance to the tissue: the shaft that is seeded about its line
 SIDE_TOLERANCE_RADII = 0.3  # by which a link that is searched on one side of its pivot may lie on the other
 MIN_VISIBLE_SHARE = 0.05  # of the frames, that must observe a seed
 # jaws whose opening was not recorded: openings (of the limits' range) and headings (rad) that are tried, and the points
@@ -39,6 +49,59 @@ HEADINGS = torch.linspace(-1.2, 1.2, 13)
 HEADING_SIGMA, HEADING_WEIGHT = 0.5, 0.02  # rad; of evidence, by which a stated heading may be less likely
 MIN_EVIDENCE_GAIN = 0.25  # over half way open and straight on: where jaws move, any opening has some evidence
 PLANE_OFFSETS = torch.cartesian_prod(torch.linspace(1, 4, 7), torch.linspace(-0.3, 0.3, 3), torch.linspace(0.1, 0.3, 3))
+
+
+@torch.no_grad()
+def align_to_links(
+    session: GaussianSession,
+    links: StatedLinks,
+    evidence: Evidence,
+    name: str,
+    shape: CarvedShape,
+    generator: torch.Generator,
+) -> CarvedShape:
+    """Return `shape`, or one carved about the line of the links at rest where its line is another.
+
+    An instrument that hardly turns leaves evidence along its lines of sight, too. The radius is at least a share of the
+    distance of the first pivots: where the tissue's fit absorbed a dark shaft, little evidence of it is left."""
+    line = links.rest_line()
+    if line is None:
+        return shape
+    pivot, step = line
+    direction = nn.functional.normalize(step, dim=0)
+    thickness = min(MIN_RADIUS_RATIO * float(step.norm()), MAX_SHAFT_RADIUS_MM)
+    origin, along = shape.instrument_from_shaft[:3, 3], shape.instrument_from_shaft[:3, 2]
+    apart = pivot - origin
+    off = float((apart - (apart @ along) * along).norm())
+    if float(along @ direction) > MIN_COSINE and off < max(MAX_OFFSET_RADII * shape.radius, MAX_OFFSET_MM):
+        return replace(shape, radius=max(shape.radius, thickness))
+    session.report(f"{name}: the shaft is searched along the stated links: carving found another line")
+    base = frame_along(pivot, direction)
+    carved = carve_along(evidence, name, base, shape.level, generator, session.config.deformation.carving)
+    found = shape if carved is None else carved
+    found = replace(found, radius=max(found.radius, thickness))
+    if carved is not None and carved.near < -MIN_EVIDENT_RADII * found.radius and found.radius < MAX_SHAFT_RADIUS_MM:
+        return found
+    return _shaft_about_line(found, base, thickness, SHAFT_LENGTH * evidence.distance, generator)
+
+
+def _shaft_about_line(
+    shape: CarvedShape, base: Tensor, radius: float, length: float, generator: torch.Generator
+) -> CarvedShape:
+    """Return `shape` with a full cylinder of seeds behind the origin of `base` [4, 4] (z along the shaft): where the
+    tissue's fit absorbed a shaft that hardly moves, or what is evident is not on its line."""
+    count = len(shape.seeds)
+    random = torch.rand(count, 3, generator=generator, device=generator.device).to(shape.seeds)
+    across, angle = radius * random[:, 0].sqrt(), 2 * math.pi * random[:, 1]
+    points = torch.stack([across * angle.cos(), across * angle.sin(), -length * random[:, 2]], 1)
+    return replace(
+        shape,
+        instrument_from_shaft=base,
+        near=-length,
+        tip=REACH_RADII * radius,
+        radius=radius,
+        seeds=points @ base[:3, :3].T + base[:3, 3],
+    )
 
 
 @torch.no_grad()
