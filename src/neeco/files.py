@@ -330,9 +330,7 @@ def read_json(path: Path) -> Any:
     text = read_text(Path(path), "JSON")
     try:
         value = json.loads(text, object_pairs_hook=distinct_keys)
-        # halves of characters, as of names that are not in UTF-8: no other file could hold them
-        if "\\ud" in text.lower() and (half := HALVES.search(json.dumps(value, ensure_ascii=False))):
-            raise NeecoError(f"{path}: holds {half[0]!r}, half a character; write its names and the files' in UTF-8")
+        _refuse_halves(path, text, value)
         return value
     except json.JSONDecodeError as error:
         raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}; mend or write it anew") from None
@@ -340,6 +338,13 @@ def read_json(path: Path) -> Any:
         raise NeecoError(f"{path}: {error}") from None
     except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels
         raise NeecoError(f"{path}: not usable JSON: a number or the nesting is too large; write it anew") from None
+
+
+def _refuse_halves(path: Path, text: str, value: Any) -> None:
+    """Raise NeecoError for a document with halves of characters, as of names that are not in UTF-8: no other file could
+    hold them."""
+    if "\\ud" in text.lower() and (half := HALVES.search(json.dumps(value, ensure_ascii=False, default=str))):
+        raise NeecoError(f"{path}: holds {half[0]!r}, half a character; write its names and the files' in UTF-8")
 
 
 class RepeatedKeyError(ValueError):
@@ -398,6 +403,7 @@ def parse_yaml(path: Path, text: str, remedy: str, loader: type[yaml.SafeLoader]
         raise NeecoError(f"{path}: {place}not valid YAML ({reason}); {remedy}") from None
     if _unfolded(value, {}) > MAX_VALUES:
         raise NeecoError(f"{path}: its aliases unfold to too many values; write the values out")
+    _refuse_halves(path, text, value)
     return value
 
 

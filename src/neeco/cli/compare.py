@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from neeco.cli.sweep import run_study
+from neeco.errors import NeecoError
 from neeco.studies.configurations import Configuration, Study, SweepRequest
 
 
@@ -22,5 +23,12 @@ class Compare(SweepRequest):
 
 def run(args: Compare) -> int:
     """Run the study whose configurations are methods with their default settings."""
+    from neeco.training.config import training_config
+
+    for name in args.methods:
+        try:
+            training_config(name or "''", {})
+        except NeecoError as error:
+            raise NeecoError(f"--methods: {str(error).removeprefix('method: ')}") from None
     configurations = {name: Configuration(method=name) for name in args.methods}
     return run_study(args, Study(title="Methods compared", configurations=configurations))

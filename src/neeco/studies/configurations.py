@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
@@ -67,6 +67,15 @@ class SweepRequest:
     lpips_weights: Path | None = None
     """Folder with alexnet.safetensors and/or vgg16.safetensors. Default: that of NEECO_LPIPS_WEIGHTS."""
     device: Device = "auto"
+
+    def check(self) -> None:
+        """Raises NeecoError naming the option that cannot be used."""
+        if self.seeds is not None and self.seeds < 1:
+            raise NeecoError(f"--seeds: {self.seeds} is none at all; give at least 1")
+        given = {key: getattr(self, key) for key in LENGTHS}
+        if any(value is not None for value in given.values()):
+            key = single_length(given)
+            require_length(f"--{key.replace('_', '-')}", given[key])
 
     def run_folder(self, name: str, seed: int) -> Path:
         """Return the run folder of a configuration and seed."""
@@ -157,37 +166,32 @@ class Study:
             if table.reference is not None:
                 require_known(f"tables.{name}.reference", table.reference, table.rows)
 
-    def unfolded(self, name: str, *within: str) -> Configuration:
+    def unfolded(self, name: str) -> Configuration:
         """Return a configuration with what it takes from the one that it is `like`. Raises NeecoError for a name that
         is unknown or leads back to itself."""
-        found, place = self.configurations[name], f"configurations.{name}"
-        if found.like is not None:
-            require_known(f"{place}.like", found.like, self.configurations)
-            if found.like in (name, *within):
-                raise NeecoError(f"{place}.like: {found.like} is like {name} in turn; give one of them a method")
-            base = self.unfolded(found.like, name, *within)
-            settings, iterations = (
-                (*base.settings, *found.settings),
-                base.iterations if found.iterations is None else found.iterations,
-            )
-            found = Configuration(method=found.method or base.method, settings=settings, iterations=iterations)
-        if not found.method:
-            raise NeecoError(f"{place}.method: none is given; choose one of `neeco train --help`")
-        return found
+        chain = [name]
+        while (like := self.configurations[chain[-1]].like) is not None:
+            place = f"configurations.{chain[-1]}.like"
+            require_known(place, like, self.configurations)
+            if like in chain:
+                raise NeecoError(f"{place}: {like} is like {chain[-1]} in turn; give one of them a method")
+            chain.append(like)
+        items = [self.configurations[each] for each in chain]
+        method = next((item.method for item in items if item.method), None)
+        if method is None:
+            raise NeecoError(f"configurations.{chain[-1]}.method: none is given; choose one of `neeco train --help`")
+        settings = tuple(setting for item in reversed(items) for setting in item.settings)
+        iterations = next((item.iterations for item in items if item.iterations is not None), None)
+        return Configuration(method=method, settings=settings, iterations=iterations)
 
     def length_of(self, name: str) -> tuple[str, float]:
         """Return the length of a configuration's runs: one of LENGTHS, and how many. Raises NeecoError where there is
         none, or several."""
         own = self.configurations[name].iterations
-        given = {"iterations": own} if own is not None else {key: getattr(self, key) for key in LENGTHS}
-        found = [(key, value) for key, value in given.items() if value is not None]
-        if len(found) != 1:
-            what = f"{' and '.join(key for key, _ in found)} are given" if found else "no length of the runs is given"
-            raise NeecoError(f"{what}; all train equally long: give one of {', '.join(LENGTHS)} (try --minutes 5)")
-        key, value = found[0]
-        if not 0 < value < math.inf:
-            raise NeecoError(f"{key}: {value} is no time to train; give more than 0")
-        return key, value
+        if own is not None:
+            return "iterations", require_length(f"configurations.{name}.iterations", own)
+        key = single_length({key: getattr(self, key) for key in LENGTHS})
+        return key, require_length(key, getattr(self, key))
 
     def only(self, tables: Iterable[str]) -> Study:
         """Return the study with these tables and the configurations that stand in them. Raises NeecoError for a name
@@ -213,6 +217,22 @@ def read_study(file: Path) -> Study:
 def ablations() -> Study:
     """Return the study of `neeco ablate`."""
     return read_study(Path(str(files("neeco.studies") / "ablations.yaml")))
+
+
+def single_length(given: Mapping[str, float | None]) -> str:
+    """Return the one key of `given` that has a value. Raises NeecoError where none has, or several."""
+    found = [key for key, value in given.items() if value is not None]
+    if len(found) == 1:
+        return found[0]
+    what = f"{' and '.join(found)} are given" if found else "no length of the runs is given"
+    raise NeecoError(f"{what}; all train equally long: give one of {', '.join(LENGTHS)} (try --minutes 5)")
+
+
+def require_length(place: str, value: float) -> float:
+    """Return a length of runs. Raises NeecoError naming `place` where nothing can be trained so long."""
+    if not 0 < value < math.inf:
+        raise NeecoError(f"{place}: {value} is no time to train; give more than 0")
+    return value
 
 
 def require_known(place: str, name: str, known: Iterable[str]) -> None:

@@ -19,7 +19,7 @@ from neeco.files import own_folder, require_same, write_json, write_text
 from neeco.raster.devices import device_of
 from neeco.scene.method_registry import method_class, unmet_need
 from neeco.scene.training_session import UNLIMITED
-from neeco.settings import plain
+from neeco.settings import name_and_value, plain
 from neeco.studies.configurations import MEASURES, Study, SweepRequest
 from neeco.studies.machine import machine
 from neeco.studies.study import REMEDY, JobEvent, Result, check_output, check_workers, run_jobs
@@ -55,11 +55,13 @@ def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) 
     device = device_of(request.device)
     check_workers(request.workers, device)
     place = f"{source}: " if source else ""
+    request.check()
     try:
         study = study.prepared(request)
     except NeecoError as error:
         raise NeecoError(f"{place}{error}") from None
-    configs = {name: config_of(request, study, name, place) for name in study.configurations}
+    methods = {name: _method_of(study, name, place) for name in study.configurations}
+    configs = {name: config_of(request, study, name, place, methods) for name in study.configurations}
     capture = read_checked(request.capture, request.transforms)
     for name, config in configs.items():
         if need := unmet_need(config.method, capture):
@@ -146,44 +148,49 @@ def _document(plan: SweepPlan) -> dict[str, Any]:
     }
 
 
-def config_of(request: SweepRequest, study: Study, name: str, place: str) -> TrainConfig:
+def config_of(request: SweepRequest, study: Study, name: str, place: str, methods: Mapping[str, str]) -> TrainConfig:
     """Return the settings of a configuration: those of the study, its own, then those of --set. place: of the study,
-    for messages. Raises NeecoError naming the field of the study, or --set."""
+    for messages; methods: by configuration. Raises NeecoError naming the field of the study, or --set."""
     configuration, where = study.configurations[name], f"{place}configurations.{name}"
     key, length = study.length_of(name)
     values: dict[str, Any] = {"transforms": request.transforms, "iterations": length}
     if key != "iterations":
         values |= {"minutes": length, "iterations": UNLIMITED}
     settings: list[str] = []
-    try:
-        method = training_config(configuration.method, values).method
-        settings += [*_of_method(study.settings, study, method), *configuration.settings]
-        settings += _of_method(request.set, study, method)
-        for field in (setting.partition("=")[0] for setting in settings):
+    given_in: dict[str, str] = {}  # where a field is set last, for messages
+    for origin, of_all, group in (
+        (f"{place}settings: ", True, study.settings),
+        (f"{where}.settings: ", False, configuration.settings),
+        ("--set ", True, request.set),
+    ):
+        for setting in group:
+            field, _ = name_and_value(origin.removesuffix(": ").strip(), setting, "ssim_weight=0.2")
             if field in SHARED:
-                raise NeecoError(f"--set {field}: give {SHARED[field]}, which all runs share")
+                raise NeecoError(f"{origin}{field}: give {SHARED[field]}, which all runs share")
+            if of_all and not any(_has(method, field) for method in methods.values()):
+                raise NeecoError(
+                    f"{origin}{field}: no such field in the methods {', '.join(dict.fromkeys(methods.values()))}"
+                )
+            if not of_all or _has(methods[name], field):
+                settings.append(setting)
+                given_in[field] = origin
+    try:
         return training_config(configuration.method, values, settings)
     except NeecoError as error:
-        text = str(error).removeprefix("--set ")
-        field = text.partition(":")[0]
-        if field in (setting.partition("=")[0] for setting in request.set):
-            raise
-        if field in (setting.partition("=")[0] for setting in study.settings):
-            raise NeecoError(f"{place}settings: {text}") from None
-        raise NeecoError(f"{where}{'' if text == str(error) else '.settings'}: {text}") from None
+        option, colon, problem = str(error).partition(":")
+        field = option.removeprefix("--set ").removeprefix("--").replace("-", "_")
+        raise NeecoError(f"{given_in.get(field, f'{where}: ')}{field}{colon}{problem}") from None
 
 
-def _of_method(settings: Sequence[str], study: Study, method: str) -> list[str]:
-    """Select from `settings` of all configurations those that `method` has: `deformation.FIELD` is a method's own.
-    Raises NeecoError for a field that no method of the study has."""
+def _method_of(study: Study, name: str, place: str) -> str:
+    """Return the method that a configuration trains. Raises NeecoError naming it where it has none."""
+    try:
+        return training_config(study.configurations[name].method, {}).method
+    except NeecoError as error:
+        raise NeecoError(f"{place}configurations.{name}: {error}") from None
 
-    def has(name: str, setting: str) -> bool:
-        group, _, field = setting.partition("=")[0].partition(".")
-        own = {item.name for item in dataclasses.fields(method_class(name).Settings)}
-        return group != "deformation" or field in own
 
-    names = {str(item.method).partition("+")[0] for item in study.configurations.values()}
-    for setting in settings:
-        if not any(has(name, setting) for name in names):
-            raise NeecoError(f"--set {setting.partition('=')[0]}: no such field in the methods {', '.join(names)}")
-    return [setting for setting in settings if has(method, setting)]
+def _has(method: str, field: str) -> bool:
+    """Return whether a method has a field of its training config; `deformation.FIELD` is a method's own."""
+    group, _, own = field.partition(".")
+    return group != "deformation" or own in {item.name for item in dataclasses.fields(method_class(method).Settings)}

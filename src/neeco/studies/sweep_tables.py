@@ -114,6 +114,10 @@ def write_tables(plan: SweepPlan, rows: Rows) -> Path:
     file, name = plan.request.output / "table.md", plan.capture.root.absolute().name
     tables = [table for _, _, table in tables_of(plan, rows)]
     lead = f"{length_words(plan.study)}. {machine_words(plan.machine)}."
+    compared = (table for table in plan.study.tables.values() if table.reference is not None)
+    references = [f"{table.rows[str(table.reference)].label or table.reference} ({table.title})" for table in compared]
+    if references:
+        lead += f" In brackets: the difference to {', '.join(references)}."
     notes = [*plan.notes, *(f"failed: {line}" for line in failures(rows))]
     write_text(file, markdown_document(f"{plan.study.title}: {name}", lead, tables, "seeds", notes))
     return file

@@ -140,7 +140,7 @@ def markdown_document(
 
 def markdown_escape(text: str) -> str:
     """`text` so that Markdown shows it as it stands, in a table too."""
-    for character in "\\|*_":
+    for character in "\\|*_<`":
         text = text.replace(character, "\\" + character)
     return text
 

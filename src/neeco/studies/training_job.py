@@ -95,7 +95,9 @@ class TrainingJob:
             resolved = method_class(wanted.method).resolved(wanted.deformation, begun.deformation)
             wanted = replace(wanted, deformation=resolved)
         old, new = vars(begun), vars(wanted)
-        require_same(str(self.folder), ((name, old[name], new[name]) for name in new), REMEDY)
+        # minutes first: with these, iterations are without a limit
+        names = sorted(new, key=lambda name: name != "minutes")
+        require_same(str(self.folder), ((name, old[name], new[name]) for name in names), REMEDY)
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:
         """Train, score, write `folder`/job.json last, and return what it holds; at once when it is there already.
