@@ -315,12 +315,12 @@ def _is_readable(value: object, only_cheaply: bool) -> bool:
 def share_lamps(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
     """Give the cameras of a still scope the lamps of the first one: the second camera of a stereo scope has none of its
     own."""
-    shared = []
-    for camera in cameras:
-        first = cameras[0].world_from_camera
-        has_lamps = torch.equal(camera.world_from_camera, first)
-        shared.append(camera if has_lamps else replace(camera, world_from_lamps=first))
-    return tuple(shared)
+    return tuple(
+        camera
+        if torch.equal(camera.world_from_camera, cameras[0].world_from_camera)
+        else replace(camera, world_from_lamps=cameras[0].world_from_camera)
+        for camera in cameras
+    )
 
 
 class RecordedStates:

@@ -123,7 +123,7 @@ class Study:
     minutes: float | None = None  # by the clock on the wall
     cpu_minutes: float | None = None  # CPU time of all threads of a run
     settings: tuple[str, ...] = ()  # of all configurations; deformation.FIELD of those whose method has the field
-    even_db: float = 0.1  # smaller differences from a reference have no direction
+    even_db: float = 0.1  # smaller differences of PSNR from a reference have no direction
     tables: dict[str, Table] = field(default_factory=dict)  # none: one of all configurations
 
     def prepared(self, request: SweepRequest) -> Study:

@@ -92,7 +92,7 @@ def size_errors(search: StateSearch, outliers: Sequence[int]) -> bool:
     if scale <= LARGE:
         return False
     session.scene.diagnostics[STATE_ERRORS] = round(scale, 3)
-    session.report("the states' errors are larger than a tracker's: they are fitted to the images")
+    session.report("the states' errors are larger than a tracker's: they are corrected by the images")
     for index, *_ in session.refinement.frames_of_instant:
         session.refinement.set_deviations(index, search.deviations(index, SCALE))
     return True
