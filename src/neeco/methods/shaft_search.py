@@ -6,12 +6,16 @@ points is a candidate; it gains the evidence that its silhouettes cover and lose
 ends where it gains most. What it gains with poses exchanged among the frames is evidence that does not move with the
 instrument, and counts against it. The best candidates are improved by random steps. A shaft leaves the image at its
 rear, so that the two directions of a line differ.
+
+Where no cylinder explains much of the evidence, which other instruments leave, too, or where a wrist bends the shaft in
+the tracked frame of its tip, the line is the principal axis of these points.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
@@ -34,6 +38,8 @@ class ShaftSettings:
     n_bins: int = 96  # along it
     n_likely: int = 96  # candidates that are also tried with exchanged poses
     n_best: int = 12  # of them that are improved
+    least_share: float = 0.2  # of the evidence, that a cylinder must gain; shafts gain 0.34 and more, else it was 0.09
+    solid: float = 0.9  # of the largest mean evidence of a point, from which it counts for the principal axis
     n_rounds: int = 4  # of random steps, each half as large as the one before
     n_steps: int = 24  # tried in a round for each candidate
     shift: float = 0.02  # standard deviation of the first steps
@@ -45,12 +51,13 @@ SETTINGS = ShaftSettings()
 
 @dataclass(frozen=True, eq=False)
 class Shaft:
-    """A line in an instrument's frame: a point [3] mm, a unit direction [3], and the radius, mm. `lead`: by how much
-    more of the evidence is explained with the tip in that direction than in the other, as a share."""
+    """A line in an instrument's frame: a point [3] mm, a unit direction [3], and the radius, mm; None: not known.
+    `lead`: by how much more of the evidence is explained with the tip in that direction than in the other, as a
+    share."""
 
     origin: Tensor
     direction: Tensor
-    radius: float
+    radius: float | None
     lead: float
 
 
@@ -169,4 +176,17 @@ def find_shaft(
         best += torch.arange(len(origins), device=best.device) * settings.n_steps
         best = best[gains[best].argsort(descending=True)][: max(3, len(best) // 2)]
         origins, directions, leads, radii = tried[best], turned[best], leads[best], radii[best]
+        gained = float(gains[best[0]])
+    if gained < settings.least_share * float(fine.worth.clamp_min(0).sum()):
+        return _principal_axis(points, scores)
     return Shaft(origins[0], directions[0], float(radii[0]), float(leads[0]))
+
+
+def _principal_axis(points: Tensor, scores: Tensor) -> Shaft:
+    """Return the principal axis of the points [Q, 3] whose mean evidence [Q] is nearly the largest."""
+    solid = points[scores >= SETTINGS.solid * scores.max()]
+    center = solid.mean(0)
+    arm = (solid - center).double()
+    covariance = (arm[:, :, None] * arm[:, None, :]).sum(0)
+    direction = torch.from_numpy(np.linalg.eigh(covariance.cpu().numpy())[1][:, -1].copy()).to(solid)
+    return Shaft(center, direction, None, 0.0)

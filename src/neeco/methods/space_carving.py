@@ -309,7 +309,7 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: C
         direction = -direction
     origin = shaft.origin + float((scores * along).sum() / scores.sum()) * shaft.direction
     shape = carve_along(evidence, name, frame_along(origin, direction), level, generator, settings)
-    return None if shape is None else replace(shape, radius=shaft.radius)
+    return shape if shape is None or shaft.radius is None else replace(shape, radius=shaft.radius)
 
 
 def carve_along(

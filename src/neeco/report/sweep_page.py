@@ -26,7 +26,7 @@ def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
     """Write `report.html` into the output and return its path. Every frame shown is rendered once per configuration.
     Raises NeecoError when a run cannot be opened or the page not be written."""
     study, capture, computer = plan.study, plan.capture, machine_words(plan.machine)
-    text = "Mean ± standard deviation over seeds; the best is bold. In brackets: the difference to the bold line."
+    text = "Mean ± standard deviation over seeds; bold: the best, or what differences in brackets are taken to."
     files = {RESULTS_FILE: csv_text(COLUMNS, rows)}
     sections = [Section(title="Results", text=text, files=files, notes=plan.notes)]
     for name, split, numbers in tables_of(plan, rows):
