@@ -97,7 +97,7 @@ def _how_tensors_differ(a: Tensor, b: Tensor) -> str:
     return f"{int(other.sum())} of {a.numel()} elements, by up to {largest:.3g}"
 
 
-def _safetensors(path: Path) -> tuple[dict[str, Tensor], Fields]:
+def read_safetensors(path: Path) -> tuple[dict[str, Tensor], Fields]:
     with safe_open(path, framework="pt") as stream:
         metadata = stream.metadata() or {}
         tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
@@ -110,7 +110,7 @@ def _safetensors(path: Path) -> tuple[dict[str, Tensor], Fields]:
     return tensors, fields
 
 
-def _read_fields(path: Path) -> Fields:
+def read_fields(path: Path) -> Fields:
     text = path.read_text()
     if path.suffix == ".jsonl":
         value = [json.loads(line) for line in text.splitlines()]
@@ -126,11 +126,11 @@ def differing_files(before: Path, after: Path, rules: Rules) -> list[str]:
     if before.read_bytes() == after.read_bytes():
         return []
     if before.suffix == ".safetensors":
-        (tensors, fields), (tensors_after, fields_after) = _safetensors(before), _safetensors(after)
+        (tensors, fields), (tensors_after, fields_after) = read_safetensors(before), read_safetensors(after)
         told = differing_tensors(tensors, tensors_after, rules)
         return told + [f"header: {text}" for text in differing_fields(fields, fields_after, rules)]
     if before.suffix in (".json", ".jsonl", ".yaml"):
-        return differing_fields(_read_fields(before), _read_fields(after), rules)
+        return differing_fields(read_fields(before), read_fields(after), rules)
     return ["other bytes"]
 
 

@@ -44,7 +44,7 @@ SMALL = {
         "refine.start=8",
         "schedule.plain_density.interval=15",
         "deformation.hinge_start=12",
-        "deformation.shadow_at=[10]",
+        "schedule.events=[{at: 0.25, action: find_shadow}, {at: 0.4, action: place_wrists}]",
         "deformation.label_sharpness_start=14",
     ],
 }

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
-from neeco.training.config import training_config
+from neeco.training.config import method_defaults, training_config
 from neeco.training.initial import initial_scene
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
@@ -35,12 +36,15 @@ EARLY = [
     "deformation.carving.tissue_steps=100",
     "log_interval=1",
     "deformation.hinge_start=12",
-    "deformation.shadow_at=[10]",
     "deformation.label_sharpness_start=14",
     "resolution.min_side=32",  # images of half their size at first
     "resolution.search_pixels=4000",
 ]
-CONFIG = training_config("kinematic", {"iterations": 40}, [*EARLY, "schedule.plain_density.interval=15"])
+SCHEDULE = method_defaults("kinematic").schedule
+EVENTS = json.dumps([*map(asdict, SCHEDULE.events), {"at": 10, "action": "find_shadow"}])
+CONFIG = training_config(
+    "kinematic", {"iterations": 40}, [*EARLY, "schedule.plain_density.interval=15", f"schedule.events={EVENTS}"]
+)
 
 
 @pytest.fixture(scope="module")

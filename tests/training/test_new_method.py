@@ -158,7 +158,7 @@ def test_extras_with_a_rate_are_learned_and_others_hold_still(
 def test_hooks_are_called_in_their_order(drift: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[str] = []
     hooks = ("fit_ranges", "initial_extras", "begin", "perturb", "training_channels", "regularisation")
-    for name in (*hooks, "between_steps", "finish"):
+    for name in (*hooks, "between_steps", "act", "finish"):
         monkeypatch.setattr(drift, name, noting(called, name, getattr(drift, name)))
     train(write_capture(tmp_path / "capture"), tmp_path / "run", training_config("drift", {"iterations": 2}))
     step = ["training_channels", "perturb", "regularisation", "between_steps"]

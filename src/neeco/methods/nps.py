@@ -210,7 +210,7 @@ class NPS(LabelledByMotion):
         joined = join_bodies(bodies)
         return joined.map(lambda tensor: tensor, (len(joined),))
 
-    def between_steps(self, training: GaussianTraining, before: float) -> None:
+    def between_steps(self, training: GaussianTraining) -> None:
         if self.settings.anneal > 0:
             self.opened.fill_(min(1.0, training.progress / self.settings.anneal))
 

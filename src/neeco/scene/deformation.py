@@ -74,8 +74,8 @@ class Deformation(nn.Module, Method):
     only freezes the parameters.
 
     Training calls the hooks of any method: `fit_ranges` and `initial_extras`, then `begin`, in every step `perturb`,
-    `training_channels` and `regularisation`, after it `between_steps`, where density is controlled `prune_mask`, and at
-    the end `finish`.
+    `training_channels` and `regularisation`, after it `between_steps` and, where an event of the schedule is due,
+    `act`, where density is controlled `prune_mask`, and at the end `finish`.
 
     `separates_instruments`: tissue and instruments are bodies of their own, and instruments of several scenes can be
     combined in one (`combined`, `fit_extras`).
@@ -173,9 +173,12 @@ class Deformation(nn.Module, Method):
         1]."""
         return {}
 
-    def between_steps(self, training: GaussianTraining, before: float) -> None:
-        """Called after every step; `before` is the progress before it, for work that is due at a share of the run. A
-        step may be several iterations (`batch_size`)."""
+    def between_steps(self, training: GaussianTraining) -> None:
+        """Called after every step, which may be several iterations (`batch_size`)."""
+
+    def act(self, training: GaussianTraining, action: str) -> None:
+        """Called after `between_steps` where an event of `schedule.events` is due, with its action, one of
+        `actions`."""
 
     def finish(self, training: GaussianTraining) -> None:
         """Called after the last step; may replace the canonical Gaussians."""

@@ -59,6 +59,7 @@ class Method:
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     needs_instruments: ClassVar[bool] = False  # whether it learns from recorded instrument states alone
     needs_times: ClassVar[bool] = False  # whether it learns from recorded times alone
+    actions: ClassVar[tuple[str, ...]] = ()  # what events of the schedule can have it do (`Deformation.act`)
     enough_frames: ClassVar[int] = 0  # training frames of fewer than which a run has fewer iterations by default
     has_gaussians: ClassVar[bool] = True  # False: nothing to rasterise, pose or densify; an image takes seconds
     large_operations: ClassVar[bool] = False  # whether torch's operations are large enough to gain from several threads

@@ -16,7 +16,7 @@ from neeco.settings import structure
 
 DEFAULT = "kinematic"
 PACKAGE = "neeco.methods"  # our package, and the entry point group of others
-REMOVED = ("label_shares",)  # settings of methods in scenes and runs before the release of version 0.3
+REMOVED = ("label_shares", "shadow_at")  # settings of methods in scenes and runs of older versions
 REMOVED_IF_OFF = ("gate_mm", "carried_places")  # the same of 0.3 and older; scenes that use them cannot be read
 
 

@@ -163,7 +163,3 @@ class GaussianTraining(Session):
     report: Report
     batch_size: int  # frames per step
     timed: bool = field(default=True, init=False)  # `State.time` is in seconds
-
-    def reached(self, iteration: int) -> bool:
-        """Whether the last step reached `iteration`."""
-        return self.iteration - self.batch_size < iteration <= self.iteration

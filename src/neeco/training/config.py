@@ -269,6 +269,14 @@ def check_ranges(config: TrainConfig) -> None:
             "--set schedule.published_steps: scales the schedule to a number of iterations, which --minutes leaves "
             "open; give --iterations alone"
         )
+    for number, event in enumerate(schedule.events):
+        if event.action not in (actions := method_class(config.method).actions):
+            known = f"it knows {', '.join(actions)}" if actions else "it has none"
+            raise NeecoError(
+                f"--set schedule.events: {number}: {event.action!r} is no action of method {config.method}; {known}"
+            )
+        if not event.at > 0:
+            raise NeecoError(f"--set schedule.events: {number}: at: {event.at} is not above 0, the run's start")
     if config.batch_size > 1 and not method_class(config.method).has_gaussians:
         raise NeecoError(
             f"--batch-size: method {config.method} samples rays of all frames in every step; "

@@ -25,6 +25,20 @@ class DensityPhase:
     threshold: float  # NDC, of mean image-space gradients above which Gaussians grow
 
 
+@dataclass(frozen=True)
+class Event:
+    """An action of the method between two steps of the run."""
+
+    at: float  # share of the run; above 1, an iteration
+    action: str  # one of the method's `actions`
+
+    def passed(self, progress: tuple[float, float], iterations: tuple[int, int]) -> bool:
+        """Return whether its moment lies after the first and not after the second of two `progress` (shares of the run)
+        or `iterations`."""
+        before, now = progress if self.at <= 1 else iterations
+        return before < self.at <= now
+
+
 # Iterations. Opacity, at its learning rate, is back about 150 steps after a reset. Rates do not scale with the run's
 # length, so neither does that: with resets closer than twice this, the scene would stay transparent and never show the
 # instrument.
@@ -52,6 +66,7 @@ class ScheduleConfig:
     plain_density: DensityPhase = DensityPhase(100, 3_000, 2e-4)  # 3DGS's: the parts of density control that are off
     phase_1: DensityPhase = DensityPhase(500, 10_000, 4e-4)
     phase_2: DensityPhase = DensityPhase(200, 3_000, 2e-4)
+    events: tuple[Event, ...] = ()  # what the method does between steps; those of one moment in this order
     # Numbers of iterations here and in TrainConfig.density_start are stated for a run of so many steps and scale with
     # the run's length; None: they stand as they are, however short the run.
     published_steps: int | None = None

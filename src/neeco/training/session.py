@@ -296,8 +296,13 @@ class GaussianSession(GaussianTraining):
         return due(interval, self.iteration - self.batch_size, self.iteration)
 
     def between_steps(self, before: float) -> None:
-        """Run the method's own hook."""
-        self.scene.deformation.between_steps(self, before)
+        """Run the method's own hook, then the events of the schedule that the last step passed."""
+        deformation = self.scene.deformation
+        deformation.between_steps(self)
+        progress, iterations = (before, self.progress), (self.iteration - self.batch_size, self.iteration)
+        for event in self.config.schedule.events:
+            if event.passed(progress, iterations):
+                deformation.act(self, event.action)
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return what a checkpoint needs besides scene, optimiser and random numbers."""

@@ -32,8 +32,15 @@ from neeco.methods.kinematic.finish import conclude
 from neeco.methods.kinematic.hinge_search import hinge_joints
 from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.lamp_search import find_shadow
-from neeco.methods.kinematic.silhouette_evidence import OBSERVED_AT, observe_silhouettes
-from neeco.methods.kinematic.state_passes import MARKS, fit_states
+from neeco.methods.kinematic.silhouette_evidence import observe_silhouettes
+from neeco.methods.kinematic.state_passes import (
+    carve_from_states,
+    conclude_states,
+    fit_states,
+    judge_states,
+    judge_states_again,
+    size_states,
+)
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.kinematic.wrist import place_wrists, refine_wrists
 from neeco.methods.space_carving import CarvingSettings
@@ -53,10 +60,9 @@ from neeco.scene.drawable import ArticulatedMotion, Skeleton
 from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.training_session import GaussianTraining, Report
 from neeco.scene.visibility import extrapolate_tissue, outside_all_views
-from neeco.training.session import gaussian_session
+from neeco.training.schedule import Event
+from neeco.training.session import GaussianSession, gaussian_session
 
-WRISTS_AT = 0.4  # share of the run: shapes are formed, and steps are left to learn
-WRISTS_AGAIN_AT = (0.6, 0.8)  # shares of the run
 PRIOR_WEIGHT = 1e-5  # on what is learned of stated kinematics, in squared standard deviations
 
 
@@ -76,8 +82,6 @@ class KinematicSettings:
     refine_wrists: bool = True  # whether wrists are looked for again at 60 and 80 % of the run
     # whether the instruments' shadow on the tissue is looked for and rendered (see `neeco.raster.shadow`)
     shadow: bool = True
-    # iterations at which it is looked for first: instruments have shape, and no shadow is learned yet as a part of them
-    shadow_at: tuple[int, ...] = (1000, 1500)
     # whether tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`)
     extrapolate_tissue: bool = True
     # whether a period is looked for with which the tissue moves, and its motion learned (see `neeco.methods.breathing`)
@@ -95,6 +99,34 @@ class Spin(Perturbation):
     looks the same)."""
 
     shaft_roll: float = 0.0
+
+
+EVENTS = (
+    Event(0.1, "observe_silhouettes"),
+    Event(0.12, "judge_states"),  # later, the scene has learned from wrong states
+    Event(0.2, "fit_states"),
+    Event(0.2, "carve_from_states"),
+    Event(0.32, "observe_silhouettes"),
+    Event(0.32, "size_states"),  # of errors that only the learned tissue shows, more is seen than before
+    Event(0.32, "fit_states"),
+    Event(0.32, "carve_from_states"),
+    Event(0.4, "find_shadow"),
+    Event(0.4, "place_wrists"),  # shapes are formed, and steps are left to learn
+    Event(0.45, "judge_states_again"),
+    Event(0.45, "fit_states"),
+    Event(0.45, "carve_from_states"),
+    Event(0.6, "find_shadow"),
+    Event(0.6, "observe_silhouettes"),
+    Event(0.6, "fit_states"),
+    Event(0.6, "refine_wrists"),
+    Event(0.75, "fit_states"),
+    Event(0.8, "find_shadow"),
+    Event(0.8, "refine_wrists"),
+    Event(0.9, "conclude_states"),
+    # iterations, not shares: instruments have shape, and no shadow is learned yet as a part of them
+    Event(1000, "find_shadow"),
+    Event(1500, "find_shadow"),
+)
 
 
 class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
@@ -117,7 +149,9 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         "refine.frame_joints": True,
         "density_start": 400,
         "resolution.full_size_at": 0.55,
+        "schedule.events": EVENTS,
     }
+    actions = tuple(dict.fromkeys(event.action for event in EVENTS))
     extra_rates: ClassVar[Mapping[str, float]] = {LINK_LOGITS: 1e-2}
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: KinematicSettings | None = None) -> None:
@@ -296,25 +330,24 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             mixed = mixed + misplaced
         return (opacities * mixed).sum() / opacities.sum().clamp_min(1e-6)
 
-    def between_steps(self, training: GaussianTraining, before: float) -> None:
+    def act(self, training: GaussianTraining, action: str) -> None:
         session = gaussian_session(training)
-        passed = [mark for mark in (WRISTS_AT, *WRISTS_AGAIN_AT) if before < mark <= session.progress]
-        if self.settings.shadow and (passed or any(map(session.reached, self.settings.shadow_at))):
-            with session.searching(as_learned=True):
-                find_shadow(session)
-        for mark in OBSERVED_AT:
-            if before < mark <= session.progress:
-                with session.searching():
-                    observe_silhouettes(session)
-        for mark in MARKS:
-            if before < mark <= session.progress:
-                fit_states(session, self, mark)
-        if WRISTS_AT in passed:
+        if action == "find_shadow":
+            if self.settings.shadow:
+                with session.searching(as_learned=True):
+                    find_shadow(session)
+        elif action == "observe_silhouettes":
+            with session.searching():
+                observe_silhouettes(session)
+        elif action == "place_wrists":
             with session.searching():
                 place_wrists(session, self)
-        elif passed and self.settings.refine_wrists:
-            with session.searching():
-                refine_wrists(session, self)
+        elif action == "refine_wrists":
+            if self.settings.refine_wrists:
+                with session.searching():
+                    refine_wrists(session, self)
+        else:
+            STATE_ACTIONS[action](session, self)
 
     def finish(self, training: GaussianTraining) -> None:
         session = gaussian_session(training)
@@ -338,6 +371,16 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             )
             found[name] = 0.0 if fixed else rates[parameter] * scale
         return found
+
+
+STATE_ACTIONS: Mapping[str, Callable[[GaussianSession, ArticulatedInstruments], None]] = {
+    "judge_states": judge_states,
+    "size_states": size_states,
+    "judge_states_again": judge_states_again,
+    "fit_states": fit_states,
+    "carve_from_states": carve_from_states,
+    "conclude_states": conclude_states,
+}
 
 
 def articulation_of(instrument: Instrument) -> Articulation:

@@ -9,7 +9,6 @@ from neeco.evidence.foreground import SETTINGS, Foreground
 from neeco.training.session import GaussianSession
 from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
 
-OBSERVED_AT = (0.1, 0.32, 0.6)  # shares of the run
 N_SAMPLED = 20  # frames from which densities are learned
 
 

@@ -1,8 +1,8 @@
 """States of the training frames as unknowns of their true size, fitted to the images between training steps.
 
 A tracker's errors are corrected by gradients alone (`Refinement`). Where a sample of frames shows larger ones, the
-prior on corrections is as wide, every frame's state is fitted at marks of the run, and the instruments' shapes are
-carved anew from the fitted states: what wrong states taught is forgotten.
+prior on corrections is as wide, events of the schedule fit every frame's state, and the instruments' shapes are carved
+anew from the fitted states: what wrong states taught is forgotten.
 """
 
 from __future__ import annotations
@@ -26,44 +26,52 @@ from neeco.methods.kinematic.discovery import carve_again
 from neeco.methods.kinematic.state_search import LARGEST, StateSearch
 from neeco.training.session import GaussianSession
 
-# shares of the run at which errors are sized; wrong states are searched at the first: later, the scene has learned from
-# these. Of errors that only the learned tissue shows, more is seen at the second
-DECIDED_AT = (0.12, 0.32)
-CARVED_AT = (0.2, 0.32, 0.45)  # shares at which states are fitted, and shapes carved anew from them
-FITTED_AT = (0.6, 0.75, 0.9)  # shares at which states are fitted
-JUDGED_AGAIN_AT = CARVED_AT[-1]
-MARKS = tuple(sorted({*DECIDED_AT, *CARVED_AT, *FITTED_AT}))
 N_SAMPLED = 16  # frames by which errors are sized
 LARGE = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
 SCALE = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
 
 
+def _fits_states(session: GaussianSession) -> bool:
+    """Return whether states are corrected, and one camera shows each instant: gradients of several cameras' images
+    determine an instant's state better than each image does."""
+    corrected = bool(session.scene.instruments) and session.config.refine.frame_poses
+    return corrected and all(len(frames) == 1 for frames in session.refinement.frames_of_instant)
+
+
 @torch.no_grad()
-def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, mark: float) -> None:
-    """Fit the states of all training frames at a mark of the run where their errors are larger than a tracker's, which
-    the recording states, or images show at the first marks (see `size_errors`). States of instants that several
-    cameras show are corrected by gradients alone."""
-    scene, refinement = session.scene, session.refinement
-    if not (scene.instruments and session.config.refine.frame_poses):
-        return
-    if any(len(frames) > 1 for frames in refinement.frames_of_instant):
-        # gradients of several cameras' images determine an instant's state better than each image does
-        if mark in DECIDED_AT and STATE_ERRORS not in scene.diagnostics:
-            size_errors(StateSearch.of(session, articulated), ())
-        return
-    if mark == JUDGED_AGAIN_AT and (STATE_ERRORS in scene.diagnostics or contradicting_states(session)):
-        judge_again(StateSearch.of(session, articulated))
-    if mark in DECIDED_AT and STATE_ERRORS not in scene.diagnostics:
+def judge_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Size the errors of the states of all training frames, and search for those that are wrong altogether."""
+    if not _fits_states(session):
+        size_states(session, articulated)
+    elif STATE_ERRORS not in session.scene.diagnostics:
         search = StateSearch.of(session, articulated)
-        if mark == DECIDED_AT[0]:
-            misfits = Misfits.of(search)
-            large = size_errors(search, misfits.outliers)
-            refit_outliers(search, SCALE if large else LARGE, misfits)
-        else:
-            size_errors(search, ())
-    if STATE_ERRORS not in scene.diagnostics or mark not in (*CARVED_AT, *FITTED_AT):
+        misfits = Misfits.of(search)
+        large = size_errors(search, misfits.outliers)
+        refit_outliers(search, SCALE if large else LARGE, misfits)
+
+
+@torch.no_grad()
+def size_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Size the errors of the states of all training frames, where they were not found large before."""
+    corrected = session.scene.instruments and session.config.refine.frame_poses
+    if corrected and STATE_ERRORS not in session.scene.diagnostics:
+        size_errors(StateSearch.of(session, articulated), ())
+
+
+@torch.no_grad()
+def judge_states_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Search again for wrong states, where errors are large or some states were found wrong before."""
+    suspected = STATE_ERRORS in session.scene.diagnostics or contradicting_states(session)
+    if _fits_states(session) and suspected:
+        judge_again(StateSearch.of(session, articulated))
+
+
+@torch.no_grad()
+def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, *, last: bool = False) -> None:
+    """Fit the states of all training frames to their images, where their errors are larger than a tracker's."""
+    if not (_fits_states(session) and STATE_ERRORS in session.scene.diagnostics):
         return
-    search, last = StateSearch.of(session, articulated), mark == FITTED_AT[-1]
+    search, refinement = StateSearch.of(session, articulated), session.refinement
     contradicting = contradicting_states(session)
     explained: dict[int, float] = {}
     for (index,) in refinement.frames_of_instant:
@@ -79,7 +87,17 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, ma
             explained[index] = fit.fit.misfit
     if last:
         leave_out_unexplained(search, explained)
-    if mark in CARVED_AT:
+
+
+def conclude_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Fit the states a last time, with the uncertainty of the fits, and leave out frames that no state explains."""
+    fit_states(session, articulated, last=True)
+
+
+@torch.no_grad()
+def carve_from_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Carve the instruments' shapes anew from fitted states."""
+    if _fits_states(session) and STATE_ERRORS in session.scene.diagnostics:
         with session.searching():
             carve_again(session, articulated)
 
