@@ -42,7 +42,7 @@ camera: still
 instruments:
   - name: instrument
     poses: {file: recording.bag, stream: /arm/measured_cp, frame: camera}
-    joints: {jaw_angle: {file: recording.bag, stream: /arm/jaw/measured_js, columns: {value: jaw_angle}}}
+    joints: {jaw_angle: {file: recording.bag, stream: /arm/jaw/measured_js, columns: {value: jaw_angle_rad}}}
 """
 
 
@@ -138,11 +138,16 @@ def _run(build: Build, verb: str, words: tuple[str, ...], written: Path) -> dict
     if ended.returncode:
         return {"failed": ended.stderr.splitlines()[-1] if ended.stderr else f"exit status {ended.returncode}"}
     files = files_of(written) if written.is_file() or verb == "train" else _all_files(written)
-    return {str(file): digest(written / file) for file in sorted(files)}
+    if not files:
+        return {"failed": "nothing was written"}
+    return {str(file): digest(written / file) for file in sorted(files) if file.name not in STATING_PATHS}
 
 
 def _all_files(folder: Path) -> set[Path]:
     return {file.relative_to(folder) for file in folder.rglob("*") if file.is_file() and file.suffix != ".html"}
+
+
+STATING_PATHS = ("README.md",)  # files that state where the run lies
 
 
 def digest(path: Path) -> str:
@@ -163,7 +168,7 @@ def digest(path: Path) -> str:
     return hashed.hexdigest()
 
 
-ASIDE = (*TIMES, "capture", "run", "created", "command")  # fields of times, and of where things lie
+ASIDE = (*TIMES, "prepared", "capture", "run", "created", "command")  # fields of times, and of where things lie
 
 
 def table(digests: dict[str, dict[str, dict[str, str]]]) -> tuple[str, bool]:
