@@ -1,15 +1,13 @@
-"""What a GPU does: frames and training steps a second, by backend and by stage, and whole verbs beside the CPU.
+"""Frames and training steps a second of a GPU, by backend and by stage.
 
     python benchmarks/gpu.py [--device cuda:0] [--workload 25000,320x256 ...] [--repeats 30] [--output FOLDER]
-                             [--train CAPTURE [--iterations N] [--set NAME=VALUE]] [--synthesize RUN [--count N]]
 
 Method `kinematic`, random Gaussians on a closed surface, a fifth of them the instrument's: `frame` poses and renders
 them, `step` does, takes the photometric loss and its gradients and one step of Adam; `draw` and `draw+backward`
 do the rasteriser's part alone, on the same posed tensors for all backends. Backends take turns, call by call; numbers
 are medians of the time from an idle device to an idle device, after three calls to warm up. gsplat (pip install gsplat;
-the stated numbers are of 1.5.3) takes part where it is installed. Stages are timed by CUDA
-events in calls of their own, and held against peaks measured in the same run (`stages.MODEL`). FOLDER gets gpu.md and
-gpu.json, after every part.
+the stated numbers are of 1.5.3) takes part where it is installed. Stages of the triton backend are timed by CUDA events
+in calls of their own. FOLDER gets gpu.md and gpu.json, after every workload.
 
 `--device cpu` measures the processor in the same way; without it and without a GPU this ends in one line.
 """
@@ -23,18 +21,17 @@ import os
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from gsplat_peer import rasterize_gsplat
+from gsplat_peer import color_by_gsplat
 from raster import make_surface
-from stages import MODEL, Stages, peaks
+from stages import Stages
 from torch import Tensor
 
 from neeco import __version__
@@ -42,7 +39,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.files import write_json, write_text
 from neeco.methods.kinematic.articulation import LINK_LOGITS
-from neeco.raster import Camera, Gaussians, Rendering, rasterize
+from neeco.raster import Camera, Gaussians, rasterize
 from neeco.raster.devices import device_of, readable_failures
 from neeco.raster.losses import photometric_loss
 from neeco.raster.native import synchronise
@@ -51,11 +48,6 @@ from neeco.raster.triton import ready
 from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.studies.machine import machine
-from neeco.studies.training_job import TrainingJob
-from neeco.synthesis.dataset import synthesize
-from neeco.synthesis.settings import Settings
-from neeco.training.config import training_config
-from neeco.training.run import open_run
 
 WORKLOADS = ("25000,320x256", "300000,960x540", "1000000,1920x1080")
 KINDS = ("draw", "frame", "draw+backward", "step")
@@ -116,11 +108,11 @@ def backends_on(device: torch.device) -> list[Backend]:
     return found
 
 
-def render(gaussians: Gaussians, camera: Camera, word: str) -> Rendering:
-    """`rasterize` by a backend of neeco or by gsplat."""
+def render(gaussians: Gaussians, camera: Camera, word: str) -> Tensor:
+    """Colour [H, W, 3] by a backend of neeco or by gsplat."""
     if word == GSPLAT:
-        return rasterize_gsplat(gaussians, camera, background=gaussians.background)
-    return rasterize(gaussians, camera, backend=word)
+        return color_by_gsplat(gaussians, camera)
+    return rasterize(gaussians, camera, backend=word).color
 
 
 def surface_scene(gaussians: Gaussians, camera: Camera) -> GaussianScene:
@@ -169,15 +161,15 @@ class Case:
 
     @torch.no_grad()
     def draw(self, word: str) -> Tensor:
-        return render(self.posed, self.camera, word).color
+        return render(self.posed, self.camera, word)
 
     @torch.no_grad()
     def frame(self, word: str) -> Tensor:
-        return render(self.scene.at(STATE), self.camera, word).color
+        return render(self.scene.at(STATE), self.camera, word)
 
     def gradients(self, word: str) -> None:
         drawn = render(replace(self.posed, **self.leaves), self.camera, word)
-        torch.autograd.backward(drawn.color, self.weights)
+        torch.autograd.backward(drawn, self.weights)
         for leaf in self.leaves.values():
             leaf.grad = None
 
@@ -185,7 +177,7 @@ class Case:
         for tensor in self.learned:
             tensor.requires_grad_(True)
         drawn = render(self.scene.at(STATE), self.camera, word)
-        photometric_loss(drawn.color, self.target, ssim_weight=0.2).backward()
+        photometric_loss(drawn, self.target, ssim_weight=0.2).backward()
         for tensor, moments in zip(self.learned, self.moments, strict=True):
             if tensor.grad is not None:
                 adam_step(tensor, tensor.grad, *moments, lr=0.0, step=1)
@@ -193,7 +185,7 @@ class Case:
             tensor.grad = None
 
 
-def measure(workload: Workload, device: torch.device, repeats: int, peak: dict[str, float]) -> dict[str, Any]:
+def measure(workload: Workload, device: torch.device, repeats: int) -> dict[str, Any]:
     """Medians of every kind and backend, in turns; stages of the triton backends; the most memory that PyTorch held."""
     case, backends = Case(workload, device), backends_on(device)
     if device.type == "cuda":
@@ -216,46 +208,9 @@ def measure(workload: Workload, device: torch.device, repeats: int, peak: dict[s
         with backend.chosen(), watched.watching():
             for _ in range(repeats):
                 case.call("draw+backward", backend)
-        stages[backend.name] = watched.rows(peak)
+        stages[backend.name] = watched.medians()
     most = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
     return {"workload": asdict(workload), "title": str(workload), "ms": rows, "stages": stages, "memory_bytes": most}
-
-
-def train_both(
-    capture: Path, device: torch.device, iterations: int, settings: Sequence[str] = ()
-) -> list[dict[str, Any]]:
-    """`kinematic` from the same seed there and on the CPU: seconds, and PSNR and mask IoU of held-out frames."""
-    rows = []
-    for where in dict.fromkeys((str(device), "cpu")):
-        with tempfile.TemporaryDirectory() as folder:
-            config = training_config("kinematic", {"iterations": iterations}, settings)
-            job = TrainingJob(
-                name="kinematic",
-                capture=capture,
-                folder=Path(folder) / "run",
-                config=config,
-                device=where,
-            )
-            done = job.run()
-        scores = {name: {k: values[k] for k in ("psnr", "mask_iou")} for name, values in done["splits"].items()}
-        rows.append({"device": where, "iterations": iterations, "seconds": done["seconds"], "splits": scores})
-    return rows
-
-
-def synthesize_some(run: Path, device: torch.device, count: int) -> dict[str, Any]:
-    """Images a second of a data set with all labels, one process; what is begun only once is not counted."""
-    with open_run(run, device) as trained, tempfile.TemporaryDirectory() as folder:
-        moments = [time.perf_counter()]
-        synthesize(
-            trained,
-            Path(folder) / "dataset",
-            Settings(count=count),
-            ("coco", "yolo"),
-            False,
-            lambda *_: moments.append(time.perf_counter()),
-        )
-    told = moments[1:]
-    return {"run": str(run), "images": count, "images_per_second": (len(told) - 1) / (told[-1] - told[0])}
 
 
 def hardware(device: torch.device) -> dict[str, Any]:
@@ -284,9 +239,7 @@ def markdown(result: dict[str, Any]) -> str:
     """The whole result as tables."""
     facts = {key: value for key, value in result["hardware"].items() if value is not None}
     lines = ["# GPU", "", ", ".join(f"{key} {value}" for key, value in facts.items()), ""]
-    peak = result["peak"]
-    rates = f"{peak['bytes'] / 1e9:.0f} GB/s copying, {peak['flops'] / 1e12:.2f} TFLOP/s float32"
-    lines += [f"Peaks, measured: {rates}. Medians of {result['repeats']}.", "", MODEL, ""]
+    lines += [f"Medians of {result['repeats']}.", ""]
     for case in result["workloads"]:
         memory = f" ({case['memory_bytes'] / 2**30:.2f} GiB at most)" if case["memory_bytes"] else ""
         lines += [f"## {case['title']}{memory}", ""]
@@ -295,45 +248,22 @@ def markdown(result: dict[str, Any]) -> str:
         for row in case["ms"]:
             cells = [f"{1e3 / row['frame']:.1f}", f"{1e3 / row['step']:.1f}", *(f"{row[kind]:.2f}" for kind in KINDS)]
             lines.append(f"| {row['backend']} | " + " | ".join(cells) + " |")
-        for name, rows in case["stages"].items():
-            lines += ["", f"| {name}: stage | ms | MB | share of bandwidth | share of arithmetic |", "|---" * 5 + "|"]
-            for row in rows:
-                computed = row["share"].get("arithmetic")
-                told = "-" if computed is None else f"{computed:.0%}"
-                cells = [f"{row['ms']:.3f}", f"{row['bytes'] / 1e6:.1f}", f"{row['share']['bandwidth']:.0%}", told]
-                lines.append(f"| {row['stage']} | " + " | ".join(cells) + " |")
+        for name, stages in case["stages"].items():
+            told = ", ".join(f"{stage} {milliseconds:.3f}" for stage, milliseconds in stages.items())
+            lines += ["", f"{name}, ms: {told}"]
         lines.append("")
-    for row in result.get("train", ()):
-        scores = [
-            f"{split}: PSNR {found['psnr']:.2f} dB"
-            + ("" if found["mask_iou"] is None else f", mask IoU {found['mask_iou']:.3f}")
-            for split, found in row["splits"].items()
-        ]
-        told = f"{row['iterations']:,} steps in {row['seconds']:.1f} s; {'; '.join(scores)}"
-        lines.append(f"- training on {row['device']}: {told}")
-    if "synthesize" in result:
-        made = result["synthesize"]
-        lines.append(f"- synthesis: {made['images_per_second']:.2f} images/s with all labels, of {made['images']}")
     return "\n".join(lines).rstrip() + "\n"
 
 
 def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Measure what was asked for; yields all so far after every part. Raises NeecoError for what cannot be."""
     workloads = [Workload.of(word) for word in arguments.workload or WORKLOADS]
-    if arguments.repeats < 1 or arguments.count < 2:
-        raise NeecoError("--repeats must be at least 1, --count at least 2")
+    if arguments.repeats < 1:
+        raise NeecoError("--repeats must be at least 1")
     device = device_of(arguments.device)
-    peak = peaks(device)
-    result: dict[str, Any] = {"hardware": hardware(device), "peak": peak, "repeats": arguments.repeats}
-    result["workloads"] = []
+    result: dict[str, Any] = {"hardware": hardware(device), "repeats": arguments.repeats, "workloads": []}
     for workload in workloads:
-        result["workloads"].append(measure(workload, device, arguments.repeats, peak))
-        yield result
-    if arguments.synthesize is not None:
-        result["synthesize"] = synthesize_some(arguments.synthesize, device, arguments.count)
-        yield result
-    if arguments.train is not None:
-        result["train"] = train_both(arguments.train, device, arguments.iterations, arguments.set)
+        result["workloads"].append(measure(workload, device, arguments.repeats))
         yield result
 
 
@@ -344,11 +274,6 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--workload", action="append", metavar="GAUSSIANS,WIDTHxHEIGHT", help="repeatable")
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--output", type=Path, metavar="FOLDER")
-    parser.add_argument("--train", type=Path, metavar="CAPTURE")
-    parser.add_argument("--iterations", type=int, default=2000, help="of --train")
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="of --train; repeatable")
-    parser.add_argument("--synthesize", type=Path, metavar="RUN")
-    parser.add_argument("--count", type=int, default=100, help="images of --synthesize")
     arguments = parser.parse_args(words)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # else cuBLAS knows no fixed order
     try:

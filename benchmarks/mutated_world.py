@@ -77,10 +77,8 @@ def make_world(desk: Path, wanted: set[str]) -> None:
     }
     for name in sorted(longer.keys() & wanted):
         run([*longer[name], "--output", name], desk)
-    if {"recording", "bags"} & wanted:
+    if "recording" in wanted:
         make_recording(desk / "recording")
-    if "bags" in wanted:
-        make_bags(desk / "bags", desk / "recording")
     make_endonerf(desk / "endonerf")
     make_colmap(desk / "colmap", document)
 
@@ -101,18 +99,6 @@ def make_recording(folder: Path) -> None:
         f"image_width: 64\nimage_height: 48\ncamera_matrix: {{rows: 3, cols: 3, data: {rows}}}\n"
         "distortion_coefficients: {rows: 1, cols: 5, data: [0.01, 0., 0., 0., 0.]}\n"
     )
-
-
-def make_bags(folder: Path, recording: Path) -> None:
-    """The recording as bags, each with its recording.yaml."""
-    from rendered.bags import LAYOUTS, write_bags
-
-    from neeco.ingest.recording.template import write_template
-
-    write_bags(recording, {"em": 0.04, "jaw_angle": -0.01})
-    shutil.move(recording / "bags", folder)
-    for name, (bag, *_) in LAYOUTS.items():
-        (folder / name / "recording.yaml").write_text(write_template(folder / name / bag))
 
 
 def make_endonerf(root: Path) -> None:

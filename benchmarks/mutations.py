@@ -73,7 +73,6 @@ RECORDING = (
     "recording/sync.json",
     "recording/video.mp4",
 )
-BAGS = ("bags/ros1/*.bag", "bags/ros2/recording-db3/*", "bags/mcap/recording-mcap/*", "bags/*/recording.yaml")
 STEPS = ["--iterations", "3", "--set", "max_tissue_gaussians=200"]
 
 
@@ -273,11 +272,6 @@ CASES: dict[str, Case] = {
         ),
         1,
         ("recording",),
-    ),
-    "ingest BAG": Case(
-        BAGS,
-        lambda pick: ["ingest", f"bags/{pick.choice(('ros1', 'ros2', 'mcap'))}/recording.yaml", "--output", "out"],
-        3,
     ),
     "ingest FOLDER": Case(
         (

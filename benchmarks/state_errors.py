@@ -31,7 +31,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from pose_errors import OPENGL_FROM_OPENCV, true_states
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -51,6 +50,7 @@ from neeco.errors import NeecoError
 from neeco.files import read_json, write_json
 from neeco.geometry.trocar import ShaftLine, line_through_trocar
 
+OPENGL_FROM_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 USUAL = (2.0, 6.0, 0.3, 1.5, 4.0)  # tilt, roll (degrees), across, depth (mm), joints (degrees)
 
 
@@ -81,6 +81,19 @@ def main() -> int:
         write_json(words.output / "truth" / "outliers.json", wrong)
     print(f"{words.output}: {len(capture.split('train'))} training frames, {len(wrong)} wrong states")
     return 0
+
+
+def true_states(capture: Capture) -> dict[str, dict[str, InstrumentState]]:
+    """By a frame's name: the true state of every instrument in the world of the capture, a still scope's own frame."""
+    found = {}
+    for frame in read_json(capture.root / "truth" / "transforms.json")["frames"]:
+        true_from_camera = torch.tensor(frame["transform_matrix"], dtype=torch.float64) @ OPENGL_FROM_OPENCV
+        world = torch.linalg.inv(true_from_camera) if capture.still else torch.eye(4, dtype=torch.float64)
+        found[Path(frame["file_path"]).stem] = {
+            item["name"]: InstrumentState(world @ torch.tensor(item["pose"], dtype=torch.float64), item["joints"])
+            for item in frame["instruments"]
+        }
+    return found
 
 
 def with_true_states(capture: Capture) -> Capture:

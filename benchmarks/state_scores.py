@@ -26,9 +26,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from pose_errors import true_states
 from scipy.spatial.transform import Rotation
-from state_errors import shaft_of
+from state_errors import shaft_of, true_states
 
 from neeco.capture import Capture, State, read_capture
 from neeco.capture.model import Instrument

@@ -1,14 +1,12 @@
 """Scores what `neeco track` found against the truth of a rendered capture.
 
     python benchmarks/tracking.py footage CAPTURE OUT [--splits test unseen] [--every N] [--from N] [--count N]
-        [--first-state] [--effect smoke=0.4 shot_noise=0.05 lens_blur_px=1.5] [--rod] [--window LEFT TOP RIGHT BOTTOM]
+        [--first-state]
     python benchmarks/tracking.py score RUN CAPTURE TRACKED
     python benchmarks/tracking.py single RUN CAPTURE [--splits test] [--every N]
 
 `footage` makes a capture of CAPTURE's images and cameras whose instruments' states are withheld (`--first-state`: all
-but that of the first frame). `--effect`: camera effects as in docs/camera-effects.md, smoke as of tissue 100 mm away;
-`--rod`: a steel rod goes through the image, before the instrument, every three seconds; `--window`: images cropped, so
-that the instrument leaves and enters. `single` finds the state in each frame for itself, nothing known before.
+but that of the first frame). `single` finds the state in each frame for itself, nothing known before.
 `score` compares TRACKED, what `neeco track RUN OUT` made of it, with CAPTURE's truth/:
 all frames of its track.json, whether they were trusted or not. Where the sensors of RUN's capture and of CAPTURE sit
 otherwise on the instrument (footage over another tissue), only the rows without the constant offset say something;
@@ -29,7 +27,6 @@ import argparse
 import json
 import math
 import re
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,7 +38,6 @@ import torch
 from torch import Tensor
 
 from neeco.capture import read_capture, write_capture
-from neeco.capture.images import write_image
 from neeco.capture.model import Frame, InstrumentState, State
 from neeco.evaluation.mask_folders import load_reference
 from neeco.geometry.camera import Camera
@@ -49,7 +45,6 @@ from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 from neeco.labels.drawing import draw
-from neeco.synthesis.camera_effects import SMOKE_MM, apply_effects
 from neeco.tracking.follow import Follower
 from neeco.tracking.parameters import fitter_of
 from neeco.tracking.track import state_of
@@ -60,7 +55,6 @@ DEG = math.pi / 180
 TIP_BEYOND = 15.0  # mm beyond the hinge along the shaft: a point near the tips
 LOST_PX, LOST_DEG = 10.0, 15.0
 WRONG_DEG, TOLD = 10.0, 0.5
-ROD_S = 3.0  # s that the rod takes to come and go
 
 
 @dataclass(frozen=True)
@@ -233,39 +227,13 @@ def footage(given: argparse.Namespace) -> None:
     frames = sorted(capture.frames, key=lambda frame: frame.state.time)
     frames = [frame for frame in frames if not given.splits or frame.split in given.splits]
     chosen = frames[given.begin :: given.every][: given.count]
-    effects = {name: float(value) for name, value in (pair.split("=") for pair in given.effect)}
-    rng, bare = np.random.default_rng(0), []
-    with tempfile.TemporaryDirectory() as scratch:
-        for k, frame in enumerate(chosen):
-            spoilt = frame if given.first_state and k == 0 else replace(frame, state=State({}, frame.state.time))
-            if effects or given.rod or given.window:
-                path = Path(scratch) / frame.image_path.with_suffix(".png").name
-                image = frame.load_image().numpy()
-                if given.rod:
-                    image = with_rod(image, frame.state.time - chosen[0].state.time)
-                if effects:
-                    image = apply_effects(image, np.full(image.shape[:2], SMOKE_MM, np.float32), effects, rng)
-                left, top, right, bottom = given.window or (0, 0, frame.camera.width, frame.camera.height)
-                write_image(path, torch.from_numpy(image[top:bottom, left:right].copy()))
-                camera = replace(frame.camera, cx=frame.camera.cx - left, cy=frame.camera.cy - top)
-                spoilt = replace(
-                    spoilt, image_path=path, camera=replace(camera, width=right - left, height=bottom - top)
-                )
-            bare.append(spoilt)
-        instruments = capture.instruments if given.first_state else ()
-        write_capture(replace(capture, frames=tuple(bare), instruments=instruments), given.output)
+    bare = [
+        frame if given.first_state and k == 0 else replace(frame, state=State({}, frame.state.time))
+        for k, frame in enumerate(chosen)
+    ]
+    instruments = capture.instruments if given.first_state else ()
+    write_capture(replace(capture, frames=tuple(bare), instruments=instruments), given.output)
     print(f"{given.output}: {len(bare)} frames without states")
-
-
-def with_rod(image: np.ndarray, seconds: float) -> np.ndarray:
-    """An image [H, W, 3] through which a grey rod goes, as thick as a tenth of the image's height: in from the right
-    and out again every ROD_S."""
-    height, width = image.shape[:2]
-    rows, columns = np.mgrid[:height, :width] + 0.5
-    across = (rows - 0.55 * height - 0.25 * (columns - width / 2)) / (0.05 * height)  # -1 to 1 on the rod
-    end = width * (1 - 0.5 * (1 - math.cos(2 * math.pi * seconds / ROD_S)))
-    light = 0.25 + 0.5 * np.sqrt(np.clip(1 - across**2, 0, 1))
-    return np.where(((np.abs(across) < 1) & (columns > end))[..., None], light[..., None], image).astype(np.float32)
 
 
 def single(given: argparse.Namespace) -> None:
@@ -296,9 +264,6 @@ def main() -> None:
     made.add_argument("--first-state", action="store_true")
     made.add_argument("--from", type=int, default=0, dest="begin")
     made.add_argument("--count", type=int)
-    made.add_argument("--effect", nargs="*", default=(), metavar="NAME=VALUE")
-    made.add_argument("--rod", action="store_true")
-    made.add_argument("--window", type=int, nargs=4)
     scored = commands.add_parser("score")
     for name in ("run", "capture", "tracked"):
         scored.add_argument(name, type=Path)

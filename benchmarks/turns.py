@@ -1,21 +1,18 @@
 """Times whole commands of two checkouts in turns: what a user waits for, at an old commit and now.
 
     git worktree add ../old COMMIT                       # each with its kernels built: pip install --no-deps -e .
-    python benchmarks/turns.py ../old . OLD_RUN NEW_RUN CAPTURE [--turns 5] [--only track check] [--json FILE]
+    python benchmarks/turns.py ../old . OLD_RUN NEW_RUN CAPTURE [--turns 5] [--only track check]
 
 OLD_RUN, NEW_RUN: what each trained of CAPTURE, which is a rendered capture with images, states and, for `ingest`,
 `video.mp4` and `logs/` (instrument.csv, camera.csv, jaw.csv, jaw_calibration.csv). Nothing of these is written to.
 
 Every command runs in a process of its own, start included; the table has the medians, every turn, and the ratio of the
 medians, by wall and by processor time of the process and its workers. Of `images` and `track` the time is per image
-and per frame: a long command less a short one. The wall time of `samples` is that of one sample, its processor time
-that of the whole benchmark, which also writes and reads a data set. Leave the machine alone meanwhile, or read the
-processor time only.
+and per frame: a long command less a short one. Leave the machine alone meanwhile, or read the processor time only.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import resource
 import shutil
@@ -36,7 +33,7 @@ from neeco.studies.machine import hardware_words, machine
 START = "import sys; from neeco.cli import main; sys.exit(main())"
 IMAGES = 300
 FRAMES = (40, 160)  # at most, of the two stretches that are tracked
-COMMANDS = ("help", "check", "one image", "images 320x256", "images 240x192", "samples", "track", "ingest")
+COMMANDS = ("help", "check", "one image", "images 320x256", "images 240x192", "track", "ingest")
 
 
 @dataclass(frozen=True)
@@ -57,8 +54,6 @@ class Turns:
     """Turns."""
     only: tuple[str, ...] = COMMANDS
     """Of these commands."""
-    json: Path | None = None
-    """File for the numbers."""
 
 
 @dataclass(frozen=True)
@@ -106,23 +101,12 @@ class Side:
             )
             short, long = (len(read_capture(path).frames) for path in self.footage)  # CAPTURE may have fewer than asked
             return many.less(few, long - short)
-        if command == "ingest":
-            logs, camera = self.capture / "logs", read_capture(self.capture).frames[0].camera
-            joint = ["--joint", "jaw_angle", str(logs / "jaw.csv"), str(logs / "jaw_calibration.csv")]
-            lens = [str(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
-            tracked = ["--instrument", str(logs / "instrument.csv"), "--laparoscope", str(logs / "camera.csv")]
-            video = ["--video", str(self.capture / "video.mp4")]
-            return self._neeco("ingest", *video, *tracked, *joint, "--intrinsics", *lens, "--output", self._output())
-        return self._samples()
-
-    def _samples(self) -> Took:
-        """A sample of `LabelledImages` with two workers, as the checkout's own benchmark has it."""
-        found = self.folder / "samples.json"
-        script = str(self.checkout / "benchmarks" / "on_the_fly.py")
-        took = self._python(script, str(self.run), "--workers", "2", "--json", str(found))
-        rows = json.loads(found.read_text())["loading"]
-        speed = next(row["samples_per_second"] for row in rows if row["source"] == "on the fly")
-        return Took(1 / speed, took.cpu)
+        logs, camera = self.capture / "logs", read_capture(self.capture).frames[0].camera
+        joint = ["--joint", "jaw_angle", str(logs / "jaw.csv"), str(logs / "jaw_calibration.csv")]
+        lens = [str(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
+        tracked = ["--instrument", str(logs / "instrument.csv"), "--laparoscope", str(logs / "camera.csv")]
+        video = ["--video", str(self.capture / "video.mp4")]
+        return self._neeco("ingest", *video, *tracked, *joint, "--intrinsics", *lens, "--output", self._output())
 
     def _output(self) -> str:
         output = self.folder / "output"
@@ -175,9 +159,6 @@ def main() -> None:
                     f"{medians[side]:.3g} ({', '.join(f'{one:.3g}' for one in sorted(values[side]))})" for side in sides
                 ]
         print(f"| {what} | {' | '.join(cells + ratios)} |")
-    if arguments.json is not None:
-        rows = {what: {side: [vars(one) for one in both[side]] for side in both} for what, both in took.items()}
-        arguments.json.write_text(json.dumps({"machine": hardware, "seconds": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""Bags for tests, by `benchmarks/rendered/bagwriter.py`; who imports this is skipped where rosbags is absent."""
+"""Bags for tests; who imports this is skipped where rosbags is absent."""
 
 from __future__ import annotations
 
 import pytest
-from rendered_truth import rendered_module
 
 pytest.importorskip("rosbags")
 
+from bagwriter import KINDS, START, BagWriter
 
-BagWriter, KINDS, START = (getattr(rendered_module("bagwriter"), name) for name in ("BagWriter", "KINDS", "START"))
+__all__ = ["KINDS", "START", "BagWriter"]

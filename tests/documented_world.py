@@ -223,7 +223,7 @@ class DocumentedWorld:
 
             write_session(world)
         else:
-            from plus_world import frame_fields, write_mha
+            from pluswriter import frame_fields, write_mha
 
             times = 12.5 + np.arange(30) / 25
             images = np.random.default_rng(7).integers(0, 256, (30, 12, 16, 3), dtype=np.uint8)

@@ -1,5 +1,5 @@
-"""LeRobot data sets for tests, by `benchmarks/rendered/lerobotwriter.py`, of pictures that say what they are; who
-imports this is skipped where pyarrow or av is absent."""
+"""LeRobot data sets for tests, of pictures that say what they are; who imports this is skipped where pyarrow or av is
+absent."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rendered_truth import rendered_module
 
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
+
+from lerobotwriter import Episode, LeRobotWriter
 
 FPS = 25
 SIZE = (64, 48)
@@ -47,7 +48,6 @@ def write_data_set(
     **options: Any,
 ) -> Path:
     """A data set with these states of every episode; shown: how many images an episode has, where not as many."""
-    writer = rendered_module("lerobotwriter")
 
     def images(episode: int, count: int) -> Any:
         return lambda: (picture(episode, number) for number in range(count))
@@ -55,5 +55,5 @@ def write_data_set(
     episodes = []
     for number, held in enumerate(states):
         count = (shown or {}).get(number, len(next(iter(held.values()))))
-        episodes.append(writer.Episode(held, {key: images(number, count) for key in cameras}))
-    return Path(writer.LeRobotWriter(folder, version, episodes, Fraction(FPS), SIZE, **options).write())
+        episodes.append(Episode(held, {key: images(number, count) for key in cameras}))
+    return Path(LeRobotWriter(folder, version, episodes, Fraction(FPS), SIZE, **options).write())

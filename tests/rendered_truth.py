@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import json
 import sys
 from collections.abc import Iterator
@@ -16,19 +15,6 @@ import pytest
 from PIL import Image
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
-
-
-def rendered_module(name: str) -> ModuleType:
-    """A module of benchmarks/rendered by itself: that package imports what these tests do without."""
-    known = f"neeco_{name}"
-    if known not in sys.modules:
-        spec = importlib.util.spec_from_file_location(known, BENCHMARKS / "rendered" / f"{name}.py")
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[known] = module
-        spec.loader.exec_module(module)
-    return sys.modules[known]
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,16 +28,6 @@ class Exposure:
         """What multiplies red, green and blue light of a frame."""
         red, green, blue = (float(self.gain[number] * value) for value in self.color[number])
         return red, green, blue
-
-    def describe(self, numbers: list[int]) -> dict[str, Any]:
-        """truth/exposure.json, of the frames `numbers`."""
-        return {
-            "meaning": "linear light of frame k was multiplied by gain[k] * color_gain[k] before the tone curve; "
-            "without automatic exposure both are 1",
-            "frames": numbers,
-            "gain": [round(float(self.gain[number]), 6) for number in numbers],
-            "color_gain": [[round(float(value), 6) for value in self.color[number]] for number in numbers],
-        }
 
 
 def meter(place: Place, trajectory: Trajectory) -> Exposure:

@@ -18,13 +18,9 @@ from torch import Tensor
 from neeco.capture.images import write_labels
 from neeco.files import write_atomically
 from rendered import instrument
-from rendered.adaptive import draw_detailed
-from rendered.breathing import Mode, breathing_modes, displacement_at
-from rendered.detail import Detail, make_detail
 from rendered.hinge import truth_ids
 from rendered.motion import Array, Moment, Trajectory, is_unseen, rigid
-from rendered.optics import Optics
-from rendered.processor import PROCESSORS, Processor
+from rendered.processor import Processor
 from rendered.render import Drawing, Lens, Place, draw, shadowed, view_of
 from rendered.scenes import SceneSpec
 from rendered.tissue import ORGANS
@@ -32,7 +28,6 @@ from rendered.tissue import ORGANS
 DEPTH_UNIT_MM, DEPTH_STRIDE, DEPTH_EVERY = 0.05, 2, 4
 # the right camera of a stereo scope: 4.6 mm beside the left one, turned towards what it looks at
 RIGHT_FROM_LEFT = rigid(Rotation.from_rotvec([0.003, -0.035, 0.004]).as_matrix(), np.array([-4.6, 0.05, 0.08]))
-AWAY_MM = 1e3
 Gains = dict[int, tuple[float, float, float]]
 
 
@@ -44,62 +39,14 @@ class Settings:
     resolution: int = 2400  # texels along the tissue's side
     every: int = 1  # keep one frame in so many (previews)
     frames: int | None = None  # slow the motion until it has so many training frames
-    exact: bool = False  # transforms.json has no errors
-    detail: bool = False  # texture finer than a pixel of the smallest size
-    breathing_mm: float = 0.0  # amplitude about the mean, where the tissue moves most
-    pulse_mm: float = 0.0
-    exposure: bool = False  # automatic exposure and white balance
-    optics: bool = False  # raw/: the images as an endoscope distorts them, in a round border
     video: bool = False  # recording/: what `neeco ingest` takes
-    bags: bool = False  # recording/bags/: the same as ROS bags
-    plus: bool = False  # recording/plus/: the same as a PLUS sequence
-    lerobot: bool = False  # recording/lerobot/: the same as LeRobot data sets
     still: bool = False  # the scope stands still
-    base_error: tuple[float, float] | None = None  # mm and degrees that recording/ is off about a robot's base
     stereo: bool = False  # right/: the images of a second camera beside it
-    plates: bool = False  # plates/: training frames without the instrument
-    processor: str | Processor | None = None  # of another endoscope: one of PROCESSORS, or its numbers
+    processor: Processor = field(default_factory=Processor)
     workers: int = 1
 
-    @property
-    def options(self) -> str:
-        """Those of the command line that make these settings, each after a blank."""
-        side = f"{self.lens.width}x{self.lens.height}"
-        size = "" if side == f"{Lens.width}x{Lens.height}" else f" --size {side}"
-        given = [
-            (self.detail and not size, " --detail"),
-            (self.breathing_mm, f" --breathing {self.breathing_mm:g}"),
-            (self.pulse_mm, f" --pulse {self.pulse_mm:g}"),
-            (self.exposure, " --exposure"),
-            (self.optics, " --lens"),
-            (self.video and not (self.bags or self.plus or self.lerobot or self.base_error), " --video"),
-            (self.bags, " --bag"),
-            (self.plus, " --plus"),
-            (self.lerobot, " --lerobot"),
-            (self.still and not (self.stereo or self.base_error), " --still"),
-            (self.base_error, " --base-error {:g}x{:g}".format(*(self.base_error or (0, 0)))),
-            (self.stereo, " --stereo"),
-            (self.plates, " --plates"),
-            (self.processor, f" --processor {self.processor}"),
-            (self.every > 1, f" --every {self.every}"),
-            (self.frames, f" --frames {self.frames}"),
-            (self.exact, " --exact"),
-        ]
-        return size + "".join(option for wanted, option in given if wanted)
-
-    @property
-    def developing(self) -> Processor:
-        """The processor of the images."""
-        if isinstance(self.processor, str):
-            return PROCESSORS[self.processor]
-        return self.processor or Processor()
-
-    def modes(self, spec: SceneSpec) -> tuple[Mode, ...]:
-        """How the tissue moves."""
-        return breathing_modes(self.breathing_mm, self.pulse_mm, spec.seed)
-
     def place(self, spec: SceneSpec) -> Place:
-        """Tissue at rest, instrument, lamps and lens."""
+        """Tissue, instrument, lamps and lens."""
         tissue = ORGANS[spec.organ](spec.seed, self.resolution)
         return Place(tissue, spec.design, spec.lamps, self.lens)
 
@@ -141,44 +88,25 @@ class Renderer:
     spec: SceneSpec
     settings: Settings
     path: Path
-    place: Place  # at rest
-    detail: Detail | None
+    place: Place
     gains: Gains  # by frame number; empty without automatic exposure
-
-    @staticmethod
-    def of(spec: SceneSpec, settings: Settings, path: Path, place: Place, gains: Gains) -> Renderer:
-        """The renderer of `place`, with the textures that the settings ask for."""
-        detail = make_detail(spec.organ, place.tissue, spec.seed) if settings.detail else None
-        return Renderer(spec, settings, path, place, detail, gains)
 
     def render(self, shot: Shot) -> Rendered:
         """Render a frame and write its image, its masks of parts and of the shadow, and its depth."""
-        place = moved(self.place, self.settings.modes(self.spec), shot.time)
-        drawing = self._draw(place, shot)
+        view, gain = view_of(shot.moment), self.gains.get(shot.number)
+        drawing = draw(self.place, view, gain)
         pixels = self._stored(drawing.color, np.random.default_rng((self.spec.seed, shot.number)))
         _write_jpeg(self.path / image_name(shot), pixels)
-        self._write_truth(shot, drawing, shadowed(place, view_of(shot.moment), drawing))
-        if self.settings.optics:
-            optics = Optics.of(self.settings.lens)
-            color = optics.add_border(self._draw(replace(place, lens=optics), shot).color)
-            raw = self._stored(color, np.random.default_rng((self.spec.seed, shot.number, 1)))
-            _write_jpeg(self.path / "raw" / Path(image_name(shot)).name, raw)
-        if self.settings.plates and shot.split == "train":
-            plate = self._stored(self._draw(place, without_instrument(shot)).color, np.random.default_rng(shot.number))
-            _write_jpeg(self.path / "plates" / Path(image_name(shot)).name, plate)
+        self._write_truth(shot, drawing, shadowed(self.place, view, drawing))
         if self.settings.stereo:
-            color = self._draw(seen_from_right(place), beside(shot)).color
+            color = draw(seen_from_right(self.place), view_of(beside(shot).moment), gain).color
             right = self._stored(color, np.random.default_rng((self.spec.seed, shot.number, 2)))
             _write_jpeg(self.path / right_name(shot), right)
         return Rendered(pixels, drawing)
 
     def _stored(self, color: Tensor, generator: np.random.Generator) -> Array:
-        processor = self.settings.developing
+        processor = self.settings.processor
         return _add_noise(processor.develop(color) if processor != Processor() else color, processor.noise, generator)
-
-    def _draw(self, place: Place, shot: Shot) -> Drawing:
-        view, gain = view_of(shot.moment), self.gains.get(shot.number)
-        return draw_detailed(place, self.detail, view, gain) if self.detail else draw(place, view, gain)
 
     def _write_truth(self, shot: Shot, drawing: Drawing, shadow: Tensor) -> None:
         truth, name = self.path / "truth", f"{shot.number:06d}.png"
@@ -203,19 +131,6 @@ def beside(shot: Shot) -> Shot:
     return replace(shot, moment=replace(shot.moment, scene_from_camera=camera))
 
 
-def without_instrument(shot: Shot) -> Shot:
-    """A shot whose instrument is far behind the camera."""
-    camera = shot.moment.scene_from_camera
-    away = shot.moment.scene_from_mechanical.copy()
-    away[:3, 3] = camera[:3, 3] - AWAY_MM * camera[:3, 2]
-    return replace(shot, moment=replace(shot.moment, scene_from_mechanical=away))
-
-
-def moved(place: Place, modes: tuple[Mode, ...], time: float) -> Place:
-    """A place at rest as it is at `time`."""
-    return replace(place, tissue=place.tissue.displaced(displacement_at(modes, time)))
-
-
 def render_all(renderer: Renderer, shots: list[Shot]) -> Iterator[Rendered]:
     """All frames in order, rendered by `settings.workers` processes; the same bytes for any number of them."""
     if renderer.settings.workers == 1:
@@ -233,7 +148,7 @@ _renderers: list[Renderer] = []  # of this worker
 def _start(spec: SceneSpec, settings: Settings, path: Path, gains: Gains) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    _renderers.append(Renderer.of(spec, settings, path, settings.place(spec), gains))
+    _renderers.append(Renderer(spec, settings, path, settings.place(spec), gains))
 
 
 def _render(shot: Shot) -> Rendered:

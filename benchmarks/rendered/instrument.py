@@ -159,10 +159,6 @@ class Design:
             vectors = torch.where((parts == part)[:, None], turn_x(vectors, -sense * angle), vectors)
         return vectors
 
-    def turn_from_link(self, opening: float, vectors: Tensor, parts: Tensor) -> Tensor:
-        """The inverse of `turn_to_link`."""
-        return self.turn_to_link(opening, vectors, parts, -1)
-
     def everything(self, points: Tensor, opening: float) -> Tensor:
         """Lower bound [M] mm of the distance to the whole instrument, shaft included."""
         x, y, z = points.unbind(-1)
@@ -202,18 +198,6 @@ def trace(design: Design, opening: float, origin: Tensor, directions: Tensor) ->
         if not len(active):
             break
     return distance / lengths, part
-
-
-def may_meet(design: Design, opening: float, origin: Tensor, unit: Tensor, spread: float) -> Tensor:
-    """Which cones [M] around the unit directions [M, 3], `spread` rad from middle to rim, may meet the instrument."""
-    centers, radii = design.balls(opening)
-    nearest = unit @ (centers - origin).T
-    off = ((centers - origin).square().sum(-1) - nearest.square()).clamp_min(0).sqrt()
-    head = ((off < radii + spread * nearest) & (nearest > 0)).any(-1)
-    flat, slope = origin[:2], unit[:, :2]
-    t = (-(slope @ flat) / slope.square().sum(-1).clamp_min(1e-9)).clamp_min(0)
-    beside = (flat + t[:, None] * slope).norm(dim=-1) < design.radius + spread * t
-    return head | (beside & (origin[2] + t * unit[:, 2] < 4 * design.radius))
 
 
 def normals(design: Design, opening: float, points: Tensor, parts: Tensor) -> Tensor:

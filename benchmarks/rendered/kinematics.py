@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.kinematics import FIXED, PRISMATIC, REVOLUTE, KinematicTree, Link
+from neeco.capture.kinematics import FIXED, REVOLUTE, KinematicTree, Link
 from rendered.hinge import JAW_LEFT, JAW_RIGHT, truth_ids
 from rendered.motion import Array
 from rendered.scenes import SceneSpec
-from rendered.wristed import SlidingDesign, WristedDesign
+from rendered.wristed import WristedDesign
 
 JAW_NAMES = {JAW_LEFT: "jaw_left", JAW_RIGHT: "jaw_right"}
 # by which every axis and every pivot is stated wrongly
@@ -27,17 +27,14 @@ def true_kinematics(spec: SceneSpec) -> KinematicTree:
     design, encoders = spec.design, spec.encoders
     sensor_from_mechanical = np.linalg.inv(spec.mount.mechanical_from_sensor())
     rotation, shift = sensor_from_mechanical[:3, :3], sensor_from_mechanical[:3, 3]
-    if not isinstance(design, WristedDesign | SlidingDesign):
+    if not isinstance(design, WristedDesign):
         hinge = rotation @ np.array([0.0, 0.0, design.hinge]) + shift
         return KinematicTree((Link("shaft"), Link("wrist", "shaft"), *_jaws(spec, rotation, hinge)))
     assert encoders is not None
     first, *others = design.wrist_joints
-    slides = isinstance(design, SlidingDesign)
-    start = 0.0 if slides else design.pitch_at
-    kind, axis = (PRISMATIC, rotation[:, 2]) if slides else (REVOLUTE, rotation[:, 1])
-    origin = _shift(rotation @ np.array([0.0, 0.0, start]) + shift)
-    links = [Link("shaft"), Link("wrist", "shaft", kind, origin, axis, {first: 1.0}, offset=-encoders.offsets[0])]
-    hinge = rotation @ np.array([0.0, 0.0, design.hinge - start])
+    origin, offset = _shift(rotation @ np.array([0.0, 0.0, design.pitch_at]) + shift), -encoders.offsets[0]
+    links = [Link("shaft"), Link("wrist", "shaft", REVOLUTE, origin, rotation[:, 1], {first: 1.0}, offset=offset)]
+    hinge = rotation @ np.array([0.0, 0.0, design.hinge - design.pitch_at])
     return KinematicTree((*links, *_jaws(spec, rotation, hinge, others, -sum(encoders.offsets[1:]))))
 
 
@@ -62,7 +59,7 @@ def stated_kinematics(spec: SceneSpec, *, exact: bool = False, along_mm: float =
     """The links as a drawing of the instrument and a ruler on its sensor give them: axes turned by AXIS_ERROR and
     pivots shifted by PIVOT_ERROR mm, each some way of its own, unless `exact`, and encoders thought to be without an
     offset. All that the shaft carries is `along_mm` farther along it, as where the sensor was measured wrongly."""
-    without = spec.encoders and replace(spec.encoders, offsets=(0.0,) * len(spec.encoders.offsets))
+    without = spec.encoders and replace(spec.encoders, offsets=(0.0, 0.0))
     right = true_kinematics(replace(spec, encoders=without))
     if exact:
         return right

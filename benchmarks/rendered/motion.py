@@ -35,7 +35,7 @@ class Path:
     roll_train: float  # about the middle, either way
     roll_most: float
     camera_rolling: float = 0.0  # rad, how far the camera rolls either way
-    wrist_train: tuple[float, ...] = ()  # how far the joints of a wrist turn (rad) or slide (mm) either way
+    wrist_train: tuple[float, ...] = ()  # how far the joints of a wrist turn either way
     wrist_most: tuple[float, ...] = ()
 
 
@@ -49,14 +49,6 @@ class Bend:
 
 
 @dataclass(frozen=True)
-class Extension:
-    """How the joints of a telescoping instrument stand: rad, and mm beyond the middle."""
-
-    opening: float
-    extension: float
-
-
-@dataclass(frozen=True)
 class Moment:
     """Exact poses and state at one time."""
 
@@ -65,14 +57,12 @@ class Moment:
     opening: float
     roll: float  # about the middle of the range
     hinge: Array  # [3], scene frame; where it is while the wrist is straight
-    wrist: tuple[float, ...] = ()  # pitch and yaw, or the extension
+    wrist: tuple[float, ...] = ()  # pitch and yaw
 
     @property
-    def joints(self) -> float | Bend | Extension:
+    def joints(self) -> float | Bend:
         """What the instrument's design takes: the opening of one that has no wrist."""
-        if not self.wrist:
-            return self.opening
-        return Bend(self.opening, *self.wrist) if len(self.wrist) == 2 else Extension(self.opening, *self.wrist)
+        return Bend(self.opening, *self.wrist) if self.wrist else self.opening
 
 
 @dataclass(frozen=True)
@@ -190,13 +180,13 @@ def _roll_curve(path: Path, end: float, rest: float, generator: np.random.Genera
 
 
 def _wrist_curve(path: Path, end: float, rest: float, generator: np.random.Generator) -> CubicSpline:
-    """Pitch and yaw, or extension: over all of their training range, then beyond it, one after the other."""
+    """Pitch and yaw: over all of their training range, then beyond it, one after the other."""
     knots = np.linspace(0, end, max(5, round(end / 0.9)))
     train, most = np.array(path.wrist_train), np.array(path.wrist_most)
     seen = 0.9 * train * _spread(len(knots), len(train), generator)  # a spline goes a little beyond its knots
     after = np.array([0.25, 0.5, 0.75, 1.0]) * rest + end
     signs = np.array([[1.0, 0.2], [-0.3, 1.0], [-1.0, -0.4], [0.5, -1.0]])
-    return CubicSpline(np.r_[knots, after], np.concatenate([seen, signs[:, : len(most)] * most]))
+    return CubicSpline(np.r_[knots, after], np.concatenate([seen, signs * most]))
 
 
 def _spread(count: int, width: int, generator: np.random.Generator) -> Array:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
-from rendered.breathing import Displacement
 from rendered.motion import Array, Moment
 from rendered.render import Drawing, Lens
 
@@ -21,11 +19,9 @@ class PointSampler:
         self.positions: list[Array] = []
         self.colors: list[Array] = []
 
-    def take(
-        self, moment: Moment, drawing: Drawing, pixels: Array, lens: Lens, displacement: Displacement | None = None
-    ) -> None:
+    def take(self, moment: Moment, drawing: Drawing, pixels: Array, lens: Lens) -> None:
         """Pick points of one frame: tissue where the image has texture, hardly ever the instrument. They err by as
-        many pixels at every size, and lie where the tissue, moved by `displacement`, rests."""
+        many pixels at every size."""
         grey = pixels.astype(np.float64).mean(-1)
         texture = np.hypot(*np.gradient(grey)) + 0.5
         texture[grey > 225] = 0  # highlights move; SfM throws them out
@@ -42,10 +38,5 @@ class PointSampler:
         wild = self.generator.random(len(points)) < OUTLIERS
         points[wild] += rays[wild] * self.generator.normal(0, 6.0, (int(wild.sum()), 1))
         pose = moment.scene_from_camera
-        points = points @ pose[:3, :3].T + pose[:3, 3]
-        if displacement is not None:
-            x, y, z = torch.from_numpy(points).unbind(-1)
-            x, y = displacement.rest(x, y)
-            points = np.stack([x, y, z - displacement.at(x, y)[2]], -1)
-        self.positions.append(points)
+        self.positions.append(points @ pose[:3, :3].T + pose[:3, 3])
         self.colors.append(pixels.reshape(-1, 3)[chosen] / 255)

@@ -15,14 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from neeco.files import write_atomically, write_json, write_text
 from rendered import errors
-from rendered.base import BASE_FROM_CAMERA, rough_base
-from rendered.frames import RIGHT_FROM_LEFT, Settings, Shot, image_name, right_name
+from rendered.frames import Settings, image_name
 from rendered.kinematics import stated_kinematics
 from rendered.motion import FRAME_RATE, Array, Trajectory, rigid
-from rendered.optics import Optics
-from rendered.plus import write_plus
-from rendered.render import Lens
-from rendered.scenes import SceneSpec
 from rendered.truth import JOINT, World
 from rendered.wristed import Encoders
 
@@ -42,10 +37,7 @@ def write_raw_recording(
     """Write `path`/recording and, of its unknowns, `path`/truth/recording.json. The images are there already."""
     folder, spec = path / "recording", world.spec
     rate = Fraction(round(FRAME_RATE), settings.every)
-    _write_video(folder / "video.mp4", [path / _recorded(shot, settings) for shot in world.shots], rate)
-    if settings.stereo:
-        _write_video(folder / "right.mp4", [path / right_name(shot) for shot in world.shots], rate)
-        write_text(folder / "stereo.yaml", _stereo_calibration(settings.lens))
+    _write_video(folder / "video.mp4", [path / image_name(shot) for shot in world.shots], rate)
     times, readings = _sensor_times(world, JAW_HZ, generator), spec.joint
     opening = np.array([trajectory.at(float(time)).opening for time in times])
     noisy = errors.disturb_readings(
@@ -67,36 +59,11 @@ def write_raw_recording(
         moments = [trajectory.at(float(time)) for time in times]
         exact = [world.sensor(m) if name == "instrument" else world.camera(m) @ CAMERA_FROM_SENSOR for m in moments]
         poses = errors.disturb_poses(np.stack(exact), _numbers(times), spec.errors, generator)
-        if settings.base_error:
-            poses = BASE_FROM_CAMERA @ poses
         _write_csv(
             folder / "logs" / f"{name}.csv", "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz", _pose_rows(times, poses, generator)
         )
     sync = {clock: round(offset + float(generator.normal(0, SYNC_S / 2)), 4) for clock, offset in _CLOCKS.items()}
-    if settings.optics:
-        write_text(folder / "calibration.yaml", Optics.of(settings.lens).calibration())
-    if settings.base_error:
-        del sync["em"]
-        write_json(
-            path / "truth" / "base.json",
-            {"camera_from_base": np.linalg.inv(BASE_FROM_CAMERA).tolist(), "clock_s": EM_CLOCK_S},
-        )
-    document = _document(world, settings, sync)
-    if spec.encoders is not None:
-        _state_links(document, spec, exact=True)
-        write_text(folder / "exact-links.yaml", yaml.safe_dump(document, sort_keys=False))
-        _state_links(document, spec, exact=False)
-    write_text(folder / "recording.yaml", yaml.safe_dump(document, sort_keys=False))
-    if settings.bags:
-        from rendered.bags import write_bags  # needs rosbags
-
-        write_bags(folder, _CLOCKS)
-    if settings.plus:
-        write_plus(folder, _CLOCKS)
-    if settings.lerobot:
-        from rendered.lerobotsets import write_data_sets  # needs pyarrow
-
-        write_data_sets(folder, _CLOCKS)
+    write_text(folder / "recording.yaml", yaml.safe_dump(_document(world, settings, sync), sort_keys=False))
     write_json(
         path / "truth" / "recording.json",
         {
@@ -120,16 +87,7 @@ def _write_wrist(path: Path, world: World, trajectory: Trajectory, encoders: Enc
         (f"{time + EM_CLOCK_S:.5f}", *(f"{value:.5f}" for value in row))
         for time, row in zip(times, readings, strict=True)
     ]
-    _write_csv(path, ",".join(["t_s", *(f"{name}_rad" for name in world.spec.reading_names)]), rows)
-
-
-def _state_links(document: dict[str, Any], spec: SceneSpec, *, exact: bool) -> None:
-    """State the links of recording.yaml's instrument, and the logs of its wrist."""
-    (instrument,) = document["instruments"]
-    instrument["kinematics"] = stated_kinematics(spec, exact=exact).to_json()
-    for name in spec.reading_names:
-        columns = {"time": "t_s", "value": f"{name}_rad"}
-        instrument["joints"][name] = {"file": "logs/wrist.csv", "clock": "em", "columns": columns}
+    _write_csv(path, ",".join(["t_s", *(f"{name}_rad" for name in world.spec.design.wrist_joints)]), rows)
 
 
 def _document(world: World, settings: Settings, sync: dict[str, float]) -> dict[str, Any]:
@@ -138,45 +96,23 @@ def _document(world: World, settings: Settings, sync: dict[str, float]) -> dict[
     joint: dict[str, object] = {"file": "logs/jaw.csv", "columns": {"time": "t_s", "value": "hall_raw"}}
     joint |= {"calibration": "logs/jaw_calibration.csv", "limits": list(spec.joint.limits)}
     of = {split: [k for k, shot in enumerate(world.shots) if shot.split == split] for split in ("test", "unseen")}
-    document: dict[str, Any] = {"video": "video.mp4"}
+    document: dict[str, Any] = {"video": "video.mp4"} | ({"camera": "still"} if settings.still else {})
     poses: object = "logs/instrument.csv"
     if settings.still:
-        document |= {"camera": "still"}
-        poses = {"file": poses} if settings.base_error else {"file": poses, "frame": "camera"}
-    instrument: dict[str, object] = {"name": spec.design.name, "poses": poses, "joints": {JOINT: joint}}
-    if settings.base_error:
-        seen = np.stack([world.sensor(shot.moment) for shot in world.shots])
-        instrument |= {"camera_from_base": rough_base(seen, *settings.base_error, spec.seed)}
-    if settings.stereo:
-        document |= {"stereo": {"video": "right.mp4", "calibration": "stereo.yaml"}}
+        poses = {"file": poses, "frame": "camera"}
+    instrument: dict[str, Any] = {"name": spec.design.name, "poses": poses, "joints": {JOINT: joint}}
+    if spec.encoders is not None:
+        instrument["kinematics"] = stated_kinematics(spec).to_json()
+        for name in spec.design.wrist_joints:
+            columns = {"time": "t_s", "value": f"{name}_rad"}
+            instrument["joints"][name] = {"file": "logs/wrist.csv", "clock": "em", "columns": columns}
     return document | {
-        "intrinsics": "calibration.yaml"
-        if settings.optics
-        else [lens.focal, lens.focal, lens.width / 2, lens.height / 2],
+        "intrinsics": [lens.focal, lens.focal, lens.width / 2, lens.height / 2],
         "instruments": [instrument],
         **({} if settings.still else {"laparoscope": "logs/camera.csv"}),
         "sync": sync,
         "splits": {split: frames for split, frames in of.items() if frames},
     }
-
-
-def _stereo_calibration(lens: Lens) -> str:
-    """The calibration of two pinholes as OpenCV's stereoCalibrate finds it, mm; principal points count from the first
-    pixel's centre."""
-    matrix = [lens.focal, 0.0, lens.width / 2 - 0.5, 0.0, lens.focal, lens.height / 2 - 0.5, 0.0, 0.0, 1.0]
-    matrices = {"M1": (3, 3, matrix), "D1": (1, 5, [0.0] * 5), "M2": (3, 3, matrix), "D2": (1, 5, [0.0] * 5)}
-    matrices |= {"R": (3, 3, RIGHT_FROM_LEFT[:3, :3].ravel().tolist()), "T": (3, 1, RIGHT_FROM_LEFT[:3, 3].tolist())}
-    lines = ["%YAML:1.0", "---", f"image_width: {lens.width}", f"image_height: {lens.height}"]
-    for name, (rows, columns, data) in matrices.items():
-        numbers = ", ".join(f"{value:.9g}" for value in data)
-        lines += [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d"]
-        lines += [f"   data: [ {numbers} ]"]
-    return "\n".join(lines) + "\n"
-
-
-def _recorded(shot: Shot, settings: Settings) -> str:
-    """The image that the video shows of a frame."""
-    return f"raw/{shot.number:06d}.jpg" if settings.optics else image_name(shot)
 
 
 def _write_video(path: Path, images: list[Path], rate: Fraction) -> None:

@@ -47,10 +47,7 @@ class Lens:
     def rays(self, shift: tuple[float, float] = (0.0, 0.0)) -> Tensor:
         """Directions [H * W, 3] with z = 1, camera frame, through pixel centres moved by `shift` px."""
         v, u = torch.meshgrid(torch.arange(self.height) + 0.5, torch.arange(self.width) + 0.5, indexing="ij")
-        return self.rays_through((u + shift[0]).reshape(-1), (v + shift[1]).reshape(-1))
-
-    def rays_through(self, u: Tensor, v: Tensor) -> Tensor:
-        """Directions [M, 3] with z = 1, camera frame, through image positions u, v [M] px."""
+        u, v = (u + shift[0]).reshape(-1), (v + shift[1]).reshape(-1)
         x, y = (u - self.width / 2) / self.focal, (v - self.height / 2) / self.focal
         return torch.stack([x, y, torch.ones_like(x)], -1)
 
@@ -156,18 +153,11 @@ def meet_instrument(place: Place, view: View, directions: Tensor) -> tuple[Tenso
 
 def _shadows(place: Place, view: View, tissue: Tensor) -> Tensor:
     """Share [L, 2H, 2W] of each lamp's light that passes the instrument, found between pixels and interpolated."""
-    transform = mechanical_from_camera(view)
-    lens = place.lens
+    transform, lens = mechanical_from_camera(view), place.lens
     rays = lens.rays((0.5, 0.5)).reshape(lens.height, lens.width, 3)[::2, ::2]
     points = (F.avg_pool2d(tissue[None], 2)[0, ..., None] * rays).reshape(-1, 3)
     points = points @ transform[:3, :3].T + transform[:3, 3]
-    planes = passing(place, view, points).reshape(1, -1, *rays.shape[:2])
-    return F.interpolate(planes, scale_factor=4, mode="bilinear", align_corners=False)[0]
-
-
-def passing(place: Place, view: View, points: Tensor) -> Tensor:
-    """Share [L, M] of each lamp's light that passes the instrument to points [M, 3], mechanical frame."""
-    transform, lamps = mechanical_from_camera(view), place.lamps
+    lamps = place.lamps
     lit = torch.stack(
         [
             tools.shadow(
@@ -182,7 +172,8 @@ def passing(place: Place, view: View, points: Tensor) -> Tensor:
     )
     if lamps.contact:
         lit *= 1 - 0.6 * torch.exp(-place.design.everything(points, view.opening).clamp_min(0) / lamps.contact)
-    return lit
+    planes = lit.reshape(1, -1, *rays.shape[:2])
+    return F.interpolate(planes, scale_factor=4, mode="bilinear", align_corners=False)[0]
 
 
 def _shade(
@@ -209,30 +200,21 @@ def _shade(
 
 
 def _shade_tissue(place: Place, view: View, points: Tensor, lit: Tensor) -> Tensor:
-    """Colour [M, 3] of tissue at points [M, 3], camera frame."""
+    """Colour [M, 3] of wet tissue at points [M, 3], camera frame; lit [L, M]: share of each lamp that reaches it."""
     rotation, origin = view.scene_from_camera[:3, :3], view.scene_from_camera[:3, 3]
     surface = place.tissue.look_up(points @ rotation.T + origin)
     albedo, gloss, openness = surface[:, :3], surface[:, 6:7], surface[:, 7:8]
     normal = F.normalize(surface[:, 3:6] @ rotation, dim=-1)
-    return light_tissue(place.lamps, points, albedo, normal, gloss, openness, lit)
-
-
-def light_tissue(
-    lamps: Lamps, points: Tensor, albedo: Tensor, normal: Tensor, gloss: Tensor, openness: Tensor, lit: Tensor,
-    sharpness: float | Tensor = WET_SHARPNESS, wet: float | Tensor = WET,
-) -> Tensor:  # fmt: skip
-    """Colour [M, 3] of wet tissue at points [M, 3] with unit normals [M, 3], camera frame. gloss, openness [M, 1];
-    lit [L, M]: share of each lamp that reaches it; sharpness, wet ([M, 1]): of its highlights."""
     towards_eye = F.normalize(-points, dim=-1)
     color = SKY * albedo * openness
-    for lamp, share in zip(lamps.positions, lit, strict=True):
-        strength, light = _light(lamps, torch.tensor(lamp), points)
+    for lamp, share in zip(place.lamps.positions, lit, strict=True):
+        strength, light = _light(place.lamps, torch.tensor(lamp), points)
         strength = strength * (0.06 + 0.94 * share[:, None])
         facing = (normal * light).sum(-1, keepdim=True)
         diffuse = ((facing + 0.15) / 1.15).clamp_min(0)  # light also comes out beside where it went in
         halfway = F.normalize(light + towards_eye, dim=-1)
-        glint = (normal * halfway).sum(-1, keepdim=True).clamp_min(0) ** sharpness
-        color += strength * openness * (albedo * diffuse + wet * gloss.square() * glint)
+        glint = (normal * halfway).sum(-1, keepdim=True).clamp_min(0) ** WET_SHARPNESS
+        color += strength * openness * (albedo * diffuse + WET * gloss.square() * glint)
     return color
 
 
@@ -242,28 +224,14 @@ def _shade_instrument(place: Place, view: View, points: Tensor, parts: Tensor) -
     local = points @ transform[:3, :3].T + transform[:3, 3]
     normal = tools.normals(place.design, view.opening, local, parts) @ transform[:3, :3]
     tone = 1 + 0.16 * tools.grain(place.design, view.opening, local, parts)[:, None]
-    return light_instrument(place, points, normal, parts, tone, ring=tools.painted(place.design, local, parts))
-
-
-def light_instrument(
-    place: Place, points: Tensor, normal: Tensor, parts: Tensor, tone: Tensor, spread: float | Tensor = 0.0,
-    ring: Tensor | None = None,
-) -> Tensor:  # fmt: skip
-    """Colour [M, 3] of the instrument at points [M, 3] with unit normals [M, 3], camera frame, on the given parts [M].
-
-    tone [M, 1] multiplies the material's colour; spread [M, 1]: variance of the slopes within a pixel; ring bool [M]:
-    painted over.
-    """
+    ring = tools.painted(place.design, local, parts)
     towards_eye = F.normalize(-points, dim=-1)
     shaft, wrist, jaw = (_rows(material) for material in place.design.materials)
     is_shaft, is_wrist = (parts == tools.SHAFT)[:, None], (parts == tools.WRIST)[:, None]
     rows = torch.where(is_shaft, shaft, torch.where(is_wrist, wrist, jaw))
     base, diffuse_share, shine, sharpness = rows[:, :3], rows[:, 3:4], rows[:, 4:5], rows[:, 5:6]
     base = base * tone
-    if ring is not None:
-        base = torch.where(ring[:, None], torch.full_like(base, tools.RING_COLOR), base)
-    if isinstance(spread, Tensor):
-        shine, sharpness = widened(shine, sharpness, spread)
+    base = torch.where(ring[:, None], torch.full_like(base, tools.RING_COLOR), base)
     mirrored = 2 * (normal * towards_eye).sum(-1, keepdim=True) * normal - towards_eye
     if place.design.mirrors:
         seen = _surroundings(place, points, mirrored)
@@ -296,13 +264,6 @@ def _surroundings(place: Place, points: Tensor, mirrored: Tensor) -> Tensor:
     room = torch.tensor([0.9, 0.95, 1.0]) * (0.02 + 0.7 * ceiling)
     share = torch.sigmoid(mirrored[:, 2:] * 12)
     return share * tissue + (1 - share) * room
-
-
-def widened(strength: float | Tensor, sharpness: float | Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
-    """Strength and sharpness [M, 1] of highlights whose normals vary with variance `spread` [M, 1] of their slopes:
-    as much light in a wider highlight (Toksvig, "Mipmapping normal maps", 2005)."""
-    share = 1 / (1 + sharpness * spread)
-    return strength * share, sharpness * share
 
 
 def _rows(material: Material) -> Tensor:

@@ -12,7 +12,7 @@ from rendered.errors import EXACT, ErrorModel
 from rendered.instrument import Blade, Design, Material
 from rendered.motion import Array, Path, look, rigid
 from rendered.render import Lamps
-from rendered.wristed import Encoders, SlidingDesign, WristedDesign
+from rendered.wristed import Encoders, WristedDesign
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,6 @@ class SceneSpec:
     world_shift: tuple[float, float, float]  # … and shift
     errors: ErrorModel = field(default_factory=ErrorModel)
     encoders: Encoders | None = None  # of the wrist, where there is one
-    swapped: bool = False  # whether the wrist's readings go by each other's names
 
     def with_rolling_camera(self) -> SceneSpec:
         """The same scene, filmed as a recording should be: turns about two axes calibrate the tracker on the scope."""
@@ -82,12 +81,6 @@ class SceneSpec:
     def without_errors(self) -> SceneSpec:
         """The same scene, its cameras, poses and readings exact."""
         return replace(self, errors=EXACT)
-
-    @property
-    def reading_names(self) -> tuple[str, ...]:
-        """Of the wrist's joints, as they are logged."""
-        names = self.design.wrist_joints
-        return names[::-1] if self.swapped else names
 
     def world_from_scene(self) -> Array:
         """[4, 4]."""
@@ -197,97 +190,6 @@ SCENES = {
     ),
 }
 
-# The organs again under one lamp, which casts a shadow, each with the other's instrument and its sensor elsewhere.
-SCENES |= {
-    "bowel-grasper": replace(
-        SCENES["bowel"],
-        design=replace(
-            GRASPER,
-            materials=(
-                Material((0.30, 0.31, 0.33), 0.60, 0.50, 24.0),
-                Material((0.36, 0.38, 0.44), 0.45, 0.70, 34.0),
-                Material((0.66, 0.66, 0.68), 0.40, 0.90, 40.0),
-            ),
-        ),
-        lamps=Lamps(((7.0, -5.0, 0.0),), power=1.25, distance=95.0, focus=2.0),
-        path=replace(
-            SCENES["bowel"].path,
-            trocar=(108.0, 64.0, 130.0),
-            opening_train=32 * DEGREE,
-            opening_most=50 * DEGREE,
-            roll_middle=-120 * DEGREE,
-        ),
-        mount=Mount((1.4, 4.6, -17.0), spin=-2.1, tilt=12 * DEGREE, tilt_towards=-1.9),
-        joint=Joint(zero=0.1, sign=1, limits=(0.0, 1.2)),
-        seed=41,
-        words="folded pale small-bowel loops under a single lamp; an 8 mm bright steel shaft with short shining "
-        "grasper jaws of which only one moves",
-        world_turn=(0.4, 1.9, -0.8),
-        world_shift=(130.0, 20.0, -75.0),
-    ),
-    "stomach-scissors": replace(
-        SCENES["stomach"],
-        design=SCISSORS,
-        lamps=Lamps(((-6.0, 4.0, 0.0),), power=1.30, distance=80.0, focus=3.0),
-        path=replace(
-            SCENES["stomach"].path,
-            trocar=(-104.0, 72.0, 128.0),
-            opening_train=48 * DEGREE,
-            opening_most=74 * DEGREE,
-            roll_middle=150 * DEGREE,
-            roll_train=55 * DEGREE,
-            roll_most=95 * DEGREE,
-        ),
-        mount=Mount((-2.4, -3.0, -34.0), spin=0.6, tilt=6 * DEGREE, tilt_towards=-0.4),
-        joint=Joint(zero=-0.15, sign=-1, limits=(-1.7, 0.0)),
-        seed=53,
-        words="smooth reddish stomach wall under a single lamp; a 5 mm black shaft with a gold wrist and long thin "
-        "scissors, curved along the hinge's axis, 64/36 of the opening per blade",
-        world_turn=(-0.7, -2.2, 0.2),
-        world_shift=(-15.0, 88.0, 240.0),
-    ),
-}
-
-# Footage of each instrument over the other organ: made and held as in its recording, moved otherwise, under one lamp.
-SCENES |= {
-    f"{organ}-footage": replace(
-        SCENES[own],
-        organ=organ,
-        lamps=SCENES[held].lamps,
-        mount=SCENES[held].mount,
-        joint=SCENES[held].joint,
-        seed=seed,
-        words=words,
-    )
-    for organ, own, held, seed, words in (
-        (
-            "stomach",
-            "bowel",
-            "stomach-scissors",
-            131,
-            "smooth reddish stomach wall under a single lamp; the bowel's scissors, seen from where they were there",
-        ),
-        (
-            "bowel",
-            "stomach",
-            "bowel-grasper",
-            149,
-            "folded pale small-bowel loops under a single lamp; the stomach's grasper, seen from where it was there",
-        ),
-    )
-}
-
-# The bowel's very instrument, sensor, jaw and scope over the stomach.
-SCENES["stomach-second"] = replace(
-    SCENES["bowel"],
-    organ="stomach",
-    path=SCENES["stomach-scissors"].path,
-    seed=61,
-    words="smooth reddish stomach wall; the bowel's scissors, sensor and scope, moved otherwise",
-    world_turn=(1.2, 0.8, -1.6),
-    world_shift=(40.0, -120.0, 95.0),
-)
-
 # The organs under an instrument with a wrist, as robots carry: pitch, then 9 mm further yaw and two unequal jaws.
 NEEDLE_DRIVER = WristedDesign(
     name="needle_driver",
@@ -364,36 +266,4 @@ SCENES["cloth-wristed"] = replace(
     "an 8 mm black shaft whose mirror-like steel wrist pitches and, 9 mm further, yaws two unequal jaws",
     world_turn=(0.3, 0.7, -1.2),
     world_shift=(25.0, -60.0, 150.0),
-)
-SCENES["bowel-wristed-swapped"] = replace(SCENES["bowel-wristed"], swapped=True)
-
-# A grasper on a rod that slides out of its shaft, as telescoping instruments have it.
-TELESCOPE = SlidingDesign(
-    name="telescope",
-    radius=4.0,
-    hinge=12.0,
-    collar=9.0,
-    wrist_radius=2.9,
-    prong_half_x=(1.7, 2.6),
-    prong_half_y=2.3,
-    pin=1.1,
-    jaws=(
-        Blade(13.0, 1.8, (1.5, 1.1), (1.45, 0.9), 0.0, 1.45, 0.0, 0.4, 0.4),
-        Blade(12.0, 1.8, (1.5, 1.2), (1.35, 0.9), 0.0, -1.35, 0.0, -0.2, 0.4),
-    ),
-    shares=(0.5, 0.5),
-    materials=(
-        Material((0.16, 0.165, 0.18), 0.9, 0.14, 18.0),
-        Material((0.30, 0.33, 0.42), 0.50, 0.35, 30.0),
-        Material((0.62, 0.58, 0.48), 0.46, 0.45, 30.0),
-    ),
-)
-
-SCENES["bowel-sliding"] = replace(
-    SCENES["bowel-wristed"],
-    design=TELESCOPE,
-    path=replace(SCENES["bowel-wristed"].path, wrist_train=(5.0,), wrist_most=(8.0,)),
-    encoders=Encoders((0.8,), 0.3, 0.1),
-    seed=101,
-    words="bowel under an 8 mm grey shaft out of which a rod with two unequal jaws slides",
 )

@@ -6,7 +6,7 @@ Scene frame: right-handed, mm, z away from the tissue towards the camera, the or
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -15,7 +15,6 @@ import torch.nn.functional as F
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from rendered.breathing import Displacement
 from rendered.noise import blur, octaves, ridges, value_noise
 
 HALF_SIZE = 150.0  # mm; beyond, the border repeats
@@ -29,7 +28,6 @@ class Tissue:
 
     height: Tensor  # [R, R] mm, what rays meet
     surface: Tensor  # [8, S, S]: linear albedo r g b, normal x y z (with fine relief), gloss, openness to light
-    displacement: Displacement | None = None  # `height` has moved by it, `surface` shows the tissue at rest
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -48,11 +46,6 @@ class Tissue:
         top = flat[index] * (1 - fu) + flat[index + 1] * fu
         bottom = flat[index + size] * (1 - fu) + flat[index + size + 1] * fu
         return top * (1 - fv) + bottom * fv
-
-    def texels(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Column and row [M] of positions [M] in `height`."""
-        scale = (self.height.shape[0] - 1) / (2 * HALF_SIZE)
-        return (x + HALF_SIZE) * scale, (y + HALF_SIZE) * scale
 
     def intersect(self, origin: Tensor, directions: Tensor) -> Tensor:
         """Distance [M] mm along rays from `origin` [3] with `directions` [M, 3] (any length, z < 0) to the surface."""
@@ -84,25 +77,8 @@ class Tissue:
 
     def look_up(self, points: Tensor) -> Tensor:
         """Surface properties [M, 8] at points [M, 3]; normals are not of unit length."""
-        rest = points[:, :2]
-        if self.displacement is not None:
-            x, y = self.displacement.rest(points[:, 0], points[:, 1])
-            rest = torch.stack([x, y], -1)
-        grid = (rest / HALF_SIZE)[None, None]
-        found = F.grid_sample(self.surface[None], grid, padding_mode="border", align_corners=True)[0, :, 0]
-        if self.displacement is not None:
-            found[3], found[4] = self.displacement.turn(x, y, (found[3], found[4], found[5]))
-        return found.T
-
-    def displaced(self, displacement: Displacement | None) -> Tissue:
-        """The tissue, which is at rest, moved."""
-        if displacement is None:
-            return self
-        axis = torch.linspace(-HALF_SIZE, HALF_SIZE, self.height.shape[0])
-        y, x = torch.meshgrid(axis, axis, indexing="ij")
-        x, y = displacement.rest(x, y)
-        height = self.height_at(x.reshape(-1), y.reshape(-1)).reshape(x.shape) + displacement.at(x, y)[2]
-        return replace(self, height=height, displacement=displacement)
+        grid = (points[:, :2] / HALF_SIZE)[None, None]
+        return F.grid_sample(self.surface[None], grid, padding_mode="border", align_corners=True)[0, :, 0].T
 
 
 def finish(height: Tensor, albedo: Tensor, gloss: Tensor, relief: Tensor) -> Tissue:

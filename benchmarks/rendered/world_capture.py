@@ -33,7 +33,7 @@ from rendered.render import Lens, Place, meet_instrument, view_of
 from rendered.scenes import SceneSpec
 from rendered.truth import World as TrueWorld
 from rendered.truth import truth_document
-from rendered.writing import SEEN, UNSEEN, clearance, recorded
+from rendered.writing import LEAST_GAP_MM, SEEN, UNSEEN, clearance, recorded
 
 TEST, BEYOND = 8, 8  # frames of the splits test and unseen
 LEAST_SHARE, MOST_SHARE = 0.02, 0.30  # of the image that the instrument covers, mean over training frames
@@ -57,7 +57,7 @@ def write_world(world: World, path: Path, workers: int = 1) -> Capture:
         gains[shot.number] = (red, green, blue)
     stereo = world.scope == "stereo"
     settings = Settings(world.lens, still=stereo, stereo=stereo, processor=world.processor, workers=workers)
-    renderer = Renderer.of(spec, settings, path, place, gains)
+    renderer = Renderer(spec, settings, path, place, gains)
     generator = np.random.default_rng((world.seed, 1))
     sampler = PointSampler(len(shots), generator)
     for shot, rendered in zip(shots, render_all(renderer, shots), strict=True):
@@ -67,7 +67,7 @@ def write_world(world: World, path: Path, workers: int = 1) -> Capture:
     if stereo:
         _truth_of_both_eyes(truth)
     write_json(path / "truth" / "transforms.json", truth)
-    capture, _ = recorded(true, trajectory, sampler, path, world.lens, generator)
+    capture = recorded(true, trajectory, sampler, path, world.lens, generator)
     capture = _as_stated(world, spec, capture)
     capture, wrong = _with_state_errors(world, capture)
     if stereo:
@@ -86,13 +86,10 @@ def _visible(world: World, place: Place) -> tuple[SceneSpec, list[Shot], Traject
     spec = world.scene()
     if world.scope != "moving":
         spec = spec.with_still_camera()
-    settings = Settings(world.lens)
     for _ in range(RAISES):
         trajectory = plan(spec.path, spec.design.hinge, SEEN, UNSEEN, spec.seed)
         shots = _shots(world, trajectory)
-        try:
-            clearance(place, settings, spec, shots)
-        except ValueError:
+        if clearance(place, shots) < LEAST_GAP_MM:
             spec = _moved(spec, (0.0, 0.0, RAISE_MM))
             continue
         share = _share(place, shots)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from rendered.instrument import WRIST, Design, rounded
-from rendered.motion import Array, Bend, Extension
+from rendered.motion import Array, Bend
 
 
 @dataclass(frozen=True)
@@ -80,60 +80,11 @@ class WristedDesign(Design):
 
 
 @dataclass(frozen=True)
-class SlidingDesign(Design):
-    """A working end on a rod that slides out of the shaft, as it stands in the middle of its range."""
-
-    wrist_joints: ClassVar[tuple[str, ...]] = ("extension",)
-
-    rod: float = 24.0  # mm of it inside the shaft
-    farthest: float = 9.0  # mm that it slides either way, at most
-
-    @property
-    def reach(self) -> float:
-        """As `Design` has it, however far it slides, with the rod that balls cover."""
-        return max(super().reach + self.farthest, self.hinge + 2 * self.farthest + self.radius)
-
-    def balls(self, joints: Extension) -> tuple[Tensor, Tensor]:
-        """Centres [K, 3] and radii [K] of balls that together hold wrist and jaws."""
-        end = self.hinge + self.prong_half_y
-        middle = torch.zeros(8, 3)
-        middle[:, 2] = torch.linspace(-self.farthest, end, 8)
-        centers, radii = self._jaw_balls(joints.opening)
-        rod = torch.full((8,), (end + self.farthest) / 14 + self.wrist_radius + 1.0)
-        return torch.cat([middle, centers]) + self._shift(joints), torch.cat([rod, radii])
-
-    def distances(self, points: Tensor, joints: Extension) -> Tensor:
-        """Lower bounds [M, 3] mm of the distances of points [M, 3] to wrist, first jaw and second jaw."""
-        return super().distances(points - self._shift(joints), joints.opening)
-
-    def _wrist(self, points: Tensor) -> Tensor:
-        x, y, z = points.unbind(-1)
-        across = (x.square() + y.square()).sqrt()
-        half = (self.collar + self.rod) / 2
-        rod = rounded(torch.stack([across - self.wrist_radius, (z + self.rod - half).abs() - half], -1), 0.3)
-        return torch.minimum(rod, self._prongs(points, self.collar - 1.0))
-
-    def on_link(self, joints: Extension, points: Tensor, parts: Tensor) -> Tensor:
-        """Points [M, 3] on the given parts [M] as they lie in the middle of the range with the jaws closed, from the
-        hinge."""
-        back = torch.where((parts >= WRIST)[:, None], points - self._shift(joints), points)
-        return self.turn_to_link(joints, back - torch.tensor([0.0, 0.0, self.hinge]), parts)
-
-    def turn_to_link(self, joints: Extension, vectors: Tensor, parts: Tensor, sense: int = 1) -> Tensor:
-        """Vectors [M, 3] as they are with the jaws closed; sense -1: the other way round."""
-        return super().turn_to_link(joints.opening, vectors, parts, sense)
-
-    @staticmethod
-    def _shift(joints: Extension) -> Tensor:
-        return torch.tensor([0.0, 0.0, joints.extension])
-
-
-@dataclass(frozen=True)
 class Encoders:
-    """What the encoders of a wrist's joints say: the angle (rad) or length (mm) plus an offset, play that lags behind
+    """What the encoders of a wrist's joints say: the angle (rad) plus an offset, play that lags behind
     the motion, and noise."""
 
-    offsets: tuple[float, ...]
+    offsets: tuple[float, float]
     play: float  # half of it, either way
     noise: float
 

@@ -14,8 +14,7 @@ from typing import ClassVar
 
 import pytest
 import torch
-from device_params import DEVICES, SLOW_ON_CPU
-from viewer_world import grasper_scene, write_recorded_images, write_run
+from device_params import DEVICES
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 KINDS = ("draw", "frame", "draw+backward", "step")
@@ -39,16 +38,6 @@ def script() -> Iterator[ModuleType]:
         sys.modules.pop("gpu", None)
 
 
-@pytest.fixture
-def quick(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """With a copy of a MiB for the peak, and one thread."""
-    torch.set_num_threads(1)
-    measured = script.peaks
-    monkeypatch.setattr(script, "peaks", lambda device: measured(device, 2**18))
-    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-    return script
-
-
 def test_without_a_gpu_it_ends_in_one_line(script: ModuleType, monkeypatch, capsys) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert script.main([]) == 1
@@ -61,30 +50,25 @@ def test_without_a_gpu_it_ends_in_one_line(script: ModuleType, monkeypatch, caps
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_every_backend_and_kind_is_timed(device: str, quick: ModuleType, tmp_path: Path, capsys) -> None:
-    assert quick.main([*SMALL, "--device", device, "--output", str(tmp_path)]) == 0
+def test_every_backend_and_kind_is_timed(device: str, script: ModuleType, tmp_path: Path, monkeypatch, capsys) -> None:
+    torch.set_num_threads(1)
+    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    assert script.main([*SMALL, "--device", device, "--output", str(tmp_path)]) == 0
     result = json.loads((tmp_path / "gpu.json").read_text())
     assert (tmp_path / "gpu.md").read_text() == capsys.readouterr().out
-    assert result["peak"]["bytes"] > 1e8
-    assert result["peak"]["flops"] > 1e8
     assert (result["hardware"]["gpu"] is not None) == (device == "cuda")
     (case,) = result["workloads"]
     assert case["workload"] == {"gaussians": 300, "width": 32, "height": 24}
     for row in case["ms"]:
         assert all(row[kind] > 0 for kind in KINDS)
-    for rows in case["stages"].values():
-        check_stages(rows)
+    for stages in case["stages"].values():
+        check_stages(stages)
     assert bool(case["stages"]) == any("triton" in row["backend"] for row in case["ms"])
 
 
-def check_stages(rows: list[dict]) -> None:
-    assert [row["stage"] for row in rows] == STAGES
-    for row in rows:
-        assert row["ms"] > 0
-        assert row["bytes"] > 300
-        assert row["share"]["bandwidth"] > 0
-        assert (row["flops"] > 0) == ("composite" in row["stage"])
-        assert ("arithmetic" in row["share"]) == ("composite" in row["stage"])
+def check_stages(stages: dict[str, float]) -> None:
+    assert list(stages) == STAGES
+    assert all(milliseconds > 0 for milliseconds in stages.values())
 
 
 @pytest.mark.slow
@@ -98,44 +82,8 @@ def test_stages_are_told_apart(tmp_path: Path) -> None:
     (case,) = json.loads((tmp_path / "gpu.json").read_text())["workloads"]
     assert [row["backend"] for row in case["ms"]] == ["cpu", "triton", "triton, fixed order"]
     assert list(case["stages"]) == ["triton", "triton, fixed order"]
-    for rows in case["stages"].values():
-        check_stages(rows)
-
-
-def test_a_tile_is_walked_until_its_last_pixel_is_full(script: ModuleType) -> None:
-    never = 2**31 - 1
-    full_at = torch.full((3, 6), 4, dtype=torch.int32)  # tiles of 2: two rows of three, the lower ones cut
-    full_at[0, 2] = never
-    full_at[2, 4] = 7
-    starts = torch.tensor([0, 9, 12, 30, 30, 40, 60], dtype=torch.int32)
-    walked = sys.modules["stages"].walked(full_at, starts, 2)
-    assert walked.tolist() == [5, 3, 5, 0, 5, 8]
-
-
-@pytest.mark.parametrize("device", SLOW_ON_CPU)
-def test_training_and_synthesis_are_timed_too(device: str, quick: ModuleType, tmp_path: Path, capsys) -> None:
-    scene = grasper_scene()
-    capture = write_recorded_images(scene, tmp_path / "capture")
-    run = write_run(scene, tmp_path / "run", capture)
-    words = [
-        "--train",
-        str(capture),
-        "--iterations",
-        "4",
-        "--set",
-        "deformation.carving.tissue_steps=5",
-        "--synthesize",
-        str(run),
-        "--count",
-        "3",
-    ]
-    assert quick.main([*SMALL, "--device", device, *words, "--output", str(tmp_path / "out")]) == 0
-    result = json.loads((tmp_path / "out" / "gpu.json").read_text())
-    assert [row["device"] for row in result["train"]] == list(dict.fromkeys((device, "cpu")))
-    assert all(row["seconds"] > 0 and 3 < row["splits"]["test"]["psnr"] < 60 for row in result["train"])
-    assert result["synthesize"]["images"] == 3
-    assert result["synthesize"]["images_per_second"] > 0
-    assert "images/s with all labels, of 3" in capsys.readouterr().out
+    for stages in case["stages"].values():
+        check_stages(stages)
 
 
 class Event:

@@ -27,7 +27,7 @@ def capture(request: pytest.FixtureRequest, benchmarks: ModuleType, tmp_path_fac
 
     path = tmp_path_factory.mktemp(request.param)
     settings = Settings(Lens(WIDTH, HEIGHT, FOCAL), resolution=240, every=50)
-    write_recording(SCENES[request.param], path, settings, lambda line: None)
+    write_recording(SCENES[request.param], path, settings)
     return path
 
 

@@ -1,4 +1,4 @@
-"""A rendered wristed or telescoping instrument stands where its stated links say, in its depth and its masks."""
+"""A rendered wristed instrument stands where its stated links say, in its depth and its masks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FOCAL, WIDTH, HEIGHT = 54.0, 64, 48
 WRIST = 2
 
 
-@pytest.fixture(scope="module", params=["bowel-wristed", "stomach-wristed", "cloth-wristed", "bowel-sliding"])
+@pytest.fixture(scope="module", params=["bowel-wristed", "stomach-wristed", "cloth-wristed"])
 def capture(request: pytest.FixtureRequest, benchmarks: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eleven frames of a scene."""
     from rendered.frames import Settings
@@ -28,14 +28,13 @@ def capture(request: pytest.FixtureRequest, benchmarks: ModuleType, tmp_path_fac
 
     path = tmp_path_factory.mktemp(request.param)
     settings = Settings(Lens(WIDTH, HEIGHT, FOCAL), resolution=240, every=25)
-    write_recording(SCENES[request.param], path, settings, lambda line: None)
+    write_recording(SCENES[request.param], path, settings)
     return path
 
 
 def test_the_capture_records_every_reading(capture: Path) -> None:
     recorded = read_capture(capture)
-    wrist = {"extension"} if "sliding" in capture.name else {"wrist_pitch", "wrist_yaw"}
-    assert set(recorded.instruments[0].joints) == {"jaw_angle"} | wrist
+    assert set(recorded.instruments[0].joints) == {"jaw_angle", "wrist_pitch", "wrist_yaw"}
     assert errors_only(check_capture(capture)) == []
 
 
@@ -50,7 +49,7 @@ def test_what_is_seen_lies_on_the_link_that_it_is_labelled_as(capture: Path) -> 
     spec = SCENES[capture.name.rstrip("0123456789")]
     rotation = spec.mount.mechanical_from_sensor()[:3, :3]
     first, second = (JAW_NAMES[part] for part in truth_ids(spec))
-    start = getattr(spec.design, "pitch_at", 0.0)
+    start = spec.design.pitch_at
     solids = {
         "wrist": lambda points: spec.design._wrist(points + torch.tensor([0.0, 0.0, start])),
         first: spec.design.jaws[0].distance,
@@ -61,7 +60,7 @@ def test_what_is_seen_lies_on_the_link_that_it_is_labelled_as(capture: Path) -> 
     for frame in frames_with_depth(capture):
         points, ids = seen_points(capture, frame)
         joints = dict(frame["instruments"][0]["joints"])
-        for name, offset in zip(spec.reading_names, spec.encoders.offsets, strict=True):
+        for name, offset in zip(spec.design.wrist_joints, spec.encoders.offsets, strict=True):
             joints[name] += offset  # as the encoders read without play and noise
         poses = tree.poses(joints)
         for link, part in parts.items():
@@ -92,7 +91,7 @@ def test_readings_err_by_their_offsets_play_and_noise(capture: Path) -> None:
     spec = SCENES[capture.name.rstrip("0123456789")]
     truth = truth_of(capture)
     recorded = json.loads((capture / "transforms.json").read_text())
-    for name, offset in zip(spec.reading_names, spec.encoders.offsets, strict=True):
+    for name, offset in zip(spec.design.wrist_joints, spec.encoders.offsets, strict=True):
         errors = np.array(
             [
                 ours["instruments"][0]["joints"][name] - theirs["instruments"][0]["joints"][name]
@@ -104,7 +103,7 @@ def test_readings_err_by_their_offsets_play_and_noise(capture: Path) -> None:
         assert errors.std() > 0
 
 
-@pytest.mark.parametrize("scene", ["bowel-wristed", "stomach-wristed", "cloth-wristed", "bowel-sliding"])
+@pytest.mark.parametrize("scene", ["bowel-wristed", "stomach-wristed", "cloth-wristed"])
 def test_the_wrist_goes_beyond_its_training_range_in_unseen_frames_only(benchmarks: ModuleType, scene: str) -> None:
     from rendered.motion import plan
     from rendered.scenes import SCENES
@@ -119,29 +118,6 @@ def test_the_wrist_goes_beyond_its_training_range_in_unseen_frames_only(benchmar
         reached[kind] = max(reached[kind], most)
     assert 0.5 < reached["seen"] <= 1.02  # a spline passes its knots by a little
     assert reached["unseen"] > 1.1
-
-
-def test_swapped_names_hold_each_others_readings(benchmarks: ModuleType) -> None:
-    from rendered.motion import plan
-    from rendered.scenes import SCENES
-    from rendered.writing import _wrist_readings
-
-    found = {}
-    for name in ("bowel-wristed", "bowel-wristed-swapped"):
-        spec = SCENES[name]
-        trajectory = plan(spec.path, spec.design.hinge, 40, 8, spec.seed)
-        moments = [trajectory.at(time) for time in trajectory.times]
-        found[name] = _wrist_readings(spec, moments, np.random.default_rng(0))
-    right, swapped = found.values()
-    assert np.array_equal(right["wrist_pitch"], swapped["wrist_yaw"])
-    assert np.array_equal(right["wrist_yaw"], swapped["wrist_pitch"])
-
-
-def test_the_log_of_a_sliding_rod_is_refused(benchmarks: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as exit:
-        benchmarks.parse(["bowel-sliding", "out", "--video"])
-    assert exit.value.code == 2
-    assert "--video: the log of what slides is not written" in capsys.readouterr().err
 
 
 def test_a_recording_logs_what_the_encoders_say_on_the_robots_clock(benchmarks: ModuleType, tmp_path: Path) -> None:
@@ -162,14 +138,12 @@ def test_a_recording_logs_what_the_encoders_say_on_the_robots_clock(benchmarks: 
 
 
 def test_all_that_casts_a_shadow_lies_within_reach(benchmarks: ModuleType) -> None:
-    from rendered.motion import Bend, Extension
+    from rendered.motion import Bend
     from rendered.scenes import SCENES
 
     bends = [Bend(1.3, pitch, yaw) for pitch, yaw in ((0.0, 0.0), (1.0, 0.9), (-1.0, 0.9), (1.0, -0.9))]
-    slides = [Extension(1.3, extension) for extension in (-8.0, 0.0, 8.0)]
-    for name, joints in (("bowel-wristed", bends), ("bowel-sliding", slides)):
-        design = SCENES[name].design
-        for each in joints:
-            centers, _ = design.balls(each)
-            away = (centers - torch.tensor([0.0, 0.0, design.hinge])).norm(dim=1)
-            assert float(away.max()) < design.reach
+    design = SCENES["bowel-wristed"].design
+    for each in bends:
+        centers, _ = design.balls(each)
+        away = (centers - torch.tensor([0.0, 0.0, design.hinge])).norm(dim=1)
+        assert float(away.max()) < design.reach

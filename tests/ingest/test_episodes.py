@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import yaml
 from ingest.still_world import FRAMES, RATE, Theatre
-from rendered_truth import benchmarks  # noqa: F401
 
 from neeco.capture import Capture, read_capture
 from neeco.capture.checks import inspect_capture

@@ -183,7 +183,7 @@ def test_a_data_sets_columns_say_their_frame(tmp_path):
 
 
 def test_a_plus_transform_to_the_ecm_is_turned_and_one_to_a_tracker_is_not(tmp_path):
-    plus_world = pytest.importorskip("plus_world")
+    plus_world = pytest.importorskip("pluswriter")
     poses = np.tile(np.eye(4), (COUNT, 1, 1))
     poses[:, :3, 3] = ECM
     poses[1, :3, :3] = Rotation.from_rotvec([0, 0, 0.1]).as_matrix()  # it moves

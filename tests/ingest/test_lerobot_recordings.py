@@ -6,7 +6,6 @@ import importlib
 
 import numpy as np
 import pytest
-from rendered_truth import benchmarks  # noqa: F401
 from scipy.spatial.transform import Rotation
 
 from neeco.capture import read_capture
@@ -31,8 +30,8 @@ def written() -> dict[str, bytes]:
 
 
 @pytest.fixture
-def sets(recorded, written, benchmarks):  # noqa: F811
-    module = importlib.import_module("rendered.lerobotsets")
+def sets(recorded, written):
+    module = importlib.import_module("lerobotsets")
     if not written:
         before = set(recorded.folder.rglob("*"))
         module.write_data_sets(recorded.folder, CLOCKS)

@@ -7,7 +7,7 @@ import zlib
 
 import numpy as np
 import pytest
-from plus_world import frame_fields, write_mha, write_nrrd
+from pluswriter import frame_fields, write_mha, write_nrrd
 
 from neeco.errors import NeecoError
 from neeco.ingest.readers import IMAGES, OTHER, POSES, format_of

@@ -22,7 +22,7 @@ POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.0
 BASE_MM, BASE_DEG = 2.0, 1.5  # standard deviations of a base
 SEVERE = 3.0  # times the limit
 MIN_POINTS = 100
-# Of a base's outline with what moves: right bases reach 0.92 to 0.97 (benchmarks/base_calibration.py)
+# Of a base's outline with what moves: right bases reach 0.92 to 0.97 (measured once)
 MIN_OVERLAP, MIN_PLAUSIBLE_OVERLAP = 0.85, 0.7
 MAX_SHOWN = 5  # warnings listed by `lines`
 N_FACTS = 2

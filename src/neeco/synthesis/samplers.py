@@ -75,7 +75,7 @@ class RecordedViews:
     """The camera of a recorded frame, one of the N_SIMILAR with the most similar states.
 
     A camera that follows its instrument observed it there: instruments stand in the image as recorded ones do, which
-    is what a detector learns from (docs/benchmarks.md). states: the recorded frames'; empty: any camera.
+    is what a detector learns from. states: the recorded frames'; empty: any camera.
     """
 
     def __init__(self, cameras: Sequence[Camera], states: Sequence[State] = ()) -> None:

@@ -3,7 +3,7 @@
 Outlines fix that place badly, and masks end where jaws end, which open. Colours along the line, as a first fit has it,
 are the same in all frames but for light. The shift of a frame's profile against all others is the fit's error there.
 Without it, of four bases before the simulated bowel (masks of its images, starts 8 mm and 5 degrees off) none is found
-within tolerance, off by 2.7 mm, with it all, off by 0.3 mm (benchmarks/base_registration.py).
+within tolerance, off by 2.7 mm, with it all, off by 0.3 mm (measured once).
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ LOG_SIZE_RANGE, SIZE_SAMPLES = 0.15, 9  # of the loss about its minimum
 MIN_OVERLAP_RATIO = 0.95  # to the overlap before: less of an instrument fits more easily
 MIN_OVERLAP = 0.25  # of the instrument's silhouette with the masks
 # Standard deviations that more frames do not lower, as wrists and jaws blur the tip: of the logarithm of the size, and
-# of the place along the shaft, which a rigid shape hardly determines (benchmarks/base_calibration.py)
+# of the place along the shaft, which a rigid shape hardly determines (measured once)
 SIZE_SD, ALONG_SD_MM = 0.03, 4.0
 RADIUS_RANGE_MM = (1.5, 5.5)  # of shafts; one outside is first taken to be typical
 LEVER_MM = 40.0  # from the instrument's middle, at which a turn counts as a shift

@@ -8,6 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+from lerobotwriter import Episode, LeRobotWriter
 from scipy.spatial.transform import Rotation
 
 from neeco.files import write_text
@@ -15,7 +16,6 @@ from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
-from rendered.lerobotwriter import Episode, LeRobotWriter
 
 CAMERA, STATE = "observation.images.endoscope.left", "observation.state"
 POSE = (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw"))
