@@ -16,13 +16,13 @@ import hashlib
 import json
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image
-from rendered.bagwriter import BagWriter
 from rendered.draws import SIZES, World, draw_world
 from rendered.world_capture import write_world
 from same_bits import TIMES, files_of, read_fields, read_safetensors
@@ -32,6 +32,9 @@ from world_runs import ROOT, Build, builds_of
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.files import read_json, write_json, write_text
+
+sys.path.append(str(ROOT / "tests"))
+from bagwriter import BagWriter
 
 SEED = 11
 BAG_HZ = 10.0
