@@ -72,6 +72,7 @@ def write_world(world: World, path: Path, workers: int = 1) -> Capture:
     capture, wrong = _with_state_errors(world, capture)
     if stereo:
         capture = _both_eyes(capture, shots, path)
+        wrong |= {f"{RIGHT}{name}": kind for name, kind in wrong.items()}
     if world.links != "none":
         write_json(path / "truth" / "kinematics.json", describe_kinematics(spec))
     if wrong:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,12 +49,16 @@ def test_all_that_can_be_drawn_is_drawn() -> None:
 @pytest.mark.parametrize("seed", [2, 9])  # of a still scope, of a stereo scope
 def test_a_world_is_written_as_a_capture_with_truth(seed: int, tmp_path: Path) -> None:
     torch.set_num_threads(1)
-    world = draw_world(seed)
+    world = replace(draw_world(seed), wrong=0.1)
     write_world(world, tmp_path)
     capture = read_capture(tmp_path)
     eyes = 2 if world.scope == "stereo" else 1
     assert len(capture.split("train")) == world.frames * eyes
     assert not [problem for problem in check_capture(tmp_path) if problem.severity == "error"]
+    wrong = json.loads((tmp_path / "truth" / "outliers.json").read_text())
+    assert wrong.keys() <= {frame.name for frame in capture.split("train")}
+    instants = {frame.state.time for frame in capture.split("train") if frame.name in wrong}
+    assert len(wrong) == eyes * len(instants) > 0  # a state is wrong for all cameras
     for frame in capture.split("test"):
         assert (tmp_path / "truth" / "masks" / f"{frame.name}.png").is_file()
     with pytest.raises(NeecoError, match="already holds a capture"):
