@@ -50,7 +50,8 @@ def contradicting_states(session: GaussianSession) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Misfits:
-    """Misfits of training frames in their present states, infinite where no instrument is in the image; `limit` above
+    """Misfits of training frames in their present states, of several that show one instant of the first, infinite where
+    no instrument is in the image; `limit` above
     which a state is an outlier, `rejection_limit` above which a frame that no other state explains is left out,
     `suspect_limit` above which a state may be wrong."""
 
@@ -62,8 +63,8 @@ class Misfits:
     @classmethod
     def of(cls, search: StateSearch) -> Misfits:
         """Measure them. With few frames, or where half of them would be, there are no outliers."""
-        count = len(search.session.recorded.names)
-        misfits = {index: search.misfit(index, search.state(index)) for index in range(count)}
+        firsts = [frames[0] for frames in search.session.refinement.frames_of_instant]
+        misfits = {index: search.misfit(index, search.state(index)) for index in firsts}
         shown = torch.tensor([misfit for misfit in misfits.values() if math.isfinite(misfit)])
         if len(shown) < MIN_FRAMES:
             return cls(misfits, math.inf, math.inf, math.inf)
@@ -132,7 +133,8 @@ def judge_again(search: StateSearch) -> None:
     misfits = replace(Misfits.of(search), rejection_limit=math.inf)
     judged = {*noted, *(names[index] for index in _suspects(search, misfits))}
     others = _states_of(search, [index for index in range(len(names)) if weights[index] > 0])
-    for index, name in enumerate(names):
+    for index in misfits.of_frame:
+        name = names[index]
         if name in judged:
             starts, own = _other_starts(search, index, others), _own_fit(search, index, 1.0)
             if search.linked:
@@ -195,7 +197,8 @@ def _judge(
         recorded = given if own is None else own.state
         session.refinement.set_state(index, given, recorded, search.deviations(index, scale))
         del session.scene.diagnostics[CONTRADICTING][name]
-    session.refinement.weights[index] = float(contradicting_states(session).get(name) != LEFT_OUT)
+    instant = session.refinement.frames_of_instant[session.refinement.instants[index]]
+    session.refinement.weights[instant] = float(contradicting_states(session).get(name) != LEFT_OUT)
 
 
 def _own_fit(search: StateSearch, index: int, scale: float) -> StateFit | None:

@@ -31,19 +31,21 @@ LARGE = 0.22  # times usual errors of a robot, from which on errors are larger t
 SCALE = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
 
 
+def _corrects_states(session: GaussianSession) -> bool:
+    """Return whether there are states, and they are corrected."""
+    return bool(session.scene.instruments) and session.config.refine.frame_poses
+
+
 def _fits_states(session: GaussianSession) -> bool:
     """Return whether states are corrected, and one camera shows each instant: gradients of several cameras' images
     determine an instant's state better than each image does."""
-    corrected = bool(session.scene.instruments) and session.config.refine.frame_poses
-    return corrected and all(len(frames) == 1 for frames in session.refinement.frames_of_instant)
+    return _corrects_states(session) and all(len(frames) == 1 for frames in session.refinement.frames_of_instant)
 
 
 @torch.no_grad()
 def judge_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Size the errors of the states of all training frames, and search for those that are wrong altogether."""
-    if not _fits_states(session):
-        size_states(session, articulated)
-    elif STATE_ERRORS not in session.scene.diagnostics:
+    if _corrects_states(session) and STATE_ERRORS not in session.scene.diagnostics:
         search = StateSearch.of(session, articulated)
         misfits = Misfits.of(search)
         large = size_errors(search, misfits.outliers)
@@ -53,8 +55,7 @@ def judge_states(session: GaussianSession, articulated: ArticulatedInstruments) 
 @torch.no_grad()
 def size_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Size the errors of the states of all training frames, where they were not found large before."""
-    corrected = session.scene.instruments and session.config.refine.frame_poses
-    if corrected and STATE_ERRORS not in session.scene.diagnostics:
+    if _corrects_states(session) and STATE_ERRORS not in session.scene.diagnostics:
         size_errors(StateSearch.of(session, articulated), ())
 
 
@@ -62,7 +63,7 @@ def size_states(session: GaussianSession, articulated: ArticulatedInstruments) -
 def judge_states_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Search again for wrong states, where errors are large or some states were found wrong before."""
     suspected = STATE_ERRORS in session.scene.diagnostics or contradicting_states(session)
-    if _fits_states(session) and suspected:
+    if _corrects_states(session) and suspected:
         judge_again(StateSearch.of(session, articulated))
 
 
