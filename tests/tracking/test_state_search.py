@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -57,11 +58,17 @@ def with_errors(states: Sequence[State], scale: float) -> list[State]:
     return wrong
 
 
-def session_of(root: Path, states: Sequence[State]) -> GaussianSession:
-    """A session whose scene is learned, over images in the TRUE states that are recorded as `states`."""
+def session_of(root: Path, states: Sequence[State], cameras: int = 1) -> GaussianSession:
+    """A session whose scene is learned, over images in the TRUE states that are recorded as `states`; of so many
+    cameras, which stand at one place."""
     scene = world.make_scene()
     capture = world.record(scene, root, TRUE, "train")
     frames = tuple(replace(f, state=state) for f, state in zip(capture.frames, states, strict=True))
+    for number in range(1, cameras):
+        others = [f.image_path.with_name(f"right{number}_{f.image_path.name}") for f in capture.frames]
+        for frame, other in zip(capture.frames, others, strict=True):
+            shutil.copy(frame.image_path, other)
+        frames += tuple(replace(f, image_path=other) for f, other in zip(frames, others, strict=False))
     scene.recorded = Recorded.of(frames, scene.instruments)
     return new_session(scene, TrainingViews.read(frames, 1.0), method_defaults("kinematic"))
 
@@ -141,6 +148,29 @@ def test_a_wrong_state_contradicts_the_others_and_is_found_from_one_of_theirs(tm
     assert session.scene.diagnostics[CONTRADICTING] == {"000003": "fitted anew"}
     found = session.refinement.state(3, states[3])
     assert session.refinement.layout.increments_between(TRUE[3], found)[3:6].norm() < 0.7
+
+
+def test_a_wrong_state_is_found_by_the_first_of_two_cameras_and_corrected_for_both(tmp_path: Path) -> None:
+    states = list(TRUE)
+    states[3] = replace(TRUE[10], time=TRUE[3].time)
+    session, count = session_of(tmp_path, states, cameras=2), len(TRUE)
+    assert session.refinement.frames_of_instant == [[k, count + k] for k in range(count)]
+    search = search_of(session)
+    refit_outliers(search, LARGE, Misfits.of(search))
+    assert session.scene.diagnostics[CONTRADICTING] == {"000003": "fitted anew"}
+    for index in (3, count + 3):
+        found = session.refinement.state(index, states[3])
+        assert session.refinement.layout.increments_between(TRUE[3], found)[3:6].norm() < 0.7
+
+
+def test_an_instant_that_no_state_explains_is_left_out_with_all_its_images(tmp_path: Path) -> None:
+    session, count = session_of(tmp_path, TRUE, cameras=2), len(TRUE)
+    frame = session.full_views.frames[5]
+    world.write_image(frame.image_path, torch.rand(64, 96, 3, generator=torch.Generator().manual_seed(0)))
+    search = search_of(session)
+    refit_outliers(search, LARGE, Misfits.of(search))
+    assert session.scene.diagnostics[CONTRADICTING] == {"000005": "left out"}
+    assert (session.refinement.weights == 0).nonzero().flatten().tolist() == [5, count + 5]
 
 
 def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
