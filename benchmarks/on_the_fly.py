@@ -71,7 +71,7 @@ def samples_per_second(images: Dataset[Any], batch: int, workers: int) -> tuple[
 
 def measure_loading(args: OnTheFly, dataset: Path) -> list[dict[str, Any]]:
     """A row per source of images and number of workers."""
-    sources = {"on the fly": neeco.LabelledImages(args.run, args.count), "from disk": neeco.StoredImages(dataset)}
+    sources = {"on the fly": neeco.LabelledImages(args.run, args.count)}
     rows = []
     for source, images in sources.items():
         for workers in args.workers:

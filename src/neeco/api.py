@@ -305,7 +305,7 @@ def synthesize(
     are doubtful (see `load`), and where every state is refused.
 
         made = neeco.synthesize("runs/sample", "dataset-4", 4, states="extrapolate")
-        images = neeco.StoredImages(made.output)
+        print(made.images, made.refused)
     """
     chosen = Settings.from_values("synthesize", count=count, **settings)
     report = progress or _silent
