@@ -191,11 +191,11 @@ def test_errors_name_arguments_in_python_and_options_on_the_command_line(
             "density__prune_interval: 'x' is not a",
         ),
         (lambda: neeco.train(SAMPLE, output, batch_size=2, method="nerfies"), "use deformation__rays=NUMBER"),
-        (lambda: neeco.synthesize(run, output, 1, max_attempts=0), "max_attempts: 0 leaves no attempt"),
+        (lambda: neeco.synthesize(run, output, 1, max_attempts=0), "max_attempts: 0 is out of range"),
         (lambda: neeco.synthesize(run, output, 1, tries=1), "tries: synthesize has no such field; it has size, scale"),
         (lambda: neeco.ingest(output=output), "video: give the video"),
         (lambda: neeco.track(run, folder / "footage", output, min_trust=2), "min_trust: 2 is not a share"),
-        (lambda: neeco.sample_states(run, 1, margin=-1), "margin: -1 is not a share"),
+        (lambda: neeco.sample_states(run, 1, margin=-1), "margin: -1 is out of range"),
     ]
     for call, message in wrong:
         with pytest.raises(neeco.NeecoError, match=r"^(?!.*--)") as caught:

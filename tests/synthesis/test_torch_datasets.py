@@ -179,7 +179,7 @@ def test_indices_and_settings_out_of_range_are_refused(run, rod_images):
     with pytest.raises(IndexError):
         rod_images[COUNT]
     for wrong, message in (
-        ({"seed": -1}, "^seed: -1 is negative"),
+        ({"seed": -1}, "^seed: -1 is out of range; give 0 or more"),
         ({"sed": 1}, "^sed: LabelledImages has no such field"),
         ({"states": "nowhere.jsonl"}, "nowhere.jsonl: no such file"),
     ):
