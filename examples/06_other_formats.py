@@ -1,4 +1,4 @@
-"""Write a data set in other formats, and read it back as PyTorch tensors.
+"""Write a data set in other formats, and read it back.
 
     python examples/06_other_formats.py RUN --output dataset
 
@@ -11,7 +11,6 @@ import argparse
 import json
 from pathlib import Path
 
-import neeco
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 from neeco.training.run import load_run
@@ -21,10 +20,8 @@ def main(run: Path, output: Path, count: int) -> None:
     synthesize(load_run(run), output, Settings(count=count), formats=("coco", "yolo", "bop", "imagefolder"))
     coco = json.loads((output / "coco" / "instances.json").read_text())
     print(f"COCO: {len(coco['images'])} images, {len(coco['annotations'])} annotations")
-    stored = neeco.StoredImages(output, split="train")
-    sample = stored[0]
-    print(f"{len(stored)} training images; the first shows {[stored.classes[k - 1] for k in sample['labels']]}")
-    print({key: tuple(value.shape) for key, value in sample.items() if hasattr(value, "shape")})
+    lines = [json.loads(line) for line in (output / "states.jsonl").read_text().splitlines()]
+    print(f"{len(lines)} images; the first shows {[label['name'] for label in lines[0]['labels'] if label['area']]}")
 
 
 if __name__ == "__main__":

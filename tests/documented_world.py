@@ -276,7 +276,7 @@ RECORDINGS = {
 }
 CAPTURES = {"CAPTURE", "my-capture", "another-capture", "OTHER", "FIRST", "SECOND", "liver", "captures/liver"}
 CAPTURES |= {"samples/liver-mini", "psm1", "TRUTH"}
-RUNS = {"RUN", "run", "better/run", "tracked/run"}
+RUNS = {"RUN", "RUN2", "run", "better/run", "tracked/run"}
 RUNS |= {f"runs/{name}" for name in ("mine", "liver", "stomach", "bowel", "sample", "other")}
 IMAGES = {"PLATES", "FRAMES", "frames-without-instrument", "frames"}
 MASKS = {"rendered/test", "sam2/masks", "masks/sam2", "masks/hand", "PREDICTED"}

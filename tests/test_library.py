@@ -125,12 +125,9 @@ def test_the_table_of_arguments_of_a_name_has_every_argument(name: str) -> None:
     """`Run` is made by functions only."""
     value = getattr(neeco, name)
     arguments = [key for key in inspect.signature(value).parameters if key != "self"]
-    shared = [*inspect.signature(neeco.LabelledImages).parameters] if name == "LabelledStream" else []
     section = SECTION.search(inspect.getdoc(value) or "")
     assert section is not None, name
-    assert [key for key in re.findall(r"^    (\w+):", section[0], re.MULTILINE)] == [
-        key for key in arguments if key not in shared
-    ]
+    assert re.findall(r"^    (\w+):", section[0], re.MULTILINE) == arguments
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/getting-started.md"])
@@ -157,12 +154,6 @@ def test_python_of_the_first_pages_runs_as_written(page: str, folder: Path, monk
     assert images[1]["image"].shape[0] == 3
 
 
-def test_a_loader_without_our_collate_function_is_told_of_it(folder: Path) -> None:
-    images = neeco.StoredImages(folder / "dataset")
-    with pytest.raises(neeco.NeecoError, match=r"give collate_fn=neeco\.LabelledImages"):
-        next(iter(torch.utils.data.DataLoader(images, batch_size=2)))
-
-
 def test_what_a_notebook_shows_of_an_object_is_one_short_line(folder: Path) -> None:
     run = neeco.load(folder / "runs" / "sample")
     (state, camera), capture = run.scene.recorded[0], run.capture
@@ -173,7 +164,7 @@ def test_what_a_notebook_shows_of_an_object_is_one_short_line(folder: Path) -> N
         run.scene.draw(state, camera),
         run.scene.draw(state, camera, False),
     ]
-    objects += [neeco.LabelledImages(run, 3), neeco.LabelledStream(run), neeco.StoredImages(folder / "dataset")]
+    objects += [neeco.LabelledImages(run, 3)]
     for shown in map(repr, objects):
         assert len(shown) < 120 + len(str(folder))
         assert "\n" not in shown
@@ -200,11 +191,11 @@ def test_errors_name_arguments_in_python_and_options_on_the_command_line(
             "density__prune_interval: 'x' is not a",
         ),
         (lambda: neeco.train(SAMPLE, output, batch_size=2, method="nerfies"), "use deformation__rays=NUMBER"),
-        (lambda: neeco.synthesize(run, output, 1, max_attempts=0), "max_attempts: 0 leaves no attempt"),
+        (lambda: neeco.synthesize(run, output, 1, max_attempts=0), "max_attempts: 0 is out of range"),
         (lambda: neeco.synthesize(run, output, 1, tries=1), "tries: synthesize has no such field; it has size, scale"),
         (lambda: neeco.ingest(output=output), "video: give the video"),
         (lambda: neeco.track(run, folder / "footage", output, min_trust=2), "min_trust: 2 is not a share"),
-        (lambda: neeco.sample_states(run, 1, margin=-1), "margin: -1 is not a share"),
+        (lambda: neeco.sample_states(run, 1, margin=-1), "margin: -1 is out of range"),
     ]
     for call, message in wrong:
         with pytest.raises(neeco.NeecoError, match=r"^(?!.*--)") as caught:

@@ -121,7 +121,7 @@ def test_no_scene_is_seen_through_normalised_intrinsics_or_from_nowhere(scene):
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ({"count": 0}, "count: 0 images"),
+        ({"count": 0}, "count: 0 is out of range"),
         ({"count": 2.5}, "count: 2.5 is not a whole number"),
         ({"count": math.nan}, "count: nan is not a whole number"),
         ({"margin": math.nan}, "margin: nan"),

@@ -14,18 +14,16 @@ if TYPE_CHECKING:
     from neeco.api import Run, Scene, check, ingest, load, synthesize, track, train
     from neeco.capture import Camera, State, read_capture
     from neeco.errors import NeecoError
-    from neeco.synthesis.torch_datasets import LabelledImages, LabelledStream, StoredImages, sample_states
+    from neeco.synthesis.torch_datasets import LabelledImages, sample_states
 
 __version__ = "0.3.0"
 __all__ = [
     "Camera",
     "LabelledImages",
-    "LabelledStream",
     "NeecoError",
     "Run",
     "Scene",
     "State",
-    "StoredImages",
     "check",
     "ingest",
     "load",
@@ -40,7 +38,7 @@ _MODULES = {
     "neeco.api": ("Run", "Scene", "check", "ingest", "load", "synthesize", "track", "train"),
     "neeco.capture": ("Camera", "State", "read_capture"),
     "neeco.errors": ("NeecoError",),
-    "neeco.synthesis.torch_datasets": ("LabelledImages", "LabelledStream", "StoredImages", "sample_states"),
+    "neeco.synthesis.torch_datasets": ("LabelledImages", "sample_states"),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 

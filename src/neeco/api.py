@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-from neeco.capture import Camera, Capture, Problem, State, check_capture
+from neeco.capture import Camera, Capture, Problem, State, check_capture, read_capture
 from neeco.capture.model import Instrument
 from neeco.errors import NeecoError, naming_arguments
 from neeco.evaluation.evaluate import evaluate_run
@@ -305,7 +305,7 @@ def synthesize(
     are doubtful (see `load`), and where every state is refused.
 
         made = neeco.synthesize("runs/sample", "dataset-4", 4, states="extrapolate")
-        images = neeco.StoredImages(made.output)
+        print(made.images, made.refused)
     """
     chosen = Settings.from_values("synthesize", count=count, **settings)
     report = progress or _silent
@@ -332,7 +332,7 @@ def track(
     output: PathLike,
     *,
     start: Literal["first", "none"] = "none",
-    tissue: Literal["run", "footage"] | None = None,
+    tissue: Run | PathLike = "run",
     min_trust: float = 0.5,
     resume: bool = False,
     device: str = "auto",
@@ -344,11 +344,11 @@ def track(
 
     Args:
         run: a run of method kinematic, or its folder
-        footage: a capture with cameras, whose states are not read, or a video file, whose cameras are found first
+        footage: a capture with cameras, whose states are not read
         output: capture folder to write
         start: "first" where the first frame's state is roughly known
-        tissue: "run" where the footage shows the run's tissue with cameras in its world, "footage" for any other;
-            None: as a capture or a video mostly is
+        tissue: "run" where the footage shows the run's tissue with cameras in its world; a run of method 3dgs that
+            learned the footage's tissue, or its folder, for any other
         min_trust: the least confidence in [0, 1] of a frame that is written
         resume: continue interrupted work in `output`
         device: where a run given as a folder is opened (see `Scene`)
@@ -362,26 +362,29 @@ def track(
         tracked = neeco.track("runs/sample", "footage", "tracked", start="first")
         print(tracked.verdict, tracked.written, len(neeco.read_capture(tracked.output).frames))
     """
-    from neeco.ingest.footage_video import read_footage
     from neeco.report.track_page import write_track_page
-    from neeco.tracking.track import track_footage
+    from neeco.tracking.track import LEARN_TISSUE, track_footage
 
     output, report = Path(output), progress or _silent
-    is_video = Path(footage).is_file()
-    if is_video and tissue == "run":
-        raise NeecoError(f"--tissue: run: {footage} is a video, whose cameras are in no run's world; leave it out")
+    if Path(footage).is_file():
+        raise NeecoError(
+            f"{footage}: a file; track takes a capture: `neeco ingest --video {footage} --output FOOTAGE`, "
+            f"{LEARN_TISSUE}"
+        )
+    if tissue == "footage" and not Path(tissue, runs.CONFIG_FILE).exists():
+        raise NeecoError(f"--tissue: footage: tissue is learned by a run of its own: {LEARN_TISSUE}")
     opened = _opened(run, device, force).gaussians("track")
+    ground = None if tissue == "run" else _opened(tissue, device, force).gaussians("track")
     with opened.scene.torch_threads():
         tracked = track_footage(
             opened,
-            read_footage(Path(footage), output, opened.scene, resume, report),
+            read_capture(Path(footage)),
             output,
             start=start,
-            tissue=tissue or ("footage" if is_video else "run"),
+            tissue=ground,
             min_trust=min_trust,
             resume=resume,
             on_progress=lambda done, total: report("track", done, total),
-            on_stage=report,
         )
         write_track_page(tracked)
     tracked.require_trusted()

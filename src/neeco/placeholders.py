@@ -1,34 +1,15 @@
-"""Recognition of what is in a file's place: pipes and devices, and what clones and downloads leave there."""
+"""Recognition of what is in a file's place: pipes, devices and Git LFS pointers."""
 
 from __future__ import annotations
 
-import os
-import re
 from pathlib import Path
 
-HEAD_BYTES = 1024  # read of a file to recognise what was stored in its place; Git LFS pointers are shorter
-_XML = rb"\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*"
-_ENDLESS = "is not a file but a pipe, socket or device; write what it holds into a file, and give that"
-_LFS = "is a Git LFS pointer, not the file; run `git lfs pull`"
-_ANNEX = "is a git-annex pointer, not the file; run `git annex get`"
-_MAC = "is macOS metadata (AppleDouble), not the file; give the file without `._`"
-_PAGE = "is a web page, not the file; download the file again (does it need a login?)"
-_ANSWER = "is a server's error message, not the file; download the file again"
-_DICOM = "is DICOM; take its video out by pydicom: next(generate_frames(dataset.PixelData, number_of_frames=1))"
-_PLACEHOLDERS = (
-    (rb".{128}DICM", _DICOM),
-    (rb"version https://(?:git-lfs|hawser)\.github\.com/spec/", _LFS),
-    (rb"[./\\][\w./\\-]*annex[/\\]objects[/\\]\S+\s*\Z", _ANNEX),
-    (rb"\0\x05\x16[\0\x07]\0", _MAC),
-    (_XML + rb"<(?:!doctype\s+html|html[\s>])", _PAGE),
-    (_XML + rb"<Error>\s*<Code>|(?:404: Not Found|Entry not found|Access to \S+ \S+ is restricted\b.*)\s*\Z", _ANSWER),
-)  # what clones and downloads leave in a file's place: how it begins, and what to do
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # how it begins
 _KINDS = {
     "recording.yaml": ("a recording, ", "`neeco ingest` makes a capture of it, for `neeco train`"),
     "config.yaml": ("a run, ", "its config.yaml names its capture"),
     "transforms.json": ("a capture, ", "`neeco train` makes a run of it"),
 }  # of folders, by a file that they hold
-PLACEHOLDERS = [(re.compile(start, re.DOTALL | re.IGNORECASE), problem) for start, problem in _PLACEHOLDERS]
 
 
 def read_head(path: Path, count: int) -> bytes:
@@ -43,17 +24,16 @@ def read_head(path: Path, count: int) -> bytes:
 
 
 def placeholder(path: Path) -> str | None:
-    """Name what is in a file's place, and the remedy: a pipe, a socket or a device, whose reading may not end, or what
-    a clone or a download left (a Git LFS or git-annex pointer, a web page); None for a file, a folder, or nothing."""
+    """Name what is in a file's place, and the remedy: a pipe, a socket or a device, whose reading may not end, or a Git
+    LFS pointer; None for a file, a folder, or nothing."""
     try:
-        if path.is_symlink() and not path.exists():
-            return _ANNEX if "annex/objects/" in os.readlink(path).replace("\\", "/") else None
         if path.exists() and not path.is_file() and not path.is_dir():
-            return _ENDLESS
+            return "is not a file but a pipe, socket or device; write what it holds into a file, and give that"
     except (OSError, ValueError):
         return None  # the reader says why
-    head = read_head(path, HEAD_BYTES).removeprefix(b"\xef\xbb\xbf")
-    return next((problem for start, problem in PLACEHOLDERS if start.match(head)), None)
+    if read_head(path, len(LFS_POINTER)) == LFS_POINTER:
+        return "is a Git LFS pointer, not the file; run `git lfs pull`"
+    return None
 
 
 def misplaced(path: Path, wanted: str, content: str = "") -> tuple[str, str]:

@@ -378,7 +378,7 @@ def test_an_option_of_several_values_without_one_is_refused(
 
 
 @pytest.mark.parametrize("words", [["evaluate", "run"], ["score-masks", "drawn", "true"], ["check", "capture"]])
-def test_numbers_go_to_no_file_without_the_ending_json(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main([*words, "--json=ev"]) == 1
-    told = "--json: ev has no ending; name a file that ends in .json, or none, to print the numbers"
+def test_numbers_go_to_no_folder(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*words, "--json", str(tmp_path)]) == 1
+    told = f"--json: {tmp_path}: is a folder; name a file, or none, to print the numbers"
     assert capsys.readouterr().err == f"neeco: error: {told}\n"

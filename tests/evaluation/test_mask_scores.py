@@ -309,10 +309,10 @@ def test_palettes_and_grey_saved_as_colour_are_read_plainly(tmp_path):
 @pytest.mark.parametrize(
     ("pixels", "mode", "told"),
     [
-        (np.random.default_rng(0).integers(0, 255, (4, 4, 3)), "RGB", "colour image"),
-        (np.full((4, 4), 7), "L", "id 7 is neither"),
+        (np.random.default_rng(0).integers(0, 255, (4, 4, 3)), "RGB", "must be an opaque 8-bit PNG"),
+        (np.full((4, 4), 7), "L", "id 7 is not among 1 shaft"),
         (np.full((4, 5), 255), "L", "mask is 5x4, its truth is 4x4"),
-        (np.dstack([np.full((4, 4, 3), 255), np.full((4, 4), 100)]), "RGBA", "transparent"),
+        (np.dstack([np.full((4, 4, 3), 255), np.full((4, 4), 100)]), "RGBA", "must be an opaque 8-bit PNG"),
     ],
 )
 def test_what_cannot_be_read_plainly_is_refused(tmp_path, pixels, mode, told):
@@ -325,7 +325,7 @@ def test_what_cannot_be_read_plainly_is_refused(tmp_path, pixels, mode, told):
 
 def test_jpeg_under_another_name_and_damaged_files_are_refused(tmp_path):
     Image.new("L", (4, 4)).save(tmp_path / "a.png", format="JPEG")
-    with pytest.raises(NeecoError, match="must be PNG, this is JPEG"):
+    with pytest.raises(NeecoError, match=r"must be an opaque 8-bit PNG.*JPEG"):
         read_ids(tmp_path / "a.png")
     (tmp_path / "b.png").write_bytes(b"no image")
     with pytest.raises(NeecoError, match=r"b\.png: not an image file"):

@@ -219,13 +219,6 @@ def test_one_image_that_is_missing_or_of_another_size_is_left_out_and_shifts_no_
     np.testing.assert_allclose(video.times, np.arange(7) / 10)
 
 
-def test_dicom_is_called_what_it_is(tmp_path):
-    path = tmp_path / "v.dcm"
-    path.write_bytes(bytes(128) + b"DICM" + bytes(200))
-    with pytest.raises(NeecoError, match=r"v\.dcm: is DICOM; take its video out by pydicom"):
-        open_video(path)
-
-
 def grey_film(path, codec="libx264", first_stamp=0, **options):
     """A film of 30 frames; the grey level of frame i is 10 + 7 i."""
     av = pytest.importorskip("av")

@@ -16,8 +16,7 @@ import torch
 from PIL import Image
 from rod_world import CAMERA, FakeRun, make_scene, rod_state
 
-from neeco import StoredImages
-from neeco.capture.images import write_image
+from neeco.capture.images import read_image, read_labels, write_image
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.cli import main
 from neeco.errors import NeecoError
@@ -291,18 +290,22 @@ def test_recorded_images_and_labels_are_written_as_large_as_asked_and_through_th
     monkeypatch.setattr(few.scene, "recorded", replace(few.scene.recorded, lens=lens))
     annotate_capture(few, tmp_path / "large", images=ImageSettings(scale=2.0, image_format="jpg"), formats=())
     annotate_capture(few, tmp_path / "bent", images=ImageSettings(lens=True), formats=())
-    large, bent = (StoredImages(tmp_path / name)[0] for name in ("large", "bent"))
+    pixels = read_image(tmp_path / "large/images/000000.jpg").permute(2, 0, 1)
+    bent = read_image(tmp_path / "bent/images/000000.png").permute(2, 0, 1)
+    large_parts, parts, ignore = (
+        read_labels(tmp_path / name / "000000.png") for name in ("large/parts", "bent/parts", "bent/ignore")
+    )
     recorded_image = few.recording.frames[0].load_image().permute(2, 0, 1)
-    shrunk = torch.nn.functional.avg_pool2d(large["image"], 2)
+    shrunk = torch.nn.functional.avg_pool2d(pixels, 2)
     assert float((shrunk - recorded_image).abs().mean()) < 0.02
-    assert large["parts"].shape == (96, 128)
+    assert large_parts.shape == (96, 128)
     # the pinhole saw less than the lens does: what it left out, no label speaks of
-    black = bent["image"].sum(0) == 0
+    black = bent.sum(0) == 0
     assert 0.05 < float(black.float().mean()) < 0.5
-    assert (bent["parts"][black] == 0).all()
+    assert (parts[black] == 0).all()
     rows, columns = np.mgrid[0:48, 0:64] + 0.5
     away = torch.from_numpy(np.hypot(columns - 32, rows - 24))
-    assert bent["ignore"][black & (away < 30)].all()
-    assert not bent["ignore"][away > 32].any()  # nothing is there in the recording either
-    seen, straight = bent["image"][:, bent["parts"] > 0], recorded_image[:, large["parts"][::2, ::2] > 0]
+    assert (ignore[black & (away < 30)] == 255).all()
+    assert not ignore[away > 32].any()  # nothing is there in the recording either
+    seen, straight = bent[:, parts > 0], recorded_image[:, large_parts[::2, ::2] > 0]
     assert float((seen.mean(1) - straight.mean(1)).abs().max()) < 0.1

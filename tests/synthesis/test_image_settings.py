@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 import neeco
+from neeco.capture.images import read_image, read_labels
 from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.labels.annotation import annotate, draw_labelled
@@ -88,13 +89,11 @@ def test_everything_in_a_data_set_agrees_with_its_size_and_format(run, tmp_path)
     )
     assert "--size 128x96 --image-format jpg" in (output / "README.md").read_text()
     assert "images/*.jpg" not in (output / "README.md").read_text()  # imagefolder comes first
-    stored, drawn = (
-        neeco.StoredImages(output)[0],
-        neeco.LabelledImages(run.scene, 2, seed=3, scale=2.0, tissue_tolerance_mm=2.0)[0],
-    )
-    assert stored["image"].shape == (3, 96, 128)
-    assert float((stored["image"] - drawn["image"]).abs().mean()) < 0.02
-    assert torch.equal(stored["parts"], drawn["parts"])
+    drawn = neeco.LabelledImages(run.scene, 2, seed=3, scale=2.0, tissue_tolerance_mm=2.0)[0]
+    stored = read_image(output / "images/000000.jpg")
+    assert stored.shape == (96, 128, 3)
+    assert float((stored.permute(2, 0, 1) - drawn["image"]).abs().mean()) < 0.02
+    assert torch.equal(read_labels(output / "parts/000000.png"), drawn["parts"])
     for other in ({"scale": None}, {"scale": 3.0}, {"image_format": "png"}, {"quality": 50}):
         with pytest.raises(NeecoError, match=r"settings\.(size|quality): begun with"):
             synthesize(run, output, replace(settings, **other), FORMATS, resume=True)
@@ -138,14 +137,13 @@ def _maps_of(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
 def test_a_data_set_drawn_through_the_lens_says_so(lens_scene, run, tmp_path):
     output = tmp_path / "dataset"
     synthesize(run, output, replace(SETTINGS, lens=True), ("coco",))
-    sample = neeco.StoredImages(output)[0]
-    assert sample["camera"].distortion == LENS.distortion
-    assert sample["camera"].border == LENS.border
+    assert json.loads((output / "states.jsonl").read_text().splitlines()[0])["intrinsics"] == LENS.intrinsics_json()
+    planes = {name: read_labels(output / name / "000000.png") for name in ("parts", "masks")}
     rows, columns = np.mgrid[0:48, 0:64] + 0.5
     outside = torch.from_numpy(np.hypot(columns - 32, rows - 24) > 30)
-    assert (sample["image"][:, outside] == 0).all()
-    assert (sample["parts"][outside] == 0).all()
-    assert (sample["depth"][outside] == 0).all()
+    assert (read_image(output / "images/000000.png")[outside] == 0).all()
+    assert all((plane[outside] == 0).all() for plane in planes.values())
+    assert (np.asarray(Image.open(output / "depth/000000.png"))[outside] == 0).all()
     assert "--lens" in (output / "README.md").read_text()
     with pytest.raises(NeecoError, match=r"--formats: bop knows no distortion"):
         synthesize(run, tmp_path / "bop", replace(SETTINGS, lens=True), ("bop",))

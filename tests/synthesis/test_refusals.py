@@ -161,7 +161,7 @@ def test_a_given_state_with_its_own_camera_is_tried_once_and_not_counted_as_draw
 def test_more_images_than_names_have_digits_for_are_refused_at_once(run, tmp_path, capsys):
     words = ["synthesize", str(run.path), "--output", str(tmp_path / "dataset"), "--count", "9999999999999"]
     assert main(words) == 1
-    assert "--count: 9999999999999 is more than 1,000,000" in capsys.readouterr().err
+    assert "--count: 9999999999999 is out of range; give 1 to 1,000,000" in capsys.readouterr().err
     words = ["render", str(run.path), "--video", str(tmp_path / "a.mp4"), "--frames", "9999999999999"]
     assert main(words) == 1
     assert "--frames: 9999999999999 is no path" in capsys.readouterr().err

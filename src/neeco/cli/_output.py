@@ -156,9 +156,8 @@ def ready_for_json(path: Path | None) -> Iterator[None]:
     """
     file = None if path == STANDARD_OUTPUT else path
     if file is not None:
-        if file.is_dir() or not file.suffix:  # more likely a word that is not of --json
-            problem = "is a folder" if file.is_dir() else "has no ending"
-            raise NeecoError(f"--json: {file} {problem}; name a file that ends in .json, or none, to print the numbers")
+        if file.is_dir():
+            raise NeecoError(f"--json: {file}: is a folder; name a file, or none, to print the numbers")
         require_ending("--json", file, ".json")
         require_replaceable(file)
     with nullcontext() if file is None else new_folder(file.parent):

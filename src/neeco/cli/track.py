@@ -19,16 +19,14 @@ class Arguments:
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote, by method kinematic."""
     footage: tyro.conf.Positional[Path]
-    """Capture with cameras, whose states are not read, or a video file; its cameras are found first, as by
-    `neeco ingest`."""
+    """Capture with cameras, whose states are not read."""
     output: Path
     """Capture folder to write; must be empty or absent unless --resume."""
     start: Literal["first", "none"] = "none"
     """first: the footage states the first frame's states roughly. none: nothing is known."""
-    tissue: Literal["run", "footage"] | None = None
-    """run: the footage shows the run's tissue, its cameras in the run's world. footage: any tissue, cameras in any
-    world; it is learned from the footage first, and OUTPUT/run becomes a run of the instruments over it. Default: run
-    for a capture, footage for a video."""
+    tissue: str = "run"
+    """run: the footage shows the run's tissue, its cameras in the run's world. The path of a run of method 3dgs that
+    learned the footage's tissue, where that is another; OUTPUT/run becomes a run of the instruments over it."""
     min_trust: float = 0.5
     """Frames trusted less are left out of the capture: 0 to 1. With --resume another value chooses anew."""
     resume: bool = False

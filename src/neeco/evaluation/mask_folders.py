@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from torch import Tensor
 
 from neeco.capture.checks.truth import MASK_FOLDERS, REFERENCE_FOLDER, USUAL_NAMES, stated_names
@@ -49,16 +48,12 @@ def load_reference(capture: Capture, frame: Frame) -> ReferenceMask | None:
 
     None when the capture has neither. Raises NeecoError when the file is damaged or of another size than the frame.
     """
-    file = truth_file(capture.root, frame.name)
-    return None if file is None else _read_reference(file, frame)
-
-
-def _read_reference(file: Path, frame: Frame) -> ReferenceMask:
-    """Read the `truth_file` of a frame: part ids (0 tissue; `truth_names`), or a mask."""
-    size = frame.camera.width, frame.camera.height
+    file, size = truth_file(capture.root, frame.name), (frame.camera.width, frame.camera.height)
+    if file is None:
+        return None
     if file.parent.name == REFERENCE_FOLDER:
         return ReferenceMask(read_mask(file, size), None)
-    parts = read_labels(file, size)
+    parts = read_labels(file, size)  # 0 tissue; `truth_names`
     return ReferenceMask(parts > 0, parts)
 
 
@@ -70,13 +65,14 @@ class Masks:
     files: Mapping[str, Path]
     names: Mapping[int, str] | None
     notes: tuple[str, ...] = ()
-    frames: Mapping[str, Frame] = field(default_factory=dict)  # of a capture's truth: whose pixels may be ignored
+    capture: Capture | None = None  # whose truth they are
+    frames: Mapping[str, Frame] = field(default_factory=dict)  # of the capture: whose pixels may be ignored
 
     def load(self, name: str) -> np.ndarray:
         """Return the ids [H, W] uint8 of the image of that name; 0 is tissue. Raises NeecoError."""
-        if name not in self.frames:
+        reference = load_reference(self.capture, self.frames[name]) if self.capture is not None else None
+        if reference is None:
             return read_ids(self.files[name])
-        reference = _read_reference(self.files[name], self.frames[name])
         return (reference.mask if reference.parts is None else reference.parts).numpy().astype(np.uint8)
 
     def counted(self, name: str) -> np.ndarray | None:
@@ -99,27 +95,21 @@ def parse_classes(words: Sequence[str], option: str) -> dict[int, str] | None:
 
 
 def read_ids(path: Path) -> np.ndarray:
-    """Read a mask as uint8 [H, W]: grey values, or a palette's indices (black and white palettes: 0 and 255).
-
-    Raises NeecoError for colours, transparency, more than 8 bits, and other files than PNG.
-    """
+    """Read a mask as uint8 [H, W]: grey values, or a palette's indices (black and white palettes: 0 and 255). Raises
+    NeecoError for anything but an opaque PNG of 8 bits without colours."""
     image = open_image(path)
-    if image.format != "PNG":
-        raise NeecoError(f"{path}: a mask must be PNG, this is {image.format}, which alters values; save it as PNG")
-    pixels = np.array(image)
-    if image.mode in ("1", "L"):
-        return pixels.astype(np.uint8) * (255 if image.mode == "1" else 1)
-    if image.mode == "P":
-        return _palette_ids(image, pixels)
-    if image.mode not in ("LA", "RGB", "RGBA"):
-        raise NeecoError(f"{path}: image mode {image.mode} is no mask; save 8-bit grey or palette PNG")
-    if image.mode.endswith("A"):
-        if pixels[..., -1].min(initial=255) < 255:
-            raise NeecoError(f"{path}: a mask must not be transparent; save it as grey PNG")
-        pixels = pixels[..., :-1]
-    if not (pixels == pixels[..., :1]).all():
-        raise NeecoError(f"{path}: a colour image: which part is which colour? save ids as grey or palette PNG")
-    return np.ascontiguousarray(pixels[..., 0])
+    if image.format == "PNG" and image.mode in ("1", "L", "P", "LA", "RGB", "RGBA"):
+        colors = np.asarray(image.convert("RGBA"))
+        grey = colors[..., 0]
+        is_grey = bool((colors[..., :3] == grey[..., None]).all())
+        if image.mode == "P" and not (is_grey and np.isin(grey, (0, 255)).all()):
+            return np.array(image)
+        if is_grey and (image.mode == "P" or (colors[..., 3] == 255).all()):
+            return np.ascontiguousarray(grey)
+    raise NeecoError(
+        f"{path}: a mask must be an opaque 8-bit PNG, grey or with a palette; this is {image.format}, {image.mode}: "
+        "save its ids as that"
+    )
 
 
 def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str = "--classes") -> Masks:
@@ -138,14 +128,24 @@ def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str
         files = {name.removesuffix(suffix): file for name, file in pictures.items() if name.endswith(suffix)}
         if files:
             break
-    if suffix == MASK_SUFFIX and classes is None:
-        _check_ids(files, {255}, "0 and 255", option)
-        return Masks(path, files, None)
-    names = classes if classes is not None else stated_names(path)
-    if names is None:
-        return _guessed(path, files, suffix == "", option)
-    _check_ids(files, set(names), ", ".join(f"{number} {part}" for number, part in names.items()), option)
-    return Masks(path, files, names)
+    found = {file: set(np.unique(read_ids(file)).tolist()) - {0} for file in files.values()}
+    ids = set().union(*found.values())
+    notes: tuple[str, ...] = ()
+    names = classes if classes is not None or suffix == MASK_SUFFIX else stated_names(path)
+    known = {255: "instrument"} if suffix == MASK_SUFFIX else USUAL_NAMES
+    if names is not None:
+        known = names
+    elif not suffix and ids in ({1}, {255}):
+        known = dict.fromkeys(ids, "instrument")
+        if ids == {1}:
+            notes = (f"{path}: its ids are 0 and 1: read as a mask of the instrument; name parts with {option}",)
+    elif suffix != MASK_SUFFIX:
+        names = USUAL_NAMES
+    for file, values in found.items():
+        if unknown := sorted(values - set(known)):
+            meaning = ", ".join(f"{number} {part}" for number, part in known.items())
+            raise NeecoError(f"{file}: id {unknown[0]} is not among {meaning}; name it with {option} PART={unknown[0]}")
+    return Masks(path, files, names, notes)
 
 
 def read_truth(path: Path) -> Capture | Path:
@@ -187,40 +187,4 @@ def open_truth(
     if classes is not None and not parts:
         what = f"{path / REFERENCE_FOLDER} tell the instrument, no parts"
         raise NeecoError(f"--truth-classes: {what}; leave --truth-classes out")
-    return Masks(path, files, (classes or truth_names(path)) if parts else None, frames=masked)
-
-
-def _palette_ids(image: Image.Image, ids: np.ndarray) -> np.ndarray:
-    palette = np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
-    used = np.unique(ids)
-    if used.max() >= len(palette):
-        return ids
-    colours = palette[used]
-    black_and_white = np.isin(colours, (0, 255)).all() and (colours == colours[:, :1]).all()
-    return palette[ids][..., 0] if black_and_white else ids
-
-
-def _found_ids(file: Path) -> set[int]:
-    return set(np.flatnonzero(np.bincount(read_ids(file).reshape(-1), minlength=256)).tolist()) - {0}
-
-
-def _check_ids(files: Mapping[str, Path], known: set[int], meaning: str, option: str) -> None:
-    for file in files.values():
-        if unknown := sorted(_found_ids(file) - known):
-            raise NeecoError(f"{file}: id {unknown[0]} is not among {meaning}; name it with {option} PART={unknown[0]}")
-
-
-def _guessed(path: Path, files: Mapping[str, Path], plain: bool, option: str) -> Masks:
-    """Return the masks with names for unnamed ids, guessed from the values in the whole folder."""
-    found = {name: _found_ids(file) for name, file in files.items()}
-    ids = set().union(*found.values())
-    if plain and ids == {255}:
-        return Masks(path, files, None)
-    if plain and ids == {1}:
-        note = f"{path}: its ids are 0 and 1: read as a mask of the instrument; name parts with {option}"
-        return Masks(path, files, None, (note,))
-    if strange := sorted(ids - set(USUAL_NAMES)):
-        name = next(name for name, values in found.items() if strange[0] in values)
-        what = f"id {strange[0]} is neither a mask's 255 nor a part's 1 to 4"
-        raise NeecoError(f"{files[name]}: {what}; say what ids mean, {option} PART={strange[0]} …")
-    return Masks(path, files, USUAL_NAMES)
+    return Masks(path, files, (classes or truth_names(path)) if parts else None, capture=truth, frames=masked)

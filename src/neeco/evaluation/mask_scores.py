@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,34 +32,13 @@ INSTRUMENT = "instrument"
 Tables = Mapping[str, np.ndarray]  # bool [256] by region: which ids belong to it
 
 
-@dataclass(frozen=True)
-class Regions:
-    """The compared regions: the instrument, the classes that both sides have, and each left-right pair as one."""
-
-    classes: tuple[str, ...]  # without overlap; Challenge IoU is over these
-    missing: tuple[str, ...]  # of `classes`, those that the prediction does not name
-    predicted: Tables
-    truth: Tables
-
-    @property
-    def pairs(self) -> dict[str, tuple[str, str]]:
-        return pairs_of(self.classes)
-
-
-@dataclass(frozen=True)
-class _Image:
+class _Image(NamedTuple):
     """One image: overlaps by (predicted region, true region), boxes by region."""
 
     name: str
     overlaps: dict[tuple[str, str], dict[str, float]]
     predicted_boxes: dict[str, np.ndarray]
     true_boxes: dict[str, np.ndarray]
-
-    def iou(self, region: str, swap: Mapping[str, str]) -> float:
-        return self.overlaps[swap.get(region, region), region]["iou"]
-
-    def shows(self, region: str) -> bool:
-        return len(self.true_boxes[region]) > 0
 
 
 def score_masks(
@@ -93,14 +71,15 @@ def score_masks(
     if not set(given.files) & set(wanted.files):
         names = f"{next(iter(given.files))!r} and {next(iter(wanted.files))!r}"
         raise NeecoError(f"{predicted}: no mask is named like one of {wanted.path} (such as {names}); rename the files")
-    regions, reason = _shared_regions(given, wanted)
+    classes_of, notes = _shared_classes(given, wanted)
+    tables = tuple(_tables(names) for names in classes_of)
     images = []
     for index, name in enumerate(sorted(wanted.files)):
-        images.append(_score_image(name, given, wanted, regions, components))
+        images.append(_score_image(name, given, wanted, tables, components))
         if progress is not None:
             progress(index + 1, len(wanted.files))
-    result = _summary(images, regions)
-    notes = [*([reason] if reason else []), *result.pop("notes"), *given.notes, *wanted.notes]
+    result = _summary(images, *classes_of)
+    notes += [*result.pop("notes"), *given.notes, *wanted.notes]
     missing, extra = sorted(set(wanted.files) - set(given.files)), sorted(set(given.files) - everything)
     if missing:
         notes.append(f"{len(missing)} of {len(images)} images have no prediction and count as empty")
@@ -133,48 +112,44 @@ def _predicted_splits(predicted: Masks, truth: Masks) -> list[str]:
     return found or _splits(truth.frames.values())
 
 
-def _shared_regions(predicted: Masks, truth: Masks) -> tuple[Regions, str | None]:
-    """Return the regions in which two folders can be compared, and why they have no parts, if so.
-
-    Where either side has one name for a pair (jaws), the other's two become one.
-    """
+def _shared_classes(predicted: Masks, truth: Masks) -> tuple[tuple[dict[int, str], dict[int, str]], list[str]]:
+    """Return the parts by id, of the prediction and of the truth, in which two folders can be compared, and a note
+    where there are none. Where either side has one name for a pair (jaws), the other's two become one."""
     ours, theirs = dict(predicted.names or {}), dict(truth.names or {})
     either = {*ours.values(), *theirs.values()}
     merged = {part: pair for pair, both in pairs_of(sorted(either)).items() if pair in either for part in both}
-    ours, theirs = ({number: merged.get(part, part) for number, part in names.items()} for names in (ours, theirs))
-    classes = list(dict.fromkeys(theirs[number] for number in sorted(theirs)))
-    reason = None
+    ours, theirs = (
+        {number: merged.get(names[number], names[number]) for number in sorted(names)} for names in (ours, theirs)
+    )
     if sides := [str(masks.path) for masks in (predicted, truth) if masks.names is None]:
-        reason = f"parts: null, {' and '.join(sides)} tell instrument from tissue only"
-    elif not set(classes) & set(ours.values()):
-        named = ", ".join(sorted(set(ours.values())))
-        reason = f"parts: null, the prediction names {named}, the truth {', '.join(classes)}"
-    if reason is not None:
-        classes = []
-    missing = tuple(part for part in classes if part not in ours.values())
-    return Regions(tuple(classes), missing, _tables(ours, classes), _tables(theirs, classes)), reason
+        return ({}, {}), [f"parts: null, {' and '.join(sides)} tell instrument from tissue only"]
+    if not set(theirs.values()) & set(ours.values()):
+        named = [", ".join(dict.fromkeys(names.values())) for names in (ours, theirs)]
+        return ({}, {}), [f"parts: null, the prediction names {named[0]}, the truth {named[1]}"]
+    return (ours, theirs), []
 
 
-def _tables(names: Mapping[int, str], classes: Sequence[str]) -> Tables:
+def _tables(names: Mapping[int, str]) -> Tables:
+    """Return the compared regions: the instrument, its parts, and each left-right pair as one."""
     tables = {INSTRUMENT: np.arange(256) > 0}
-    for part in classes:
+    for part in dict.fromkeys(names.values()):
         tables[part] = np.isin(np.arange(256), [number for number, name in names.items() if name == part])
-    for pair, (left, right) in pairs_of(classes).items():
+    for pair, (left, right) in pairs_of(names.values()).items():
         tables[pair] = tables[left] | tables[right]
     return tables
 
 
-def _score_image(name: str, predicted: Masks, truth: Masks, regions: Regions, components: bool) -> _Image:
+def _score_image(name: str, predicted: Masks, truth: Masks, tables: Sequence[Tables], components: bool) -> _Image:
     ids, counted = truth.load(name), truth.counted(name)
     guess = predicted.load(name) if name in predicted.files else np.zeros_like(ids)
     if guess.shape != ids.shape:
         found, wanted = (f"{image.shape[1]}x{image.shape[0]}" for image in (guess, ids))
         raise NeecoError(f"{predicted.files[name]}: size: mask is {found}, its truth is {wanted}; resize it (nearest)")
-    guesses = {region: table[guess] for region, table in regions.predicted.items()}
-    truths = {region: table[ids] for region, table in regions.truth.items()}
+    truths = {region: table[ids] for region, table in tables[1].items()}
+    guesses = {region: tables[0].get(region, np.zeros(256, bool))[guess] for region in truths}
     everywhere = True if counted is None else counted
     pairs = [(region, region) for region in truths]
-    pairs += [way for left, right in regions.pairs.values() for way in ((left, right), (right, left))]
+    pairs += [way for left, right in pairs_of(truths).values() for way in ((left, right), (right, left))]
     return _Image(
         name,
         {(ours, theirs): _overlap(guesses[ours], truths[theirs], counted) for ours, theirs in pairs},
@@ -190,29 +165,39 @@ def _overlap(mask: np.ndarray, truth: np.ndarray, counted: np.ndarray | None) ->
     return {"iou": overlap, "dice": dice(mask, truth, counted), "boundary_f": contours}
 
 
-def _summary(images: Sequence[_Image], regions: Regions) -> dict[str, Any]:
+def _summary(images: Sequence[_Image], predicted: Mapping[int, str], truth: Mapping[int, str]) -> dict[str, Any]:
     """Return numbers per region, pairs assigned as fits the whole folder better (see `mask_metrics.PartTally`)."""
+    classes = tuple(dict.fromkeys(truth.values()))  # without overlap; Challenge IoU is over these
 
     def mean_iou(ours: str, theirs: str) -> float:
         return mean_of([image.overlaps[ours, theirs]["iou"] for image in images])
 
-    swap, assignment = assigned_pairs(regions.pairs, mean_iou)
-    numbers = {region: _region_numbers(images, region, swap) for region in regions.truth}
+    def challenge(regions: Sequence[str]) -> tuple[float, float]:
+        """Challenge IoU, and the IoU that also counts regions only predicted (see `score_masks`)."""
+        rows = [{part: image.overlaps[swap.get(part, part), part]["iou"] for part in regions} for image in images]
+        shown = [[part for part in regions if len(image.true_boxes[part])] for image in images]
+        in_truth = [mean_of([row[part] for part in parts]) for row, parts in zip(rows, shown, strict=True)]
+        return mean_of(in_truth), mean_of([mean_of(list(row.values())) for row in rows])
+
+    swap, assignment = assigned_pairs(pairs_of(classes), mean_iou)
+    numbers: dict[str, dict[str, Any]] = {}
     notes = []
-    for part in regions.missing:
-        numbers[part] = dict.fromkeys((*SCORES, "images"))
-        notes.append(f"{part}: null, the prediction has no such part; it counts as not found in Challenge IoU")
+    for region in images[0].true_boxes:
+        numbers[region] = _region_numbers(images, region, swap)
+        if region in classes and region not in predicted.values():
+            numbers[region] = dict.fromkeys((*SCORES, "images"))
+            notes.append(f"{region}: null, the prediction has no such part; it counts as not found in Challenge IoU")
     if unnamed := [part for part, value in numbers.items() if value["images"] == 0]:
         notes.append(f"{', '.join(unnamed)}: null, no image shows it")
-    instrument = numbers.pop(INSTRUMENT) | {"challenge_iou": _challenge(images, (INSTRUMENT,), {})[0]}
+    instrument = numbers.pop(INSTRUMENT) | {"challenge_iou": challenge((INSTRUMENT,))[0]}
     overall = None
-    if regions.classes:
-        challenge, isinet = _challenge(images, regions.classes, swap)
-        class_iou = mean_of([mean_iou(swap.get(part, part), part) for part in regions.classes])
-        overall = {"challenge_iou": challenge, "isinet_iou": isinet, "mean_class_iou": class_iou}
+    if classes:
+        in_truth, in_either = challenge(classes)
+        class_iou = mean_of([mean_iou(swap.get(part, part), part) for part in classes])
+        overall = {"challenge_iou": in_truth, "isinet_iou": in_either, "mean_class_iou": class_iou}
     return {
         INSTRUMENT: instrument,
-        "parts": numbers if regions.classes else None,
+        "parts": numbers if classes else None,
         "classes": overall,
         "pair_assignment": assignment,
         "per_image": [{"name": image.name} | image.overlaps[INSTRUMENT, INSTRUMENT] for image in images],
@@ -223,15 +208,10 @@ def _summary(images: Sequence[_Image], regions: Regions) -> dict[str, Any]:
 def _region_numbers(images: Sequence[_Image], region: str, swap: Mapping[str, str]) -> dict[str, Any]:
     source = swap.get(region, region)
     rows = [image.overlaps[source, region] for image in images]
-    numbers: dict[str, Any] = {key: mean_of([row[key] for row in rows]) for key in OVERLAPS}
     boxes = [image.predicted_boxes[source] for image in images], [image.true_boxes[region] for image in images]
-    numbers["box_ap"] = average_precision(*boxes)
-    numbers["box_ap50"] = average_precision(*boxes, thresholds=(0.5,))
-    return numbers | {"images": sum(not math.isnan(row["iou"]) for row in rows)}
-
-
-def _challenge(images: Sequence[_Image], classes: Sequence[str], swap: Mapping[str, str]) -> tuple[float, float]:
-    """Return Challenge IoU, and the IoU that also counts classes only predicted (see `score_masks`)."""
-    in_truth = [mean_of([image.iou(part, swap) for part in classes if image.shows(part)]) for image in images]
-    in_either = [mean_of([image.iou(part, swap) for part in classes]) for image in images]
-    return mean_of(in_truth), mean_of(in_either)
+    return {
+        **{key: mean_of([row[key] for row in rows]) for key in OVERLAPS},
+        "box_ap": average_precision(*boxes),
+        "box_ap50": average_precision(*boxes, thresholds=(0.5,)),
+        "images": sum(not math.isnan(row["iou"]) for row in rows),
+    }

@@ -336,39 +336,6 @@ class LabelledImage(RGBDImage):
         return f"LabelledImage({self.image.shape[1]}x{self.image.shape[0]} px, {names})"
 
     @classmethod
-    def of(
-        cls,
-        *,
-        image: Tensor,
-        depth: Tensor,
-        parts: Tensor,
-        ignore: Tensor,
-        labels: Sequence[Mapping[str, Any]],
-        part_names: tuple[tuple[str, str], ...],
-        keypoint_names: tuple[str, ...],
-    ) -> LabelledImage:
-        """Make one from pixels and the `labels` of a data set's record (`InstrumentLabel.to_json`)."""
-        visible = [label for label in labels if label["area"] > 0]
-        ids = {name: [k + 1 for k, (owner, _) in enumerate(part_names) if owner == name] for name, _ in part_names}
-        masks = [torch.from_numpy(shows_any(parts.numpy(), ids[label["name"]])) for label in visible]
-        boxes = [(x, y, x + width, y + height) for x, y, width, height in (label["box"] for label in visible)]
-        keypoints = [[label["keypoints"].get(name, (0, 0, 0)) for name in keypoint_names] for label in visible]
-        count = len(visible)
-        return cls(
-            image=image.float(),
-            depth=depth.float(),
-            parts=parts,
-            ignore=ignore,
-            instruments=tuple(label["name"] for label in visible),
-            masks=torch.stack(masks) if masks else torch.zeros((0, *parts.shape), dtype=torch.bool),
-            boxes=torch.tensor(boxes, dtype=torch.float32).reshape(count, 4),
-            keypoints=torch.tensor(keypoints, dtype=torch.float32).reshape(count, len(keypoint_names), 3),
-            poses=torch.tensor([label["camera_from_instrument"] for label in visible]).float().reshape(count, 4, 4),
-            part_names=part_names,
-            keypoint_names=keypoint_names,
-        )
-
-    @classmethod
     def from_drawing(
         cls,
         drawing: LayeredDrawing,
@@ -377,21 +344,22 @@ class LabelledImage(RGBDImage):
         keypoint_names: tuple[str, ...],
     ) -> LabelledImage:
         """Make one from a rendering and the `labels` that `annotate` finds in it."""
-        return cls.of(
-            image=drawing.image,
-            depth=torch.from_numpy(drawing.depth),
-            parts=drawing.parts,
+        visible = [label for label in labels if label.mask.any()]
+        parts, count = drawing.parts, len(visible)
+        boxes = [(x, y, x + width, y + height) for x, y, width, height in (bounding_box(one.mask) for one in visible)]
+        keypoints = [[label.keypoints.get(name, (0, 0, 0)) for name in keypoint_names] for label in visible]
+        masks = [torch.from_numpy(label.mask) for label in visible]
+        poses = np.array([label.camera_from_instrument for label in visible])
+        return cls(
+            image=drawing.image.float(),
+            depth=torch.from_numpy(drawing.depth).float(),
+            parts=parts,
             ignore=drawing.ignored,
-            labels=[
-                {
-                    "name": label.name,
-                    "area": int(label.mask.sum()),
-                    "box": bounding_box(label.mask),
-                    "keypoints": label.keypoints,
-                    "camera_from_instrument": label.camera_from_instrument,
-                }
-                for label in labels
-            ],
+            instruments=tuple(label.name for label in visible),
+            masks=torch.stack(masks) if masks else torch.zeros((0, *parts.shape), dtype=torch.bool),
+            boxes=torch.tensor(boxes, dtype=torch.float32).reshape(count, 4),
+            keypoints=torch.tensor(keypoints, dtype=torch.float32).reshape(count, len(keypoint_names), 3),
+            poses=torch.from_numpy(poses).float().reshape(count, 4, 4),
             part_names=part_names,
             keypoint_names=keypoint_names,
         )

@@ -72,7 +72,7 @@ class Mixture:
             raise NeecoError("--tissue: a run remembers no recorded frame; train it again with this version")
         gains = tuple(_gain(tissue, scene) for scene in instrument_scenes)
         mixture = cls(
-            scene=_merged(tissue, instrument_scenes, gains),
+            scene=merged_scene(tissue, instrument_scenes, gains),
             tissue=tissue,
             instrument_scenes=tuple(instrument_scenes),
             gains=gains,
@@ -198,17 +198,23 @@ def tissue_depth(tissue: Gaussians, camera: Camera, point: np.ndarray) -> float:
     return float(surface_depth(rendering)[row, column])
 
 
-def _merged(
-    tissue: GaussianScene, instrument_scenes: Sequence[GaussianScene], gains: Sequence[tuple[float, float, float]]
+def merged_scene(
+    tissue: GaussianScene,
+    instrument_scenes: Sequence[GaussianScene],
+    gains: Sequence[tuple[float, float, float]] | None = None,
 ) -> GaussianScene:
-    """Build one scene of the tissue of `tissue` and the instruments of `instrument_scenes`."""
+    """Return one scene of the tissue of `tissue` and the instruments of `instrument_scenes`, which share a method.
+
+    gains: by which the colours of each instrument scene are multiplied; None: they stay as they are.
+    """
+    method, combined = instrument_scenes[0].method, instrument_scenes[0].deformation.combined
     instruments = tuple(instrument for scene in instrument_scenes for instrument in scene.instruments)
-    deformation = tissue.deformation.combined([scene.deformation for scene in instrument_scenes])
+    deformation = combined([scene.deformation for scene in instrument_scenes])
     bodies = [_body(tissue, 0, deformation)]
-    for scene, gain in zip(instrument_scenes, gains, strict=True):
+    for scene, gain in zip(instrument_scenes, gains or [(1.0, 1.0, 1.0)] * len(instrument_scenes), strict=True):
         bodies += [_brightened(_body(scene, k + 1, deformation), gain) for k in range(len(scene.instruments))]
     mixed = GaussianScene(
-        tissue.method, join_bodies(bodies), deformation, instruments, tissue.recorded, tissue.center.detach().clone()
+        method, join_bodies(bodies), deformation, instruments, tissue.recorded, tissue.center.detach().clone()
     ).to(tissue.center.device)
     with torch.no_grad():
         own_light = tissue.falloff[1] if len(tissue.canonical.counts) > 1 else tissue.falloff[0]
@@ -224,8 +230,9 @@ def _body(scene: GaussianScene, index: int, deformation: Deformation) -> Canonic
     """Return one body alone, with the extras of the mixed scene's `deformation` and its visibility."""
     canonical, rows = scene.canonical, scene.canonical.body(index)
     seen = scene.visibility()[rows]
-    extras = deformation.fit_extras({name: tensor[rows] for name, tensor in canonical.extras.items()})
     alone = dataclasses.replace(canonical, extras={}).map(lambda tensor: tensor[rows], (len(seen),))
+    own = {name: tensor[rows] for name, tensor in canonical.extras.items()}
+    extras = deformation.fit_extras(deformation.initial_extras(alone) | own)
     return alone.with_extras(**extras, **{VISIBILITY: seen})
 
 

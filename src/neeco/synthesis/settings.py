@@ -129,6 +129,17 @@ def formats_help() -> str:
     return f"Index files in addition to the plain images, masks, parts and depth: {', '.join(format_names())}."
 
 
+RANGES = {  # of settings: smallest and largest value
+    "count": (1, MAX_IMAGES),
+    "seed": (0, math.inf),
+    "margin": (0, math.inf),
+    "label_threshold": (0.001, 0.999),
+    "min_component": (0, 0.999),
+    "tissue_tolerance_mm": (0, math.inf),
+    "min_share": (0, 1),
+    "max_unobserved": (0, 1),
+    "max_attempts": (1, math.inf),
+}
 RECORDED_SIZE, AS_RECORDED = SizeSettings(), ImageSettings()
 
 
@@ -197,28 +208,11 @@ class Settings(ImageSettings):
                 raise NeecoError(f"--{option}: {number} is not a whole number; give one")
         if self.views not in get_args(Views):
             raise NeecoError(f"--views: {self.views!r} is none; give one of {', '.join(get_args(Views))}")
-        if not 0 <= self.margin < math.inf:
-            raise NeecoError(f"--margin: {self.margin} is not a share of the recorded range; give 0 or more")
-        if not 0 <= self.min_share <= 1:
-            raise NeecoError(f"--min-share: {self.min_share} is not a share; give 0 to 1")
-        if self.count < 1:
-            raise NeecoError(f"--count: {self.count} images is nothing to make; give at least 1")
-        if self.count > MAX_IMAGES:
-            raise NeecoError(
-                f"--count: {self.count} is more than {MAX_IMAGES:,}; make several data sets, each with --seed"
-            )
-        if self.seed < 0:
-            raise NeecoError(f"--seed: {self.seed} is negative; give 0 or more")
-        if self.max_attempts < 1:
-            raise NeecoError(f"--max-attempts: {self.max_attempts} leaves no attempt; give at least 1")
-        if self.label_threshold is not None and not 0 < self.label_threshold < 1:
-            raise NeecoError(f"--label-threshold: {self.label_threshold} is not between 0 and 1")
-        if self.tissue_tolerance_mm is not None and not self.tissue_tolerance_mm >= 0:
-            raise NeecoError(f"--tissue-tolerance-mm: {self.tissue_tolerance_mm} is negative; give 0 or more")
-        if not 0 <= self.max_unobserved <= 1:
-            raise NeecoError(f"--max-unobserved: {self.max_unobserved} is not a share; give 0 to 1")
-        if not 0 <= self.min_component < 1:
-            raise NeecoError(f"--min-component: {self.min_component} is not a share; give 0 or more and less than 1")
+        for name, (low, high) in RANGES.items():
+            value = getattr(self, name)
+            if value is not None and not (low <= value <= high and math.isfinite(value)):
+                limits = f"{low:,g} or more" if math.isinf(high) else f"{low:,g} to {high:,}"
+                raise NeecoError(f"--{name.replace('_', '-')}: {value} is out of range; give {limits}")
 
     def image_folders(self) -> dict[str, str | None]:
         """Return the folders of images of another operation, by setting."""

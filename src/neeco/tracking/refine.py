@@ -84,8 +84,8 @@ def _tracked_frames(path: Path, scene: GaussianScene) -> list[Frame]:
     """Return the frames of a tracked capture, to train on. Raises NeecoError where they do not fit the scene."""
     capture = read_capture(path)
     info = read_json(path / INFO) if (path / INFO).exists() else {}
-    if isinstance(info, dict) and info.get("tissue") == "footage":
-        raise NeecoError(f"{path / INFO}: tissue: is the footage's, in a world of its own; train on {path} by itself")
+    if isinstance(info, dict) and info.get("tissue", "run") != "run":
+        raise NeecoError(f"{path / INFO}: tissue: another run's, in a world of its own; train on {path} by itself")
     known = {item.name: set(item.joints) for item in scene.instruments}
     for frame in capture.frames:
         given = {name: set(state.joints) for name, state in frame.state.instruments.items()}

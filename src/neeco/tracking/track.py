@@ -24,12 +24,11 @@ from neeco.capture.model import Capture, Frame, InstrumentState, State
 from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
-from neeco.files import LOCK, own_folder, read_begun, read_json, require_same, write_json
+from neeco.files import own_folder, read_begun, read_json, require_same, write_json
 from neeco.scene import Recorded
-from neeco.scene.io import load_gaussians, save_scene
+from neeco.scene.io import save_scene
+from neeco.synthesis.mixing import merged_scene
 from neeco.tracking.follow import SEARCH_ROLLS_EVERY, Follower, Step
-from neeco.tracking.footage_scene import adapted, over_tissue
-from neeco.tracking.footage_tissue import Progress, learn_again, learn_tissue
 from neeco.tracking.parameters import TrackedParameters, fitter_of
 from neeco.tracking.trust import Reference
 from neeco.training.run import SCENE_FILE, scene_digest, stored_config, write_config
@@ -41,19 +40,17 @@ if TYPE_CHECKING:
 SCHEMA = "neeco-track/1"
 INFO = "track.json"
 STEPS = "steps"  # the folder of finished steps, removed at the end
-SECOND = "second"  # in it: steps with tissue and light that were learned again
-FOOTAGE = "footage"  # the folder of the output in which `neeco track` keeps a video as a capture
 PAGE = "track.html"
 RUN = "run"  # the folder of the run with which footage over another tissue was tracked
-OTHER_TISSUE_MISFIT = 3.0  # of instruments over tissue learned from footage, times that over their own
+OTHER_TISSUE_MISFIT = 3.0  # of instruments over another run's tissue, times that over their own
 MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
 MIN_TRUSTED_SHARE = 0.5  # of the frames, below which the result is DOUBTFUL
 CERTAIN = 0.8  # trust with which following begins at once
 N_BEGINNINGS = 8  # frames in which the instruments are searched for, until one is CERTAIN
 FOLLOW_AGAIN = 0.7  # trust below which a stretch is followed once more, from its far end
+LEARN_TISSUE = "`neeco train --method 3dgs FOOTAGE --output RUN2`, then `neeco track RUN FOOTAGE --tissue RUN2`"
 
 Start = Literal["first", "none"]
-TissueOf = Literal["run", "footage"]
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,7 @@ class Tracked:
             best = max(record["trust"]["value"] for record in self.records)
             raise NeecoError(
                 f"{self.footage.root}: no frame has a trust of {self.min_trust:g}, the highest is {best:.2f}; is it "
-                f"the run's instrument, over its tissue (if not: --tissue footage)? {self.output} shows what was found"
+                f"the run's instrument, over its tissue (if not: {LEARN_TISSUE})? {self.output} shows what was found"
             )
 
 
@@ -102,17 +99,16 @@ def track_footage(
     output: Path,
     *,
     start: Start = "none",
-    tissue: TissueOf = "run",
+    tissue: GaussianRun | None = None,
     min_trust: float = MIN_TRUST,
     resume: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-    on_stage: Progress = lambda what, done, total: None,
 ) -> Tracked:
     """Find the states of the run's instruments in every frame of `footage`, and write those that are trusted as a
     capture.
 
-    tissue: "run" where the footage shows the run's tissue and its cameras are in the run's world. "footage" for any
-    other: the tissue is learned from the footage, and the scene used for tracking becomes the output's own run (`RUN`).
+    tissue: a run that learned the tissue of the footage, in the world of its cameras; the scene used for tracking, the
+    instruments over that tissue, becomes the output's own run (`RUN`). None: the footage shows the tissue of `run`.
 
     States of the footage are ignored, except that of its first frame where `start` is "first". Interrupted (Ctrl-C) or
     failing, it keeps finished steps for `resume`. The caller sets the number of torch threads (`open_run`). Raises
@@ -121,8 +117,8 @@ def track_footage(
     """
     if not 0 <= min_trust <= 1:
         raise NeecoError(f"--min-trust: {min_trust} is not a share; give 0 to 1")
-    scene = run.scene
-    parameters = TrackedParameters.of(scene)
+    parameters = TrackedParameters.of(run.scene)
+    scene = run.scene if tissue is None else over_tissue(run.scene, tissue.scene)
     frames = sorted(footage.frames, key=lambda frame: frame.state.time)
     given = _first_state(footage, frames[0], scene) if start == "first" else None
     trained_on = run.capture()
@@ -134,38 +130,34 @@ def track_footage(
         "scene_sha256": scene_digest(run.path),
         "captures_sha256": [fingerprint(capture) for capture in (footage, trained_on)],
         "start": start,
-        "tissue": tissue,
+        "tissue": "run" if tissue is None else os.path.abspath(tissue.path),
+        **({} if tissue is None else {"tissue_sha256": scene_digest(tissue.path)}),
         "min_trust": min_trust,
     }
-    _check_output(output, info, resume)
+    if (begun := read_begun(output, INFO, resume, "tracked footage")) is not None:
+        keys = ("schema", "version", "scene_sha256", "captures_sha256", "start", "tissue", "tissue_sha256")
+        require_same(str(output / INFO), ((key, begun.get(key), info.get(key)) for key in keys))
     with own_folder(output):
         stored = read_json(output / INFO) if (output / INFO).exists() else {}
         if not stored.get("complete"):
             write_json(output / INFO, info | {"complete": False})
-            fitter, allowance = fitter_of(scene), 1.0
+            fitter, allowance = fitter_of(run.scene), 1.0
             reference = Reference.of(fitter, trained_on.split("train"))
-            if tissue == "footage":
-                scene, info["light"] = _over_footage(scene, footage, output / STEPS, on_stage)
+            if tissue is not None:
                 fitter, allowance = fitter_of(scene), OTHER_TISSUE_MISFIT
             follower = Follower.of(frames, fitter, reference, allowance)
             steps = StepFiles(output / STEPS, follower, on_progress).all_steps(given)
-            if tissue == "footage":
-                scene = _learned_again(scene, frames, steps, output / STEPS, on_stage)
-                follower = Follower.of(frames, fitter_of(scene), reference, allowance)
-                steps = StepFiles(output / STEPS / SECOND, follower, on_progress).all_steps(given)
             records = [_record(frames[k], step, parameters) for k, step in enumerate(steps)]
             info |= {"complete": True, "reference": reference.to_json(), "frames": records}
         else:
             info = stored | {"min_trust": min_trust}  # of the same steps, other frames may be trusted
-            if tissue == "footage":
-                scene = load_gaussians(output / RUN / SCENE_FILE, "track", scene.center.device)
-        registered = trained_on.registered or tissue == "footage"
+        registered = trained_on.registered or tissue is not None
         trusted = replace(footage, frames=_with_trust(frames, info["frames"], min_trust), registered=registered)
         if trusted.frames:
             write_tracked(trusted, output, scene, trained_on)
         elif stored.get("complete"):
             info = stored  # its capture stays
-        if tissue == "footage" and (trusted.frames or not stored.get("complete")):
+        if tissue is not None and (trusted.frames or not stored.get("complete")):
             _write_run(output, run, scene)
         write_json(output / INFO, info)
         if (output / STEPS).exists():
@@ -173,27 +165,20 @@ def track_footage(
     return Tracked(output, footage, info["frames"], len(trusted.frames), min_trust, scene)
 
 
-def _learned_again(
-    scene: GaussianScene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Progress
-) -> GaussianScene:
-    """Return the scene with tissue and light learned again from the tracked frames; kept in `folder`."""
-    file = folder / "scene-2.safetensors"
-    if not file.exists():
-        save_scene(learn_again(scene, frames, steps, report), file)
-    return load_gaussians(file, "track", scene.center.device)
+def over_tissue(instruments: GaussianScene, tissue: GaussianScene) -> GaussianScene:
+    """Return the instruments of one scene over the tissue of another, in its light.
 
-
-def _over_footage(
-    instruments: GaussianScene, footage: Capture, folder: Path, report: Progress
-) -> tuple[GaussianScene, dict[str, Any]]:
-    """Return the instruments over the footage's tissue in its light, and that light; kept in `folder`."""
-    file, light = folder / SCENE_FILE, folder / "light.json"
-    if not light.exists():
-        ground = learn_tissue(footage, folder / "tissue", instruments.center.device, report)
-        found = adapted(over_tissue(instruments, ground), footage.frames, report)
-        save_scene(found.scene, file)
-        write_json(light, found.to_json())
-    return load_gaussians(file, "track", instruments.center.device), read_json(light)
+    Recorded are the states and cameras of the first, corrected by its registration, which is removed. Raises NeecoError
+    for a scene that does not tell its tissue from what moves.
+    """
+    if tissue.deformation.motion(tissue.canonical) is None:
+        raise NeecoError(f"--tissue: method {tissue.method} learns no tissue by itself; use a run of method 3dgs")
+    merged = merged_scene(tissue, [instruments])
+    with torch.no_grad():
+        merged.falloff[1] = instruments.falloff[1]
+    recorded = instruments.recorded
+    merged.recorded = replace(recorded, states=tuple(instruments.registered(state) for state in recorded.states))
+    return merged
 
 
 def _write_run(output: Path, run: GaussianRun, scene: GaussianScene) -> None:
@@ -348,12 +333,3 @@ def _first_state(footage: Capture, frame: Frame, scene: GaussianScene) -> State:
             )
         states[item.name] = InstrumentState(given.pose.double(), {name: given.joints[name] for name in item.joints})
     return State(states, frame.state.time)
-
-
-def _check_output(output: Path, info: dict[str, Any], resume: bool) -> None:
-    """Raise NeecoError when `output` may not be written to."""
-    if output.is_dir() and {FOOTAGE} <= {entry.name for entry in output.iterdir()} <= {FOOTAGE, LOCK}:
-        return
-    if (begun := read_begun(output, INFO, resume, "tracked footage")) is not None:
-        keys = ("schema", "version", "scene_sha256", "captures_sha256", "start", "tissue")
-        require_same(str(output / INFO), ((key, begun.get(key), info[key]) for key in keys))

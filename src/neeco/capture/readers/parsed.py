@@ -17,7 +17,6 @@ from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
 from neeco.files import follows_links
 from neeco.geometry.lens import Lens
-from neeco.placeholders import placeholder
 from neeco.plausible import Fault
 
 NOWHERE = "put it there or correct the path"
@@ -84,8 +83,6 @@ def inside(root: Path, folder: Path, text: str) -> Path:
         outside = not path.resolve().is_relative_to(root.resolve())
     except (OSError, RuntimeError, ValueError):
         raise NeecoError(f"{printable(text)} is not a usable path; repair it") from None
-    if path.is_symlink() and (problem := placeholder(path)):
-        raise NeecoError(f"{printable(text)} {problem}")
     if outside and path.is_relative_to(os.path.normpath(root)):
         if follows_links():
             return path

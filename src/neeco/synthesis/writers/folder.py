@@ -23,7 +23,6 @@ from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.errors import NeecoError
 from neeco.files import (
     read_bytes,
-    read_json_lines,
     read_text,
     require_replaceable,
     write_atomically,
@@ -47,18 +46,6 @@ MAX_INSTRUMENTS = (
 )
 POLYGONS = ("polygons", "segmentation")  # of a label or part, left out of states.jsonl
 FOLDERS = ("images", *LABELS, RECORDS)
-PUBLIC = {  # what every line of states.jsonl holds, among others
-    "index": int,
-    "image": str,
-    "split": str,
-    "width": int,
-    "height": int,
-    "time": float,
-    "instruments": [{"name": str, "pose": [[float]], "joints": {str: float}}],
-    "camera": [[float]],
-    "intrinsics": {"fl_x": float, "fl_y": float, "cx": float, "cy": float},
-    "labels": [{"name": str, "area": int, "keypoints": {str: [float]}, "camera_from_instrument": [[float]]}],
-}
 VALIDATION_EVERY = 5  # every fifth image is for validation; by the index alone, so a data set can grow
 
 
@@ -193,11 +180,6 @@ def write_states(root: Path, records: list[Record]) -> None:
         line["labels"] = [_without_polygons(label) for label in record["labels"]]
         lines.append(json.dumps(line, allow_nan=False))
     write_text(root / "states.jsonl", "".join(f"{line}\n" for line in lines))
-
-
-def read_public_records(root: Path) -> list[Record]:
-    """Return the lines of states.jsonl. Raises NeecoError naming the line that is not as `write_states` writes it."""
-    return read_json_lines(root / "states.jsonl", PUBLIC, "one JSON object per image", "write the data set anew")
 
 
 def public_record(record: Record) -> dict[str, Any]:
