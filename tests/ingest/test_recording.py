@@ -14,8 +14,8 @@ from neeco.ingest.readers.columns import Units
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import IngestSettings, Splits
-from neeco.ingest.recording.template import write_template
-from neeco.ingest.sources import open_questions, recording_from_flags
+from neeco.ingest.recording.template import open_questions, write_template
+from neeco.ingest.sources import recording_from_flags
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 
@@ -110,7 +110,7 @@ def test_init_asks_for_the_lens_and_the_clock_that_no_file_states(folder):
     document = {"fl_x": 1, "frames": [], "clocks": {"em": {"offset_s": 0.1, "sd_s": 0.001}}}  # as `ingest` writes it
     (folder / "capture/transforms.json").write_text(json.dumps(document))
     assert [line.strip() for line in asked() if "intrinsics" in line or "clock" in line] == [
-        "# intrinsics: [290, 290, 160, 128]   # no calibration was found",
+        "# intrinsics: [290, 290, 160, 128]   # fl_x, fl_y, cx, cy px; no calibration was found",
         "# clock: em   # left out, it is its own, whose offset nothing states",
     ]
     (folder / "recording.yaml").write_text(write_template(folder).replace("# clock: em ", "clock: em "))

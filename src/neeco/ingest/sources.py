@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,41 +17,15 @@ from neeco.ingest.readers.video import IMAGES, VIDEOS
 from neeco.ingest.recording.file import RecordingSection, read_recording
 from neeco.ingest.recording.model import MAX_SHAFT_MM, MIN_FRAMES, Recording
 from neeco.ingest.recording.sections import faults_in, node_of, read_section
-from neeco.ingest.recording.template import holds_streams, write_template
+from neeco.ingest.recording.template import open_questions, write_template
 
 RECORDING = "recording.yaml"
 
 
-# Lines of a draft that leave something open: what marks the first of them, and what to write there
-_QUESTIONS = (
-    (r"^  - name: ", "what is the instrument called in labels? Correct its name"),
-    (r"^ +# kinematics: \{dvrk_tool", "which tool is it? Remove the # and give its file, or write out its links below"),
-    (r"^ +# camera_from_base: \{transform", "how does the robot's base stand to the camera? Remove the # of one line"),
-    (r"a guess: correct it", "at which rate were these taken? Correct the number"),
-    (r"# units: .*nothing says them", "in which units? Correct them and remove the #"),
-    (r"^# intrinsics: .*no calibration was found", "which lens? Remove the # and give a calibration's file or numbers"),
-    (r"^ +# clock: .*its own", "is it the clock of the poses? Remove the #; else give its offset in sync, below"),
-    (r"is not clear: ", "which columns hold it? Name them"),
-    (r"^ +# +(?:frame|quaternion\w*|rotation\w*|euler\w*): ", "what do its poses mean? Correct it, remove the #"),
-)
-
-
-def open_questions(draft: str) -> list[tuple[int, str]]:
-    """Return the lines of a drafted recording.yaml, from 1, that only the one who recorded can answer, and what to
-    write there."""
-    found = []
-    for number, line in enumerate(draft.splitlines(), 1):
-        found += [(number, words) for marks, words in _QUESTIONS if re.search(marks, line)][:1]
-    return found
-
-
 def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
-    """Write a recording.yaml for what lies at `source`, into the folder or next to the file. Return lines on what was
-    written; `report` is called with what is left out.
-
-    Raises NeecoError where a recording.yaml exists, and where there are no images.
-    """
-    path = (source.parent if holds_streams(source) else source) / RECORDING
+    """Write a recording.yaml for what lies at `source`, into the folder or next to the file, and return lines on it;
+    `report` is called with what is left out. Raises NeecoError where there is one, and where there are no images."""
+    path = (source.parent if source.is_file() or format_of(source) is not None else source) / RECORDING
     if path.exists():
         raise NeecoError(f"{path}: already exists; edit it, or move it away first")
     draft = write_template(source, lambda problem: report(f"left out: {problem}"), video_stands_still)
