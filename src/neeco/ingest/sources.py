@@ -14,10 +14,10 @@ from neeco.ingest.cameras.still_scene import video_stands_still
 from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.columns import recognise_time
 from neeco.ingest.readers.video import IMAGES, VIDEOS
-from neeco.ingest.recording.file import RecordingSection, read_recording
+from neeco.ingest.recording.file import read_recording, recording_of
 from neeco.ingest.recording.model import MAX_SHAFT_MM, MIN_FRAMES, Recording
-from neeco.ingest.recording.sections import faults_in, node_of, read_section
 from neeco.ingest.recording.template import open_questions, write_template
+from neeco.settings import faults_in
 
 RECORDING = "recording.yaml"
 
@@ -127,7 +127,7 @@ def recording_from_flags(
     }
     where = Path("command line")
     with faults_in(where):
-        return replace(read_section(RecordingSection, node_of(document, where)).recording(where), path=video)
+        return replace(recording_of(document, where), path=video)
 
 
 def check_frame_count(frames: int | None) -> None:

@@ -35,7 +35,8 @@ class FoundFrames:
     def open(self) -> VideoSource:
         """Return the images; those of a folder at an assumed rate. Raises NeecoError."""
         is_folder = self.line.startswith("images")
-        return (ImageFolder(self.file, fps=25.0) if is_folder else VideoFile(self.file, stream=self.stream)).open()
+        source = ImageFolder(self.file, fps=25.0) if is_folder else VideoFile(self.file, stream=self.stream)
+        return source.open()
 
 
 def draft_scope(
