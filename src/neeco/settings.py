@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+import os
 import re
 import textwrap
 import types
@@ -34,7 +35,7 @@ FIELD = re.compile(  # of a dataclass: the comments above, the name, the comment
     r'((?:^ {4}# [^\n]*\n)*)^ {4}(\w+): [^\n]*?(?: {2}# ([^\n]*))?\n(?: {4}"""(.*?)""")?', re.MULTILINE | re.DOTALL
 )
 GROUP = "is a group of fields, each with a value of its own; write them as NAME: VALUE"
-WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+WORDS = {Path: "a path", bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
 
 class Fault(ValueError):
@@ -116,6 +117,8 @@ def read(hint: Any, place: Place, owner: str = "it") -> Any:
         if not isinstance(value, Mapping) or not all(isinstance(name, str) and name for name in value):
             raise Fault(place.field, GROUP)
         return {name: read(arms[1], place.child(name), owner) for name in value}
+    if hint is Path and isinstance(value, str | os.PathLike):
+        return Path(value)
     return _scalar(place, hint) if hint in WORDS else value
 
 

@@ -15,7 +15,8 @@ from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import IngestSettings, Splits
 from neeco.ingest.recording.template import open_questions, write_template
-from neeco.ingest.sources import recording_from_flags
+from neeco.ingest.request import IngestRequest
+from neeco.ingest.sources import recordings_of
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 
@@ -36,11 +37,11 @@ def flags(folder, **more):
     given = {
         "instrument": folder / "logs/instrument.csv",
         "laparoscope": folder / "logs/camera.csv",
-        "joints": [("jaw_angle", folder / "logs/jaw.csv", folder / "logs/jaw_calibration.csv")],
+        "joint": [("jaw_angle", folder / "logs/jaw.csv", folder / "logs/jaw_calibration.csv")],
         "intrinsics": (290, 290, 160, 128),
         "sync": folder / "logs/sync.json",
     }
-    return recording_from_flags(folder / "video.mp4", **(given | more))
+    return recordings_of(IngestRequest(video=folder / "video.mp4", **(given | more)))[0]
 
 
 def test_flags(folder):
@@ -336,7 +337,7 @@ def test_sync_files(world, folder, content, offsets):
 
 
 def test_an_offset_of_a_log_that_was_not_given_is_noted(folder):
-    recording = flags(folder, joints=())
+    recording = flags(folder, joint=())
     assert recording.sync == {"em": 0.038}
     assert any("'jaw_minus_video_s' belongs to no log" in note for note in recording.notes)
 
@@ -351,7 +352,7 @@ def test_sync_files_that_are_none(world, folder, content, message):
 
 
 def test_flags_that_cannot_be(folder):
-    with pytest.raises(NeecoError, match=r"--laparoscope: .*absent\.csv: no such file"):
+    with pytest.raises(NeecoError, match=r"--laparoscope: no such file: .*absent\.csv"):
         flags(folder, laparoscope=folder / "absent.csv")
     with pytest.raises(NeecoError, match="--joint jaw_angle: needs --instrument"):
         flags(folder, instrument=None)
@@ -359,7 +360,7 @@ def test_flags_that_cannot_be(folder):
         flags(folder, frames=1)
     joint = ("jaw_angle", folder / "logs/jaw.csv", None)
     with pytest.raises(NeecoError, match="--joint jaw_angle: given twice"):
-        flags(folder, joints=[joint, joint])
+        flags(folder, joint=[joint, joint])
 
 
 def test_two_instruments_with_one_joint_name_have_two_clocks(world, folder):
@@ -370,17 +371,17 @@ def test_two_instruments_with_one_joint_name_have_two_clocks(world, folder):
 
 def test_a_fault_of_a_flag_is_told_by_its_flag(folder):
     (folder / "empty").mkdir()
-    with pytest.raises(NeecoError, match=r"--video: .*empty: holds no images; give a folder of frames"):
-        recording_from_flags(folder / "empty")
+    with pytest.raises(NeecoError, match=r"empty: holds 0 images"):
+        recordings_of(IngestRequest(video=folder / "empty", fps=25))[0].source.open()
     (folder / "frames").mkdir()
     Image.new("RGB", (8, 8)).save(folder / "frames" / "1.png")
-    with pytest.raises(NeecoError, match=r"--video: .*frames: when were the images taken\? Give --fps"):
-        recording_from_flags(folder / "frames")
+    with pytest.raises(NeecoError, match=r"--fps: when were the images taken\?"):
+        recordings_of(IngestRequest(video=folder / "frames"))
     joint = ("jaw_angle", folder / "logs/jaw_calibration.csv", folder / "logs/jaw.csv")
     with pytest.raises(
         NeecoError, match=r"--joint jaw_angle: .*calibration\.csv has no times, .*jaw\.csv has; give the"
     ):
-        flags(folder, joints=[joint])
+        flags(folder, joint=[joint])
     with pytest.raises(NeecoError, match=r"^--intrinsics: fl_x, fl_y: must be two positive focal lengths in pixels"):
         flags(folder, intrinsics=(-290, 290, 160, 128)).read_lens()
     with pytest.raises(NeecoError) as told:

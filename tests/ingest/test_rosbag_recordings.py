@@ -26,7 +26,8 @@ from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, Pose
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.sources import recording_from_flags
+from neeco.ingest.request import IngestRequest
+from neeco.ingest.sources import recordings_of
 from neeco.ingest.timing.reading import read_episodes
 
 SIZE = (64, 48)  # px
@@ -179,7 +180,7 @@ def test_a_bag_alone_is_enough_where_it_holds_one_of_each(tmp_path: Path) -> Non
         for time in np.arange(40) / 25:
             bag.pose("/tool/pose", time, shaft(time), [1, 0, 0, 0], "tracker")
             bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
-    recording = recording_from_flags(bag.path, bag.path)
+    (recording,) = recordings_of(IngestRequest(video=bag.path, instrument=bag.path))
     data = read_episodes([recording])
     states, usable = data.with_assumed_clocks().states_at(data.times)
     assert usable.all()

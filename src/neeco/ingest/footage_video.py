@@ -14,8 +14,9 @@ from neeco.capture.readers import read_capture
 from neeco.errors import NeecoError
 from neeco.files import open_file, read_begun, require_same, write_json
 from neeco.ingest.pipeline import ingest
+from neeco.ingest.request import IngestRequest
 from neeco.ingest.result import IngestResult
-from neeco.ingest.sources import recording_from_flags
+from neeco.ingest.sources import recordings_of
 from neeco.scene import GaussianScene
 from neeco.tracking.footage_tissue import Progress
 from neeco.tracking.track import FOOTAGE
@@ -43,7 +44,7 @@ def read_footage(path: Path, output: Path, scene: GaussianScene, resume: bool, r
     if (begun := read_begun(output, name, resume, "tracked footage")) is not None:
         require_same(str(output / name), ((key, begun.get(key), source[key]) for key in source))
         return read_capture(capture_folder)
-    recording = recording_from_flags(path)
+    (recording,) = recordings_of(IngestRequest(video=path))
     recording = replace(
         recording,
         frames=len(recording.source.open().times),
