@@ -105,7 +105,7 @@ def test_a_wrong_base_ends_in_one_line(tmp_path, base, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"name": "PSM1", "measured_cp": []}', "measured_cp: states the arm in the base of the arm that holds"),
+        ('{"name": "PSM1", "measured_cp": []}', "base-frame.*: is missing"),
         ('{"x": 1}', r"base-frame.*: is missing; .* or write \{transform: 4 rows, mm, sd_mm: 8, sd_deg: 5\}"),
         ('{"matrix": [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]]}', "matrix.*: in metres"),
         ('{"matrix": [[1, 0, 0, 100]]}', "matrix"),

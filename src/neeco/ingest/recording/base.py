@@ -68,15 +68,6 @@ class BaseSection:
             raise Fault(missing, "is missing; give both, or none where the transform is exact")
 
 
-def same_base(one: StatedBase | None, other: StatedBase | None) -> bool:
-    """Return whether two recordings state the same of a base."""
-    if one is None or other is None:
-        return one is other
-    mine, theirs = one.matrix, other.matrix
-    same = mine is theirs if mine is None or theirs is None else np.array_equal(mine, theirs)
-    return same and (one.sd_mm, one.sd_deg, one.to_world) == (other.sd_mm, other.sd_deg, other.to_world)
-
-
 def _of_hand_eye(path: Path) -> StatedBase:
     """Read the YAML that easy_handeye saves, in metres: of a still camera (eye_on_hand: false), base_from_camera.
     Raises NeecoError."""
@@ -137,11 +128,6 @@ def read_dvrk_registration(path: Path) -> StatedBase:
         with faults_in(path):
             usual = {"sd_mm": DVRK_SD_MM, "sd_deg": DVRK_SD_DEG, "transform": document.pop(key)}
             return _stated(Node(usual | document, str(path)))
-    if isinstance(document, dict) and "measured_cp" in document:
-        node.child("measured_cp").error(
-            "states the arm in the base of the arm that holds the scope, not in the camera's frame",
-            "give the file …-registration-open-cv.json",
-        )
     frame = node.child("base-frame")
     if not isinstance(frame.value, dict):
         frame.error(

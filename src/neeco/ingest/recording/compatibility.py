@@ -6,11 +6,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from neeco.errors import NeecoError
 from neeco.ingest.readers import format_of
-from neeco.ingest.recording.base import same_base
-from neeco.ingest.recording.model import ImageFolder, IngestSettings, InstrumentLogs, Recording, VideoFile
+from neeco.ingest.recording.model import ImageFolder, IngestSettings, Recording, VideoFile
 
 
 def separate(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
@@ -85,17 +85,11 @@ def check_recordings(recordings: Sequence[Recording]) -> None:
     lens, where = first.read_lens()
     for other in recordings[1:]:
         if other.read_lens()[0] != lens:
-            raise refusal(other, f"intrinsics: are others than {where} gives", first)
-        for key in ("camera", "laparoscope", "stereo"):
-            mine, theirs = getattr(other, key), getattr(first, key)
-            if (mine is None) != (theirs is None) or (key == "camera" and mine != theirs):
-                raise refusal(other, f"{key}: is not as", first)
-        names = [item.name for item in other.instruments]
-        if names != [item.name for item in first.instruments]:
-            raise refusal(other, f"instruments: {', '.join(names) or 'none'} are not those", first)
-        for mine, theirs in zip(other.instruments, first.instruments, strict=True):
-            if fault := _difference(mine, theirs):
-                raise refusal(other, f"instruments: {mine.name}: {fault} not as", first)
+            raise refusal(other, f"intrinsics: differ from what {where} gives", first)
+        theirs = _stated_once(first)
+        for place, mine in _stated_once(other).items():
+            if mine != theirs[place]:
+                raise refusal(other, f"{place}: differs from that", first)
         for key, default in (("frames", None), ("splits", None), ("settings", IngestSettings())):
             if getattr(other, key) not in (default, getattr(first, key)):
                 raise refusal(other, f"{key}: differs from that", first)
@@ -107,19 +101,20 @@ def refusal(other: Recording, what: str, first: Recording) -> NeecoError:
     )
 
 
-def _difference(mine: InstrumentLogs, theirs: InstrumentLogs) -> str | None:
-    """Return in words what a capture states once and two recordings of an instrument state differently, if anything."""
-    if (mine.poses is None) != (theirs.poses is None) or mine.from_video != theirs.from_video:
-        return "poses are"
-    if (mine.roll is None) != (theirs.roll is None):
-        return "roll is"
-    limits = [{name: source.limits for name, source in item.joints.items()} for item in (mine, theirs)]
-    if limits[0].keys() != limits[1].keys():
-        return f"joints ({', '.join(limits[0]) or 'none'}) are"
-    if limits[0] != limits[1]:
-        return "limits of its joints are"
-    if mine.kinematics != theirs.kinematics:
-        return "kinematics are"
-    if not same_base(mine.base, theirs.base):
-        return "the place of its base is"
-    return None
+def _stated_once(recording: Recording) -> dict[str, Any]:
+    """Return what a capture states once for all of its recordings, by place; the instruments' names come first."""
+    items, camera = recording.instruments, recording.camera
+    stated: dict[str, Any] = {"instruments": [item.name for item in items], "camera": camera}
+    stated |= {key: getattr(recording, key) is not None for key in ("laparoscope", "stereo")}
+    for item in items:
+        base = item.base
+        matrix = None if base is None or base.matrix is None else base.matrix.tolist()
+        of_item = {
+            "poses": (item.poses is not None, item.from_video),
+            "roll": item.roll is not None,
+            "joints": {name: log.limits for name, log in item.joints.items()},
+            "kinematics": item.kinematics,
+            "base": base and (matrix, base.sd_mm, base.sd_deg, base.to_world),
+        }
+        stated |= {f"instruments: {item.name}: {key}": value for key, value in of_item.items()}
+    return stated
