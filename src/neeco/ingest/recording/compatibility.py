@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
 from typing import Any
 
 from neeco.errors import NeecoError
 from neeco.ingest.readers import format_of
-from neeco.ingest.recording.model import ImageFolder, IngestSettings, Recording, VideoFile
+from neeco.ingest.readers.columns import JointColumns, PoseColumns
+from neeco.ingest.recording.model import IngestSettings, InstrumentLogs, Recording, StereoPartner, VideoFile
 
 
 def separate(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
@@ -23,39 +23,29 @@ def separate(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
 
 def _of_episode(recording: Recording, episode: int) -> Recording:
     """Return the recording with all its streams of one episode of the data set that holds them."""
-    moved = 0
+    moved = []
 
-    def stream_of(path: Path | None, stream: str | None, key: str) -> str | None:
-        nonlocal moved
-        known = None if path is None else format_of(path)
+    def in_episode(value: Any, key: str) -> Any:
+        if isinstance(value, Mapping):
+            return {name: in_episode(item, f"{key}: {name}") for name, item in value.items()}
+        if isinstance(value, tuple):
+            return tuple(in_episode(item, key) for item in value)
+        if isinstance(value, InstrumentLogs | StereoPartner):
+            held = {field.name: in_episode(getattr(value, field.name), field.name) for field in fields(value)}
+            return replace(value, **held)
+        if not isinstance(value, VideoFile | PoseColumns | JointColumns):
+            return value
+        known = format_of(value.file if isinstance(value, VideoFile) else value.path)
         if known is None or known.of_episode("", episode) is None:
-            return stream
-        if stream is None:
+            return value
+        if value.stream is None:
             raise NeecoError(f"{recording.path}: {key}: stream: missing; name the feature, as in observation.state")
-        moved += 1
-        return known.of_episode(stream, episode)
+        moved.append(key)
+        return replace(value, stream=known.of_episode(value.stream, episode))
 
-    def source_of(source: VideoFile | ImageFolder, key: str) -> VideoFile | ImageFolder:
-        if isinstance(source, ImageFolder):
-            return source
-        return replace(source, stream=stream_of(source.file, source.stream, key))
-
-    instruments = []
-    for item in recording.instruments:
-        poses = item.poses and replace(item.poses, stream=stream_of(item.poses.path, item.poses.stream, "poses"))
-        joints = {
-            name: replace(log, stream=stream_of(log.path, log.stream, f"joints: {name}"))
-            for name, log in item.joints.items()
-        }
-        roll = item.roll and replace(item.roll, stream=stream_of(item.roll.path, item.roll.stream, "roll"))
-        instruments.append(replace(item, poses=poses, joints=joints, roll=roll))
-    scope, partner = recording.laparoscope, recording.stereo
-    changed = replace(
-        recording, source=source_of(recording.source, "video"), instruments=tuple(instruments),
-        laparoscope=scope and replace(scope, stream=stream_of(scope.path, scope.stream, "laparoscope")),
-        stereo=partner and replace(partner, source=source_of(partner.source, "stereo")),
-        episode=f"episode_{episode}",
-    )  # fmt: skip
+    places = {"source": "video", "instruments": "instruments", "laparoscope": "laparoscope", "stereo": "stereo"}
+    held = {field: in_episode(getattr(recording, field), key) for field, key in places.items()}
+    changed = replace(recording, **held, episode=f"episode_{episode}")
     if not moved:
         raise NeecoError(
             f"{recording.path}: episodes: no file named here holds several; leave it out, and give several recordings "
