@@ -66,12 +66,16 @@ class Place:
     def child(self, key: str) -> typing.Self:
         """The value under `key` (None when absent)."""
         value = self.value.get(key) if isinstance(self.value, dict) else None
-        return dataclasses.replace(self, value=value, field=join_places(self.field, key_name(key)))
+        return self.at(value, join_places(self.field, key_name(key)))
 
     def item(self, index: int) -> typing.Self:
         """The element `index` of a list (None when this is not one)."""
         value = self.value[index] if isinstance(self.value, list | tuple) else None
-        return dataclasses.replace(self, value=value, field=f"{self.field}[{index}]")
+        return self.at(value, f"{self.field}[{index}]")
+
+    def at(self, value: Any, field: str) -> typing.Self:
+        """Another value of the file."""
+        return type(self)(value, self.file, field)
 
 
 def join_places(*places: str) -> str:

@@ -7,7 +7,7 @@ import re
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal, NoReturn, Self
 
 import numpy as np
 
@@ -133,6 +133,9 @@ class Node(Place):
     def has(self, key: str) -> bool:
         """Return True if the object has this key with a value other than null."""
         return isinstance(self.value, dict) and self.value.get(key) is not None
+
+    def at(self, value: Any, field: str) -> Self:
+        return type(self)(value, self.file, field, self.report)
 
     def items(self) -> Iterator[Node]:
         """The elements of a list; reports an error and yields nothing when this is not a list."""
