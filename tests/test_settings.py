@@ -60,7 +60,7 @@ def test_what_is_written_is_read_again(value: Outer) -> None:
         ({"share": 10**400}, "group.share: a huge integer is out of range"),
         ({"share": 7}, "group.share: 7 is unlucky"),
         ({"names": "jaw"}, r"group.names: 'jaw' is not a list; write \[jaw\]"),
-        ({"names": [1]}, "group.names: 1 is not a word"),
+        ({"names": [1]}, r"group.names\[0\]: 1 is not a word"),
         ({"flag": "no"}, "group.flag: 'no' is not true or false"),
         ({"colour": 1}, "group.colour: it has no such field"),
     ],

@@ -395,35 +395,20 @@ def track(
 def ingest(
     *recordings: PathLike,
     output: PathLike,
-    video: PathLike | None = None,
-    instrument: PathLike | None = None,
-    laparoscope: PathLike | None = None,
     joints: Mapping[str, tuple[PathLike, PathLike | None]] | None = None,
-    shaft_diameter: float | None = None,
-    intrinsics: tuple[float, float, float, float] | None = None,
-    calibration: PathLike | None = None,
-    sync: PathLike | None = None,
-    frames: int | None = None,
-    fps: float | None = None,
     progress: Progress | None = None,
+    **options: Any,
 ) -> Ingested:
     """Make a capture from a recording, as `neeco ingest` does.
 
     Args:
         recordings: recording.yaml, or several of one instrument; or one folder in another format (nerfstudio, Blender,
-            COLMAP, EndoNeRF), which is converted; none: `video` and what follows
+            COLMAP, EndoNeRF), which is converted; none: `options` state one
         output: capture folder to write
-        video: a file, or a folder of images
-        instrument: CSV log of the instrument's tracker
-        laparoscope: CSV log of the laparoscope's tracker
         joints: name -> (CSV log, calibration or None)
-        shaft_diameter: mm, of an instrument that nothing tracked
-        intrinsics: fx, fy, cx, cy in px
-        calibration: file of the camera's calibration, in place of `intrinsics`
-        sync: JSON file of clock offsets
-        frames: how many to keep
-        fps: frames per second, where the video does not state it
         progress: is called with what is being done, how much of it is done, and of how much
+        options: those of `neeco ingest --help` by their names, instead of recordings: video, fps, instrument,
+            laparoscope, shaft_diameter, intrinsics, calibration, sync, and in any case frames
 
     Raises NeecoError for unusable input: file, row or key, and what to do.
 
@@ -431,37 +416,20 @@ def ingest(
         print(made.output, made.verdict, len(made.capture.frames))
     """
     from neeco.ingest.convert import convert_folder
-    from neeco.ingest.sources import folder_to_convert, read_recordings, recording_from_flags
+    from neeco.ingest.request import IngestRequest
+    from neeco.ingest.sources import folder_to_convert, recordings_of
     from neeco.report.ingest_page import Ingested, ingest_and_report
 
-    sources, output, report = [Path(path) for path in recordings], Path(output), progress or _silent
-    if (folder := folder_to_convert(sources)) is not None:
+    joint = [(name, *files) for name, files in (joints or {}).items()]
+    request, output = IngestRequest.of(source=recordings, joint=joint, **options), Path(output)
+    if (folder := folder_to_convert(request.source)) is not None:
+        request.refuse_others(f"{folder}: a folder in another format")
         return Ingested(output, notes=convert_folder(folder, output))
-    if sources:
-        return ingest_and_report(read_recordings(sources, frames), output, report)
-    if video is None:
-        raise NeecoError("--video: give the video (or a folder of images), or a recording.yaml")
-    recording = recording_from_flags(
-        Path(video),
-        instrument=_path(instrument),
-        laparoscope=_path(laparoscope),
-        joints=[(name, Path(log), _path(table)) for name, (log, table) in (joints or {}).items()],
-        intrinsics=intrinsics,
-        calibration=_path(calibration),
-        sync=_path(sync),
-        frames=frames,
-        fps=fps,
-        shaft_diameter=shaft_diameter,
-    )
-    return ingest_and_report([recording], output, report)
+    return ingest_and_report(recordings_of(request), output, progress or _silent)
 
 
 def _opened(run: Run | PathLike, device: str, force: bool) -> runs.TrainedRun:
     return run.trained if isinstance(run, Run) else runs.load_run(Path(run), device_of(device), force=force)
-
-
-def _path(path: PathLike | None) -> Path | None:
-    return None if path is None else Path(path)
 
 
 def _silent(what: str, done: int, total: int) -> None:

@@ -1,7 +1,9 @@
-"""Settings as frozen dataclasses: read from YAML or JSON by their types, written back, described for help texts.
+"""Frozen dataclasses from YAML or JSON by their types, every fault stated with its place; and settings written back and
+described for help texts.
 
-cattrs structures nested dataclasses, tuples and optional fields. Scalars have their own hooks: cattrs would accept "3"
-as a number and any text as true.
+The type of a field states how its value is read: a scalar, a list (tuple), an object (another dataclass, dict), one of
+several words (Literal), or `Annotated[..., parser]` with a function of the value's `Place`. Null counts as absent where
+the type has no None. A class attribute `shorthand` names the field that a value other than an object is for.
 """
 
 from __future__ import annotations
@@ -9,12 +11,16 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+import os
 import re
 import textwrap
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -28,7 +34,96 @@ VALUES = {str: "STR", int: "INT", float: "FLOAT", bool: "true|false"}
 FIELD = re.compile(  # of a dataclass: the comments above, the name, the comment behind, the text below
     r'((?:^ {4}# [^\n]*\n)*)^ {4}(\w+): [^\n]*?(?: {2}# ([^\n]*))?\n(?: {4}"""(.*?)""")?', re.MULTILINE | re.DOTALL
 )
-WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+GROUP = "is a group of fields, each with a value of its own; write them as NAME: VALUE"
+WORDS = {Path: "a path", bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+
+
+class Fault(ValueError):
+    """A fault of a value. field: its place below the value that is read ("" for that itself)."""
+
+    def __init__(self, field: str, message: str) -> None:
+        super().__init__(message)
+        self.field = field
+
+
+@contextmanager
+def faults_in(file: Path | str) -> Iterator[None]:
+    """Raise the block's Fault as NeecoError in one line: `file: place: what is wrong; what to do`."""
+    try:
+        yield
+    except Fault as fault:
+        raise NeecoError(": ".join(part for part in (str(file), fault.field, str(fault)) if part)) from None
+
+
+@dataclass(frozen=True)
+class Place:
+    """A value of a file, and where it is."""
+
+    value: Any
+    file: str = ""
+    field: str = ""
+
+    def child(self, key: str) -> typing.Self:
+        """The value under `key` (None when absent)."""
+        value = self.value.get(key) if isinstance(self.value, dict) else None
+        return self.at(value, join_places(self.field, key_name(key)))
+
+    def item(self, index: int) -> typing.Self:
+        """The element `index` of a list (None when this is not one)."""
+        value = self.value[index] if isinstance(self.value, list | tuple) else None
+        return self.at(value, f"{self.field}[{index}]")
+
+    def at(self, value: Any, field: str) -> typing.Self:
+        """Another value of the file."""
+        return type(self)(value, self.file, field)
+
+
+def join_places(*places: str) -> str:
+    """Return one place: `instruments[0].poses` of `instruments` and `[0].poses`."""
+    return ".".join(place for place in places if place).replace(".[", "[")
+
+
+def key_name(key: str) -> str:
+    """A JSON key as messages write it."""
+    return key if key.isidentifier() else f"[{printable(key)}]"
+
+
+def printable(value: Any, limit: int = 60) -> str:
+    """A value from a file, as one short printable piece of text."""
+    if isinstance(value, dict | list):
+        return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)}"
+    if isinstance(value, int) and abs(value) >= 10**20:
+        return "a huge integer"
+    text = repr(value)
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def read(hint: Any, place: Place, owner: str = "it") -> Any:
+    """Return the value at `place` as a type asks. owner: who has the fields, in messages. Raises Fault."""
+    value, origin, arms = place.value, typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        return arms[1](place) if isinstance(arms[1], types.FunctionType) else read(arms[0], place, owner)
+    if _is_optional(hint):
+        (arm,) = (arm for arm in arms if arm is not type(None))
+        return None if value is None else read(arm, place, owner)
+    if origin is typing.Literal and value not in arms:
+        raise Fault(place.field, f"{value!r} is none of {', '.join(map(str, arms))}")
+    if origin is tuple:
+        if isinstance(value, str) or not isinstance(value, Sequence):
+            raise Fault(place.field, f"{printable(value)} is not a list; write [{value}]")
+        kinds = arms[:1] * len(value) if ... in arms else arms
+        if len(value) != len(kinds):
+            raise Fault(place.field, f"has {len(value)} values; give {len(kinds)}")
+        return tuple(read(kind, place.item(index), owner) for index, kind in enumerate(kinds))
+    if dataclasses.is_dataclass(hint):
+        return _read_fields(hint, place, owner)
+    if origin is dict:
+        if not isinstance(value, Mapping) or not all(isinstance(name, str) and name for name in value):
+            raise Fault(place.field, GROUP)
+        return {name: read(arms[1], place.child(name), owner) for name in value}
+    if hint is Path and isinstance(value, str | os.PathLike):
+        return Path(value)
+    return _scalar(place, hint) if hint in WORDS else value
 
 
 def structure(kind: type[T], values: Mapping[str, Any], where: str = "", owner: str = "it") -> T:
@@ -37,12 +132,9 @@ def structure(kind: type[T], values: Mapping[str, Any], where: str = "", owner: 
 
     Raises NeecoError naming the field (`where` and its dotted path) that is unknown or does not fit its type.
     """
-    from cattrs.errors import BaseValidationError
-
-    try:
-        return _converter().structure(values, kind)
-    except BaseValidationError as error:
-        raise NeecoError(next(_problems(error, where, owner))) from None
+    with faults_in(""):
+        found: T = read(kind, Place(values, field=where), owner)
+        return found
 
 
 def name_and_value(option: str, text: str, example: str) -> tuple[str, str]:
@@ -120,83 +212,47 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
+def _read_fields(kind: Any, place: Place, owner: str) -> Any:
+    value, hints = place.value, _hints(kind)
+    if not isinstance(value, Mapping):
+        if not (shorthand := getattr(kind, "shorthand", "")):
+            raise Fault(place.field, GROUP)
+        value = {shorthand: value}
+        place = dataclasses.replace(place, value=value)
+    for key in value:
+        if key not in hints:
+            likely, known = nearest(str(key), hints), ", ".join(hints) or "none"
+            message = f"{owner} has no such field; it has {known}" + (f"; did you mean {likely}?" if likely else "")
+            raise Fault(join_places(place.field, key_name(str(key))), message)
+    given = {}
+    for field in dataclasses.fields(kind):
+        if value.get(field.name) is not None or (field.name in value and _is_optional(hints[field.name])):
+            given[field.name] = read(hints[field.name], place.child(field.name), owner)
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise Fault(join_places(place.field, field.name), "missing; give it")
+    try:
+        return kind(**given)
+    except Fault as fault:
+        raise Fault(join_places(place.field, fault.field), str(fault)) from None
+
+
 @cache
-def _converter() -> Any:
-    import cattrs
-
-    converter = cattrs.Converter(forbid_extra_keys=True)
-    for kind in WORDS:
-        converter.register_structure_hook(kind, _scalar)
-    converter.register_structure_hook_func(lambda kind: typing.get_origin(kind) is typing.Literal, _word)
-    converter.register_structure_hook_func(_is_optional, lambda value, kind: _optional(converter, value, kind))
-    converter.register_structure_hook_func(
-        lambda kind: typing.get_origin(kind) is tuple, lambda value, kind: _tuple(converter, value, kind)
-    )
-    return converter
+def _hints(kind: Any) -> dict[str, Any]:
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
 
 
-def _scalar(value: Any, kind: type[Any]) -> Any:
+def _is_optional(hint: Any) -> bool:
+    return typing.get_origin(hint) in (typing.Union, types.UnionType) and type(None) in typing.get_args(hint)
+
+
+def _scalar(place: Place, kind: type[Any]) -> Any:
+    value = place.value
     allowed = (int, float) if kind is float else (kind,)  # a whole number is a number too
     if not isinstance(value, allowed) or (isinstance(value, bool) and kind is not bool):
-        raise ValueError(f"{value!r} is not {WORDS[kind]}")
+        raise Fault(place.field, f"{printable(value)} is not {WORDS[kind]}; give one")
     if isinstance(value, int) and abs(value) >= MAX_INTEGER:
-        raise ValueError("a huge integer is out of range")
+        raise Fault(place.field, "a huge integer is out of range; correct it")
     if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{value!r} is not a finite number")
+        raise Fault(place.field, f"{value!r} is not a finite number; correct it")
     return value
-
-
-def _word(value: Any, kind: Any) -> Any:
-    allowed = typing.get_args(kind)
-    if value not in allowed:
-        raise ValueError(f"{value!r} is none of {', '.join(map(str, allowed))}")
-    return value
-
-
-def _is_optional(kind: Any) -> bool:
-    return typing.get_origin(kind) in (typing.Union, types.UnionType) and type(None) in typing.get_args(kind)
-
-
-def _optional(converter: Any, value: Any, kind: Any) -> Any:
-    (arm,) = (arm for arm in typing.get_args(kind) if arm is not type(None))
-    return None if value is None else converter.structure(value, arm)
-
-
-def _tuple(converter: Any, value: Any, kind: Any) -> Any:
-    item, *_ = typing.get_args(kind)
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        raise ValueError(f"{value!r} is not a list; write [{value}]")
-    return tuple(converter.structure(entry, item) for entry in value)
-
-
-def _problems(error: BaseException, where: str, owner: str) -> Iterator[str]:
-    """Yield the messages of a structuring error, field by field."""
-    from cattrs.errors import (
-        AttributeValidationNote,
-        BaseValidationError,
-        ForbiddenExtraKeysError,
-        IterableValidationNote,
-    )
-
-    if isinstance(error, BaseValidationError):
-        for inner in error.exceptions:
-            notes = getattr(inner, "__notes__", [])
-            names = [note.name for note in notes if isinstance(note, AttributeValidationNote)]
-            names += [str(note.index) for note in notes if isinstance(note, IterableValidationNote)]
-            yield from _problems(inner, _dotted(where, *names), owner)
-    elif isinstance(error, ForbiddenExtraKeysError):
-        known = [field.name for field in dataclasses.fields(error.cl)]
-        for name in sorted(error.extra_fields):
-            meant = nearest(name, known)
-            hint = "" if meant is None else f"; did you mean {meant}?"
-            yield f"{_dotted(where, name)}: {owner} has no such field; it has {', '.join(known) or 'none'}{hint}"
-    elif isinstance(error, NeecoError):
-        yield str(error)
-    elif isinstance(error, ValueError):
-        yield f"{where}: {error}"
-    else:
-        yield f"{where}: is a group of fields, each with a value of its own"
-
-
-def _dotted(*names: str) -> str:
-    return ".".join(name for name in names if name)

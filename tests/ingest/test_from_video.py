@@ -21,9 +21,10 @@ from neeco.ingest.pipeline import ingest
 from neeco.ingest.posing.hand_posed import HandPose
 from neeco.ingest.posing.posed_capture import PosedCapture
 from neeco.ingest.recording.file import read_recording
+from neeco.ingest.request import IngestRequest
 from neeco.ingest.shaft.axis import axis_between, contour_normals, image_lines
 from neeco.ingest.shaft.from_video import find_shaft
-from neeco.ingest.sources import recording_from_flags
+from neeco.ingest.sources import recordings_of
 from neeco.ingest.timing.episodes import with_roll
 
 
@@ -226,7 +227,7 @@ def test_without_a_logged_roll_it_can_be_posed_by_hand(recorded, tmp_path):
     [
         ({"from_video": {"shaft_diameter_mm": 0}}, "shaft_diameter_mm: 0 is out of range"),
         ({"from_video": {"working_length_mm": 20}}, "shaft_diameter_mm: missing"),
-        ({"from_video": {"shaft_diameter_mm": 5, "fixed_trocar": "yes"}}, "fixed_trocar: expected true or false"),
+        ({"from_video": {"shaft_diameter_mm": 5, "fixed_trocar": "yes"}}, "fixed_trocar: .* is not true or false"),
         ({"from_video": {"shaft_diameter_mm": 5, "length": 3}}, "length"),
         ({"poses": "roll.csv"}, "poses are logged"),
         ({"from_video": None, "roll": "roll.csv"}, "roll: belongs to an instrument from_video"),
@@ -245,12 +246,13 @@ def test_what_a_recording_says_wrong_of_its_shaft_is_refused(tmp_path, changes, 
 def test_the_command_line_takes_a_diameter_instead_of_a_tracker(tmp_path):
     (tmp_path / "v.mp4").write_bytes(b"")
     (tmp_path / "log.csv").write_text("t_s,a_rad\n0,0\n")
-    recording = recording_from_flags(tmp_path / "v.mp4", joints=[("jaw", tmp_path / "log.csv", None)], shaft_diameter=5)
+    video, log = tmp_path / "v.mp4", tmp_path / "log.csv"
+    (recording,) = recordings_of(IngestRequest(video=video, joint=(("jaw", log, None),), shaft_diameter=5))
     (item,) = recording.instruments
     assert item.from_video is not None
     assert item.placed
     assert list(item.joints) == ["jaw"]
-    with pytest.raises(NeecoError, match="--shaft-diameter: -1 is no shaft's"):
-        recording_from_flags(tmp_path / "v.mp4", shaft_diameter=-1)
-    with pytest.raises(NeecoError, match="--shaft-diameter: finds an instrument that was not tracked"):
-        recording_from_flags(tmp_path / "v.mp4", tmp_path / "log.csv", shaft_diameter=5)
+    with pytest.raises(NeecoError, match="--shaft-diameter: -1 is out of range"):
+        recordings_of(IngestRequest(video=video, shaft_diameter=-1))
+    with pytest.raises(NeecoError, match="--shaft-diameter: poses are logged"):
+        recordings_of(IngestRequest(video=video, instrument=log, shaft_diameter=5))

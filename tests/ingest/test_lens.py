@@ -31,7 +31,6 @@ FISHEYE = {
     "camera_model": "OPENCV_FISHEYE", "w": 640, "h": 480, "fl_x": 330, "fl_y": 335, "cx": 322, "cy": 241,
     "k1": -0.02, "k2": 0.01, "k3": -0.004, "k4": 0.0007,
 }  # fmt: skip
-OMNIDIRECTIONAL = {"width": 1350, "height": 1080, "cx": 678.5, "cy": 543.0, "a0": 769.0, "a2": -8e-4, "a3": 6e-7}
 ROS = """image_width: 320
 image_height: 240
 distortion_model: plumb_bob
@@ -187,8 +186,6 @@ def test_a_field_of_view_is_a_focal_length(world):
         ("a.json", "{}", "fl_x: missing"),
         *(("a.json", text, "expected an object with fl_x") for text in ("null", "3", '"fl_x"', "[1, 2]", "true")),
         *(("a.yaml", text, "no keys; expected") for text in ("null", "3", "fl_x", "[1, 2]", "true")),
-        ("a.json", json.dumps(OMNIDIRECTIONAL), "is an omnidirectional model .* is not read; undistort"),
-        ("a.yaml", json.dumps(OMNIDIRECTIONAL), "is an omnidirectional model .* is not read; undistort"),
         ("a.txt", "300 0 160\n0 300 120\n0 0 2", "no keys; expected camera_matrix"),
         ("a.json", '{"fl_x": "x", "cx": 1, "cy": 1}', "'x' is not a usable number"),
         ("a.json", json.dumps(FISHEYE | {"fl_x": 90, "fl_y": 90}), "covers more than 80 degrees off its axis"),
@@ -268,16 +265,16 @@ def test_a_file_that_holds_no_object_ends_in_one_line(tmp_path, text, suffix):
 
 
 @pytest.mark.parametrize(
-    ("document", "message"),
+    "document",
     [
-        ({"cx": 678.5, "cy": 542.9, "a0": 769.2, "a1": 0, "a2": -8e-4, "a3": 6e-7, "a4": 0}, "omnidirectional"),
-        ({"FocalLength": [1035, 1035], "PrincipalPoint": [597, 520], "ImageSize": [1024, 1280]}, "MATLAB"),
-        ({"width": 1280, "height": 720, "ppx": 640.1, "ppy": 360.2, "fx": 900, "fy": 901}, "RealSense"),
+        {"cx": 678.5, "cy": 542.9, "a0": 769.2, "a1": 0, "a2": -8e-4, "a3": 6e-7, "a4": 0},  # Scaramuzza's
+        {"FocalLength": [1035, 1035], "PrincipalPoint": [597, 520], "ImageSize": [1024, 1280]},  # MATLAB's
+        {"width": 1280, "height": 720, "ppx": 640.1, "ppy": 360.2, "fx": 900, "fy": 901},  # RealSense's
     ],
 )
 @pytest.mark.parametrize("suffix", [".json", ".yaml"])
-def test_calibrations_of_other_kinds_are_named(tmp_path, document, message, suffix):
+def test_calibrations_of_other_kinds_are_refused(tmp_path, document, suffix):
     path = tmp_path / f"lens{suffix}"
     path.write_text(json.dumps(document))
-    with pytest.raises(NeecoError, match=message):
+    with pytest.raises(NeecoError, match=r"missing; (give|expected)"):
         read_lens(path)

@@ -14,8 +14,9 @@ from neeco.ingest.readers.columns import Units
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import IngestSettings, Splits
-from neeco.ingest.recording.template import write_template
-from neeco.ingest.sources import open_questions, recording_from_flags
+from neeco.ingest.recording.template import open_questions, write_template
+from neeco.ingest.request import IngestRequest
+from neeco.ingest.sources import recordings_of
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 
@@ -36,11 +37,11 @@ def flags(folder, **more):
     given = {
         "instrument": folder / "logs/instrument.csv",
         "laparoscope": folder / "logs/camera.csv",
-        "joints": [("jaw_angle", folder / "logs/jaw.csv", folder / "logs/jaw_calibration.csv")],
+        "joint": [("jaw_angle", folder / "logs/jaw.csv", folder / "logs/jaw_calibration.csv")],
         "intrinsics": (290, 290, 160, 128),
         "sync": folder / "logs/sync.json",
     }
-    return recording_from_flags(folder / "video.mp4", **(given | more))
+    return recordings_of(IngestRequest(video=folder / "video.mp4", **(given | more)))[0]
 
 
 def test_flags(folder):
@@ -110,7 +111,7 @@ def test_init_asks_for_the_lens_and_the_clock_that_no_file_states(folder):
     document = {"fl_x": 1, "frames": [], "clocks": {"em": {"offset_s": 0.1, "sd_s": 0.001}}}  # as `ingest` writes it
     (folder / "capture/transforms.json").write_text(json.dumps(document))
     assert [line.strip() for line in asked() if "intrinsics" in line or "clock" in line] == [
-        "# intrinsics: [290, 290, 160, 128]   # no calibration was found",
+        "# intrinsics: [290, 290, 160, 128]   # fl_x, fl_y, cx, cy px; no calibration was found",
         "# clock: em   # left out, it is its own, whose offset nothing states",
     ]
     (folder / "recording.yaml").write_text(write_template(folder).replace("# clock: em ", "clock: em "))
@@ -238,9 +239,12 @@ def test_links_are_given_inline_or_by_a_tool_file(world, folder):
             r"instruments\[0\]\.kinematics\.links: joined in a circle: 'tip'",
         ),
         ("{dvrk_tool: none.json}", r"instruments\[0\]\.kinematics\.dvrk_tool: no such file: 'none\.json'"),
-        ("{dvrk_tool: tool.json, reading: {}}", r"kinematics\.reading: unknown key; did you mean readings\?"),
+        (
+            "{dvrk_tool: tool.json, reading: {}}",
+            r"reading: it has no such field; .*did you mean readings\?",
+        ),
         ("{dvrk_tool: tool.json, readings: {yaw: jaw}}", r"kinematics\.readings\.yaw: unknown key"),
-        ("{dvrk_tool: tool.json, readings: 3}", r"kinematics\.readings: expected keys"),
+        ("{dvrk_tool: tool.json, readings: 3}", r"kinematics\.readings: is a group of fields"),
         ("{dvrk_tool: tool.json}", r"instruments\[0\]\.kinematics: 'wrist_pitch' is no joint of it"),
         ("7", r"instruments\[0\]\.kinematics: expected an object, found 7"),
     ],
@@ -261,8 +265,12 @@ def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder)
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("frames:", "frmes:", r"frmes: unknown key; did you mean frames\?"),
-        ("quaternion:", "quaternions:", r"instruments\[0\]\.poses\.columns\.quaternions: unknown key; did you mean"),
+        ("frames:", "frmes:", r"frmes: it has no such field; it has .*; did you mean frames\?"),
+        (
+            "quaternion:",
+            "quaternions:",
+            r"\[0\]\.poses\.columns\.quaternions: it has no such field; .*did you mean",
+        ),
         ("file: video.mp4", "file: vide.mp4", r"video\.file: no such file: 'vide\.mp4'"),
         ("fps: 50", "fps: -1", r"video\.fps: -1 is out of range; give a number above 0"),
         ("fps: 50", "fps: fast", r"video\.fps: expected a number, found 'fast'"),
@@ -289,9 +297,13 @@ def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder)
         ("10-12", "12-10", r"splits\.unseen: '12-10' is no range of frames"),
         ("video: {file: video.mp4, fps: 50}", "", "give either `video: FILE` or `images:"),
         ("video: {file: video.mp4, fps: 50}", "images: {folder: logs}", r"images\.fps: when were the images taken\?"),
-        ("instruments:\n", "instruments: 3\nx:\n", r"unknown key"),
+        ("instruments:\n", "instruments: 3\nx:\n", r"x: it has no such field"),
         ("frames: 100", "frames: [100", r"line \d+: not valid YAML"),
-        ("shape_frames: 20", "shape_frame: 20", r"settings\.shape_frame: unknown key; did you mean shape_frames\?"),
+        (
+            "shape_frames: 20",
+            "shape_frame: 20",
+            r"settings\.shape_frame: it has no such .*did you mean shape_frames\?",
+        ),
         (
             "shape_frames: 20",
             "shape_frames: 0",
@@ -325,7 +337,7 @@ def test_sync_files(world, folder, content, offsets):
 
 
 def test_an_offset_of_a_log_that_was_not_given_is_noted(folder):
-    recording = flags(folder, joints=())
+    recording = flags(folder, joint=())
     assert recording.sync == {"em": 0.038}
     assert any("'jaw_minus_video_s' belongs to no log" in note for note in recording.notes)
 
@@ -340,7 +352,7 @@ def test_sync_files_that_are_none(world, folder, content, message):
 
 
 def test_flags_that_cannot_be(folder):
-    with pytest.raises(NeecoError, match=r"--laparoscope: .*absent\.csv: no such file"):
+    with pytest.raises(NeecoError, match=r"--laparoscope: no such file: .*absent\.csv"):
         flags(folder, laparoscope=folder / "absent.csv")
     with pytest.raises(NeecoError, match="--joint jaw_angle: needs --instrument"):
         flags(folder, instrument=None)
@@ -348,7 +360,7 @@ def test_flags_that_cannot_be(folder):
         flags(folder, frames=1)
     joint = ("jaw_angle", folder / "logs/jaw.csv", None)
     with pytest.raises(NeecoError, match="--joint jaw_angle: given twice"):
-        flags(folder, joints=[joint, joint])
+        flags(folder, joint=[joint, joint])
 
 
 def test_two_instruments_with_one_joint_name_have_two_clocks(world, folder):
@@ -359,17 +371,17 @@ def test_two_instruments_with_one_joint_name_have_two_clocks(world, folder):
 
 def test_a_fault_of_a_flag_is_told_by_its_flag(folder):
     (folder / "empty").mkdir()
-    with pytest.raises(NeecoError, match=r"--video: .*empty: holds no images; give a folder of frames"):
-        recording_from_flags(folder / "empty")
+    with pytest.raises(NeecoError, match=r"empty: holds 0 images"):
+        recordings_of(IngestRequest(video=folder / "empty", fps=25))[0].source.open()
     (folder / "frames").mkdir()
     Image.new("RGB", (8, 8)).save(folder / "frames" / "1.png")
-    with pytest.raises(NeecoError, match=r"--video: .*frames: when were the images taken\? Give --fps"):
-        recording_from_flags(folder / "frames")
+    with pytest.raises(NeecoError, match=r"--fps: when were the images taken\?"):
+        recordings_of(IngestRequest(video=folder / "frames"))
     joint = ("jaw_angle", folder / "logs/jaw_calibration.csv", folder / "logs/jaw.csv")
     with pytest.raises(
         NeecoError, match=r"--joint jaw_angle: .*calibration\.csv has no times, .*jaw\.csv has; give the"
     ):
-        flags(folder, joints=[joint])
+        flags(folder, joint=[joint])
     with pytest.raises(NeecoError, match=r"^--intrinsics: fl_x, fl_y: must be two positive focal lengths in pixels"):
         flags(folder, intrinsics=(-290, 290, 160, 128)).read_lens()
     with pytest.raises(NeecoError) as told:

@@ -26,7 +26,8 @@ from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, Pose
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.sources import recording_from_flags
+from neeco.ingest.request import IngestRequest
+from neeco.ingest.sources import recordings_of
 from neeco.ingest.timing.reading import read_episodes
 
 SIZE = (64, 48)  # px
@@ -174,38 +175,12 @@ def test_a_folder_with_a_bag_and_other_files_is_looked_through(tmp_path: Path) -
     assert {item["poses"]["file"] for item in document["instruments"]} == {"first.bag", "second-db3"}
 
 
-@pytest.mark.parametrize("copy", ["arms.csv", "other-db3"])
-def test_of_a_bag_and_its_copy_one_is_drafted_and_the_other_named(tmp_path: Path, copy: str) -> None:
-    for kind in {"recording.bag", copy} - {"arms.csv"}:
-        with BagWriter(tmp_path, kind) as bag:
-            write_dvrk(bag)
-    alone = yaml.safe_load(write_template(tmp_path / "recording.bag"))
-    if copy == "arms.csv":  # in mm, rounded, and every second row
-        rows = [[time, *np.round(1000 * shaft(time), 2), 1, 0, 0, 0, 0.3 * time] for time in np.arange(0, 2, 0.04)]
-        lines = [",".join(map(str, row)) for row in [["t_s", "x_mm", "y_mm", "z_mm", *"wxyz", "jaw_rad"], *rows]]
-        (tmp_path / copy).write_text("\n".join(lines).replace(",w,x,y,z,", ",qw,qx,qy,qz,"))
-        (tmp_path / "force.csv").write_text("t_s,gripper_angle_rad\n0,0.1\n1,0.9\n2,0.3\n")
-    text = write_template(tmp_path)
-    document = yaml.safe_load(text)
-    assert [item["name"] for item in document["instruments"]] == ["PSM1", "PSM2"]
-    joints = [sorted(item["joints"]) for item in document["instruments"]]
-    more = ["gripper_angle_rad_angle", "force_angle"] if copy == "arms.csv" else []
-    assert [[joint for joint in arm if joint not in more] for arm in joints] == [
-        sorted(item["joints"]) for item in alone["instruments"]
-    ]
-    used = {item["poses"]["file"] for item in document["instruments"]}
-    assert used == {min("recording.bag", copy) if copy != "arms.csv" else "recording.bag"}
-    (unused,) = {"recording.bag", copy} - used
-    assert f"#   {unused}: " in text.partition("not used:")[2]
-    assert "another copy of it" in text
-
-
 def test_a_bag_alone_is_enough_where_it_holds_one_of_each(tmp_path: Path) -> None:
     with BagWriter(tmp_path, "recording-db3") as bag:
         for time in np.arange(40) / 25:
             bag.pose("/tool/pose", time, shaft(time), [1, 0, 0, 0], "tracker")
             bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
-    recording = recording_from_flags(bag.path, bag.path)
+    (recording,) = recordings_of(IngestRequest(video=bag.path, instrument=bag.path))
     data = read_episodes([recording])
     states, usable = data.with_assumed_clocks().states_at(data.times)
     assert usable.all()

@@ -7,12 +7,14 @@ import re
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal, NoReturn, Self
 
 import numpy as np
 
 from neeco.errors import NeecoError, visible
 from neeco.geometry.rotations import rigid_fault
+from neeco.settings import Fault, Place, printable
+from neeco.settings import key_name as key_name
 
 MIN_CONDENSED = 3  # problems similar to another one, from which they are counted instead of listed
 VARYING = re.compile(
@@ -85,19 +87,11 @@ class RaisingReport(ProblemReport):
         raise NeecoError(str(problem))
 
 
-def printable(value: Any, limit: int = 60) -> str:
-    """A value from a file, as one short printable piece of text."""
-    if isinstance(value, dict | list):
-        return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)}"
-    if isinstance(value, int) and abs(value) >= 10**20:
-        return "a huge integer"
-    text = repr(value)
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+class FaultReport(ProblemReport):
+    """Raises the first error as a Fault, for whoever knows the file."""
 
-
-def key_name(key: str) -> str:
-    """A JSON key as messages write it."""
-    return key if key.isidentifier() else f"[{printable(key)}]"
+    def error(self, file: str, field: str, message: str, remedy: str = "") -> NoReturn:
+        raise Fault(field, f"{message}; {remedy}" if remedy else message)
 
 
 def as_float(value: Any) -> float | None:
@@ -111,16 +105,14 @@ def as_float(value: Any) -> float | None:
 
 
 @dataclass(frozen=True)
-class Node:
+class Node(Place):
     """A value of a JSON or YAML file and its place. A reading that fails reports one error and returns None.
 
-    Whether that ends the reading is the report's choice: `ProblemReport` collects, `RaisingReport` raises.
+    Whether that ends the reading is the report's choice: `ProblemReport` collects; `RaisingReport` raises, as does
+    `FaultReport`, for `neeco.settings.read`.
     """
 
-    value: Any
-    file: str
-    field: str
-    report: ProblemReport
+    report: ProblemReport = field(default_factory=FaultReport)
 
     def error(self, message: str, remedy: str = "") -> None:
         self.report.error(self.file, self.field, message, remedy)
@@ -142,16 +134,8 @@ class Node:
         """Return True if the object has this key with a value other than null."""
         return isinstance(self.value, dict) and self.value.get(key) is not None
 
-    def child(self, key: str) -> Node:
-        """The value under `key` (None when absent)."""
-        path = f"{self.field}.{key_name(key)}" if self.field else key_name(key)
-        value = self.value.get(key) if isinstance(self.value, dict) else None
-        return Node(value, self.file, path, self.report)
-
-    def item(self, index: int) -> Node:
-        """The element `index` of a list (None when this is not one)."""
-        value = self.value[index] if isinstance(self.value, list) else None
-        return Node(value, self.file, f"{self.field}[{index}]", self.report)
+    def at(self, value: Any, field: str) -> Self:
+        return type(self)(value, self.file, field, self.report)
 
     def items(self) -> Iterator[Node]:
         """The elements of a list; reports an error and yields nothing when this is not a list."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,45 +13,30 @@ from neeco.files import write_text
 from neeco.ingest.cameras.still_scene import video_stands_still
 from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.columns import recognise_time
-from neeco.ingest.readers.video import IMAGES, VIDEOS
-from neeco.ingest.recording.file import RecordingSection, read_recording
-from neeco.ingest.recording.model import MAX_SHAFT_MM, MIN_FRAMES, Recording
-from neeco.ingest.recording.sections import faults_in, node_of, read_section
-from neeco.ingest.recording.template import holds_streams, write_template
+from neeco.ingest.readers.video import VIDEOS
+from neeco.ingest.recording.file import read_recording, recording_of
+from neeco.ingest.recording.model import MIN_FRAMES, Recording
+from neeco.ingest.recording.template import open_questions, write_template
+from neeco.ingest.request import IngestRequest
+from neeco.settings import Fault
 
 RECORDING = "recording.yaml"
-
-
-# Lines of a draft that leave something open: what marks the first of them, and what to write there
-_QUESTIONS = (
-    (r"^  - name: ", "what is the instrument called in labels? Correct its name"),
-    (r"^ +# kinematics: \{dvrk_tool", "which tool is it? Remove the # and give its file, or write out its links below"),
-    (r"^ +# camera_from_base: \{transform", "how does the robot's base stand to the camera? Remove the # of one line"),
-    (r"a guess: correct it", "at which rate were these taken? Correct the number"),
-    (r"# units: .*nothing says them", "in which units? Correct them and remove the #"),
-    (r"^# intrinsics: .*no calibration was found", "which lens? Remove the # and give a calibration's file or numbers"),
-    (r"^ +# clock: .*its own", "is it the clock of the poses? Remove the #; else give its offset in sync, below"),
-    (r"is not clear: ", "which columns hold it? Name them"),
-    (r"^ +# +(?:frame|quaternion\w*|rotation\w*|euler\w*): ", "what do its poses mean? Correct it, remove the #"),
-)
-
-
-def open_questions(draft: str) -> list[tuple[int, str]]:
-    """Return the lines of a drafted recording.yaml, from 1, that only the one who recorded can answer, and what to
-    write there."""
-    found = []
-    for number, line in enumerate(draft.splitlines(), 1):
-        found += [(number, words) for marks, words in _QUESTIONS if re.search(marks, line)][:1]
-    return found
+_OPTIONS = {
+    "video.fps": "--fps",
+    "images.fps": "--fps",
+    "video": "--video",
+    "images": "--video",
+    "instruments[0].joints": "--joint",
+    "instruments[0].from_video": "--shaft-diameter",
+    "instruments[0].poses": "--instrument",
+    **{name: f"--{name}" for name in ("intrinsics", "laparoscope", "sync", "frames")},
+}  # by the beginning of a field of recording.yaml
 
 
 def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
-    """Write a recording.yaml for what lies at `source`, into the folder or next to the file. Return lines on what was
-    written; `report` is called with what is left out.
-
-    Raises NeecoError where a recording.yaml exists, and where there are no images.
-    """
-    path = (source.parent if holds_streams(source) else source) / RECORDING
+    """Write a recording.yaml for what lies at `source`, into the folder or next to the file, and return lines on it;
+    `report` is called with what is left out. Raises NeecoError where there is one, and where there are no images."""
+    path = (source.parent if source.is_file() or format_of(source) is not None else source) / RECORDING
     if path.exists():
         raise NeecoError(f"{path}: already exists; edit it, or move it away first")
     draft = write_template(source, lambda problem: report(f"left out: {problem}"), video_stands_still)
@@ -82,87 +66,54 @@ def folder_to_convert(sources: Sequence[Path]) -> Path | None:
     return None
 
 
-def read_recordings(sources: Sequence[Path], frames: int | None = None) -> list[Recording]:
-    """Read recording files. frames: how many to keep, instead of what they state. Raises NeecoError."""
-    check_frame_count(frames)
-    recordings = [read_recording(source) for source in sources]
-    return [item if frames is None else replace(item, frames=frames) for item in recordings]
-
-
-def recording_from_flags(
-    video: Path,
-    instrument: Path | None = None,
-    laparoscope: Path | None = None,
-    joints: Sequence[tuple[str, Path, Path | None]] = (),
-    intrinsics: Sequence[float] | None = None,
-    calibration: Path | None = None,
-    sync: Path | None = None,
-    frames: int | None = None,
-    fps: float | None = None,
-    shaft_diameter: float | None = None,
-) -> Recording:
-    """Return a recording from the command line's options: columns are recognised from the headers. `video`: a file or a
-    folder of images; joints: (name, log, calibration or None); shaft_diameter: mm, of an instrument that was not
-    tracked. Raises NeecoError naming the option."""
-    if intrinsics is not None and calibration is not None:
+def recordings_of(request: IngestRequest) -> list[Recording]:
+    """Return the recordings that a request states: by files, or by its other options, whose columns are recognised from
+    the headers. Raises NeecoError naming the file or the option."""
+    if request.frames is not None and request.frames < MIN_FRAMES:
+        raise NeecoError(f"--frames: {request.frames} is too few; give {MIN_FRAMES} or more")
+    if request.source:
+        request.refuse_others(f"{request.source[0]}: states what was recorded", "output", "frames", "json", "strict")
+        recordings = [read_recording(source) for source in request.source]
+        return [item if request.frames is None else replace(item, frames=request.frames) for item in recordings]
+    if request.video is None:
+        raise NeecoError("--video: give the video (or a folder of images), or a recording.yaml")
+    if request.intrinsics is not None and request.calibration is not None:
         raise NeecoError("--calibration: given together with --intrinsics; give one of them")
-    given = [("--video", video), ("--instrument", instrument), ("--laparoscope", laparoscope), ("--sync", sync)]
-    given += [(f"--joint {joint}", file) for joint, *files in joints for file in files]
-    for option, file in given:
-        if file is not None and not Path(file).exists():
-            raise NeecoError(f"{option}: {file}: no such file; correct the path")
+    shaft, joints = request.shaft_diameter, request.joint
+    tracked = request.instrument is not None or shaft is not None
     for joint, log, table in joints:
-        timed = [recognise_time(read_table(Path(file)).header).time for file in (log, table) if file is not None]
-        if timed[0] is None and timed[-1] is not None:
+        if [name for name, *_ in joints].count(joint) > 1:
+            raise NeecoError(f"--joint {joint}: given twice; give each joint once")
+        if not tracked:
+            raise NeecoError(f"--joint {joint}: needs --instrument, whose joint it is, or --shaft-diameter")
+        timed = [recognise_time(read_table(file).header).time for file in (log, table) if file and file.exists()]
+        if timed and timed[0] is None and timed[-1] is not None:
             raise NeecoError(f"--joint {joint}: {log} has no times, {table} has; give the log first, its table second")
-    names = [joint for joint, *_ in joints]
-    twice = next((joint for joint in names if names.count(joint) > 1), None)
-    if twice is not None:
-        raise NeecoError(f"--joint {twice}: given twice; give each joint once")
-    if joints and instrument is None and shaft_diameter is None:
-        raise NeecoError(
-            f"--joint {names[0]}: needs --instrument, the log of the instrument it belongs to, or --shaft-diameter"
-        )
-    if shaft_diameter is not None and instrument is not None:
-        raise NeecoError("--shaft-diameter: finds an instrument that was not tracked, and --instrument says it was")
-    if shaft_diameter is not None and not 0 < shaft_diameter < MAX_SHAFT_MM:
-        raise NeecoError(f"--shaft-diameter: {shaft_diameter:g} is no shaft's; give it in mm, as in 5")
-    check_frame_count(frames)
-    if fps is not None and not 0 < fps < 1e6:  # NaN compares false
-        raise NeecoError(f"--fps: {fps:g} is no frame rate; give frames per second")
-    if intrinsics is not None and len(intrinsics) != 4:
-        raise NeecoError(f"--intrinsics: takes FX FY CX CY, not {len(intrinsics)} numbers")
-    video = Path(video)
-    is_folder = video.is_dir() and format_of(video) is None
-    if is_folder and fps is None:
-        images = any(entry.suffix.lower() in IMAGES for entry in video.iterdir())
-        problem = "when were the images taken? Give --fps" if images else "holds no images; give a folder of frames"
-        raise NeecoError(f"--video: {video}: {problem}")
+    is_folder = request.video.is_dir() and format_of(request.video) is None
     tool = {
         "name": "instrument",
-        "poses": _plain(instrument),
+        "poses": _plain(request.instrument),
         "joints": {joint: {"file": _plain(log), "calibration": _plain(table)} for joint, log, table in joints},
-        "from_video": shaft_diameter and {"shaft_diameter_mm": shaft_diameter},
+        "from_video": None if shaft is None else {"shaft_diameter_mm": shaft},
     }
+    images = {"folder" if is_folder else "file": str(request.video), "fps": request.fps}
     document = {
-        "images" if is_folder else "video": {"folder" if is_folder else "file": _plain(video), "fps": fps},
-        "intrinsics": _plain(calibration or intrinsics),
-        "instruments": [] if instrument is None and shaft_diameter is None else [tool],
-        "laparoscope": _plain(laparoscope),
-        "sync": _plain(sync),
-        "frames": frames,
+        "images" if is_folder else "video": images,
+        "intrinsics": _plain(request.calibration or request.intrinsics),
+        "instruments": [tool] if tracked else [],
+        "laparoscope": _plain(request.laparoscope),
+        "sync": _plain(request.sync),
+        "frames": request.frames,
     }
-    where = Path("command line")
-    with faults_in(where):
-        return replace(read_section(RecordingSection, node_of(document, where)).recording(where), path=video)
+    try:
+        return [replace(recording_of(document, Path("this folder")), path=request.video)]
+    except Fault as fault:
+        options = (option for field, option in _OPTIONS.items() if fault.field.startswith(field))
+        option = "--calibration" if request.calibration and fault.field == "intrinsics" else next(options, fault.field)
+        joint = fault.field.split(".")[2] if option == "--joint" else ""
+        raise NeecoError(f"{option} {joint}".rstrip() + f": {fault}") from None
 
 
-def check_frame_count(frames: int | None) -> None:
-    """Raise NeecoError when the option asks for too few frames."""
-    if frames is not None and frames < MIN_FRAMES:
-        raise NeecoError(f"--frames: {frames} is too few; give {MIN_FRAMES} or more")
-
-
-def _plain(value: Any) -> Any:
+def _plain(value: Path | Sequence[float] | None) -> Any:
     """Return an option as recording.yaml has it."""
-    return str(value) if isinstance(value, Path) else [*value] if isinstance(value, list | tuple) else value
+    return value if value is None else str(value) if isinstance(value, Path) else [*value]

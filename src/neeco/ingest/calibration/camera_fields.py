@@ -114,17 +114,6 @@ def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
     if not isinstance(document, dict):
         return ()
     keys = _plain(document)
-    if {"a0", "a2", "a3"} <= keys.keys() or {"ss", "pol", "mappingcoefficients"} & keys.keys():
-        raise NeecoError(
-            f"{where}: is an omnidirectional model (Scaramuzza's), which is not read; undistort the images"
-        )
-    if "focallength" in keys and "principalpoint" in keys:
-        raise NeecoError(
-            f"{where}: FocalLength: MATLAB's cameraParameters are not read; write camera_matrix (its IntrinsicMatrix "
-            "transposed, principal point less 1 px) and distortion_coefficients"
-        )
-    if {"ppx", "ppy"} <= keys.keys():
-        raise NeecoError(f"{where}: ppx: RealSense's intrinsics are not read; write camera_matrix of fx, fy, ppx, ppy")
     for pair in SIDES:
         sides = [_side(keys, side) for side in pair]
         if all(_has_camera(side) for side in sides):

@@ -16,10 +16,11 @@ from typing import Annotated, Any
 
 import yaml
 
-from neeco.capture.documents import Node, printable
+from neeco.capture.documents import Node
 from neeco.errors import NeecoError
 from neeco.files import YamlDumper, parse_yaml, read_text, write_text
-from neeco.ingest.recording.sections import Fault, faults_in, list_of, node_of
+from neeco.ingest.recording.sections import Name
+from neeco.settings import Fault, faults_in, printable, read
 
 FILE = "hand_posed.yaml"
 HEADER = """\
@@ -40,7 +41,7 @@ def _degrees(node: Node) -> float:
 def _joints(node: Node) -> dict[str, float]:
     if not isinstance(node.value, dict):
         raise Fault(node.field, f"is not name: degrees; {REMEDY}")
-    return {str(name): _degrees(node_of(value, Path(node.file), str(name))) for name, value in node.value.items()}
+    return {str(name): _degrees(Node(value, node.file, str(name))) for name, value in node.value.items()}
 
 
 def _remark(node: Node) -> str:
@@ -51,8 +52,8 @@ def _remark(node: Node) -> str:
 class HandPose:
     """An answer: roll and joints of one instrument in one frame. frame: its image's name without the suffix."""
 
-    frame: str
-    instrument: str
+    frame: Name
+    instrument: Name
     roll_deg: Annotated[float, _degrees]
     joints_deg: Annotated[dict[str, float], _joints] = field(default_factory=dict)
     when: Annotated[str, _remark] | None = None
@@ -66,7 +67,7 @@ def read_answers(capture: Path) -> list[HandPose]:
         return []
     entries = parse_yaml(path, read_text(path, "YAML"), REMEDY)
     with faults_in(path):
-        return list(list_of(HandPose)(node_of([] if entries is None else entries, path, "answers")))
+        return list(read(tuple[HandPose, ...], Node([] if entries is None else entries, str(path), "answers")))
 
 
 def write_answers(capture: Path, answers: Iterable[HandPose]) -> None:

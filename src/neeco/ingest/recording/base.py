@@ -11,14 +11,15 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.documents import Node, RaisingReport, printable
+from neeco.capture.documents import Node, RaisingReport
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_text
 from neeco.geometry.conventions import DVRK_ECM
 from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_of
-from neeco.ingest.recording.sections import Fault, existing_file, faults_in, join_places, node_of, read_section, word
+from neeco.ingest.recording.sections import Positive, existing_file, word
+from neeco.settings import Fault, faults_in, join_places, printable, read
 
 BASE_KEY, WORLD_KEY = "camera_from_base", "world_from_base"  # to a still camera; to the laparoscope's tracker
 UNKNOWN = "unknown"
@@ -56,8 +57,8 @@ class BaseSection:
 
     transform: Annotated[np.ndarray | None, Node.rigid] = None
     axes: Annotated[str, _AXES] = CAMERA
-    sd_mm: float | None = None
-    sd_deg: float | None = None
+    sd_mm: Positive | None = None
+    sd_deg: Positive | None = None
 
     def __post_init__(self) -> None:
         if self.transform is None:
@@ -65,15 +66,6 @@ class BaseSection:
         if (self.sd_mm is None) != (self.sd_deg is None):
             missing = "sd_mm" if self.sd_mm is None else "sd_deg"
             raise Fault(missing, "is missing; give both, or none where the transform is exact")
-
-
-def same_base(one: StatedBase | None, other: StatedBase | None) -> bool:
-    """Return whether two recordings state the same of a base."""
-    if one is None or other is None:
-        return one is other
-    mine, theirs = one.matrix, other.matrix
-    same = mine is theirs if mine is None or theirs is None else np.array_equal(mine, theirs)
-    return same and (one.sd_mm, one.sd_deg, one.to_world) == (other.sd_mm, other.sd_deg, other.to_world)
 
 
 def _of_hand_eye(path: Path) -> StatedBase:
@@ -135,12 +127,7 @@ def read_dvrk_registration(path: Path) -> StatedBase:
             node.child(key).error(f"is within {NEAR_MM:g} mm of the camera: in metres?", "give it in mm")
         with faults_in(path):
             usual = {"sd_mm": DVRK_SD_MM, "sd_deg": DVRK_SD_DEG, "transform": document.pop(key)}
-            return _stated(node_of(usual | document, path))
-    if isinstance(document, dict) and "measured_cp" in document:
-        node.child("measured_cp").error(
-            "states the arm in the base of the arm that holds the scope, not in the camera's frame",
-            "give the file …-registration-open-cv.json",
-        )
+            return _stated(Node(usual | document, str(path)))
     frame = node.child("base-frame")
     if not isinstance(frame.value, dict):
         frame.error(
@@ -174,7 +161,7 @@ def parse_base(node: Node) -> StatedBase:
 
 
 def _stated(node: Node) -> StatedBase:
-    stated = read_section(BaseSection, node)
+    stated: BaseSection = read(BaseSection, node)
     assert stated.transform is not None
     return StatedBase(CAMERA_FRAMES[stated.axes].poses_to_opencv(stated.transform), stated.sd_mm, stated.sd_deg)
 

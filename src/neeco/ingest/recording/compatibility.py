@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any
 
 from neeco.errors import NeecoError
 from neeco.ingest.readers import format_of
-from neeco.ingest.recording.base import same_base
-from neeco.ingest.recording.model import ImageFolder, IngestSettings, InstrumentLogs, Recording, VideoFile
+from neeco.ingest.readers.columns import JointColumns, PoseColumns
+from neeco.ingest.recording.model import IngestSettings, InstrumentLogs, Recording, StereoPartner, VideoFile
 
 
 def separate(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
@@ -23,39 +23,29 @@ def separate(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
 
 def _of_episode(recording: Recording, episode: int) -> Recording:
     """Return the recording with all its streams of one episode of the data set that holds them."""
-    moved = 0
+    moved = []
 
-    def stream_of(path: Path | None, stream: str | None, key: str) -> str | None:
-        nonlocal moved
-        known = None if path is None else format_of(path)
+    def in_episode(value: Any, key: str) -> Any:
+        if isinstance(value, Mapping):
+            return {name: in_episode(item, f"{key}: {name}") for name, item in value.items()}
+        if isinstance(value, tuple):
+            return tuple(in_episode(item, key) for item in value)
+        if isinstance(value, InstrumentLogs | StereoPartner):
+            held = {field.name: in_episode(getattr(value, field.name), field.name) for field in fields(value)}
+            return replace(value, **held)
+        if not isinstance(value, VideoFile | PoseColumns | JointColumns):
+            return value
+        known = format_of(value.file if isinstance(value, VideoFile) else value.path)
         if known is None or known.of_episode("", episode) is None:
-            return stream
-        if stream is None:
+            return value
+        if value.stream is None:
             raise NeecoError(f"{recording.path}: {key}: stream: missing; name the feature, as in observation.state")
-        moved += 1
-        return known.of_episode(stream, episode)
+        moved.append(key)
+        return replace(value, stream=known.of_episode(value.stream, episode))
 
-    def source_of(source: VideoFile | ImageFolder, key: str) -> VideoFile | ImageFolder:
-        if isinstance(source, ImageFolder):
-            return source
-        return replace(source, stream=stream_of(source.file, source.stream, key))
-
-    instruments = []
-    for item in recording.instruments:
-        poses = item.poses and replace(item.poses, stream=stream_of(item.poses.path, item.poses.stream, "poses"))
-        joints = {
-            name: replace(log, stream=stream_of(log.path, log.stream, f"joints: {name}"))
-            for name, log in item.joints.items()
-        }
-        roll = item.roll and replace(item.roll, stream=stream_of(item.roll.path, item.roll.stream, "roll"))
-        instruments.append(replace(item, poses=poses, joints=joints, roll=roll))
-    scope, partner = recording.laparoscope, recording.stereo
-    changed = replace(
-        recording, source=source_of(recording.source, "video"), instruments=tuple(instruments),
-        laparoscope=scope and replace(scope, stream=stream_of(scope.path, scope.stream, "laparoscope")),
-        stereo=partner and replace(partner, source=source_of(partner.source, "stereo")),
-        episode=f"episode_{episode}",
-    )  # fmt: skip
+    places = {"source": "video", "instruments": "instruments", "laparoscope": "laparoscope", "stereo": "stereo"}
+    held = {field: in_episode(getattr(recording, field), key) for field, key in places.items()}
+    changed = replace(recording, **held, episode=f"episode_{episode}")
     if not moved:
         raise NeecoError(
             f"{recording.path}: episodes: no file named here holds several; leave it out, and give several recordings "
@@ -85,17 +75,11 @@ def check_recordings(recordings: Sequence[Recording]) -> None:
     lens, where = first.read_lens()
     for other in recordings[1:]:
         if other.read_lens()[0] != lens:
-            raise refusal(other, f"intrinsics: are others than {where} gives", first)
-        for key in ("camera", "laparoscope", "stereo"):
-            mine, theirs = getattr(other, key), getattr(first, key)
-            if (mine is None) != (theirs is None) or (key == "camera" and mine != theirs):
-                raise refusal(other, f"{key}: is not as", first)
-        names = [item.name for item in other.instruments]
-        if names != [item.name for item in first.instruments]:
-            raise refusal(other, f"instruments: {', '.join(names) or 'none'} are not those", first)
-        for mine, theirs in zip(other.instruments, first.instruments, strict=True):
-            if fault := _difference(mine, theirs):
-                raise refusal(other, f"instruments: {mine.name}: {fault} not as", first)
+            raise refusal(other, f"intrinsics: differ from what {where} gives", first)
+        theirs = _stated_once(first)
+        for place, mine in _stated_once(other).items():
+            if mine != theirs[place]:
+                raise refusal(other, f"{place}: differs from that", first)
         for key, default in (("frames", None), ("splits", None), ("settings", IngestSettings())):
             if getattr(other, key) not in (default, getattr(first, key)):
                 raise refusal(other, f"{key}: differs from that", first)
@@ -107,19 +91,20 @@ def refusal(other: Recording, what: str, first: Recording) -> NeecoError:
     )
 
 
-def _difference(mine: InstrumentLogs, theirs: InstrumentLogs) -> str | None:
-    """Return in words what a capture states once and two recordings of an instrument state differently, if anything."""
-    if (mine.poses is None) != (theirs.poses is None) or mine.from_video != theirs.from_video:
-        return "poses are"
-    if (mine.roll is None) != (theirs.roll is None):
-        return "roll is"
-    limits = [{name: source.limits for name, source in item.joints.items()} for item in (mine, theirs)]
-    if limits[0].keys() != limits[1].keys():
-        return f"joints ({', '.join(limits[0]) or 'none'}) are"
-    if limits[0] != limits[1]:
-        return "limits of its joints are"
-    if mine.kinematics != theirs.kinematics:
-        return "kinematics are"
-    if not same_base(mine.base, theirs.base):
-        return "the place of its base is"
-    return None
+def _stated_once(recording: Recording) -> dict[str, Any]:
+    """Return what a capture states once for all of its recordings, by place; the instruments' names come first."""
+    items, camera = recording.instruments, recording.camera
+    stated: dict[str, Any] = {"instruments": [item.name for item in items], "camera": camera}
+    stated |= {key: getattr(recording, key) is not None for key in ("laparoscope", "stereo")}
+    for item in items:
+        base = item.base
+        matrix = None if base is None or base.matrix is None else base.matrix.tolist()
+        of_item = {
+            "poses": (item.poses is not None, item.from_video),
+            "roll": item.roll is not None,
+            "joints": {name: log.limits for name, log in item.joints.items()},
+            "kinematics": item.kinematics,
+            "base": base and (matrix, base.sd_mm, base.sd_deg, base.to_world),
+        }
+        stated |= {f"instruments: {item.name}: {key}": value for key, value in of_item.items()}
+    return stated

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from neeco.capture.documents import Node, as_float, printable
+from neeco.capture.documents import Node, as_float
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import SEPARATE_TISSUES
 from neeco.capture.readers import read_dvrk_tool, read_urdf
@@ -38,20 +38,17 @@ from neeco.ingest.recording.model import (
 )
 from neeco.ingest.recording.sections import (
     MAX_NUMBER,
-    Fault,
+    File,
+    Name,
+    Positive,
     columns,
     existing_file,
-    faults_in,
     integer,
-    join_places,
-    list_of,
-    mapping_of,
-    node_of,
     ranges,
-    read_section,
     text,
     word,
 )
+from neeco.settings import Fault, faults_in, join_places, printable, read
 
 _OFFSET_SUFFIX = "_minus_video_s"  # of clocks' names in sync files
 _EULER = re.compile(r"(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})")  # no axis twice in a row
@@ -68,7 +65,13 @@ def read_recording(path: Path) -> Recording:
     with faults_in(path):
         if isinstance(document, dict) and "tissue" in document:
             raise Fault("tissue", f"a capture has one tissue; leave the key out, or {SEPARATE_TISSUES}")
-        return read_section(RecordingSection, node_of(document, path)).recording(path)
+        return recording_of(document, path)
+
+
+def recording_of(document: Any, path: Path) -> Recording:
+    """Return the recording that a document of the file `path` states. Raises Fault."""
+    section: RecordingSection = read(RecordingSection, Node(document, str(path)))
+    return section.recording(path)
 
 
 Names = tuple[str, ...]
@@ -98,7 +101,7 @@ class PoseColumnsSection:
     rotation_matrix: Annotated[Names, columns(9)] | None = None
     matrix: Annotated[Names, columns(12, 16)] | None = None
     euler_convention: Annotated[str, _euler] | None = None
-    state: str | None = None
+    state: Name | None = None
     good: Annotated[Names, _words] = ("OK",)
 
     def __post_init__(self) -> None:
@@ -133,11 +136,11 @@ class LogSection:
     """Keys of every log, or its file alone."""
 
     shorthand: ClassVar[str] = "file"
-    file: Path
-    stream: str | None = None
-    clock: str | None = None
+    file: File
+    stream: Name | None = None
+    clock: Name | None = None
     units: Units = field(default_factory=Units)
-    rate_hz: float | None = None
+    rate_hz: Positive | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,7 +148,7 @@ class PoseSection(LogSection):
     """A log of poses."""
 
     columns: PoseColumnsSection = field(default_factory=PoseColumnsSection)
-    tool: str | None = None
+    tool: Name | None = None
     frame: Annotated[str, word(FRAMES, "is no frame of poses", f"write one of {', '.join(FRAMES)}")] | None = None
 
     def log(self, video: Path | None) -> PoseColumns:
@@ -164,7 +167,7 @@ class JointSection(LogSection):
     """A log of a joint's readings."""
 
     columns: JointColumnsSection = field(default_factory=JointColumnsSection)
-    calibration: Path | None = None
+    calibration: File | None = None
     limits: Annotated[tuple[float, float], lambda node: node.range("rad")] | None = None
 
     def log(self, clock: str, poses: PoseColumns | None, video: Path | None) -> JointColumns:
@@ -180,29 +183,22 @@ class JointSection(LogSection):
         )  # fmt: skip
 
 
-def _readings(node: Node) -> dict[str, str]:
-    given = node.value
-    if not isinstance(given, dict) or not all(isinstance(item, str) for item in (*given, *given.values())):
-        raise Fault(node.field, "expected keys and names, {joint: name of the recording's}; write them")
-    return given
-
-
 @dataclass(frozen=True, kw_only=True)
 class LinksFile:
     """A tool file of the dVRK, or a URDF. readings: the recording's names of its joints."""
 
-    dvrk_tool: Path | None = None
-    urdf: Path | None = None
-    root: str | None = None
-    pose_of: str | None = None
-    readings: Annotated[dict[str, str], _readings] = field(default_factory=dict)
+    dvrk_tool: File | None = None
+    urdf: File | None = None
+    root: Name | None = None
+    pose_of: Name | None = None
+    readings: dict[str, str] = field(default_factory=dict)
 
 
 def _links(node: Node) -> KinematicTree | None:
     """Return the links of an instrument, from a file or as transforms.json has them."""
     if not node.has("dvrk_tool") and not node.has("urdf"):
         return parse_kinematics(node)
-    stated = read_section(LinksFile, node)
+    stated: LinksFile = read(LinksFile, node)
     if stated.urdf is not None:
         return read_urdf(stated.urdf, stated.root, stated.pose_of, stated.readings)
     for key in stated.readings.keys() - {*DVRK_READINGS}:
@@ -231,11 +227,9 @@ class BasesSection:
 class InstrumentSection(BasesSection):
     """A tracked rigid body with its joints and links, or one to be found in the video."""
 
-    name: str
+    name: Name
     poses: PoseSection | None = None
-    joints: Annotated[
-        dict[str, JointSection], mapping_of(JointSection, "jaw_angle: {file: jaw.csv}")
-    ] = field(default_factory=dict)  # fmt: skip
+    joints: dict[str, JointSection] = field(default_factory=dict)
     kinematics: Annotated[KinematicTree, _links] | None = None
     from_video: ShaftInVideo | None = None
     roll: JointSection | None = None
@@ -294,8 +288,8 @@ class CalibrationSection:
     """A calibration of two cameras, or a recording that holds one. stream: whose camera is the right one."""
 
     shorthand: ClassVar[str] = "file"
-    file: Path
-    stream: str | None = None
+    file: File
+    stream: Name | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -343,7 +337,7 @@ class RecordingSection(FramesSection, BasesSection):
     stereo: StereoSection | None = None
     episodes: Annotated[tuple[int, ...], _episodes] = ()
     intrinsics: Annotated[Any, _intrinsics] = None
-    instruments: Annotated[tuple[InstrumentSection, ...], list_of(InstrumentSection)] = ()
+    instruments: tuple[InstrumentSection, ...] = ()
     laparoscope: PoseSection | None = None
     sync: Any = None
     frames: Annotated[int, integer(MIN_FRAMES)] | None = None
@@ -372,7 +366,7 @@ class RecordingSection(FramesSection, BasesSection):
         shared = [name for name in names if names.count(name) > 1]
         instruments = tuple(item.logs(video, self.base, shared) for item in self.instruments)
         scope = None if self.laparoscope is None else self.laparoscope.log(video)
-        sync, notes = _sync(node_of(self.sync, path, "sync"), instruments, scope)
+        sync, notes = _sync(Node(self.sync, str(path), "sync"), instruments, scope)
         stereo = None if self.stereo is None else self.stereo.partner(self.source)
         found = Recording(
             path, self.source, intrinsics=self.intrinsics, instruments=instruments, laparoscope=scope, sync=sync,
@@ -415,11 +409,11 @@ def _sync(
         raise NeecoError(f'{file}: expected clock offsets, as in {{"clocks": {{"em": 0.038}}}}')
     with faults_in(file):
         if isinstance(document.get("clocks"), dict):
-            return _offsets(node_of(document["clocks"], file, "clocks"), clocks)
+            return _offsets(Node(document["clocks"], str(file), "clocks"), clocks)
         stated = {key: value for key, value in document.items() if key.endswith(_OFFSET_SUFFIX)}
         if not stated:
             raise Fault("clocks", 'missing; give offsets, as in {"clocks": {"em": 0.038}}')
-        return _offsets(node_of(stated, file), clocks)
+        return _offsets(Node(stated, str(file)), clocks)
 
 
 def _offsets(node: Node, clocks: tuple[str, ...]) -> tuple[dict[str, float], tuple[str, ...]]:

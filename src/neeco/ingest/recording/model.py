@@ -19,7 +19,8 @@ from neeco.ingest.readers import DELIMITED, RecordingFormat, VideoSource, format
 from neeco.ingest.readers.columns import JointColumns, PoseColumns
 from neeco.ingest.readers.video import open_images, open_video
 from neeco.ingest.recording.base import StatedBase
-from neeco.ingest.recording.sections import Fault, columns, integer, number, ranges
+from neeco.ingest.recording.sections import Count, File, Name, Positive, columns, integer, number, ranges
+from neeco.settings import Fault
 
 STILL, MOVING = "still", "moving"  # what `camera` may say of a scope
 MIN_FRAMES = 10  # from which cameras can be found
@@ -32,9 +33,9 @@ class VideoFile:
     """A video, or a file that holds one as a stream. fps: overrides the video's own times; stream: which of several."""
 
     shorthand: ClassVar[str] = "file"
-    file: Path
-    fps: float | None = None
-    stream: str | None = None
+    file: File
+    fps: Positive | None = None
+    stream: Name | None = None
 
     def __post_init__(self) -> None:
         if self.fps is not None and format_of(self.file) is not None:
@@ -56,9 +57,9 @@ class ImageFolder:
     """A folder of images, with their rate or a table of their times."""
 
     shorthand: ClassVar[str] = "folder"
-    folder: Path
-    fps: float | None = None
-    times: Path | None = None
+    folder: File
+    fps: Positive | None = None
+    times: File | None = None
 
     def __post_init__(self) -> None:
         if self.fps is None and self.times is None:
@@ -75,7 +76,7 @@ class ShaftInVideo:
     the tip (None: measured), and whether it passes a fixed trocar (None: found out)."""
 
     shaft_diameter_mm: Annotated[float, number(above=0.0, below=MAX_SHAFT_MM)]
-    working_length_mm: float | None = None
+    working_length_mm: Positive | None = None
     fixed_trocar: bool | None = None
 
 
@@ -114,7 +115,7 @@ class Splits:
 
     test_every: Annotated[int, integer(0)] | None = None
     unseen_fraction: Annotated[float, number(least=0.0, below=0.9)] = 0.15
-    unseen_by: str | None = None
+    unseen_by: Name | None = None
     test: Annotated[tuple[tuple[int, int], ...], ranges] = ()
     unseen: Annotated[tuple[tuple[int, int], ...], ranges] = ()
     _: KW_ONLY
@@ -126,18 +127,18 @@ class Splits:
 class IngestSettings:
     """Numbers that decide what comes of a recording (`settings` in recording.yaml). All are above 0."""
 
-    max_frames: int = 400  # kept, unless the recording's `frames` says how many
-    min_sharpness: float = 0.5  # of the neighbouring frames' sharpness: a frame below is dropped as blurred
-    sfm_features: int = 1200  # SIFT features per image
-    sfm_keyframes: int = 80  # about so many frames are mapped; the others are placed among their points
-    sfm_minutes: float = 20.0  # of processor time looking for cameras, after which no further way is tried
-    shape_frames: int = 60  # from which an instrument's rough shape is carved
-    moving_px: float = 1.5  # optical flow in images of 320x256 that the still scene does not explain: the pixel moves
-    tracker_noise_mm: float = 0.25  # residual of a tracker's samples beyond which the robust loss discounts one
-    tracker_noise_rad: float = 0.002
-    tracker_drift_mm: float = 0.3  # of a tracker over seconds
-    registration_steps: int = 40  # evaluations of the least-squares solver
-    scene_distance_mm: float = 100.0  # from the cameras to the tissue, where nothing measures it
+    max_frames: Count = 400  # kept, unless the recording's `frames` says how many
+    min_sharpness: Positive = 0.5  # of the neighbouring frames' sharpness: a frame below is dropped as blurred
+    sfm_features: Count = 1200  # SIFT features per image
+    sfm_keyframes: Count = 80  # about so many frames are mapped; the others are placed among their points
+    sfm_minutes: Positive = 20.0  # of processor time looking for cameras, after which no further way is tried
+    shape_frames: Count = 60  # from which an instrument's rough shape is carved
+    moving_px: Positive = 1.5  # optical flow in images of 320x256 that the still scene does not explain
+    tracker_noise_mm: Positive = 0.25  # residual of a tracker's samples beyond which the robust loss discounts one
+    tracker_noise_rad: Positive = 0.002
+    tracker_drift_mm: Positive = 0.3  # of a tracker over seconds
+    registration_steps: Count = 40  # evaluations of the least-squares solver
+    scene_distance_mm: Positive = 100.0  # from the cameras to the tissue, where nothing measures it
 
 
 @dataclass(frozen=True)

@@ -1,29 +1,23 @@
-"""`neeco ingest --init`: a commented recording.yaml, by looking at the files in a folder."""
+"""`neeco ingest --init`: a drafted recording.yaml, by looking at the files in a folder."""
 
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from neeco.errors import NeecoError, visible
 from neeco.files import read_json, require_content
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers import IMAGES as IMAGE_STREAMS
-from neeco.ingest.readers import POSES, READINGS, Stream, Table, format_of, numbers, read_table
+from neeco.ingest.readers import POSES, READINGS, Stream, format_of, read_table
 from neeco.ingest.readers.columns import (
     BASE,
     MATRIX,
-    UNITS,
     PoseColumns,
     RecognisedColumns,
     joint_columns,
@@ -44,10 +38,27 @@ from neeco.placeholders import placeholder
 MAX_FILES = 400  # looked at; a folder with more is not one recording
 MIN_IMAGES = 10  # in a folder of frames
 MAX_CALIBRATION_ROWS = 200
-MAX_OTHERS = 60  # listed as not used
-SAME_VALUES = 0.02  # of their span, by which copies of a log may differ: rounded, or a few rows less
 _EPISODES = re.compile(r"episodes (\d+) to (\d+)")
 _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)", re.IGNORECASE)
+
+# Lines of a draft that leave something open: what marks the first of them, and what to write there
+_QUESTIONS = (
+    (r"^  - name: ", "what is the instrument called in labels? Correct its name"),
+    (r"^ +# kinematics: \{dvrk_tool", "which tool is it? Remove the # and give its file, or its links"),
+    (r"^ +# camera_from_base: ", "how does the robot's base stand to the camera? Remove the #"),
+    (r"a guess: correct it", "at which rate were these taken? Correct the number"),
+    (r"# units: .*nothing says them", "in which units? Correct them and remove the #"),
+    (r"^# intrinsics: .*no calibration was found", "which lens? Remove the # and give a calibration's file or numbers"),
+    (r"^ +# clock: .*its own", "is it the clock of the poses? Remove the #; else give its offset in sync, below"),
+    (r"is not clear: ", "which columns hold it? Name them"),
+    (r"^ +# +(?:frame|quaternion\w*|rotation\w*|euler\w*): ", "what do its poses mean? Correct it, remove the #"),
+)
+
+
+def open_questions(draft: str) -> list[tuple[int, str]]:
+    """Return the lines of a draft, from 1, that only the one who recorded can answer, and what to write there."""
+    asked = [[words for marks, words in _QUESTIONS if re.search(marks, line)] for line in draft.splitlines()]
+    return [(number, words[0]) for number, words in enumerate(asked, 1) if words]
 
 
 @dataclass(frozen=True)
@@ -62,32 +73,19 @@ class _Log:
     in_base: bool = False  # are its poses stated in a base's frame?
 
     @property
-    def hints(self) -> tuple[str, ...]:
-        """Remarks on the body."""
-        return self.stream.hints if self.stream else self.meaning.hints if self.meaning else ()
-
-    @property
-    def asks(self) -> tuple[str, ...]:
-        """Keys that nothing in the file answers."""
-        return self.stream.asks if self.stream else self.meaning.asks if self.meaning else ()
+    def says(self) -> Stream | NamedFrame:
+        """The holder of remarks on the body (`hints`), and of keys that nothing in the file answers (`asks`)."""
+        return self.stream or self.meaning or NamedFrame(BASE)
 
     @property
     def stem(self) -> str:
         """A name for the log's body."""
-        return without_frame(self._name)
-
-    @property
-    def place(self) -> str:
-        return ": ".join(filter(None, (self.file, self.stream.name if self.stream else None, self.tool)))
-
-    @property
-    def _name(self) -> str:
-        if self.stream is not None:
-            return self.stream.body or re.sub(r"[^A-Za-z0-9]+", "_", self.stream.name).strip("_")
-        if self.tool is not None:
-            name = re.sub(r"[^A-Za-z0-9]+", "_", self.tool).strip("_")
-            return name if name[:1].isalpha() else f"tool_{name}"
-        return Path(self.file).stem
+        if self.stream is None and self.tool is None:
+            return without_frame(Path(self.file).stem)
+        name = re.sub(r"[^A-Za-z0-9]+", "_", self.stream.name if self.stream else str(self.tool)).strip("_")
+        if self.tool is not None and not name[:1].isalpha():
+            name = f"tool_{name}"
+        return without_frame((self.stream and self.stream.body) or name)
 
     def lines(self) -> list[str]:
         given = [("file", self.file), ("stream", self.stream.name if self.stream else None), ("tool", self.tool)]
@@ -96,40 +94,32 @@ class _Log:
 
 @dataclass(kw_only=True)
 class _FolderFiles:
-    """The files of a folder by their likely kind, as paths relative to it. others: those not used, in words."""
+    """The files of a folder by their likely kind, as paths relative to it. joints: log, time, column and joint's name;
+    problems: what cannot be read, and whether it may be images; others: all that is not used."""
 
-    folder: Path
-    videos: list[_Log] = field(default_factory=list)
-    images: list[str] = field(default_factory=list)
+    frames: list[FoundFrames] = field(default_factory=list)
     lenses: list[str] = field(default_factory=list)
     syncs: list[str] = field(default_factory=list)
     poses: list[tuple[_Log, RecognisedColumns]] = field(default_factory=list)
     joints: list[tuple[_Log, RecognisedColumns, str, str | None]] = field(default_factory=list)
-    travels: dict[str, float] = field(default_factory=dict)  # mm, between the extremes of poses, by stream
-    values: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)  # `_summary`, by a log's place and column
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)  # of others, those that cannot be read
-    image_problems: list[str] = field(default_factory=list)  # of these, those that may be of images
+    problems: list[tuple[str, bool]] = field(default_factory=list)
     episodes: str | None = None  # of a data set that holds several, "0-9"
 
     def leave_out(self, what: str, why: str = "", images: bool = False) -> None:
         """List something as not used. why: what is wrong with it, where anything is; images: may they be in it?"""
         line = visible(f"{what}: {why}" if why else what)
         self.others.append(line)
-        self.problems += [line] if why else []
-        self.image_problems += [line] if why and images else []
+        self.problems += [(line, images)] if why else []
 
 
 def write_template(
     source: Path, report: Callable[[str], None] = lambda problem: None, stands_still: StandsStill | None = None
 ) -> str:
-    """The text of a recording.yaml for the files in a folder and its subfolders, or for one file or folder that holds
-    several streams, to stand next to it; `read_recording` accepts it. report: called with each
-    file that cannot be read, which is left out; stands_still: looks at images for `camera: still`.
-
-    Raises NeecoError when there are no images.
-    """
+    """Return a recording.yaml for the files in a folder and its subfolders, or for one file or folder of several
+    streams, to stand next to it. report: called with each file that cannot be read, which is left out; stands_still:
+    looks at images for `camera: still`. Raises NeecoError when there are no images."""
     source = Path(source)
     if not source.exists():
         raise NeecoError(f"{source}: no such file or folder; correct the path")
@@ -139,87 +129,75 @@ def write_template(
     if source.is_file() and (known is None or not known.streams(source)):
         raise NeecoError(f"{source}: is a file of no format that holds images and logs; give the recording's folder")
     found = _find_files(source)
-    _leave_out_copies(found)
-    if not found.videos and not found.images:
-        if found.image_problems:
-            first, *rest = found.image_problems
-            first, more = first.removeprefix(f"{source.name}: "), f" (and {len(rest)} more)" if rest else ""
-            raise NeecoError(f"{source}: holds no images that can be read: {first}{more}")
+    if not found.frames:
+        if problems := [line.removeprefix(f"{source.name}: ") for line, images in found.problems if images]:
+            more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+            raise NeecoError(f"{source}: holds no images that can be read: {problems[0]}{more}")
         raise NeecoError(f"{source}: holds no video and no folder of images; put the recording's video there")
-    for problem in found.problems:
-        report(problem)
-    frames = [
-        FoundFrames(f"video: {_scalar(log.file)}", log.file, found.folder / log.file)
-        if log.stream is None
-        else FoundFrames(f"video: {{{', '.join(log.lines())}}}", log.file, found.folder / log.file, log.stream.name)
-        for log in found.videos
-    ]
-    frames += [
-        FoundFrames(f"images: {{folder: {_scalar(folder)}, fps: 25}}", folder, found.folder / folder)
-        for folder in found.images
-    ]
-    poses = [(log, columns) for log, columns in found.poses if not _SCOPE.search(log.stem)]
+    for line, _ in found.problems:
+        report(line)
+    return "\n".join(_draft(found, stands_still)) + "\n"
+
+
+def _draft(found: _FolderFiles, stands_still: StandsStill | None) -> Iterator[str]:
+    """Yield the lines of the draft."""
+    frames = found.frames
     scopes = [(log, columns) for log, columns in found.poses if _SCOPE.search(log.stem)]
-    own = scopes[0][0].stream if scopes else None
-    scope = draft_scope(frames, found.lenses, None if own is None else found.travels.get(own.name), stands_still)
-    guess = "" if found.videos else "   # the rate is a guess: correct it"
-    environment = Environment(
-        loader=PackageLoader("neeco.ingest.recording", ""),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters["scalar"] = _scalar
-    return environment.get_template("recording.yaml.j2").render(
-        frames=[f"{frames[0].line}{guess}", *(item.line for item in frames[1:] if item.line != scope.right)],
-        camera=scope,
-        lenses=found.lenses,
-        instruments=_instruments(found, poses, scope.still or not scopes),
-        scope=_pose_lines(*scopes[0]) if scopes else None,
-        scope_hints=scopes[0][0].hints if scopes else (),
-        other_scopes=[", ".join(log.lines()) for log, _ in scopes[1:]],
-        sync=next(iter(found.syncs), None),
-        shares_clock=any(log.stream is not None and log.file == frames[0].name for log, _ in found.poses),
-        others=found.others[:MAX_OTHERS],
-        episodes=found.episodes,
-    )
-
-
-def holds_streams(source: Path) -> bool:
-    """Return whether the path is a recording in itself (a bag, a data set's folder), not a folder of its files."""
-    return source.is_file() or format_of(source) is not None
+    on_scope, right, still = draft_scope(frames, [*map(_scalar, found.lenses)], stands_still)
+    yield "# A recording, for `neeco ingest recording.yaml --output CAPTURE`, drafted by looking at the files. Check"
+    yield "# every line. Paths are relative to this file; docs/recording.md explains all keys."
+    yield frames[0].line + ("   # the rate is a guess: correct it" if frames[0].line.startswith("images") else "")
+    yield from (f"# {item.line}   # another one found" for item in frames[1:] if item.line != right)
+    if found.episodes:
+        yield f'# episodes: ["{found.episodes}"]   # of the data set, or [0, 3, 7]: they become one capture'
+    yield from on_scope
+    yield from _instruments(found, in_camera=still or not scopes)
+    if scopes:
+        yield "laparoscope:"
+        yield from (f"  # {hint}" for hint in scopes[0][0].says.hints)
+        yield from (f"  {line}" for line in _pose_lines(*scopes[0]))
+        yield from (f"# laparoscope: {{{', '.join(log.lines())}}}   # another one found" for log, _ in scopes[1:])
+    shared = any(log.stream is not None and log.file == frames[0].name for log, _ in found.poses)
+    offsets = "# sync: {video: 0.0}" if shared else "# sync: {em: 0.0}"
+    yield f"sync: {_scalar(found.syncs[0])}" if found.syncs else f"{offsets}   # s, t_log = t_video + offset, by clock"
+    if found.others:
+        yield "# There, too, and not used:"
+        yield from (f"#   {line}" for line in found.others)
 
 
 def _find_files(source: Path) -> _FolderFiles:
-    found = _FolderFiles(folder=source if source.is_dir() and format_of(source) is None else source.parent)
+    found = _FolderFiles()
     if _add_streams(found, source, source.name):
         return found
-    folder = source
-    for inner in sorted(entry for pattern in ("*", "*/*") for entry in folder.glob(pattern) if entry.is_dir()):
+    folder, found_in = source, ("*", "*/*")
+    for inner in sorted(entry for pattern in found_in for entry in folder.glob(pattern) if entry.is_dir()):
         _add_streams(found, inner, inner.relative_to(folder).as_posix())
-    held = [folder / log.file for log in [*found.videos, *(log for log, _ in found.poses)]]
+    held = {item.file for item in found.frames} | {folder / log.file for log, _ in found.poses}
     files = sorted(
-        file for pattern in ("*", "*/*") for file in folder.glob(pattern) if file.is_file() or placeholder(file)
+        file
+        for pattern in found_in
+        for file in folder.glob(pattern)
+        if (file.is_file() or placeholder(file)) and not held & {*file.parents}
+        if not any(part.startswith(".") for part in file.relative_to(folder).parts)
     )
-    files = [file for file in files if not any(part.startswith(".") for part in file.relative_to(folder).parts)]
-    files = [file for file in files if not any(other in file.parents for other in held)]
-    for parent, count in Counter(file.parent for file in files if file.suffix.lower() in IMAGES).items():
-        if count >= MIN_IMAGES:
-            found.images.append(parent.relative_to(folder).as_posix())
     for file in [file for file in files if file.suffix.lower() not in IMAGES][:MAX_FILES]:
         name, suffix = file.relative_to(folder).as_posix(), file.suffix.lower()
         if problem := placeholder(file):
             found.leave_out(name, problem, images=True)
         elif suffix in VIDEOS:
-            found.videos.append(_Log(name))
+            found.frames.append(FoundFrames(f"video: {_scalar(name)}", name, file))
         elif format_of(file) is not None:
             if not _add_streams(found, file, name):
                 _classify_table(found, _Log(name), file)
         elif suffix == ".json" and _is_sync(file):
             found.syncs.append(name)
-        elif suffix in (".yaml", ".yml", ".xml", ".json") and _is_lens(file):
-            found.lenses.append(name)
+        elif suffix in (".yaml", ".yml", ".xml", ".json"):
+            with suppress(NeecoError):
+                found.lenses += [name] if read_lens(file) is not None else []
+    for parent, count in Counter(file.parent for file in files if file.suffix.lower() in IMAGES).items():
+        name = parent.relative_to(folder).as_posix()
+        line = f"images: {{folder: {_scalar(name)}, fps: 25}}"
+        found.frames += [FoundFrames(line, name, parent)] if count >= MIN_IMAGES else []
     return found
 
 
@@ -238,7 +216,8 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         log = _Log(name, stream)
         used = stream.offered and stream.count > 0 and stream.problem is None
         if used and stream.kind == IMAGE_STREAMS:
-            found.videos.append(log)
+            line = f"video: {{{', '.join(log.lines())}}}"
+            found.frames.append(FoundFrames(line, name, path, stream.name))
         elif used and stream.kind in (POSES, READINGS):
             try:
                 _classify_stream(found, log, stream, path)
@@ -258,60 +237,14 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
 def _classify_stream(found: _FolderFiles, log: _Log, stream: Stream, path: Path) -> None:
     table = read_table(path, stream.name)
     when = recognise_time(table.header)
+    joints: Sequence[tuple[str | None, str]] = stream.joints or ()
     if stream.kind == POSES:
         header = table.header if stream.columns is None else (*(when.time or ()), *stream.columns)
-        pose = recognise_pose(header)
-        unit = split_unit(pose.position[0], "length")[1] if pose.position else None
-        places = _summary(found, log, table, pose.position or ())
-        if unit and np.isfinite(places).all():
-            found.travels[stream.name] = UNITS["length"][unit] * float(np.linalg.norm(places[2] - places[0]))
-        found.poses.append((replace(log, in_base=table.frame in (None, BASE) and not stream.asks), pose))
-        for joint, column in stream.joints or ():
-            _summary(found, log, table, [column])
-            found.joints.append((log, when, column, joint))
-        return
-    angles = [column for column in table.header if split_unit(column, "angle")[1]]  # every angle is a joint
-    named = [(None, column) for column in angles] if stream.joints is None else stream.joints
-    for _, column in named:
-        _summary(found, log, table, [column])
-    found.joints += [(log, when, column, joint) for joint, column in named]
-
-
-def _leave_out_copies(found: _FolderFiles) -> None:
-    """List as not used what holds the values of another file's stream, in any unit."""
-    originals: list[tuple[_Log, str]] = []
-    found.poses.sort(key=lambda item: item[0].stream is None)
-    found.joints.sort(key=lambda item: item[0].stream is None)
-
-    def copied(log: _Log, column: str) -> bool:
-        values = found.values[log.place, column]
-        for other, of in originals:
-            if other.stream and other.file != log.file and _same(values, found.values[other.place, of]):
-                found.leave_out(f"{log.place}: {column} as in {other.place}: another copy of it")
-                return True
-        originals.append((log, column))
-        return False
-
-    found.poses = [item for item in found.poses if not copied(item[0], (item[1].position or ("",))[0])]
-    found.joints = [item for item in found.joints if not copied(item[0], item[2])]
-
-
-def _same(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether summaries [3, C] agree but for their unit."""
-    ratios = {a / b for kind in ("length", "angle") for a in UNITS[kind].values() for b in UNITS[kind].values()}
-    close = SAME_VALUES * (np.ptp(other, axis=0).max() or np.abs(other).max())
-    return one.shape == other.shape and any(np.allclose(ratio * one, other, rtol=0, atol=close) for ratio in ratios)
-
-
-def _summary(found: _FolderFiles, log: _Log, table: Table, columns: Sequence[str]) -> np.ndarray:
-    """Note and return the least, mean and greatest values [3, C] of columns over the rows that have all; NaN where none
-    has."""
-    values = numbers(table, columns)[0] if columns else np.empty((0, 1))
-    values = values[np.isfinite(values).all(axis=1)]
-    empty = np.full((3, values.shape[1]), np.nan)
-    summary = np.stack([values.min(0), values.mean(0), values.max(0)]) if len(values) else empty
-    found.values[log.place, next(iter(columns), "")] = summary
-    return summary
+        in_base = table.frame in (None, BASE) and not stream.asks
+        found.poses.append((replace(log, in_base=in_base), recognise_pose(header)))
+    elif stream.joints is None:  # every angle is one
+        joints = [(None, column) for column in table.header if split_unit(column, "angle")[1]]
+    found.joints += [(log, when, column, joint) for joint, column in joints]
 
 
 def _without_place(message: str, path: Path, name: str) -> str:
@@ -327,22 +260,21 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     except NeecoError as error:
         found.leave_out(name, _without_place(str(error), file, name))
         return
-    if tools := tool_names(table):
-        for tool in tools:
-            try:
-                own = tool_columns(table, PoseColumns(file, tool=tool))
-            except NeecoError as error:
-                found.leave_out(f"{name}: {tool}", _without_place(str(error), file, name))
-                continue
-            found.poses.append((_Log(name, tool=tool), recognise_pose(own.header)))
-            _summary(found, _Log(name, tool=tool), own, found.poses[-1][1].position or ())
+    tools = tool_names(table)
+    for tool in tools:
+        try:
+            own = tool_columns(table, PoseColumns(file, tool=tool))
+        except NeecoError as error:
+            found.leave_out(f"{name}: {tool}", _without_place(str(error), file, name))
+            continue
+        found.poses.append((_Log(name, tool=tool), recognise_pose(own.header)))
+    if tools:
         return
     pose = recognise_pose(table.header)
     value, when = recognise_value(table.header)
     columns = [column for column in table.header if column]
     angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
     if pose.rotation or "rotation" in pose.unclear:
-        _summary(found, log, table, pose.position or ())
         found.poses.append((replace(log, meaning=meaning), pose))
         joints = joint_columns(columns, pose_bodies(columns))
         found.joints += [(log, when, column, _joint_of(column)) for column in joints]
@@ -354,8 +286,6 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
         found.calibrations.append((name, table.header))
     elif not (when.time and len(columns) <= 2):
         found.leave_out(f"{name}: columns {', '.join(columns[:10])[:100]}")
-    for column in [column for one, _, column, _ in found.joints if one == log]:
-        _summary(found, log, table, [column])
 
 
 def _is_sync(file: Path) -> bool:
@@ -366,97 +296,70 @@ def _is_sync(file: Path) -> bool:
     return False
 
 
-def _is_lens(file: Path) -> bool:
-    with suppress(NeecoError):
-        return read_lens(file) is not None
-    return False
-
-
-def _instruments(
-    found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColumns]], to_camera: bool
-) -> list[dict[str, Any]]:
-    """Name, lines of the pose log and (name, lines) of the joints of every instrument. to_camera: do the poses of a
-    base have to be related to a still camera?"""
+def _instruments(found: _FolderFiles, *, in_camera: bool) -> Iterator[str]:
+    """Yield the lines of all instruments. in_camera: do the poses of a base have to be related to a still camera?"""
+    poses = [(log, columns) for log, columns in found.poses if not _SCOPE.search(log.stem)]
     if not poses and not found.joints:
-        return []
+        return
     names = _unique([log.stem for log, _ in poses]) or ["instrument"]
     # a joint's log belongs to the instrument of its body or that its name begins with, else to the first
     owners = {
-        log: next((name for name in names if log.stem == name), None)
-        or next((name for name in names if log.stem.startswith(name.split("_")[0])), names[0])
+        log: min(names, key=lambda name: (log.stem != name, not log.stem.startswith(name.split("_")[0])))
         for log, *_ in found.joints
     }
-    instruments = []
+    yield "instruments:"
     for index, name in enumerate(names):
+        yield f"  - name: {_scalar(name)}"
+        if poses:
+            log, columns = poses[index]
+            yield from (f"    # {hint}" for hint in log.says.hints)
+            if in_camera and log.in_base:
+                yield "    # camera_from_base: unknown   # or its registration, or a transform: docs/still-scopes.md"
+            yield "    poses:"
+            yield from (f"      {line}" for line in _pose_lines(log, columns))
         logs = [log for log in found.joints if owners[log[0]] == name]
-        chain = [joint for *_, joint in logs]
-        if all(joint in DVRK_WRIST for joint in chain):
+        if all(joint in DVRK_WRIST for *_, joint in logs):
             logs.sort(key=lambda log: DVRK_WRIST.index(str(log[3])))
-        joints = _unique([joint or _joint_name(log, value) for log, _, value, joint in logs])
-        instruments.append(
-            {
-                "name": name,
-                "poses": _pose_lines(*poses[index]) if poses else None,
-                "joints": [(joint, _joint_lines(found, *log)) for joint, log in zip(joints, logs, strict=True)],
-                "hints": poses[index][0].hints if poses else (),
-                "in_base": to_camera and bool(poses) and poses[index][0].in_base,
-                "wristed": set(DVRK_WRIST) <= set(joints),
-            }
-        )
-    return instruments
+        yield from ["    joints:"] if logs else []
+        for joint, own in zip(_unique([_joint_name(*log) for log in logs]), logs, strict=True):
+            yield f"      {_scalar(joint)}:"
+            yield from (f"        {line}" for line in _joint_lines(found, *own))
 
 
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     of_length = (columns.rotation or ())[3:4] if columns.form == MATRIX else columns.position
     clock = "em" if log.stream is None else log.stream.clock
+    asks = log.says.asks
     lines = [*log.lines(), *([f"clock: {clock}"] if clock else [])]
-    lines += [f"# {ask}" for ask in log.asks if not ask.startswith(" ")]
-    known_again = log.tool is not None or (log.stream is not None and log.stream.columns is None)
-    if known_again and columns.time and of_length and columns.rotation:
-        return [*lines, *_unit_lines(columns, {"length": of_length})]  # recognised again when read
-    given = [
-        ("time", columns.time),
-        ("position", columns.position),
-        (columns.form or "", columns.rotation),
-        ("state", (columns.state,) if columns.state else None),
-    ]
-    known = [f"  {key}: {_list(names)}" for key, names in given if names and not (log.stream and key == "time")]
-    known += [f"  # {ask.strip()}" for ask in log.asks if ask.startswith(" ")]
-    lines += ["columns:", *known] if known else []
-    lines += ["  good: [OK]"] if columns.state else []
+    lines += [f"# {ask}" for ask in asks if not ask.startswith(" ")]
+    if log.stream is not None and log.stream.columns is not None:  # others are recognised again when read
+        given = (("position", columns.position), (columns.form, columns.rotation))
+        lines += ["columns:", *(f"  {key}: [{', '.join(map(_scalar, names))}]" for key, names in given if names)]
+        lines += [f"  # {ask.strip()}" for ask in asks if ask.startswith(" ")]
     lines += [f"# columns: {what} is not clear: {why}" for what, why in columns.unclear.items()]
     return lines + _unit_lines(columns, {"length": of_length})
 
 
 def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value: str, named: str | None) -> list[str]:
-    time = [f"  time: {_list(when.time)}"] if when.time and log.stream is None else []
-    # a table of several joints is a robot's, as its poses are
-    clock = ["clock: em   # that of the poses: correct it where another computer logged it"]
-    own = [] if found.syncs else ["# clock: em   # left out, it is its own, whose offset nothing states"]
-    lines = [*log.lines(), *([] if log.stream else clock if named else own), "columns:", *time]
-    lines.append(f"  value: {_scalar(value)}")
+    lines = log.lines()
+    if log.stream is None and named:  # a table of several joints is a robot's, as its poses are
+        lines.append("clock: em   # that of the poses: correct it where another computer logged it")
+    elif log.stream is None and not found.syncs:
+        lines.append("# clock: em   # left out, it is its own, whose offset nothing states")
+    lines.append(f"columns: {{value: {_scalar(value)}}}")
     stem = log.stem.lower()
     tables = [name for name, header in found.calibrations if value in header]
     tables += [name for name, _ in found.calibrations if Path(name).stem.lower().startswith(stem)]
-    if tables:
-        lines.append(f"calibration: {_scalar(tables[0])}")
-    elif log.stream is None:
-        lines.append("# calibration: table.csv   # of counts and angle_rad, where the values are counts")
-    lines += _unit_lines(when, {} if tables else {"angle": (value,)})
-    least, _, most = found.values[log.place, value][:, 0].tolist()
-    if log.stream is None or not least < most:
-        return [*lines, "# limits: [0, 1.5]   # rad, of the joint"]
-    low, high = math.floor(10 * least) / 10, math.ceil(10 * most) / 10
-    return [*lines, f"# limits: [{low:g}, {high:g}]   # how far it goes; its readings are {least:.2f} to {most:.2f}"]
+    lines += [f"calibration: {_scalar(tables[0])}"] if tables else []
+    return lines + _unit_lines(when, {} if tables else {"angle": (value,)})
 
 
 def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | None]) -> list[str]:
     """A line asking for the units that neither the columns' names nor their format say."""
     lines = []
-    if columns.counts_frames:
-        lines.append("rate_hz: 40   # time counts frames, and this rate is a guess: correct it")
-    elif columns.time is None:
-        lines.append("rate_hz: 40   # nothing says when its rows were taken, and this rate is a guess: correct it")
+    if columns.counts_frames or columns.time is None:
+        why = "time counts frames" if columns.counts_frames else "nothing says when its rows were taken"
+        lines.append(f"rate_hz: 40   # {why}, and this rate is a guess: correct it")
     elif columns.time and len(columns.time) == 1 and not (columns.time_unit or split_unit(columns.time[0], "time")[1]):
         wanted = {"time": columns.time} | wanted
     implied = {"length": columns.length_unit}
@@ -470,9 +373,9 @@ def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | 
     return lines
 
 
-def _joint_name(log: _Log, value: str) -> str:
-    if log.stream is not None:
-        return _joint_of(value)
+def _joint_name(log: _Log, when: RecognisedColumns, value: str, named: str | None) -> str:
+    if named or log.stream is not None:
+        return named or _joint_of(value)
     stem = re.sub(r"[^A-Za-z0-9_]+", "_", log.stem)
     return stem if stem.endswith("angle") else f"{stem}_angle"
 
@@ -490,7 +393,3 @@ def _scalar(text: str) -> str:
     words = ("yes", "no", "on", "off", "true", "false", "null")
     plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_./\-]*", text) and text.lower() not in words
     return text if plain else json.dumps(text)
-
-
-def _list(names: Sequence[str]) -> str:
-    return _scalar(names[0]) if len(names) == 1 else f"[{', '.join(_scalar(name) for name in names)}]"
