@@ -299,4 +299,4 @@ def _frames(table: Table) -> list[str]:
     if "header.frame_id" not in table.header:
         return []
     index = table.header.index("header.frame_id")
-    return sorted({row[index].lstrip("/") for row in table.rows if len(row) > index})
+    return sorted({cell.lstrip("/") for cell in table.rows[:, index]})

@@ -130,9 +130,9 @@ def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
 def _frame_names(table: Table) -> list[str]:
     """The name in a column such as `header.frame_id`; [] where there is none, or it counts or names images."""
     for index, name in enumerate(table.header):
-        if isinstance(table.rows, np.ndarray) or not _FRAME_COLUMN.fullmatch(name.strip().lower()):
+        if table.rows.dtype != object or not _FRAME_COLUMN.fullmatch(name.strip().lower()):
             continue
-        found = sorted({cells[index].strip("/\"' ") for cells in table.rows if index < len(cells)} - {""})
+        found = sorted({cell.strip("/\"' ") for cell in table.rows[:, index]} - {""})
         if len(found) > 1 and any(meaning_of(cell).frame != named.BASE for cell in found):
             listed = ", ".join(found[:4])
             raise NeecoError(f"{table.where}: {name}: poses are stated in several frames ({listed}); write one a file")

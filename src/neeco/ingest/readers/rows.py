@@ -61,7 +61,7 @@ def keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
         return
     index = column_index(table, name)
     good = {value.lower() for value in source.good}
-    states = [cells[index] if index < len(cells) else "" for cells in table.rows]
+    states = [str(cell) for cell in table.rows[:, index]]
     by_state: dict[str, list[int]] = {}
     for row, state in enumerate(states):
         if state.lower() not in good:
@@ -228,7 +228,7 @@ def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float
 
 def _headers(table: Table, rows: range) -> list[int]:
     """Return the lines that repeat the header."""
-    return [int(table.lines[row]) for row in rows if tuple(table.rows[row]) == tuple(table.header)]
+    return [int(table.lines[row]) for row in rows if tuple(table.rows[row]) == table.header]
 
 
 def find_gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:

@@ -395,7 +395,7 @@ def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[
     times, rows_used = values[:, 0] * scale, list(range(len(values)))
     by_name = {file.name: file for file in files} | {file.stem: file for file in files}
     for index in range(len(table.header)):
-        cells = [Path(row[index]).name if index < len(row) else "" for row in table.rows]
+        cells = [Path(str(cell)).name for cell in table.rows[:, index]]
         if sum(cell in by_name for cell in cells) > 0.5 * len(cells):
             there = [row for row, cell in enumerate(cells) if cell in by_name]
             absent = [folder / cell for cell in cells if cell not in by_name]
