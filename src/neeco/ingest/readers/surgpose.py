@@ -160,9 +160,8 @@ def _by_arm(file: Path, parse: Callable[[Any], np.ndarray], expected: str) -> di
         frames, sound = sorted(rows), [row for row in rows.values() if row is not None]
         bad = [frame for frame in frames if rows[frame] is None]
         if len(bad) > MAX_WRONG * len(rows) or len({len(row) for row in sound}) != 1:
-            raise NeecoError(
-                f"{file}: frame {(bad or frames)[0]}: {printable(arm)}: expected {expected} in every frame; copy it again"
-            )
+            where = f"{file}: frame {(bad or frames)[0]}: {printable(arm)}"
+            raise NeecoError(f"{where}: expected {expected} in every frame; copy it again")
         missing = np.full(len(sound[0]), np.nan)
         filled = [missing if row is None else row for row in (rows[frame] for frame in frames)]
         tables[arm] = (np.array(frames, np.int64), np.array(filled))
