@@ -255,16 +255,6 @@ def test_a_truncated_bag_is_refused_with_what_repairs_it(
         assert message.partition("(")[0] != refusal(lambda: read_arm(file)).partition("(")[0]
 
 
-def test_a_bag_that_was_not_closed_is_refused(tmp_path: Path, bags: dict[str, Path]) -> None:
-    path = _copy(bags["recording.bag"], tmp_path)
-    content = path.read_bytes()
-    at = content.index(b"index_pos=") + len(b"index_pos=")
-    path.write_bytes(content[:at] + bytes(8) + content[at + 8 :])
-    assert "(Bag is not indexed, reindex before reading); repair it with `rosbag reindex`" in refusal(
-        lambda: read_arm(path)
-    )
-
-
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap", "a.db3"])
 @pytest.mark.parametrize("content", [b"", b"#ROSBAG V1.2\n", b"nothing of the kind" * 100])
 def test_what_is_no_bag_is_refused(tmp_path: Path, name: str, content: bytes) -> None:

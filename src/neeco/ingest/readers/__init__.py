@@ -219,27 +219,23 @@ def read_table(path: Path, stream: str | None = None) -> Table:
 
 def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kinds: Sequence[str]) -> Stream:
     """The stream that is wanted, or the only one of these kinds. Raises NeecoError listing what there is."""
-    fitting = [stream for stream in streams if stream.kind in kinds and stream.problem is None]
+    of_kind = [stream for stream in streams if stream.kind in kinds]
+    fitting = [stream for stream in of_kind if stream.problem is None]
     listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
+    found = [stream for stream in streams if stream.name == wanted] if wanted is not None else fitting or of_kind[:1]
+    if len(found) == 1 and found[0].problem is not None:
+        raise NeecoError(f"{path}: {found[0].name}: {found[0].problem}")
+    if len(found) == 1 and found[0] in fitting:
+        return found[0]
     if wanted is None:
-        if len(fitting) == 1:
-            return fitting[0]
-        broken = next((stream for stream in streams if stream.kind in kinds and stream.problem is not None), None)
-        if broken is not None and not fitting:
-            raise NeecoError(f"{path}: {broken.name}: {broken.problem}")
-        raise NeecoError(
-            f"{path}: holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream` in the recording: "
-            f"{listed}"
-        )
-    found = next((stream for stream in streams if stream.name == wanted), None)
-    if found is None:
-        raise NeecoError(f"{path}: stream: holds no {printable(wanted)}; name one of {listed}")
-    if found.problem is not None:
-        raise NeecoError(f"{path}: {found.name}: {found.problem}")
-    if found not in fitting:
-        kind = f"{found.type}, not {' or '.join(kinds)}"
-        raise NeecoError(f"{path}: stream: {printable(wanted)} is {kind}; name one of {listed}")
-    return found
+        what = f"holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream` in the recording: {listed}"
+        raise NeecoError(f"{path}: {what}")
+    what = (
+        f"{printable(wanted)} is {found[0].type}, not {' or '.join(kinds)}"
+        if found
+        else f"holds no {printable(wanted)}"
+    )
+    raise NeecoError(f"{path}: stream: {what}; name one of {listed}")
 
 
 def compare_counts(
