@@ -326,8 +326,10 @@ def test_which_episode_must_be_said_where_there_are_several(plain):
 
 def test_what_is_not_there(plain):
     assert "holds no episode 7; there are episodes 0 to 2" in refusal(plain, f"episode 7/{STATE}")
-    assert f"holds no 'wrong'; name one of episode 1/{STATE}, episode 1/action" in refusal(plain, "episode 1/wrong")
-    assert "is float32, no images" in refusal(plain, f"episode 1/{STATE}", images=True)
+    assert f"holds no 'episode 1/wrong'; name one of episode 1/{STATE}, episode 1/action" in refusal(
+        plain, "episode 1/wrong"
+    )
+    assert "is float32, not images" in refusal(plain, f"episode 1/{STATE}", images=True)
     assert "holds no 'nonsense'" in refusal(plain, "nonsense")
 
 

@@ -222,7 +222,8 @@ def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kin
     of_kind = [stream for stream in streams if stream.kind in kinds]
     fitting = [stream for stream in of_kind if stream.problem is None]
     listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
-    found = [stream for stream in streams if stream.name == wanted] if wanted is not None else fitting or of_kind[:1]
+    named = [stream for stream in streams if stream.name == wanted][:1]
+    found = named if wanted is not None else fitting or of_kind[:1]
     if len(found) == 1 and found[0].problem is not None:
         raise NeecoError(f"{path}: {found[0].name}: {found[0].problem}")
     if len(found) == 1 and found[0] in fitting:

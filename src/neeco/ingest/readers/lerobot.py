@@ -149,24 +149,14 @@ class LeRobot(RecordingFormat):
     def _chosen(self, data: DataSet, stream: str | None, kinds: Sequence[str]) -> tuple[Episode, str]:
         """Return the episode and the feature that a stream names; the only ones there are where none is named."""
         match = None if stream is None else _NAME.fullmatch(stream)
-        if match is None and stream is None and len(data.records) > 1:
-            examples = [
-                f"episode {min(data.records)}/{key}" for key, own in data.features.items() if _kind(own) in kinds
-            ]
-            raise NeecoError(
-                f"{data.path}: stream: missing, and there are {data.range_words}; name one, as in "
-                f"{', '.join(examples)[:300]}"
-            )
-        if match is None:
-            match = _NAME.fullmatch(choose_stream(data.path, self.streams(data.path), stream, kinds).name)
-            assert match is not None
-        number, key = int(match[1]), match[2]
-        feature = data.features.get(key)
-        if feature is None or _kind(feature) not in kinds:
-            what = "holds no" if feature is None else f"is {feature.dtype}, no {' or '.join(kinds)}:"
-            fitting = [f"episode {number}/{name}" for name, own in data.features.items() if _kind(own) in kinds]
-            listed = ", ".join(fitting)[:400] or "none"
-            raise NeecoError(f"{data.path}: stream: {what} {printable(key)}; name one of {listed}")
+        number = int(match[1]) if match else min(data.records)
+        wanted = f"episode {number}/{match[2]}" if match else stream
+        named = [Stream(f"episode {number}/{key}", _kind(own), own.dtype, 0) for key, own in data.features.items()]
+        if stream is None and len(data.records) > 1:
+            examples = ", ".join(held.name for held in named if held.kind in kinds)[:300]
+            what = f"missing, and there are {data.range_words}; name one, as in {examples}"
+            raise NeecoError(f"{data.path}: stream: {what}")
+        key = choose_stream(data.path, named, wanted, kinds).name.partition("/")[2]
         return data.episode(number), key
 
     def _episode_streams(self, data: DataSet, episode: Episode) -> tuple[Stream, ...]:
