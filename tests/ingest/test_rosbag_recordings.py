@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import struct
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from bag_world import KINDS, BagWriter
+from damaged_files import refusals
 from ingest.still_world import HEIGHT, RATE, WIDTH, Theatre
 from scipy.spatial.transform import Rotation
 
@@ -345,50 +345,18 @@ def _only_ours() -> bool:
 def test_whatever_happens_to_its_bytes_a_bag_is_read_or_refused_in_one_line(
     tmp_path: Path, bags: dict[str, Path], kind: str
 ) -> None:
-    for case in range(CASES):
-        pick = np.random.default_rng([case, KINDS.index(kind)])
-        path = _copy(bags[kind], tmp_path / str(case))
-        files = [path] if path.is_file() else sorted(path.iterdir())
-        _damage(files[int(pick.integers(len(files)))], pick)
-        known = format_of(path)
-        if known is None:
-            continue
-        jaw = JointColumns(path, "video", stream="/dvrk/PSM1/jaw/measured_js")
-        actions: list[Callable[[], object]] = [
-            lambda path=path: write_template(path),
-            lambda path=path: read_arm(path),
-            lambda jaw=jaw: read_reading_log(jaw),
-            lambda path=path, known=known: list(known.open_images(path, RIGHT).read(range(2))),
-            lambda path=path, known=known: list(known.open_images(path, "/left/compressed").read(range(2))),
-            lambda path=path, known=known: known.lens(path, "/left/compressed"),
-        ]
-        said = [_refused(action) for action in actions]
-        assert all(str(path) in message and "\n" not in message for message in said if message is not None), case
-        shutil.rmtree(tmp_path / str(case))
-
-
-def _refused(action: Callable[[], object]) -> str | None:
-    try:
-        action()
-    except NeecoError as error:
-        return str(error)
-    return None
-
-
-def _damage(file: Path, pick: np.random.Generator) -> None:
-    content = bytearray(file.read_bytes())
-    place = int(pick.integers(len(content)))
-    match int(pick.integers(4)):
-        case 0:
-            content = content[:place]
-        case 1:
-            content = content[:place] + content[place + int(pick.integers(200)) :]
-        case 2:
-            content[place : place + 4] = struct.pack("<I", int(pick.choice([0, 1, 2**31 - 1, 2**32 - 1])))
-        case _:
-            for at in pick.integers(0, len(content), int(pick.choice([1, 3, 30]))):
-                content[at] = int(pick.integers(256))
-    file.write_bytes(content)
+    path = _copy(bags[kind], tmp_path)
+    known = format_of(path)
+    assert known is not None
+    reads: list[Callable[[], object]] = [
+        lambda: write_template(path),
+        lambda: read_arm(path),
+        lambda: read_reading_log(JointColumns(path, "video", stream="/dvrk/PSM1/jaw/measured_js")),
+        lambda: list(known.open_images(path, RIGHT).read(range(2))),
+        lambda: list(known.open_images(path, "/left/compressed").read(range(2))),
+        lambda: known.lens(path, "/left/compressed"),
+    ]
+    refusals([path] if path.is_file() else sorted(path.iterdir()), reads, CASES)
 
 
 def _copy(path: Path, folder: Path) -> Path:

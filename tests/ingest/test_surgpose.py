@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
+from damaged_files import refusals
 
 from neeco.errors import NeecoError
 from neeco.ingest.readers import format_of
@@ -114,21 +115,10 @@ def test_what_is_no_trajectory_is_refused_in_one_line(trajectory, name, text, me
 
 def test_no_bytes_make_reading_raise(trajectory):
     known = format_of(trajectory)
-    messages = []
-    for seed in range(30):
-        pick = np.random.default_rng(seed)
-        path = trajectory / str(pick.choice(["api_cp_data.yaml", "api_jp_data.yaml", "StereoCalibrationDVRK.ini"]))
-        whole = path.read_bytes()
-        content = bytearray(whole[: int(pick.integers(0, len(whole)))] if seed % 4 == 0 else whole)
-        for place in pick.integers(0, max(len(content), 1), min(1 + seed, len(content))):
-            content[place] = int(pick.integers(0, 256))
-        path.write_bytes(content)
-        try:
-            known.streams(trajectory)
-            known.lens(trajectory, "regular/left_video.mp4")
-            read_pose_log(PoseColumns(trajectory, stream="PSM1"))
-        except NeecoError as error:
-            messages.append(str(error))
-        path.write_bytes(whole)
-    assert messages
-    assert all(len(message.splitlines()) == 1 and str(trajectory) in message for message in messages)
+    reads = [
+        lambda: known.streams(trajectory),
+        lambda: known.lens(trajectory, "regular/left_video.mp4"),
+        lambda: read_pose_log(PoseColumns(trajectory, stream="PSM1")),
+    ]
+    names = ("api_cp_data.yaml", "api_jp_data.yaml", "StereoCalibrationDVRK.ini")
+    refusals([trajectory / name for name in names], reads, 30)
