@@ -509,7 +509,13 @@ def test_parquet_of_other_columns(tmp_path):
 
 def test_lines_of_episodes_that_are_none(tmp_path):
     path = data_set(tmp_path, version="v2.1")
-    for line in ("{", "[]", '{"episode_index": 0}', '{"episode_index": true, "length": 3}'):
+    for line in (
+        "{",
+        "[]",
+        '{"episode_index": 0}',
+        '{"episode_index": true, "length": 3}',
+        '{"episode_index": 1, "length": Infinity}',
+    ):
         (path / "meta/episodes.jsonl").write_text('{"episode_index": 0, "length": 20}\n' + line + "\n")
         assert "episodes.jsonl: line 2: is no episode" in refusal(path)
 

@@ -217,6 +217,14 @@ def read_table(path: Path, stream: str | None = None) -> Table:
     return known.read(path, stream)
 
 
+def file_state(*files: Path) -> tuple[tuple[str, int, int], ...]:
+    """Return what distinguishes files from others of their names, for what is kept of them. Raises NeecoError."""
+    try:
+        return tuple((str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files)
+    except OSError as error:
+        raise NeecoError(f"{error.filename}: cannot read: {error.strerror or error}; correct the path") from None
+
+
 def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kinds: Sequence[str]) -> Stream:
     """The stream that is wanted, or the only one of these kinds. Raises NeecoError listing what there is."""
     of_kind = [stream for stream in streams if stream.kind in kinds]

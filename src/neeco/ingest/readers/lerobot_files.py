@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -213,7 +214,7 @@ def _records_3(path: Path, films: Sequence[str]) -> dict[int, Record]:
 
 
 def _count(where: str, value: Any) -> int:
-    if type(value) not in (int, float) or value != value or value < 0 or value != int(value):
+    if type(value) not in (int, float) or not 0 <= value < 1e9 or value != int(value):  # NaN compares false
         raise NeecoError(f"{where}: is no episode with episode_index and length; download it again")
     return int(value)
 
@@ -308,7 +309,7 @@ def _feature(file: Path, key: str, value: Any) -> Feature:
     sound = isinstance(shape, list) and all(type(side) is int and 0 <= side < 1e6 for side in shape)
     if not isinstance(dtype, str) or not isinstance(shape, list) or not sound:
         raise NeecoError(f"{file}: features: {printable(key)}: has no dtype and shape; correct it")
-    count = int(np.prod(shape, dtype=np.int64))
+    count = math.prod(shape)
     numeric = re.fullmatch(r"(float|int|uint)\d+|bool", dtype) is not None and count <= MAX_NUMBERS
     depth = any(isinstance(held, dict) and held.get(name) for held in (value, value.get("info"))
                 for name in ("is_depth_map", "video.is_depth_map"))  # fmt: skip

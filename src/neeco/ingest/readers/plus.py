@@ -21,6 +21,7 @@ from neeco.ingest.readers import (
     Table,
     VideoSource,
     choose_stream,
+    file_state,
     parse_number,
 )
 from neeco.ingest.readers._sequencefile import META, NRRD, FrameSequence, SequenceImages, read_sequence
@@ -118,15 +119,11 @@ class PlusSequence(RecordingFormat):
 
 def _sequence_of(path: Path) -> FrameSequence:
     require_content(path)
-    try:
-        state = path.stat()
-    except OSError as error:
-        raise NeecoError(f"{path}: cannot read: {error.strerror or error}; correct the path") from None
-    return _cached(path, state.st_size, state.st_mtime_ns)
+    return _cached(path, file_state(path))
 
 
 @lru_cache(maxsize=4)
-def _cached(path: Path, size: int, changed: int) -> FrameSequence:
+def _cached(path: Path, state: tuple[object, ...]) -> FrameSequence:
     return read_sequence(path)
 
 

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError, counted
+from neeco.files import visible_entries
 from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid
 from neeco.ingest.calibration.camera_fields import cameras_in
@@ -31,6 +32,7 @@ from neeco.ingest.readers import (
     Table,
     VideoSource,
     choose_stream,
+    file_state,
     rate_of,
 )
 from neeco.ingest.readers.columns import BASE, CAMERA, PoseColumns
@@ -134,12 +136,7 @@ class RosBag(RecordingFormat):
         self.require_package(path)
         from neeco.ingest.readers._bagfile import survey_of
 
-        try:
-            files = sorted(path.iterdir()) if path.is_dir() else [path]
-            state = tuple((str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files)
-        except OSError:
-            raise NeecoError(f"{path}: cannot be read; correct the path or allow it") from None
-        return survey_of(path, state)
+        return survey_of(path, file_state(*(visible_entries(path) if path.is_dir() else [path])))
 
     def _image_stream(self, survey: Survey, name: str) -> Stream:
         log = survey.images[name]

@@ -31,6 +31,7 @@ from neeco.ingest.readers import (
     VideoSource,
     choose_stream,
     compare_lengths,
+    file_state,
 )
 from neeco.ingest.readers.rosbag import DVRK_HINT
 from neeco.ingest.readers.rows import MAX_WRONG
@@ -126,15 +127,11 @@ def _videos(path: Path) -> list[str]:
 
 def _read(path: Path) -> _Arms:
     files = [path / name for name in (POSE_FILE, JOINT_FILE) if name == POSE_FILE or (path / name).exists()]
-    try:
-        states = [(file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-    except OSError as error:
-        raise NeecoError(f"{path}: cannot read: {error.strerror or error}; put the trajectory's files there") from None
-    return _cached(path, tuple(states))
+    return _cached(path, file_state(*files))
 
 
 @lru_cache(maxsize=2)
-def _cached(path: Path, state: tuple[tuple[int, int], ...]) -> _Arms:
+def _cached(path: Path, state: tuple[object, ...]) -> _Arms:
     poses = _by_arm(path / POSE_FILE, _pose, "R (3x3) and t")
     return _Arms(poses, _by_arm(path / JOINT_FILE, _joints, "six or seven joints") if len(state) > 1 else {})
 
