@@ -20,6 +20,7 @@ from neeco.ingest.readers.columns import UNITS, canonical_unit
 from neeco.ingest.readers.ndi import find_tools
 
 EXPECTED = "CSV with a header line"
+MAX_COLUMNS = 4096
 SAMPLE_LINES = 400  # that tell which columns hold numbers
 _COMMENT = re.compile(r"^\s*(?:#+|//|%\s)\s*")
 
@@ -82,16 +83,19 @@ def read_cells(path: Path) -> Cells:
     lines = [_COMMENT.sub("", text) for _, text in texts]
     counts = np.array([len(line.split()) if sign == " " else line.count(sign) + 1 for line in lines])
     columns = range(int(counts.max()))
+    if len(columns) > MAX_COLUMNS:
+        line = texts[int(counts.argmax())][0]
+        raise NeecoError(f"{path}: line {line}: has {len(columns)} cells; expected at most {MAX_COLUMNS}")
     is_open = any(line.count('"') % 2 for line in lines)  # a quote left open must not swallow the rest of the file
     try:
         frame = pandas.read_csv(
             StringIO("\n".join(lines)), sep=r"\s+" if sign == " " else sign, header=None, names=columns,
-            usecols=columns, index_col=False, dtype=str, na_filter=False, skip_blank_lines=False,
+            index_col=False, dtype=str, na_filter=False, skip_blank_lines=False, low_memory=False,
             quoting=csv.QUOTE_NONE if is_open else csv.QUOTE_MINIMAL,
         )  # fmt: skip
     except (ValueError, OverflowError) as error:
         raise NeecoError(f"{path}: not readable as CSV ({' '.join(str(error).split())[:100]}); repair it") from None
-    cells = np.array([[cell.strip(' \t"') for cell in row] for row in frame.to_numpy(object)], dtype=object)
+    cells = np.array([[cell.strip(' \t"') for cell in row] for row in frame.fillna("").to_numpy(object)], dtype=object)
     commas = sign in ";\t" and any("," in text for text in plain[:49])
     return Cells(cells, np.array([number for number, _ in texts]), counts, comment, commas)
 
