@@ -70,7 +70,7 @@ def test_another_tool_is_another(polaris):
     ("source", "message"),
     [
         ({}, r"holds 2 tools; say which as `tool` in the recording: .*0x01: 8700340.*, .*needle driver"),
-        ({"tool": "0x07"}, r"tool: '0x07' is none of them; name one of"),
+        ({"tool": "0x07"}, r"tool: '0x07' is none of them; say which"),
         # the second Tx is the first tool's first marker
         (
             {"position": ("Tx#2", "Ty#2", "Tz#2"), "rotation": ("Q0#2", "Qx#2", "Qy#2", "Qz#2")},

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import zlib
 
 import numpy as np
 import pytest
+from damaged_files import refusals
 from pluswriter import frame_fields, write_mha, write_nrrd
 
 from neeco.errors import NeecoError
@@ -169,7 +169,7 @@ def changed(path, old, new):
         (b"16 12 1 30", b"16 twelve 1 30", "expected whole numbers"),
         (b"16 12 1 30", b"-16 12 1 30", "expected whole numbers"),
         (b"NumberOfChannels = 3", b"NumberOfChannels = 4", "has 4 channels"),
-        (b"MET_UCHAR", b"MET_FLOAT", "ElementType: is 'MET_FLOAT', and MET_UCHAR is read"),
+        (b"MET_UCHAR", b"MET_FLOAT", "ElementType: is 'MET_FLOAT', and met_uchar is read"),
         (b"BinaryData = True", b"BinaryData = False", "BinaryData: is 'False'"),
         (b"= LOCAL", b"= ../../etc/passwd", "is no file next to"),
         (b"= LOCAL", b"= LIST", "'LIST' is no file next to"),
@@ -203,16 +203,10 @@ def test_truncated_and_damaged_images_are_refused(world, transforms):
                 list(format_of(path).open_images(path).read(range(COUNT)))
 
 
-def test_a_compressed_bomb_is_refused_before_it_is_unpacked(world, transforms):
+def test_a_header_that_promises_far_more_than_is_packed_is_refused(world, transforms):
     path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms), film(), compressed=True)
     changed(path, b"16 12 1 30", b"8000 8000 1 3000")
-    with pytest.raises(NeecoError, match="of which no 3000 images"):
-        list(format_of(path).open_images(path).read(range(COUNT)))
-    # and one whose header fits the little that it says, while far more comes out
-    content = path.read_bytes().replace(b"8000 8000 1 3000", b"16 12 1 30")
-    start = content.index(b"LOCAL\n") + 6
-    path.write_bytes(content[:start] + zlib.compress(bytes(50_000_000)))
-    with pytest.raises(NeecoError, match="more images than its header says"):
+    with pytest.raises(NeecoError, match="its images end early"):
         list(format_of(path).open_images(path).read(range(COUNT)))
 
 
@@ -278,28 +272,13 @@ def test_a_folder_lists_what_it_cannot_read(world, transforms):
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_no_bytes_make_reading_raise(world, transforms, name):
     path = write(world.folder, name, frame_fields(TIMES, transforms), film())
-    whole = path.read_bytes()
-    head = whole.find(b"Seq_Frame0001")
-    messages = []
     known = format_of(path)
-    for seed in range(40):
-        pick = np.random.default_rng(seed)
-        content = bytearray(whole[: int(pick.integers(0, len(whole)))] if seed % 4 == 0 else whole)
-        within = len(content) if seed % 2 else head  # more of the damage where it does most
-        for place in pick.integers(0, max(min(within, len(content)), 1), min(1 + seed, len(content))):
-            content[place] = int(pick.integers(0, 256))
-        path.write_bytes(content)
-        for read in (
-            lambda: known.streams(path),
-            lambda: read_pose_log(PoseColumns(path, stream="StylusToTracker")),
-            lambda: list(known.open_images(path).read([0, 1])),
-        ):
-            try:
-                read()
-            except NeecoError as error:
-                messages.append(str(error))
-    assert messages
-    assert all(len(message.splitlines()) == 1 and str(world.folder) in message for message in messages)
+    reads = [
+        lambda: known.streams(path),
+        lambda: read_pose_log(PoseColumns(path, stream="StylusToTracker")),
+        lambda: list(known.open_images(path).read([0, 1])),
+    ]
+    refusals([path], reads, 40)
 
 
 def test_a_transform_without_to_is_read_and_its_frame_asked_for(tmp_path, world):

@@ -227,7 +227,7 @@ def test_transforms_that_do_not_hang_together_are_refused(tmp_path: Path) -> Non
         for time in TICKS:
             for frame, child in (("a", "b"), ("b", "a"), ("one", "two"), ("left", "tip"), ("right", "tip")):
                 bag.tf(time, place(time), turn(time), frame, child)
-    assert "form a cycle" in refusal(lambda: poses(bag.path, "tf:b in two"))
+    assert "b is its own parent" in refusal(lambda: poses(bag.path, "tf:b in two"))
     assert "nothing joins two to left" in refusal(lambda: poses(bag.path, "tf:two in left"))
     assert "has several parents (left, right)" in refusal(lambda: poses(bag.path, "tf:tip in one"))
     assert "several frames (left, right)" in refusal(lambda: poses(bag.path, "tf:tip"))
@@ -340,7 +340,7 @@ def test_images_come_by_time_and_doubled_or_damaged_ones_are_left_out(tmp_path: 
     for number, pixels in found.items():
         np.testing.assert_array_equal(pixels, picture(number))
     assert len(film.notes) == 3
-    assert "1 image shares a time with another; left out" in film.notes[2]
+    assert "1 image left out: one shares its time with another" in film.notes[2]
 
 
 def test_images_whose_time_begins_anew_are_refused(tmp_path: Path) -> None:

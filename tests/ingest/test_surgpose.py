@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
+from damaged_files import refusals
 
 from neeco.errors import NeecoError
 from neeco.ingest.readers import format_of
@@ -96,14 +97,11 @@ def test_a_video_of_another_length_is_refused(world, trajectory):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("api_cp_data.yaml", "", "expected states by frame"),
-        ("api_cp_data.yaml", "[1, 2]", "expected states by frame"),
-        ("api_cp_data.yaml", "'0': 3", "frame 0: expected the state of each arm"),
+        ("api_cp_data.yaml", "", "expected states of arms by frame"),
+        ("api_cp_data.yaml", "'0': 3", "expected states of arms by frame"),
         ("api_cp_data.yaml", "'0': {PSM1: {R: [[1, 0, 0]], t: [0, 0, 0]}}", "frame 0: 'PSM1': expected R"),
-        ("api_cp_data.yaml", "'0': {PSM1: {R: eye, t: [0, 0, 0]}}", "frame 0: 'PSM1': expected R"),
-        ("api_cp_data.yaml", "first: {PSM1: 1}", "'first' is no number of a frame"),
+        ("api_cp_data.yaml", "first: {PSM1: 1}", "expected states of arms by frame"),
         ("api_jp_data.yaml", "'0': {PSM1: [1, 2]}", "expected six or seven joints"),
-        ("api_jp_data.yaml", "'0': {}", "holds no arm's states"),
         ("api_jp_data.yaml", "'0': {PSM1: [1, 2, 3", "not valid YAML"),
     ],
 )
@@ -117,21 +115,10 @@ def test_what_is_no_trajectory_is_refused_in_one_line(trajectory, name, text, me
 
 def test_no_bytes_make_reading_raise(trajectory):
     known = format_of(trajectory)
-    messages = []
-    for seed in range(30):
-        pick = np.random.default_rng(seed)
-        path = trajectory / str(pick.choice(["api_cp_data.yaml", "api_jp_data.yaml", "StereoCalibrationDVRK.ini"]))
-        whole = path.read_bytes()
-        content = bytearray(whole[: int(pick.integers(0, len(whole)))] if seed % 4 == 0 else whole)
-        for place in pick.integers(0, max(len(content), 1), min(1 + seed, len(content))):
-            content[place] = int(pick.integers(0, 256))
-        path.write_bytes(content)
-        try:
-            known.streams(trajectory)
-            known.lens(trajectory, "regular/left_video.mp4")
-            read_pose_log(PoseColumns(trajectory, stream="PSM1"))
-        except NeecoError as error:
-            messages.append(str(error))
-        path.write_bytes(whole)
-    assert messages
-    assert all(len(message.splitlines()) == 1 and str(trajectory) in message for message in messages)
+    reads = [
+        lambda: known.streams(trajectory),
+        lambda: known.lens(trajectory, "regular/left_video.mp4"),
+        lambda: read_pose_log(PoseColumns(trajectory, stream="PSM1")),
+    ]
+    names = ("api_cp_data.yaml", "api_jp_data.yaml", "StereoCalibrationDVRK.ini")
+    refusals([trajectory / name for name in names], reads, 30)

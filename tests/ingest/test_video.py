@@ -167,9 +167,9 @@ def test_images_at_the_times_of_a_table(world, images):
     ("header", "rows", "message"),
     [
         ("t_s", [[i] for i in range(5)], "has 5 times for 12 images"),
-        ("t_s", [[-i] for i in range(12)], "line 3: t_s does not increase"),
+        ("t_s", [[-i] for i in range(12)], "line 3: t_s: expected a time after the one before"),
         ("t", [[i] for i in range(12)], r"in which time unit\?"),
-        ("t_s", [["x"]] * 12, "line 2: t_s: no time"),
+        ("t_s", [["x"]] * 12, "line 2: t_s: expected a time"),
         (
             "file,t_s",
             [*[[f"frame{i}.png", i] for i in range(9)], *[[f"other{i}.png", i] for i in range(9, 12)]],

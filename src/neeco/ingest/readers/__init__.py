@@ -37,17 +37,19 @@ ENTRY_POINTS = "neeco.readers"  # the group in which installed packages name the
 class Body:
     """One of several bodies whose poses share the rows of a table. columns: by their index, of which the second
     and later ones of a name end in `#2`, ...; without that, they are named as a table of this body alone would name
-    them."""
+    them; title, aliases: what messages call it, and a recording may."""
 
     name: str
     columns: tuple[int, ...]
+    title: str = ""
+    aliases: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
 class Table:
-    """The content of a log file, or of one stream of it. header: column names, all different; rows: cells, stripped, of
-    which a row may have more or fewer than the header, or numbers [R, C], NaN where missing; lines: int64 [R] the
-    file's line (or record) of each row, from 1; stream: which of the file's; record: what a row is called; stated_in:
+    """The content of a log file, or of one stream of it. header: column names, all different; rows [R, C]: cells as
+    text, stripped, "" where missing (dtype object), or numbers, NaN where missing; lines: int64 [R] the file's line (or
+    record) of each row, from 1; stream: which of the file's; record: what a row is called; stated_in:
     the file's own name of the frame that poses are stated in, meaning: what that says (None: nothing, taken as a base);
     notes: what reading it changed or left out, in words; image_hz: images a second of the video, where every row is the
     state of one of its images; None: rows have times of their own; bodies: where the columns of several stand next to
@@ -55,7 +57,7 @@ class Table:
 
     path: Path
     header: tuple[str, ...]
-    rows: list[list[str]] | np.ndarray
+    rows: np.ndarray
     lines: np.ndarray
     _: KW_ONLY
     decimal_comma: bool = False
@@ -215,29 +217,34 @@ def read_table(path: Path, stream: str | None = None) -> Table:
     return known.read(path, stream)
 
 
+def file_state(*files: Path) -> tuple[tuple[str, int, int], ...]:
+    """Return what distinguishes files from others of their names, for what is kept of them. Raises NeecoError."""
+    try:
+        return tuple((str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files)
+    except OSError as error:
+        raise NeecoError(f"{error.filename}: cannot read: {error.strerror or error}; correct the path") from None
+
+
 def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kinds: Sequence[str]) -> Stream:
     """The stream that is wanted, or the only one of these kinds. Raises NeecoError listing what there is."""
-    fitting = [stream for stream in streams if stream.kind in kinds and stream.problem is None]
+    of_kind = [stream for stream in streams if stream.kind in kinds]
+    fitting = [stream for stream in of_kind if stream.problem is None]
     listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
+    named = [stream for stream in streams if stream.name == wanted][:1]
+    found = named if wanted is not None else fitting or of_kind[:1]
+    if len(found) == 1 and found[0].problem is not None:
+        raise NeecoError(f"{path}: {found[0].name}: {found[0].problem}")
+    if len(found) == 1 and found[0] in fitting:
+        return found[0]
     if wanted is None:
-        if len(fitting) == 1:
-            return fitting[0]
-        broken = next((stream for stream in streams if stream.kind in kinds and stream.problem is not None), None)
-        if broken is not None and not fitting:
-            raise NeecoError(f"{path}: {broken.name}: {broken.problem}")
-        raise NeecoError(
-            f"{path}: holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream` in the recording: "
-            f"{listed}"
-        )
-    found = next((stream for stream in streams if stream.name == wanted), None)
-    if found is None:
-        raise NeecoError(f"{path}: stream: holds no {printable(wanted)}; name one of {listed}")
-    if found.problem is not None:
-        raise NeecoError(f"{path}: {found.name}: {found.problem}")
-    if found not in fitting:
-        kind = f"{found.type}, not {' or '.join(kinds)}"
-        raise NeecoError(f"{path}: stream: {printable(wanted)} is {kind}; name one of {listed}")
-    return found
+        what = f"holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream` in the recording: {listed}"
+        raise NeecoError(f"{path}: {what}")
+    what = (
+        f"{printable(wanted)} is {found[0].type}, not {' or '.join(kinds)}"
+        if found
+        else f"holds no {printable(wanted)}"
+    )
+    raise NeecoError(f"{path}: stream: {what}; name one of {listed}")
 
 
 def compare_counts(
@@ -268,26 +275,19 @@ def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
 
     Missing or unreadable cells are NaN. Raises NeecoError when a column does not exist.
     """
-    indices = [column_index(table, name) for name in columns]
-    if isinstance(table.rows, np.ndarray):
-        chosen = table.rows[:, indices]
-        missing = ~(np.abs(chosen) < HUGE)  # NaN compares false
-        return np.where(missing, np.nan, chosen), np.any(missing, axis=1), []
-    values = np.full((len(table.rows), len(columns)), np.nan)
-    bad: list[tuple[int, str]] = []
-    for row, cells in enumerate(table.rows):
-        for slot, index in enumerate(indices):
-            if index >= len(cells):
-                bad.append((row, f"has {len(cells)} cells, the header {len(table.header)}"))
-                break
-            value = parse_number(cells[index].replace(",", ".") if table.decimal_comma else cells[index])
+    chosen, bad = table.rows[:, [column_index(table, name) for name in columns]], dict[int, str]()
+    if chosen.dtype == object:
+        cells, chosen = chosen, np.full(chosen.shape, np.nan)
+        for (row, slot), cell in np.ndenumerate(cells):
+            value = parse_number(cell.replace(",", ".") if table.decimal_comma else cell)
             if value is None:
-                bad.append((row, f"{columns[slot]} is {printable(cells[index], 24)}, not a number"))
-                break
-            values[row, slot] = value
-    missing = np.any(np.isnan(values), axis=1)
-    missing[[row for row, _ in bad]] = False
-    return values, missing, bad
+                bad.setdefault(row, f"{columns[slot]} is {printable(cell, 24)}, not a number")
+            else:
+                chosen[row, slot] = value
+    missing = ~(np.abs(chosen) < HUGE)  # NaN compares false
+    incomplete = missing.any(axis=1)
+    incomplete[list(bad)] = False
+    return np.where(missing, np.nan, chosen), incomplete, list(bad.items())
 
 
 def column_index(table: Table, name: str) -> int:

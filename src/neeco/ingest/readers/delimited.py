@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,10 @@ from neeco.errors import NeecoError
 from neeco.files import read_bytes
 from neeco.ingest.readers import DELIMITED, MISSING, RecordingFormat, Table, parse_number
 from neeco.ingest.readers.columns import UNITS, canonical_unit
+from neeco.ingest.readers.ndi import find_tools
 
 EXPECTED = "CSV with a header line"
+MAX_COLUMNS = 4096
 SAMPLE_LINES = 400  # that tell which columns hold numbers
 _COMMENT = re.compile(r"^\s*(?:#+|//|%\s)\s*")
 
@@ -35,48 +38,66 @@ class DelimitedText(RecordingFormat):
         """Raises NeecoError when absent, empty, binary or without a header line."""
         if stream is not None:
             raise NeecoError(f"{path}: stream: a table is one; leave it out")
-        lines = read_lines(path)
-        names, rows = _header_and_rows(path, lines)
-        if not rows:
+        text = read_cells(path)
+        names, start = _header(path, text)
+        used = ~text.comment & (np.arange(len(text.lines)) >= start)
+        if not used.any():
             raise NeecoError(f"{path}: has a header but no rows; record again or name another file")
-        cells = [line.cells for line in rows]
-        numbers, comma = np.array([line.number for line in rows]), lines[0].decimal_comma
-        return Table(path, unique_names(names), cells, numbers, decimal_comma=comma)
+        header, rows = unique_names(names), text.cells[used, : len(names)]
+        return Table(
+            path, header, rows, text.lines[used], decimal_comma=text.decimal_comma, bodies=find_tools(header, rows)
+        )
 
 
-@dataclass(frozen=True)
-class Line:
-    """A line of a table that is not blank. number: in the file, from 1; cells: stripped; is_comment: behind a `#`, `//`
-    or `% `, which is left out; decimal_comma: commas in its cells are those of decimals."""
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The lines of a text that hold anything. cells [N, W]: stripped, "" where a line has fewer; lines [N]: their
+    numbers, from 1; counts [N]: of their own cells; comment [N]: are they behind a `#`, `//` or `% `, which is left
+    out?; decimal_comma: commas in cells are those of decimals."""
 
-    number: int
-    cells: list[str]
-    is_comment: bool
+    cells: np.ndarray
+    lines: np.ndarray
+    counts: np.ndarray
+    comment: np.ndarray
     decimal_comma: bool
 
-    def number_at(self, column: int) -> bool:
-        """Return whether a cell holds a number."""
-        cell = self.cells[column] if column < len(self.cells) else ""
-        value = parse_number(cell.replace(",", ".") if self.decimal_comma else cell)
-        return value is not None and cell.lower() not in MISSING
+    def numeric(self, rows: np.ndarray | slice) -> np.ndarray:
+        """Return which cells [R, W] of some lines hold numbers."""
+        found = np.zeros(self.cells[rows].shape, dtype=bool)
+        for place, cell in np.ndenumerate(self.cells[rows]):
+            value = parse_number(cell.replace(",", ".") if self.decimal_comma else cell)
+            found[place] = value is not None and cell.lower() not in MISSING
+        return found
 
 
-def read_lines(path: Path) -> list[Line]:
+def read_cells(path: Path) -> Cells:
     """The lines of a text file that hold anything, of which one at least is no comment. Raises NeecoError."""
+    import pandas
+
     texts = [(number, text) for number, text in enumerate(_read_text(path).splitlines(), 1) if text.strip(",;\t ")]
-    plain = [text for _, text in texts if not _COMMENT.match(text)]
-    if not plain:
+    comment = np.array([_COMMENT.match(text) is not None for _, text in texts], dtype=bool)
+    if comment.all():
         raise NeecoError(f"{path}: holds only comments; expected {EXPECTED}")
-    delimiter = _delimiter(plain)
-    commas = delimiter in ";\t" and any("," in text for text in plain[:49])
-    lines = []
-    for number, text in texts:
-        # one line is one row: a quote left open must not swallow the rest of the file
-        mark = _COMMENT.match(text)
-        lines.append(
-            Line(number, _split(path, number, text[mark.end() if mark else 0 :], delimiter), bool(mark), commas)
-        )
-    return lines
+    plain = [text for (_, text), is_comment in zip(texts, comment, strict=True) if not is_comment]
+    sign = _delimiter(plain)
+    lines = [_COMMENT.sub("", text) for _, text in texts]
+    counts = np.array([len(line.split()) if sign == " " else line.count(sign) + 1 for line in lines])
+    columns = range(int(counts.max()))
+    if len(columns) > MAX_COLUMNS:
+        line = texts[int(counts.argmax())][0]
+        raise NeecoError(f"{path}: line {line}: has {len(columns)} cells; expected at most {MAX_COLUMNS}")
+    is_open = any(line.count('"') % 2 for line in lines)  # a quote left open must not swallow the rest of the file
+    try:
+        frame = pandas.read_csv(
+            StringIO("\n".join(lines)), sep=r"\s+" if sign == " " else sign, header=None, names=columns,
+            index_col=False, dtype=str, na_filter=False, skip_blank_lines=False, low_memory=False,
+            quoting=csv.QUOTE_NONE if is_open else csv.QUOTE_MINIMAL,
+        )  # fmt: skip
+    except (ValueError, OverflowError) as error:
+        raise NeecoError(f"{path}: not readable as CSV ({' '.join(str(error).split())[:100]}); repair it") from None
+    cells = np.array([[cell.strip(' \t"') for cell in row] for row in frame.fillna("").to_numpy(object)], dtype=object)
+    commas = sign in ";\t" and any("," in text for text in plain[:49])
+    return Cells(cells, np.array([number for number, _ in texts]), counts, comment, commas)
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -89,54 +110,59 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(unique)
 
 
-def _header_and_rows(path: Path, lines: Sequence[Line]) -> tuple[list[str], list[Line]]:
-    """The names of the columns, and the rows beneath them. Raises NeecoError where nothing names the columns."""
-    plain = [line for line in lines if not line.is_comment]
+def _header(path: Path, text: Cells) -> tuple[list[str], int]:
+    """The names of the columns, and the line from which the rows are. Raises NeecoError where nothing names them."""
+    plain = np.flatnonzero(~text.comment).tolist()
     sample = plain[len(plain) // 2 :][:SAMPLE_LINES]
-    width = max(len(line.cells) for line in sample)
-    numeric = [i for i in range(width) if sum(line.number_at(i) for line in sample) > 0.5 * len(sample)]
-    start = next((number for number, line in enumerate(plain) if _is_row(line, numeric)), None)
-    if not numeric or start is None:
-        return plain[0].cells, plain[1:]
-    place = next((i for i in reversed(range(start)) if _names_columns(plain[i], numeric)), None)
-    units: list[str] = []
-    if place is not None and place > 0 and _are_units(plain[place].cells) and _names_columns(plain[place - 1], numeric):
-        units, place = plain[place].cells, place - 1
-    if place is None and start > 0 and len(plain[start - 1].cells) == len(plain[start].cells):
-        place = start - 1 if plain[start - 1].cells[0] and not plain[start - 1].number_at(0) else None
-    if place is not None:
-        names = plain[place].cells
-        if place > 0:
-            names = _grouped(names, plain[place - 1].cells)
-        known = [_unit_of(cell) for cell in units] + [None] * len(names)
-        names = [f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, known, strict=False)]
-        return names, plain[place + (2 if units else 1) :]
-    commented = [line for line in lines if line.is_comment and line.number < plain[start].number]
-    for line in reversed(commented):
-        if len(line.cells) == len(plain[start].cells) and _names_columns(line, numeric):
-            return line.cells, plain[start:]
-    found, number = printable(",".join(plain[0].cells)[:40]), plain[0].number
-    if start > 0:
+    numeric = np.flatnonzero(text.numeric(np.array(sample)).mean(axis=0) > 0.5)
+    start = next((row for row in plain if _is_row(text, row, numeric)), None)
+    if not len(numeric) or start is None:
+        return _names(text, plain[0]), plain[0] + 1
+    above = [int(row) for row in plain if row < start]
+    places = [row for row in above if _names_columns(text, row, numeric)]
+    if places:
+        place, units = places[-1], [_unit_of(cell) for cell in text.cells[places[-1]]]
+        filled = [unit for unit, cell in zip(units, text.cells[place], strict=True) if cell.strip("[]()- ")]
+        before = next((row for row in reversed(above) if row < place), None)
+        if before in places and sum(unit is not None for unit in filled) > 0.5 * len(filled) > 0:
+            place, before = before, next((row for row in reversed(above) if row < before), None)
+        else:
+            units = [None] * len(units)
+        names = _names(text, place)
+        if before is not None:
+            names = _grouped(names, text.cells[before])
+        named = (f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, units, strict=False))
+        return list(named), places[-1] + 1
+    if above and text.counts[above[-1]] == text.counts[start] and _names_columns(text, above[-1], np.array([0])):
+        return _names(text, above[-1]), above[-1] + 1
+    for row in reversed(np.flatnonzero(text.comment[:start]).tolist()):
+        if text.counts[row] == text.counts[start] and _names_columns(text, row, numeric):
+            return _names(text, row), start
+    found, number = printable(",".join(_names(text, plain[0]))[:40]), text.lines[plain[0]]
+    where = f"{path}: line {number}"
+    if above:
         raise NeecoError(
-            f"{path}: line {number} is no header of columns (found {found}), and the rows of numbers begin at line "
-            f"{plain[start].number}; write a line that names the columns above that"
+            f"{where} is no header of columns (found {found}), and the rows of numbers begin at line "
+            f"{text.lines[start]}; write a line that names the columns above that"
         )
-    raise NeecoError(f"{path}: line {number}: no header (found {found}); add a line naming the columns")
+    raise NeecoError(f"{where}: no header (found {found}); add a line naming the columns")
 
 
-def _is_row(line: Line, numeric: Sequence[int]) -> bool:
+def _names(text: Cells, row: int) -> list[str]:
+    return text.cells[row, : text.counts[row]].tolist()
+
+
+def _is_row(text: Cells, row: int, numeric: np.ndarray) -> bool:
     """Return whether a line holds numbers, or a word for a missing one, wherever most do."""
-    held = [line.number_at(i) for i in numeric]
-    return any(held) and all(
-        is_number or (i < len(line.cells) and line.cells[i].lower() in MISSING)
-        for i, is_number in zip(numeric, held, strict=True)
-    )
+    held = text.numeric(slice(row, row + 1))[0, numeric]
+    missing = [index < text.counts[row] and text.cells[row, index].lower() in MISSING for index in numeric]
+    return bool(held.any() and (held | missing).all())
 
 
-def _names_columns(line: Line, numeric: Sequence[int]) -> bool:
+def _names_columns(text: Cells, row: int, numeric: np.ndarray) -> bool:
     """Return whether a line has no numbers where the rows have them, and names for at least half of those columns."""
-    named = sum(i < len(line.cells) and bool(line.cells[i]) for i in numeric)
-    return named >= 0.5 * len(numeric) and not any(line.number_at(i) for i in numeric)
+    named = sum(bool(cell) for cell in text.cells[row, numeric])
+    return named >= 0.5 * len(numeric) and not text.numeric(slice(row, row + 1))[0, numeric].any()
 
 
 def _unit_of(cell: str) -> str | None:
@@ -144,18 +170,12 @@ def _unit_of(cell: str) -> str | None:
     return unit if any(unit in units for units in UNITS.values()) else None
 
 
-def _are_units(cells: Sequence[str]) -> bool:
-    filled = [cell for cell in cells if cell.strip("[]()- ")]
-    return bool(filled) and sum(_unit_of(cell) is not None for cell in filled) > 0.5 * len(filled)
-
-
 def _grouped(names: list[str], groups: Sequence[str]) -> list[str]:
     """Names of columns behind those of their groups, where these tell columns of one name apart."""
-    filled, last = [], ""
-    for index in range(len(names)):
-        last = (groups[index] if index < len(groups) else "") or last
-        filled.append(last)
-    joined = ["_".join(part for part in pair if part) for pair in zip(filled, names, strict=True)]
+    joined, last = [], ""
+    for name, group in zip(names, groups, strict=False):
+        last = group or last
+        joined.append("_".join(filter(None, (last, name))))
     return joined if len(set(names)) < len(set(joined)) else names
 
 
@@ -178,17 +198,6 @@ def _read_text(path: Path) -> str:
         text = content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError:
         text = "\0" if is_utf16 else content.decode("latin-1")
-    if any(character < " " and character not in "\t\r\n\f\v" for character in text[:4096]):
-        raise NeecoError(f"{path}: not a text file; expected {EXPECTED}")
-    if not text.strip():
-        raise NeecoError(f"{path}: the file is empty; expected {EXPECTED}")
+    if not text.strip() or any(character < " " and character not in "\t\r\n\f\v" for character in text[:4096]):
+        raise NeecoError(f"{path}: {'not a text file' if text.strip() else 'the file is empty'}; expected {EXPECTED}")
     return text
-
-
-def _split(path: Path, number: int, line: str, delimiter: str) -> list[str]:
-    if delimiter == " ":
-        return line.split()
-    try:
-        return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
-    except csv.Error as error:
-        raise NeecoError(f"{path}: line {number}: not readable as CSV ({error}); repair or remove the line") from None

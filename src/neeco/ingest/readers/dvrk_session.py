@@ -31,7 +31,7 @@ from neeco.ingest.readers import (
     numbers,
     rate_of,
 )
-from neeco.ingest.readers.delimited import DelimitedText
+from neeco.ingest.readers.delimited import DelimitedText, unique_names
 from neeco.ingest.readers.frame_names import meaning_of
 from neeco.ingest.readers.rosbag import DVRK_HINT, POSE_HEADER, RosBag, joint_column, wrist_joints
 from neeco.ingest.readers.video import ChosenFrames, ImageFiles, open_video
@@ -144,48 +144,48 @@ def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:
         return _stamped_files(path), {}
     document = read_json(path / INDEX)
     videos = [video for entry in [document, *_list(document, "streams")] for video in _list(entry, "videos")]
+    names = [video.get("file") for video in videos if isinstance(video, dict)]
     found: dict[str, _Film] = {}
     absent: dict[str, str] = {}
-    for video in videos:
-        name = video.get("file") if isinstance(video, dict) else None
-        if not isinstance(name, str) or Path(name).name != name or not name.lower().endswith(".mp4"):
-            continue
-        file = path / name
+    for file in (path / str(name) for name in names if str(name).lower().endswith(".mp4") and _is_plain(name)):
         if not file.is_file():
-            absent[file.stem] = f"{path / INDEX}: videos: {printable(name)} is not there; put it next to {INDEX}"
+            absent[file.stem] = f"{path / INDEX}: videos: {printable(file.name)} is not there; put it next to {INDEX}"
             continue
         try:
             times, layout = _frame_times(file.with_suffix(".json"))
         except NeecoError as error:
             absent[file.stem] = str(error)
             continue
-        if layout in HALVES:
-            for half, side in enumerate(HALVES[layout]):
-                found[f"{file.stem}.{side}"] = _Film(times, (file,), half)
-        else:
+        for half, side in enumerate(HALVES.get(layout, ())):
+            found[f"{file.stem}.{side}"] = _Film(times, (file,), half)
+        if layout not in HALVES:
             found[file.stem] = _Film(times, (file,))
     return found, absent
+
+
+def _is_plain(name: Any) -> bool:
+    return isinstance(name, str) and bool(name) and Path(name).name == name
 
 
 def _frame_times(sidecar: Path) -> tuple[np.ndarray, str]:
     """Unix times [N] s of a video's frames, less the camera's latency, and how it shows two cameras."""
     document = read_json(sidecar)
-    if not isinstance(document, dict):
-        raise NeecoError(f"{sidecar}: expected the times of the video's frames; record again")
-    stamps: Any = document.get("timestamps_ns")
-    if stamps is None:
-        stamps = [frame.get("cpu_ts") if isinstance(frame, dict) else None for frame in _list(document, "frames")]
-    good = isinstance(stamps, list) and all(type(stamp) is int and 0 < stamp < 1 << 62 for stamp in stamps)
-    if not good or len(stamps) < 2:
+    frames = _list(document, "frames")
+    stamps = _list(document, "timestamps_ns") or [_entry(frame, "cpu_ts") for frame in frames]
+    latency = _entry(document, "estimated_latency") or 0.0
+    if len(stamps) < 2 or not all(type(stamp) is int and 0 < stamp < 1 << 62 for stamp in stamps):
         raise NeecoError(f"{sidecar}: frames: expected a cpu_ts (ns) of each frame of the video; record again")
-    latency = document.get("estimated_latency", 0.0)
     if not isinstance(latency, int | float) or not abs(latency) < 60:
         raise NeecoError(f"{sidecar}: estimated_latency: {printable(latency)} is none in s; correct it")
-    return np.array(stamps, np.int64) * 1e-9 - float(latency), str(document.get("side_by_side", ""))
+    return np.array(stamps, np.int64) * 1e-9 - float(latency), str(_entry(document, "side_by_side"))
+
+
+def _entry(document: Any, name: str) -> Any:
+    return document.get(name) if isinstance(document, dict) else None
 
 
 def _list(document: Any, name: str) -> list[Any]:
-    value = document.get(name) if isinstance(document, dict) else None
+    value = _entry(document, name)
     return value if isinstance(value, list) else []
 
 
@@ -212,11 +212,9 @@ def _bag(path: Path) -> Path | None:
         document = read_json(path / INDEX) if (path / INDEX).is_file() else {}
     except NeecoError:
         return None
-    name = document.get("rosbags", document.get("rosbag")) if isinstance(document, dict) else None
-    name = name.get("name") if isinstance(name, dict) else name
-    if not isinstance(name, str) or not name or Path(name).name != name or not (path / name).exists():
-        return None
-    return path / name
+    name = _entry(document, "rosbags") or _entry(document, "rosbag")
+    name = _entry(name, "name") or name
+    return path / name if _is_plain(name) and (path / name).exists() else None
 
 
 def _tables_in(path: Path) -> list[Path]:
@@ -250,53 +248,47 @@ def _columns(table: Table) -> tuple[str | None, list[str]]:
 
 def _stream(topic: str, kind: str, columns: list[str], table: Table) -> Stream:
     match = (_POSES if kind == POSES else _JOINTS).fullmatch(topic)
-    body = match[1] if match else None
+    body, offered = match[1] if match else None, match is not None
     if kind == POSES:
-        stated_in = _frames(table)
-        meaning = meaning_of(stated_in[0] if len(stated_in) == 1 else "", dvrk=True)
+        frames = _frames(table)
+        meaning = meaning_of(frames[0] if len(frames) == 1 else "", dvrk=True)
+        hints = (*meaning.hints, DVRK_HINT)
         return Stream(
-            topic, POSES, "poses", len(table.rows), offered=match is not None, body=body,
-            hints=(*meaning.hints, DVRK_HINT), asks=meaning.asks,
-        )  # fmt: skip
+            topic, POSES, "poses", len(table.rows), offered=offered, body=body, hints=hints, asks=meaning.asks
+        )
     joints = wrist_joints(_joint_names(table, columns), "/jaw/" in topic)
-    return Stream(topic, READINGS, "joints", len(table.rows), offered=match is not None, body=body, joints=joints)
+    return Stream(topic, READINGS, "joints", len(table.rows), offered=offered, body=body, joints=joints)
 
 
 def _joint_names(table: Table, columns: list[str]) -> list[str]:
     """Return the joints of columns position.0, position.1, ..., by the first row's name.0, name.1, ..."""
-    first = dict(zip(table.header, table.rows[0], strict=False))
+    first = dict(zip(table.header, table.rows[0], strict=True))
     return [first.get(f"name.{number}") or f"joint_{number + 1}" for number in range(len(columns))]
 
 
 def _converted(path: Path, stream: Stream, table: Table, columns: list[str], start: float) -> Table:
     """A topic's CSV as numbers, its times s from `start` on."""
-    when = ["header.stamp.sec", "header.stamp.nanosec"]
+    when, frames = ["header.stamp.sec", "header.stamp.nanosec"], _frames(table)
     times = numbers(table, ["timestamp"])[0][:, 0] * 1e-9  # of receipt
     if set(when) <= set(table.header):
         stamps = numbers(table, when)[0] @ [1.0, 1e-9]
         times = np.where(stamps == 0, times, stamps)
-    if stream.kind == POSES:
-        header: tuple[str, ...] = POSE_HEADER
-    else:
-        header = ("t_s", *map(joint_column, _joint_names(table, columns)))
-        if len(set(header)) < len(header):
-            raise NeecoError(f"{table.path}: names a joint twice; record again")
-    values, _, bad = numbers(table, columns)
-    notes = [f"{path.name}: {stream.name}: {len(bad)} rows cannot be read; left out"] if bad else []
-    rows = np.column_stack([times - start, values])
-    found = Table(path, header, rows, table.lines, stream=stream.name, notes=tuple(notes))
-    frames = _frames(table)
-    if stream.kind != POSES or not frames:
-        return found
+    header: tuple[str, ...] = POSE_HEADER
+    if stream.kind != POSES:
+        header, frames = unique_names(["t_s", *map(joint_column, _joint_names(table, columns))]), []
     if len(frames) > 1:
         listed = ", ".join(frames[:4])
         raise NeecoError(f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame")
-    return replace(found, stated_in=frames[0], meaning=meaning_of(frames[0], dvrk=True))
+    values, _, bad = numbers(table, columns)
+    notes = (f"{path.name}: {stream.name}: {len(bad)} rows cannot be read; left out",) if bad else ()
+    return Table(
+        path, header, np.column_stack([times - start, values]), table.lines, stream=stream.name, notes=notes,
+        stated_in=frames[0] if frames else None, meaning=meaning_of(frames[0], dvrk=True) if frames else None,
+    )  # fmt: skip
 
 
 def _frames(table: Table) -> list[str]:
     """Names of the frames that a topic's poses are stated in."""
     if "header.frame_id" not in table.header:
         return []
-    index = table.header.index("header.frame_id")
-    return sorted({row[index].lstrip("/") for row in table.rows if len(row) > index})
+    return sorted({cell.lstrip("/") for cell in table.rows[:, table.header.index("header.frame_id")]})

@@ -14,16 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from neeco.errors import NeecoError
-from neeco.files import read_bytes
-from neeco.ingest.readers import POSES, RecordingFormat, Stream, Table, choose_stream
+from neeco.ingest.readers import POSES, RecordingFormat, Stream, Table, choose_stream, parse_number
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
+from neeco.ingest.readers.delimited import read_cells
 from neeco.ingest.readers.frame_names import NamedFrame
 from neeco.placeholders import read_head
 
 ARMS = ("master left", "master right", "slave left", "slave right")  # in the order of their columns
 COLUMNS = 19  # of an arm
 RATE_HZ = 30.0
-MAX_BYTES = 2**28
 GRIPPER = "gripper_angle_rad"
 HEADER = ("t_s", "x_m", "y_m", "z_m", *(f"r{row}{column}" for row in range(3) for column in range(3)), GRIPPER)
 USED = (*range(12), 18)  # of an arm's columns; its velocities follow from them
@@ -36,10 +35,13 @@ class JigsawsKinematics(RecordingFormat):
     holds = "poses and gripper angles of the arms: text of 76 columns without a header"
 
     def claims(self, path: Path) -> bool:
-        return path.suffix.lower() == ".txt" and _row(read_head(path, 4096).partition(b"\n")[0]) is not None
+        first = read_head(path, 4096).partition(b"\n")[0].decode("utf-8", "replace").split()
+        return (
+            path.suffix.lower() == ".txt" and len(first) == COLUMNS * len(ARMS) and None not in map(parse_number, first)
+        )
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        count = len(_numbers(path))
+        count = len(read_cells(path).lines)
         hints = ("poses are stated in the frame of this arm's own base",)
         return tuple(
             Stream(
@@ -51,33 +53,11 @@ class JigsawsKinematics(RecordingFormat):
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         arm = choose_stream(path, self.streams(path), stream, (POSES,)).name
-        values = _numbers(path)
-        first = COLUMNS * ARMS.index(arm)
-        rows = np.column_stack([np.arange(len(values)) / RATE_HZ, values[:, [first + index for index in USED]]])
-        lines = np.arange(1, len(rows) + 1)
-        return Table(path, HEADER, rows, lines, stream=arm, meaning=NamedFrame(BASE), image_hz=RATE_HZ)
-
-
-def _numbers(path: Path) -> np.ndarray:
-    """float64 [R, 76]. Raises NeecoError naming the line that has not as many numbers."""
-    if path.is_file() and path.stat().st_size > MAX_BYTES:
-        raise NeecoError(f"{path}: has over {MAX_BYTES >> 20} MiB; cut it into trials")
-    lines = read_bytes(path, "kinematics of 76 columns").splitlines()
-    while lines and not lines[-1].strip():
-        lines.pop()
-    rows = [_row(line) for line in lines]
-    bad = next((number for number, row in enumerate(rows, 1) if row is None), None)
-    if bad is not None:
-        raise NeecoError(f"{path}: line {bad}: has not {COLUMNS * len(ARMS)} numbers; repair it, or cut the file there")
-    return np.array(rows, dtype=np.float64)
-
-
-def _row(line: bytes) -> list[float] | None:
-    """The 76 numbers of a line; None where it has others."""
-    cells = line.split()
-    if len(cells) != COLUMNS * len(ARMS) or b"_" in line:  # Python would read 1_000
-        return None
-    try:
-        return [float(cell) for cell in cells]
-    except ValueError:
-        return None
+        text, columns = read_cells(path), COLUMNS * len(ARMS)
+        bad = (text.counts != columns) | ~text.numeric(slice(None))[:, :columns].all(axis=1)
+        if bad.any():
+            line = text.lines[bad][0]
+            raise NeecoError(f"{path}: line {line}: has not {columns} numbers; repair it, or cut the file there")
+        used = [COLUMNS * ARMS.index(arm) + index for index in USED]
+        rows = np.column_stack([np.arange(len(text.lines)) / RATE_HZ, text.cells[:, used].astype(np.float64)])
+        return Table(path, HEADER, rows, text.lines, stream=arm, meaning=NamedFrame(BASE), image_hz=RATE_HZ)

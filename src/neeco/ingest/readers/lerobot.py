@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from io import BytesIO
-from itertools import islice
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +45,16 @@ from neeco.ingest.readers.columns import (
     split_unit,
 )
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
-from neeco.ingest.readers.lerobot_files import FIXED, DataSet, Episode, Feature, ParquetFile, read_data_set
+from neeco.ingest.readers.lerobot_files import (
+    FIXED,
+    DataSet,
+    Episode,
+    Feature,
+    batches,
+    parquet_names,
+    read_columns,
+    read_data_set,
+)
 from neeco.ingest.readers.video import ChosenFrames, open_video
 from neeco.placeholders import read_head
 
@@ -74,27 +82,21 @@ class LeRobot(RecordingFormat):
     def streams(self, path: Path) -> tuple[Stream, ...]:
         """Return those of the first episode that was downloaded; all others have the same."""
         data = self._data_set(path)
-        count, first, last = data.episodes()
         found = self._episode_streams(data, data.first_present())
-        if count > 1:
-            found = (*found, Stream(f"episodes {first} to {last}", OTHER, "episodes with the same streams", count))
+        if len(data.records) > 1:
+            found = (*found, Stream(data.range_words, OTHER, "episodes with the same streams", len(data.records)))
         return found
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         data = self._data_set(path)
         episode, key = self._chosen(data, stream, (POSES, READINGS))
-        feature, name = data.features[key], f"episode {episode.number}/{key}"
+        names, name = data.features[key].names, f"episode {episode.number}/{key}"
         times, order, _, notes = _times(data, episode)
-        values = ParquetFile(episode.data).read([key], episode.number)[key]
-        if values[0].size != len(feature.names):
-            raise NeecoError(
-                f"{episode.data}: {key}: has {values[0].size} numbers a row, meta/info.json says {len(feature.names)}; "
-                "download the data set again"
-            )
-        rows = np.column_stack([times, values.reshape(len(values), -1)[order].astype(np.float64)])
-        header, lines = (TIME, *feature.names), np.arange(len(rows))
-        meaning = _meaning(key, feature.names)
-        return Table(path, header, rows, lines, stream=name, record="frame", notes=notes, meaning=meaning)
+        rows = np.column_stack([times, self._values(episode, key, names)[order]])
+        return Table(
+            path, (TIME, *names), rows, np.arange(len(rows)), stream=name, record="frame", notes=notes,
+            meaning=_meaning(key, names),
+        )  # fmt: skip
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         data = self._data_set(path)
@@ -105,7 +107,7 @@ class LeRobot(RecordingFormat):
         if key in episode.absent:
             raise NeecoError(episode.absent[key])
         film = episode.films[key]
-        part = None if film.start is None or film.end is None else (film.start, film.end)
+        part = film.part
         if part is not None and places[-1] >= len(places):  # the part was counted without the rows that were removed
             part = part[0], max(part[1], part[0] + (int(places[-1]) + 1) / data.fps)
         video = open_video(film.file, part=part)
@@ -147,32 +149,20 @@ class LeRobot(RecordingFormat):
     def _chosen(self, data: DataSet, stream: str | None, kinds: Sequence[str]) -> tuple[Episode, str]:
         """Return the episode and the feature that a stream names; the only ones there are where none is named."""
         match = None if stream is None else _NAME.fullmatch(stream)
-        if match is None:
-            count, first, last = data.episodes()
-            if stream is None and count > 1:
-                examples = ", ".join(
-                    f"episode {first}/{key}" for key, held in data.features.items() if _kind(held) in kinds
-                )
-                raise NeecoError(
-                    f"{data.path}: stream: missing, and there are episodes {first} to {last}; name one, as in "
-                    f"{examples[:300]}"
-                )
-            chosen = choose_stream(data.path, self.streams(data.path), stream, kinds).name
-            match = _NAME.fullmatch(chosen)
-            assert match is not None
-        number, key = int(match[1]), match[2]
-        feature = data.features.get(key)
-        fitting = [f"episode {number}/{name}" for name, other in data.features.items() if _kind(other) in kinds]
-        if feature is None or _kind(feature) not in kinds:
-            what = "holds no" if feature is None else f"is {feature.dtype}, no {' or '.join(kinds)}:"
-            listed = ", ".join(fitting)[:400] or "none"
-            raise NeecoError(f"{data.path}: stream: {what} {printable(key)}; name one of {listed}")
+        number = int(match[1]) if match else min(data.records)
+        wanted = f"episode {number}/{match[2]}" if match else stream
+        named = [Stream(f"episode {number}/{key}", _kind(own), own.dtype, 0) for key, own in data.features.items()]
+        if stream is None and len(data.records) > 1:
+            examples = ", ".join(held.name for held in named if held.kind in kinds)[:300]
+            what = f"missing, and there are {data.range_words}; name one, as in {examples}"
+            raise NeecoError(f"{data.path}: stream: {what}")
+        key = choose_stream(data.path, named, wanted, kinds).name.partition("/")[2]
         return data.episode(number), key
 
     def _episode_streams(self, data: DataSet, episode: Episode) -> tuple[Stream, ...]:
         found = []
         absent = dict(episode.absent)
-        for key in set(data.features) - set(data.films) - set(ParquetFile(episode.data).names):
+        for key in set(data.features) - set(data.films) - set(parquet_names(episode.data)):
             absent[key] = f"{episode.data}: has no column {printable(key)}; download the data set again"
         for key in sorted(data.features, key=_camera_order):
             feature, name = data.features[key], f"episode {episode.number}/{key}"
@@ -222,11 +212,17 @@ class LeRobot(RecordingFormat):
         return [plain]
 
     def _columns(self, episode: Episode, feature: Feature, columns: Sequence[str]) -> np.ndarray:
-        values = ParquetFile(episode.data).read([feature.key], episode.number)[feature.key]
-        values = values.reshape(len(values), -1)
-        if values.shape[1] != len(feature.names):
-            return np.zeros((len(values), len(columns)))
+        values = self._values(episode, feature.key, feature.names)
         return values[:, [feature.names.index(column) for column in columns]]
+
+    def _values(self, episode: Episode, key: str, names: Sequence[str]) -> np.ndarray:
+        values = read_columns(episode.data, ["episode_index", key], episode.number)[key]
+        if values.shape[1] != len(names):
+            raise NeecoError(
+                f"{episode.data}: {key}: has {values.shape[1]} numbers a row, meta/info.json says {len(names)}; "
+                "download the data set again"
+            )
+        return values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,18 +235,18 @@ class _Stored(VideoSource):
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = {self.rows[int(index)]: int(index) for index in indices}
-        found = ((wanted[row], cell) for row, cell in _cells(self.path, self.key, self.episode) if row in wanted)
-        ahead: deque[tuple[int, Future[np.ndarray]]] = deque()
-        missing = len(wanted)
+        row = 0
         with ThreadPoolExecutor(DECODERS) as pool:  # zlib lets other threads run
-            for index, cell in islice(found, missing):
-                where = f"{self.path}: {self.key}: frame {index}"
-                ahead.append((index, pool.submit(_decoded, where, cell, self.size)))
-                missing -= 1
-                while len(ahead) > (DECODERS if missing else 0):
-                    index, pixels = ahead.popleft()
-                    yield index, pixels.result()
-        if missing:
+            for cells in _cells(self.path, self.key, self.episode):
+                numbers = [number for number in range(row, row + len(cells)) if number in wanted]
+                chosen = [cells[number - row] for number in numbers]
+                places = [f"{self.path}: {self.key}: frame {wanted[number]}" for number in numbers]
+                row += len(cells)
+                for number, pixels in zip(numbers, pool.map(_decoded, places, chosen, repeat(self.size)), strict=True):
+                    yield wanted.pop(number), pixels
+                if not wanted:
+                    return
+        if wanted:
             raise NeecoError(f"{self.path}: {self.key}: is shorter than before; do not change the data set")
 
 
@@ -258,29 +254,25 @@ def _open_stored(
     data: DataSet, episode: Episode, key: str, times: np.ndarray, order: np.ndarray, notes: tuple[str, ...]
 ) -> VideoSource:
     where = f"{episode.data}: {key}"
-    first = next(iter(_cells(episode.data, key, episode.number)), None)
-    if first is None:
+    first = next(_cells(episode.data, key, episode.number), None)
+    if not first:
         raise NeecoError(f"{where}: holds no images of episode {episode.number}; download it again")
-    pixels = _decoded(f"{where}: frame 0", first[1], None)
-    size = (pixels.shape[1], pixels.shape[0])
+    height, width = _decoded(f"{where}: frame 0", first[0], None).shape[:2]
     rows = tuple(order.tolist())
-    return _Stored(episode.data, size, notes, times, key=key, episode=episode.number, rows=rows)
+    return _Stored(episode.data, (width, height), notes, times, key=key, episode=episode.number, rows=rows)
 
 
-def _cells(file: Path, key: str, episode: int) -> Iterator[tuple[int, Any]]:
-    """Yield (row of the episode, bytes) of a column of images."""
+def _cells(file: Path, key: str, episode: int) -> Iterator[list[Any]]:
+    """Yield the bytes of a column of images, of some rows of the episode at a time."""
     import pyarrow
 
-    row = 0
-    for part in ParquetFile(file).batches(["episode_index", key], episode, IMAGES_AT_ONCE):
+    for part in batches(file, ["episode_index", key], episode, IMAGES_AT_ONCE):
         column = part.column(key)
         if pyarrow.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0:
             column = column.field("bytes")
         if not (pyarrow.types.is_binary(column.type) or pyarrow.types.is_large_binary(column.type)):
             raise NeecoError(f"{file}: {key}: holds {printable(str(column.type))}, no images; name another feature")
-        for cell in column:
-            yield row, cell.as_py()
-            row += 1
+        yield column.to_pylist()
 
 
 def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np.ndarray:
@@ -303,8 +295,8 @@ def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np
 def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
     """Return times [R] s of an episode's rows from the first on, the rows of its file in their order, the number of
     each row's image in its film: the one nearest to its timestamp where no two share one, and notes."""
-    table = ParquetFile(episode.data).read(["timestamp", "frame_index"], episode.number)
-    frames, stamps = table["frame_index"].reshape(-1), table["timestamp"].reshape(-1).astype(np.float64)
+    table = read_columns(episode.data, ["episode_index", "timestamp", "frame_index"], episode.number)
+    frames, stamps = table["frame_index"][:, 0], table["timestamp"][:, 0]
     if len(frames) != episode.length:
         raise NeecoError(
             f"{episode.data}: has {len(frames)} rows of episode {episode.number}, meta says {episode.length}; download "

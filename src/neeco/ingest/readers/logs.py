@@ -130,9 +130,9 @@ def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
 def _frame_names(table: Table) -> list[str]:
     """The name in a column such as `header.frame_id`; [] where there is none, or it counts or names images."""
     for index, name in enumerate(table.header):
-        if isinstance(table.rows, np.ndarray) or not _FRAME_COLUMN.fullmatch(name.strip().lower()):
+        if table.rows.dtype != object or not _FRAME_COLUMN.fullmatch(name.strip().lower()):
             continue
-        found = sorted({cells[index].strip("/\"' ") for cells in table.rows if index < len(cells)} - {""})
+        found = sorted({cell.strip("/\"' ") for cell in table.rows[:, index]} - {""})
         if len(found) > 1 and any(meaning_of(cell).frame != named.BASE for cell in found):
             listed = ", ".join(found[:4])
             raise NeecoError(f"{table.where}: {name}: poses are stated in several frames ({listed}); write one a file")
@@ -289,10 +289,9 @@ def _rotation_columns(table: Table, source: PoseColumns, found: RecognisedColumn
 
 def _unclear(table: Table, found: RecognisedColumns, what: str, expected: str) -> NeecoError:
     reason = found.unclear.get(what) or (found.unclear.get("quaternion") if what == "rotation" else None)
-    problem = (
-        f"no {expected} found among {', '.join(table.header[:12])[:120]!r}; name them in the recording under columns: "
-        + ("position" if what == "position" else _FORMS)
-    )
+    names = "position" if what == "position" else _FORMS
+    listed = repr(", ".join(table.header[:12])[:120])
+    problem = f"no {expected} found among {listed}; name them in the recording under columns: {names}"
     return NeecoError(f"{table.where}: header: {f'{what}: {reason}' if reason else problem}")
 
 
@@ -333,18 +332,13 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
         raise NeecoError(f"{path}: line {table.lines[row]}: {what}; repair or remove the line")
     order = np.argsort(values[:, 0], kind="stable")
     counts, angles, lines = values[order, 0], values[order, 1] * named.UNITS["angle"][unit], table.lines[order]
-    if len(counts) < 2:
-        raise NeecoError(f"{path}: has one point; a calibration table needs two or more")
-    same = np.flatnonzero(np.diff(counts) <= 0)
-    if len(same):
-        first, second = lines[same[0] : same[0] + 2]
-        raise NeecoError(f"{path}: lines {first} and {second}: the same count {counts[same[0]]:g} twice; keep one")
-    turning = np.flatnonzero(np.diff(angles) * np.sign(angles[-1] - angles[0]) <= 0)
-    if len(turning):
-        first, second = lines[turning[0] : turning[0] + 2]
+    turning = (np.diff(counts) <= 0) | (np.diff(angles) * np.sign(angles[-1] - angles[0]) <= 0)
+    if len(counts) < 2 or turning.any():
+        place = (
+            f"lines {' and '.join(map(str, lines[int(turning.argmax()) :][:2]))}" if len(counts) > 1 else "one point"
+        )
         raise NeecoError(
-            f"{path}: lines {first} and {second}: the angle does not go on rising (or falling) with the counts, so a "
-            "count has no one angle; measure these points again"
+            f"{path}: {place}: expected two points or more, whose angles rise (or fall) as the counts do; measure again"
         )
     if np.abs(angles).max() > MAX_ANGLE:
         raise NeecoError(f"{path}: {angle_name}: goes beyond two turns; correct the column's unit")
@@ -364,13 +358,11 @@ def _calibrated(
     outside = excess > CLAMPED_SHARE * (high - low)
     values = PchipInterpolator(counts, angles)(np.clip(readings, low, high))
     clamped = (excess > 0) & ~outside
-    note = ""
+    notes: tuple[str, ...] = ()
     if clamped.any():
-        note = (
-            f"{table.title}: {counted(int(clamped.sum()), 'row')} with {name} just outside the table "
-            f"{path.name} ({low:g} to {high:g}, by at most {excess[clamped].max():g}): "
-            f"read as its end ({table.list_rows(table.lines[clamped])})"
-        )
+        by = f"{low:g} to {high:g}, by at most {excess[clamped].max():g}"
+        what = f"{counted(int(clamped.sum()), 'row')} with {name} just outside the table {path.name} ({by})"
+        notes = (f"{table.title}: {what}: read as its end ({table.list_rows(table.lines[clamped])})",)
     reason = f"{name} lies far outside the calibration table {path.name}"
     rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
-    return values, (note,) if note else ()
+    return values, notes

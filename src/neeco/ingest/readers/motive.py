@@ -7,8 +7,6 @@ are empty where a body was not tracked. Angles are in degrees, about the body's 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
-from neeco.ingest.readers import Body, RecordingFormat, Table, numbers
+from neeco.ingest.readers import Body, RecordingFormat, Table, numbers, parse_number
 from neeco.ingest.readers.columns import UNITS, canonical_unit
-from neeco.ingest.readers.delimited import read_lines, unique_names
+from neeco.ingest.readers.delimited import read_cells, unique_names
 from neeco.placeholders import read_head
 
 FIRST = b"Format Version"  # words of a file
@@ -39,63 +37,53 @@ class MotiveExport(RecordingFormat):
     def read(self, path: Path, stream: str | None = None) -> Table:
         if stream is not None:
             raise NeecoError(f"{path}: stream: an export is one table; name a rigid body as `tool` instead")
-        lines = read_lines(path)
-        preamble = dict(zip(lines[0].cells[::2], lines[0].cells[1::2], strict=False))
-        types = next((n for n, line in enumerate(lines) if BODY_TYPE in map(str.lower, line.cells)), None)
-        start = next((n for n, line in enumerate(lines) if line.cells[0].lower() == "frame"), 0)
-        if types is None or start < types + 3:
+        text = read_cells(path)
+        preamble = dict(zip(text.cells[0, ::2], text.cells[0, 1::2], strict=False))
+        lower = np.char.lower(text.cells[: min(len(text.cells), 20)].astype(str))
+        types = np.flatnonzero((lower == BODY_TYPE).any(axis=1))
+        starts = np.flatnonzero(lower[:, 0] == "frame")
+        if not len(types) or not len(starts) or starts[0] < types[0] + 3:
             raise NeecoError(f"{path}: holds no rigid bodies; export the take from Motive with its rigid bodies")
-        rows = lines[start + 1 :]
-        if not rows:
+        start, names = int(starts[0]), text.cells[types[0] + 1]
+        kinds, parts, axes = lower[types[0]], lower[start - 1], lower[start]
+        if start + 1 == len(text.lines):
             raise NeecoError(f"{path}: has a header but no rows; export the take again")
-        axes = lines[start].cells
-        cells, places = [line.cells for line in rows], np.array([line.number for line in rows])
-        raw = Table(path, tuple(map(str, range(len(axes)))), cells, places, decimal_comma=lines[0].decimal_comma)
-        kinds, names, parts = ([*lines[n].cells, *[""] * len(axes)] for n in (types, types + 1, start - 1))
-        unit = canonical_unit(preamble.get("Length Units", ""))
+        cells, lines = text.cells[start + 1 :], text.lines[start + 1 :]
+        raw = Table(path, tuple(map(str, range(len(axes)))), cells, lines, decimal_comma=text.decimal_comma)
+
+        def values(name: str, part: str, letters: str) -> np.ndarray:
+            """[R, A] of a body's columns; NaN where it was not tracked."""
+            own = {
+                axes[i]: str(i) for i in range(len(axes)) if (names[i], kinds[i], parts[i]) == (name, BODY_TYPE, part)
+            }
+            if not set(letters) <= set(own):
+                raise NeecoError(f"{path}: {part}: a rigid body has no columns of it; export the take with 6 DoF data")
+            return numbers(raw, [own[letter] for letter in letters])[0]
+
+        kind, unit = preamble.get("Rotation Type", QUATERNION).lower(), canonical_unit(preamble.get("Length Units", ""))
+        if kind not in (QUATERNION, *ORDERS):
+            raise NeecoError(f"{path}: Rotation Type: {printable(kind)} is not read; export quaternions")
         suffix = f"_{unit}" if unit in UNITS["length"] else ""
         header, columns, bodies = ["t_s"], [_times(raw, axes, preamble)], []
-        owned = [i for i in range(len(axes)) if kinds[i].lower() == BODY_TYPE]
-        for name, group in groupby(owned, key=lambda i: names[i].strip('"')):
-            own = {(parts[i].lower(), axes[i].lower()): i for i in group}
-            turns = _quats(raw, own, preamble.get("Rotation Type", QUATERNION).lower())
-            positions = _values(raw, own, "position", "xyz")
+        for name in dict.fromkeys(names[kinds == BODY_TYPE]):
+            quats = values(name, "rotation", "xyzw" if kind == QUATERNION else kind)
+            if kind != QUATERNION:
+                known, angles = np.isfinite(quats).all(axis=1), quats
+                quats = np.full((len(angles), 4), np.nan)
+                if known.any():
+                    quats[known] = Rotation.from_euler(kind.upper(), angles[known], degrees=True).as_quat()
             bodies.append(Body(name, tuple(range(len(header), len(header) + 7))))
             header += [*(axis + suffix for axis in "xyz"), *QUATS]
-            columns += [positions, turns]
-        return Table(path, unique_names(header), np.column_stack(columns), places, bodies=tuple(bodies))
+            columns += [values(name, "position", "xyz"), quats]
+        return Table(path, unique_names(header), np.column_stack(columns), lines, bodies=tuple(bodies))
 
 
-def _times(raw: Table, axes: Sequence[str], preamble: dict[str, str]) -> np.ndarray:
+def _times(raw: Table, axes: np.ndarray, preamble: dict[str, str]) -> np.ndarray:
     """[R] s: as they stand there, else of the frames at the export's rate."""
-    column = next((i for i, name in enumerate(axes) if name.lower().startswith("time (sec")), None)
-    if column is not None:
-        return numbers(raw, [str(column)])[0][:, 0]
-    try:
-        rate = float(preamble.get("Export Frame Rate", preamble.get("Capture Frame Rate", "")))
-    except ValueError:
-        rate = 0.0
+    for index, name in enumerate(axes):
+        if name.startswith("time (sec"):
+            return numbers(raw, [str(index)])[0][:, 0]
+    rate = parse_number(preamble.get("Export Frame Rate", preamble.get("Capture Frame Rate", ""))) or 0.0
     if not 0 < rate < 1e6:  # NaN compares false
         raise NeecoError(f"{raw.path}: has no column of times and no Export Frame Rate; export the take with its times")
     return numbers(raw, ["0"])[0][:, 0] / rate
-
-
-def _values(raw: Table, own: dict[tuple[str, str], int], part: str, axes: str) -> np.ndarray:
-    """[R, A] of a body's columns; NaN where it was not tracked. own: by part and axis."""
-    if not all((part, axis) in own for axis in axes):
-        raise NeecoError(f"{raw.path}: {part}: a rigid body has no columns of it; export the take with 6 DoF data")
-    return numbers(raw, [str(own[part, axis]) for axis in axes])[0]
-
-
-def _quats(raw: Table, own: dict[tuple[str, str], int], kind: str) -> np.ndarray:
-    """[R, 4] xyzw of a body."""
-    if kind == QUATERNION:
-        return _values(raw, own, "rotation", "xyzw")
-    if kind not in ORDERS:
-        raise NeecoError(f"{raw.path}: Rotation Type: {printable(kind)} is not read; export quaternions")
-    angles = _values(raw, own, "rotation", kind)
-    quats = np.full((len(angles), 4), np.nan)
-    known = np.isfinite(angles).all(axis=1)
-    if known.any():
-        quats[known] = Rotation.from_euler(kind.upper(), angles[known], degrees=True).as_quat()
-    return quats

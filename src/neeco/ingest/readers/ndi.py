@@ -1,18 +1,19 @@
 """Exports of trackers with the columns of several bodies in a row: NDI's tools, each followed by its markers, and the
-rigid bodies of `Table.bodies`."""
+rigid bodies of other formats."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
-from neeco.ingest.readers import Table
+from neeco.ingest.readers import Body, Table
 from neeco.ingest.readers.columns import PoseColumns
 
 _PORT = re.compile(r"port\b\s*(?P<port>[^:]*?)\s*(?::\s*(?P<name>.*))?$", re.IGNORECASE)
@@ -20,15 +21,28 @@ _NUMBERED = re.compile(r"#\d+$")  # what tells columns of one name apart
 MARKERS = "markers"  # the column behind which those of a tool's markers begin
 
 
-@dataclass(frozen=True)
-class _Tool:
-    """One tool's own columns, by their index in the header, and what it may be called."""
-
-    columns: tuple[int, ...]
-    title: str
-    port: str
-    name: str
-    names: frozenset[str]
+def find_tools(header: Sequence[str], rows: np.ndarray) -> tuple[Body, ...]:
+    """Return NDI's tools: the columns of each from its `Port` to its markers; named by name or serial number, else by
+    port, where that is no other's."""
+    plain = [_NUMBERED.sub("", name).strip() for name in header]
+    starts = [index for index, name in enumerate(plain) if _PORT.match(name)]
+    found: list[tuple[range, str, list[str]]] = []
+    for start, end in pairwise([*starts, len(plain)]):
+        names = [name.lower() for name in plain[start:end]]
+        own = next((n for n, name in enumerate(names) if name == MARKERS or name in names[:n]), len(names))
+        if {"q0", "tx"} <= set(names[:own]):
+            match, cell = _PORT.match(plain[start]), next(filter(None, rows[:, start]), "")
+            port, name = (match["port"], match["name"] or "") if match else ("", "")
+            title = plain[start] if port or name else cell or plain[start]
+            found.append((range(start, start + own), title, [name, port or cell, plain[start], cell]))
+    shared = Counter(word for _, _, words in found for word in {_canonical(word) for word in words if word})
+    return tuple(
+        Body(
+            next((word for word in words[:2] if word and shared[_canonical(word)] == 1), printable(title)),
+            tuple(columns), title=printable(title), aliases=frozenset(_canonical(word) for word in words if word),
+        )
+        for columns, title, words in found
+    )  # fmt: skip
 
 
 def tool_columns(table: Table, source: PoseColumns) -> Table:
@@ -38,89 +52,40 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
     Raises NeecoError where there are several tools and none is named, or columns are named that are not all one tool's:
     the second `Tx` is the first tool's first marker.
     """
-    tools = _tools(table)
-    if not tools:
+    if not table.bodies:
         if source.tool is not None:
             raise NeecoError(f"{table.path}: tool: there are no columns of tools or rigid bodies; leave it out")
         return table
-    listed = ", ".join(tool.title for tool in tools)
     if source.tool is None and (source.position or source.rotation):
-        _refuse_mixed(table, source, tools)
+        _refuse_mixed(table, source)
         return table
     wanted = None if source.tool is None else _canonical(source.tool)
-    chosen = [tool for tool in tools if wanted is None or wanted in tool.names]
-    if not chosen:
-        raise NeecoError(f"{table.path}: tool: {printable(source.tool)} is none of them; name one of {listed}")
-    if len(chosen) > 1:
-        problem = (
-            f"holds {len(tools)} tools" if wanted is None else f"{len(chosen)} tools go by {printable(source.tool)}"
-        )
+    chosen = [body for body in table.bodies if wanted is None or wanted in {_canonical(body.name), *body.aliases}]
+    if len(chosen) != 1:
+        listed = ", ".join(body.title or printable(body.name) for body in table.bodies)
+        count, given = len(chosen) or "none", printable(source.tool)
+        problem = f"holds {len(table.bodies)} tools" if wanted is None else f"tool: {given} is {count} of them"
         raise NeecoError(f"{table.path}: {problem}; say which as `tool` in the recording: {listed}")
-    table = replace(table, stream=chosen[0].name or chosen[0].port or None)  # which messages and notes name
-    first = min(tool.columns[0] for tool in tools)
-    columns = [*range(first), *chosen[0].columns]
+    columns = [*range(min(body.columns[0] for body in table.bodies)), *chosen[0].columns]
     header = tuple(_NUMBERED.sub("", table.header[index]) for index in columns)
-    if isinstance(table.rows, np.ndarray):
-        return replace(table, header=header, rows=table.rows[:, columns])
-    rows = [[cells[index] if index < len(cells) else "" for index in columns] for cells in table.rows]
-    return replace(table, header=header, rows=rows)
+    return replace(table, header=header, rows=table.rows[:, columns], stream=chosen[0].name, bodies=())
 
 
 def tool_names(table: Table) -> tuple[str, ...]:
-    """Return a name for each tool of an export of several: its name or serial number, else its port; () for other
-    tables, and for one tool without a name."""
-    tools = _tools(table)
-    if len(tools) < 2 and not table.bodies:
-        return ()
-    shared = Counter(name for tool in tools for name in tool.names)
-    return tuple(
-        next((word for word in (tool.name, tool.port) if word and shared[_canonical(word)] == 1), tool.title)
-        for tool in tools
-    )
+    """Return the name of each body of an export of several; () for other tables, and for NDI's with one tool."""
+    single = len(table.bodies) == 1 and table.bodies[0].aliases
+    return () if single else tuple(body.name for body in table.bodies)
 
 
-def _tools(table: Table) -> list[_Tool]:
-    if table.bodies or isinstance(table.rows, np.ndarray):
-        return [
-            _Tool(body.columns, printable(body.name), "", body.name, frozenset([_canonical(body.name)]))
-            for body in table.bodies
-        ]
-    plain = [_NUMBERED.sub("", name).strip() for name in table.header]
-    starts = [index for index, name in enumerate(plain) if _PORT.match(name)]
-    found = []
-    for start, end in pairwise([*starts, len(plain)]):
-        own: list[int] = []
-        seen: set[str] = set()
-        for index in range(start, end):
-            name = plain[index].lower()
-            if name == MARKERS or name in seen:
-                break
-            seen.add(name)
-            own.append(index)
-        if {"q0", "tx"} <= seen:
-            match = _PORT.match(plain[start])
-            assert match is not None
-            cell = next((cells[start] for cells in table.rows if start < len(cells) and cells[start]), "")
-            words = [plain[start], match["port"], match["name"], cell]
-            title = plain[start] if match["port"] or match["name"] else cell or plain[start]
-            names = frozenset(_canonical(word) for word in words if word)
-            found.append(_Tool(tuple(own), printable(title), match["port"] or cell, match["name"] or "", names))
-    return found
-
-
-def _refuse_mixed(table: Table, source: PoseColumns, tools: list[_Tool]) -> None:
+def _refuse_mixed(table: Table, source: PoseColumns) -> None:
     """Raise NeecoError where the columns that the recording names are not all one tool's own."""
     named = [*(source.position or ()), *(source.rotation or ()), *([source.state] if source.state else [])]
     places = {name: table.header.index(name) for name in named if name in table.header}
-    owners = [next((tool.title for tool in tools if place in tool.columns), None) for place in places.values()]
-    if None in owners:
-        name = next(name for name, owner in zip(places, owners, strict=True) if owner is None)
-        message = f"{name} is a marker's, no tool's"
-    elif len(set(owners)) > 1:
-        message = f"{', '.join(places)} are of several tools ({', '.join(dict.fromkeys(map(str, owners)))})"
-    else:
-        return
-    raise NeecoError(f"{table.path}: columns: {message}; name the tool instead, as `tool` in the recording")
+    owners = {name: [body.name for body in table.bodies if place in body.columns] for name, place in places.items()}
+    strangers = [name for name, own in owners.items() if not own]
+    if strangers or len({own[0] for own in owners.values()}) > 1:
+        what = f"{strangers[0]} is a marker's, no tool's" if strangers else f"{', '.join(places)} are of several tools"
+        raise NeecoError(f"{table.path}: columns: {what}; name the tool instead, as `tool` in the recording")
 
 
 def _canonical(name: str) -> str:

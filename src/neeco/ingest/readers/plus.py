@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,6 +21,7 @@ from neeco.ingest.readers import (
     Table,
     VideoSource,
     choose_stream,
+    file_state,
     parse_number,
 )
 from neeco.ingest.readers._sequencefile import META, NRRD, FrameSequence, SequenceImages, read_sequence
@@ -56,27 +56,23 @@ class PlusSequence(RecordingFormat):
             frames, notes = _image_frames(sequence)
             why = f" ({notes[0].partition(': ')[2]})" if notes else ""
             few = f"{len(frames)} of {sequence.count} images can be used{why}; record again"
-            problem = None if len(frames) >= MIN_IMAGES else few
             color = "grey" if sequence.channels == 1 else "RGB"
             title = f"{color} images of {sequence.size[0]}x{sequence.size[1]}"
+            problem = None if len(frames) >= MIN_IMAGES else few
             rate = _rate(times, sequence.count)
             found.append(Stream(IMAGE_STREAM, IMAGES, title, len(frames), rate, problem=problem))
         for name in _transforms(sequence):
-            texts = sequence.fields[name + TRANSFORM]
+            texts, meaning = sequence.fields[name + TRANSFORM], _meaning(name)
             # what is the same in every frame is a calibration (ImageToProbe), no motion
             fixed = len(texts) > 1 and len(set(texts.values())) == 1
-            title = "fixed transform" if fixed else "transform"
-            body, kind = _ends(name)[0], OTHER if fixed else POSES
-            statuses = sequence.fields.get(name + TRANSFORM + STATUS, {})
-            problem = None
-            if not any(statuses.get(frame, GOOD).lower() == GOOD for frame in texts):
-                status = f"{name}{TRANSFORM}{STATUS} is {printable(next(iter(statuses.values())), 20)}"
-                problem = f"no frame can be used: {status} in all; record again, or name another transform"
-            meaning = _meaning(name)
+            statuses = list(_statuses(sequence, name).values())
+            why = f"{name}{TRANSFORM}{STATUS} is {printable(statuses[0], 20)} in all"
+            problem = None if GOOD in map(str.lower, statuses) else _unusable(why)
             found.append(
                 Stream(
-                    name, kind, title, len(texts), _rate(times, len(texts)), body=body, hints=meaning.hints,
-                    asks=meaning.asks, problem=problem,
+                    name, OTHER if fixed else POSES, "fixed transform" if fixed else "transform", len(texts),
+                    _rate(times, len(texts)), body=_ends(name)[0], hints=meaning.hints, asks=meaning.asks,
+                    problem=problem,
                 )
             )  # fmt: skip
         return tuple(found)
@@ -89,34 +85,27 @@ class PlusSequence(RecordingFormat):
             )
         wanted = None if stream is None else stream.removesuffix(TRANSFORM)
         name = choose_stream(path, self.streams(path), wanted, (POSES,)).name
-        times, texts = _times(sequence), sequence.fields[name + TRANSFORM]
-        statuses = sequence.fields.get(name + TRANSFORM + STATUS, {})
-        dropped: dict[str, list[int]] = {}
+        times, statuses, dropped = _times(sequence), _statuses(sequence, name), dict[str, list[int]]()
         rows, frames = [], []
-        for frame in sorted(texts):
-            status = statuses.get(frame, GOOD)
-            matrix = _matrix(texts[frame])
-            if status.lower() != GOOD:
-                dropped.setdefault(f"{name}{TRANSFORM}{STATUS} is {printable(status, 20)}", []).append(frame)
-            elif frame not in times:
-                dropped.setdefault(f"they have no {TIME}", []).append(frame)
-            elif matrix is None:
-                dropped.setdefault(f"{name}{TRANSFORM} is not 16 numbers", []).append(frame)
+        for frame, text in sorted(sequence.fields[name + TRANSFORM].items()):
+            numbers = [parse_number(word) for word in text.split()]
+            if statuses[frame].lower() != GOOD:
+                dropped.setdefault(f"{name}{TRANSFORM}{STATUS} is {printable(statuses[frame], 20)}", []).append(frame)
+            elif frame not in times or len(numbers) != 16 or not np.isfinite(np.array(numbers, np.float64)).all():
+                dropped.setdefault(f"they have no {TIME}, or no 16 numbers", []).append(frame)
             else:
-                rows.append([times[frame], *matrix])
+                rows.append([times[frame], *numbers])
                 frames.append(frame)
-        values, numbers = np.array(rows).reshape(-1, 17), np.array(frames, np.int64)
-        _, stated_in = _ends(name)
         table = Table(
-            path, HEADER, values, numbers, stream=name, record="frame", stated_in=stated_in, meaning=_meaning(name)
-        )
-        notes = [
+            path, HEADER, np.array(rows, np.float64).reshape(-1, 17), np.array(frames, np.int64), stream=name,
+            record="frame", stated_in=_ends(name)[1], meaning=_meaning(name),
+        )  # fmt: skip
+        if not rows:
+            raise NeecoError(f"{table.where}: {_unusable(next(iter(dropped)))}")
+        notes = (
             f"{table.title}: {counted(len(left), 'frame')} dropped: {why} ({table.list_rows(left)})"
             for why, left in dropped.items()
-        ]
-        if not rows:
-            why = next(iter(dropped))
-            raise NeecoError(f"{table.where}: no frame can be used: {why}; record again, or name another transform")
+        )
         return replace(table, notes=tuple(notes))
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
@@ -129,18 +118,23 @@ class PlusSequence(RecordingFormat):
 
 
 def _sequence_of(path: Path) -> FrameSequence:
-    path = Path(path)
     require_content(path)
-    try:
-        state = path.stat()
-    except OSError as error:
-        raise NeecoError(f"{path}: cannot read: {error.strerror or error}; correct the path") from None
-    return _cached(path, state.st_size, state.st_mtime_ns)
+    return _cached(path, file_state(path))
 
 
 @lru_cache(maxsize=4)
-def _cached(path: Path, size: int, changed: int) -> FrameSequence:
+def _cached(path: Path, state: tuple[object, ...]) -> FrameSequence:
     return read_sequence(path)
+
+
+def _unusable(why: str) -> str:
+    return f"no frame can be used: {why}; record again, or name another transform"
+
+
+def _statuses(sequence: FrameSequence, name: str) -> dict[int, str]:
+    """The status of each frame that has a transform."""
+    stated = sequence.fields.get(name + TRANSFORM + STATUS, {})
+    return {frame: stated.get(frame, GOOD) for frame in sequence.fields[name + TRANSFORM]}
 
 
 def _transforms(sequence: FrameSequence) -> list[str]:
@@ -174,23 +168,18 @@ def _stamps(sequence: FrameSequence) -> dict[int, float]:
 
 def _image_frames(sequence: FrameSequence) -> tuple[list[int], list[str]]:
     """The frames whose images can be used, in order, and notes on the others."""
-    stamps = _stamps(sequence)
+    stamps, latest = _stamps(sequence), -np.inf
     statuses = next((sequence.fields[name] for name in IMAGE_STATUSES if name in sequence.fields), {})
-    bad = [frame for frame in range(sequence.count) if statuses.get(frame, GOOD).lower() != GOOD]
-    invalid, frames, unstamped, latest = set(bad), [], 0, -np.inf
-    for frame in range(sequence.count):
-        if frame in invalid:
-            continue
-        stamp = stamps.get(frame, -np.inf)
-        if stamp <= latest:
-            unstamped += 1
-            continue
-        frames.append(frame)
-        latest = stamp
+    good = [frame for frame in range(sequence.count) if statuses.get(frame, GOOD).lower() == GOOD]
+    frames: list[int] = []
+    for frame in good:
+        if stamps.get(frame, -np.inf) > latest:
+            frames.append(frame)
+            latest = stamps[frame]
     name, notes = sequence.path.name, []
-    if bad:
-        notes.append(f"{name}: {len(bad)} images are not OK and left out")
-    if unstamped:
+    if bad := sequence.count - len(good):
+        notes.append(f"{name}: {bad} images are not OK and left out")
+    if unstamped := len(good) - len(frames):
         notes.append(f"{name}: {unstamped} images have no {TIME} later than the one before; left out")
     return frames, notes
 
@@ -206,11 +195,3 @@ def _times(sequence: FrameSequence) -> dict[int, float]:
 def _rate(times: dict[int, float], count: int) -> float | None:
     span = max(times.values()) - min(times.values())
     return (count - 1) / span if span > 0 and count > 1 else None
-
-
-def _matrix(text: str) -> Sequence[float] | None:
-    """16 numbers, row by row."""
-    numbers = [parse_number(word) for word in text.split()]
-    if len(numbers) != 16 or any(number is None or not np.isfinite(number) for number in numbers):
-        return None
-    return [number for number in numbers if number is not None]

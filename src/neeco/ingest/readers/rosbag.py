@@ -15,8 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError
+from neeco.capture.documents import printable
+from neeco.errors import NeecoError, counted
+from neeco.files import visible_entries
 from neeco.geometry.lens import Lens
+from neeco.geometry.rotations import rigid
+from neeco.ingest.calibration.camera_fields import cameras_in
 from neeco.ingest.calibration.stereo import RosCamera, from_projections
 from neeco.ingest.readers import (
     IMAGES,
@@ -28,16 +32,20 @@ from neeco.ingest.readers import (
     Table,
     VideoSource,
     choose_stream,
+    file_state,
     rate_of,
 )
-from neeco.ingest.readers.columns import BASE, CAMERA
+from neeco.ingest.readers.columns import BASE, CAMERA, PoseColumns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, meaning_of, of_dvrk
+from neeco.ingest.readers.interpolate import poses_at
+from neeco.ingest.readers.logs import NORM_TOLERANCE, read_pose_log
 from neeco.placeholders import read_head
 
 if TYPE_CHECKING:
-    from neeco.ingest.readers._bagsurvey import Joints, Samples, Survey
+    from neeco.ingest.readers._bagfile import Joints, Samples, Survey
 
 DVRK_CAMERA = "ECM"  # the arm that holds the endoscope, and the frame of its tip
+CHAIN_HEADER = ("t_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 POSE_HEADER = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 MM_PER_M = 1000.0
 OTHER_CLOCK_S = 1.0  # between stamps and receipt: they are of different clocks
@@ -75,9 +83,7 @@ class RosBag(RecordingFormat):
     def read(self, path: Path, stream: str | None = None) -> Table:
         survey = self._survey(path)
         if stream is not None and stream.startswith("tf:") and stream not in survey.poses:
-            from neeco.ingest.readers._bagsurvey import chained
-
-            return chained(survey, stream, _image_frames(survey))
+            return _chained(survey, stream)
         chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS)).name
         if chosen in survey.joints:
             readings = survey.joints[chosen]
@@ -98,18 +104,12 @@ class RosBag(RecordingFormat):
         return replace(_table(survey, chosen, poses, POSE_HEADER, values), stated_in=stated_in, meaning=meaning)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
-        from neeco.ingest.readers._rosimages import open_topic
+        from neeco.ingest.readers._bagfile import open_topic
 
         survey = self._survey(path)
-        if stream in survey.images:
-            chosen = str(stream)
-        else:
-            chosen = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
-        log = survey.images[chosen]
-        received = np.array(log.received, np.int64)[np.array(log.numbers, np.int64)]
-        seconds = survey.seconds(log.stamps, received.tolist())
-        notes = _time_notes(f"{path.name}: {chosen}", log.stamps, received)
-        return open_topic(path, chosen, log, seconds, notes)
+        if stream not in survey.images:
+            stream = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        return open_topic(survey, stream, _time_notes(f"{path.name}: {stream}", survey.images[stream]))
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
         survey = self._survey(path)
@@ -134,23 +134,15 @@ class RosBag(RecordingFormat):
 
     def _survey(self, path: Path) -> Survey:
         self.require_package(path)
-        from neeco.ingest.readers._bagsurvey import survey_of
+        from neeco.ingest.readers._bagfile import survey_of
 
-        try:
-            files = sorted(path.iterdir()) if path.is_dir() else [path]
-            state = tuple((str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files)
-        except OSError:
-            raise NeecoError(f"{path}: cannot be read; correct the path or allow it") from None
-        return survey_of(path, state)
+        return survey_of(path, file_state(*(visible_entries(path) if path.is_dir() else [path])))
 
     def _image_stream(self, survey: Survey, name: str) -> Stream:
         log = survey.images[name]
-        received = [log.received[number] for number in log.numbers]
-        rate = rate_of(survey.seconds(log.stamps, received))
-        usable = len(log.numbers) > 0
-        problem = None if usable or not log.bad else f"no image can be used: one {log.bad.most_common(1)[0][0]}"
-        kind = f"{survey.image_types[name]}{f' ({log.description})' if usable else ''}"
-        return Stream(name, IMAGES if usable or problem else OTHER, kind, len(log.received), rate, problem=problem)
+        kind = f"{log.type}{f' ({log.description})' if log.stamps else ''}"
+        rate, used = rate_of(survey.seconds(log)), log.stamps or log.bad
+        return Stream(name, IMAGES if used else OTHER, kind, len(log.arrived), rate, problem=log.problem)
 
     def _pose_stream(self, survey: Survey, name: str) -> Stream:
         log, meaning = survey.poses[name], _meaning(survey, name)
@@ -171,10 +163,10 @@ class RosBag(RecordingFormat):
                 offered, title = False, f"{title}, the arms' in {', '.join(sorted(of_arms))}"
         elif name in dvrk:
             hints.append(DVRK_HINT)
-        rate = rate_of(survey.seconds(log.stamps, log.received))
+        rate = rate_of(survey.seconds(log))
         return Stream(
             name, OTHER if log.static else POSES, title, len(log.stamps), rate, offered=offered, body=_body(name),
-            hints=tuple(hints), asks=meaning.asks, problem=_all_damaged(log),
+            hints=tuple(hints), asks=meaning.asks, problem=log.problem,
         )  # fmt: skip
 
     def _joint_stream(self, survey: Survey, name: str) -> Stream:
@@ -183,42 +175,34 @@ class RosBag(RecordingFormat):
             offered = bool(_DVRK_JOINTS.search(name))
             names = _joint_names(name, log)
             wrist = wrist_joints(names, "jaw" in name)
-        rate = rate_of(survey.seconds(log.stamps, log.received))
+        rate = rate_of(survey.seconds(log))
         return Stream(
             name, READINGS, log.type, len(log.stamps), rate, offered=offered, body=_body(name), joints=wrist,
-            problem=_all_damaged(log),
+            problem=log.problem,
         )  # fmt: skip
 
 
 def _table(survey: Survey, name: str, log: Samples, header: tuple[str, ...], values: np.ndarray) -> Table:
-    seconds = survey.seconds(log.stamps, log.received)
     title = f"{survey.path.name}: {name}"
-    notes = _time_notes(title, log.stamps, np.array(log.received, np.int64))
-    if log.damaged:
-        notes.append(f"{title}: {log.damaged} message{' is' if log.damaged == 1 else 's are'} damaged; left out")
-    rows, numbers = np.column_stack([seconds, values]), np.arange(1, len(seconds) + 1)
+    notes = _time_notes(title, log)
+    notes += [f"{title}: {counted(count, 'message')} left out: one {why}" for why, count in log.bad.items()]
+    rows, numbers = np.column_stack([survey.seconds(log), values]), np.arange(1, len(values) + 1)
     return Table(survey.path, header, rows, numbers, stream=name, record="message", notes=tuple(notes))
 
 
-def _all_damaged(log: Samples) -> str | None:
-    return f"all {log.damaged} messages are damaged" if log.damaged and not log.stamps else None
-
-
-def _time_notes(title: str, stamps: Sequence[int], received: np.ndarray) -> list[str]:
+def _time_notes(title: str, log: Samples) -> list[str]:
     """Return notes on missing stamps and on stamps of another clock."""
-    given = np.array(stamps, np.int64)
-    none = given == 0
-    notes = []
+    given, received = np.array(log.stamps, np.int64), np.array(log.received, np.int64)
+    none, notes = given == 0, []
     if none.any():
         what = "its headers have no times" if none.all() else f"{int(none.sum())} headers have no time"
         notes.append(f"{title}: {what}; those of receipt are taken")
-    if not none.all() and len(given):
-        late = float(np.median(received[~none] - given[~none])) * 1e-9
-        if abs(late) > OTHER_CLOCK_S:
-            notes.append(
-                f"{title}: its headers' times are {late:.2f} s before those of receipt, on another clock; where "
-                "the streams do not share one, name its `clock` and give `sync`"
-            )
+    late = 0.0 if none.all() else float(np.median((received - given)[~none])) * 1e-9
+    if abs(late) > OTHER_CLOCK_S:
+        notes.append(
+            f"{title}: its headers' times are {late:.2f} s before those of receipt, on another clock; where "
+            "the streams do not share one, name its `clock` and give `sync`"
+        )
     return notes
 
 
@@ -244,20 +228,18 @@ def _meaning(survey: Survey, name: str) -> NamedFrame:
 def _camera_from_stated(survey: Survey, name: str) -> np.ndarray | None:
     """Return [4, 4] mm from the frame of a stream's poses to the images', where the name leaves the axes open
     but static transforms state them; else None."""
-    from neeco.ingest.readers._bagsurvey import fixed_transform
-
     frame, images = next(iter(survey.poses[name].frames), ""), _image_frames(survey)
     if len(survey.poses[name].frames) != 1 or len(images) != 1 or frame in images:
         return None
     own = next(iter(images))
     certain = meaning_of(frame, images, dvrk=of_dvrk(name)).frame is not None
-    return None if certain or meaning_of(own, images).frame is None else fixed_transform(survey, frame, own)
+    return None if certain or meaning_of(own, images).frame is None else _fixed_transform(survey, frame, own)
 
 
 def _info_topic(survey: Survey, stream: str | None, of_right: bool) -> str | None:
     """Return the topic of the camera_info of a stream of images, which is in their namespace; of another bag's stream,
     whose topic is not in this one, that of its only right camera (with a baseline) or left one."""
-    from neeco.ingest.readers._rosimages import matrix_of
+    from neeco.ingest.readers._bagfile import matrix_of
 
     plain = (stream or "").removesuffix("/compressed")
     topic = f"{plain.rpartition('/')[0]}/camera_info" if stream else None
@@ -268,13 +250,119 @@ def _info_topic(survey: Survey, stream: str | None, of_right: bool) -> str | Non
 
 
 def _camera(survey: Survey, topic: str | None, stream: str) -> RosCamera | None:
-    """Return the camera that a topic states, as it takes the images of a stream; None where it is not calibrated."""
-    from neeco.ingest.readers._rosimages import camera_of
+    """Return the camera that a topic states, as it takes the images of a stream; None where it is not calibrated.
+    Raises NeecoError."""
+    from neeco.ingest.readers._bagfile import matrix_of, plain
 
     if topic not in survey.lenses:
         return None
+    info, where = survey.lenses[topic], f"{survey.path}: {topic}"
     rectified = stream.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
-    return camera_of(f"{survey.path}: {topic}", survey.lenses[topic], rectified)
+    numbers, region = {name: matrix_of(info, name) for name in "KDRP"}, info.roi
+    cut = region.height not in (0, info.height) or region.width not in (0, info.width)
+    if max(info.binning_x, info.binning_y) > 1 or cut:
+        raise NeecoError(f"{where}: states binning or a part of the image; give the images' own `intrinsics`")
+    if not numbers["P" if rectified else "K"][0]:
+        return None
+    document = {
+        "camera_matrix": numbers["K"],
+        "distortion_coefficients": [] if rectified else numbers["D"],
+        "rectification_matrix": numbers["R"],
+        "projection_matrix": numbers["P"],
+        "image_width": int(info.width),
+        "image_height": int(info.height),
+        "distortion_model": "" if rectified else plain(info.distortion_model),
+    }
+    return RosCamera(where, cameras_in(where, document)[0], rectified)
+
+
+def _chained(survey: Survey, stream: str) -> Table:
+    """Return poses of `tf:CHILD in FRAME`, at the times of the child's nearest transform that moves."""
+    child, word, frame = stream.removeprefix("tf:").partition(" in ")
+    where = f"{survey.path}: {stream}"
+    children = {name.removeprefix("tf:") for name in survey.poses if name.startswith("tf:")}
+    known = children.union(*(survey.poses[f"tf:{name}"].frames for name in children))
+    missing = [name for name in (child, frame) if name not in known] if word else [child]
+    if missing:
+        listed = printable(", ".join(sorted(known)), 300).strip("'")
+        remedy = f"name one of {listed}" if known else "the bag has no tf; name a topic"
+        raise NeecoError(f"{where}: there is no transform of {printable(missing[0])}; {remedy}")
+    ups, downs = _path(survey, where, child, frame)
+    moving = [edge for edge in (*ups, *downs) if not survey.poses[f"tf:{edge}"].static]
+    if not moving:
+        raise NeecoError(f"{where}: does not move: all transforms between are static; name another frame")
+    seconds = np.unique(survey.seconds(survey.poses[f"tf:{moving[0]}"]))
+    frame_from_child = np.linalg.inv(_composed(survey, downs, seconds)) @ _composed(survey, ups, seconds)
+    known_rows = np.isfinite(frame_from_child).all(axis=(1, 2))
+    quats = np.full((len(seconds), 4), np.nan)
+    quats[known_rows] = Rotation.from_matrix(frame_from_child[known_rows, :3, :3]).as_quat()
+    rows, meaning = (
+        np.column_stack([seconds, frame_from_child[:, :3, 3], quats]),
+        meaning_of(frame, _image_frames(survey), dvrk=of_dvrk(child)),
+    )
+    return Table(
+        survey.path, CHAIN_HEADER, rows, np.arange(1, len(rows) + 1), stream=stream, record="message",
+        stated_in=frame, meaning=meaning,
+    )  # fmt: skip
+
+
+def _fixed_transform(survey: Survey, child: str, frame: str) -> np.ndarray | None:
+    """Return frame_from_child [4, 4] mm where static transforms join the two; None elsewhere."""
+    try:
+        ups, downs = _path(survey, str(survey.path), child, frame)
+    except NeecoError:
+        return None
+    if not all(survey.poses[f"tf:{edge}"].static for edge in (*ups, *downs)):
+        return None
+    once = np.zeros(1)
+    return np.asarray((np.linalg.inv(_composed(survey, downs, once)) @ _composed(survey, ups, once))[0])
+
+
+def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str], list[str]]:
+    """Return the transforms from a child and from a frame up to their common ancestor, each by its child. Raises
+    NeecoError."""
+    ends, paths = [], []
+    for name in (child, frame):
+        edges: list[str] = []
+        while f"tf:{name}" in survey.poses:
+            parents = survey.poses[f"tf:{name}"].frames
+            if len(parents) > 1 or name in edges:
+                what = (
+                    f"has several parents ({', '.join(sorted(parents)[:4])})"
+                    if len(parents) > 1
+                    else "is its own parent"
+                )
+                raise NeecoError(f"{where}: {name} {what}; name another, or record the transforms anew")
+            edges.append(name)
+            name = next(iter(parents))
+        ends.append(name)
+        paths.append(edges)
+    ups, downs = paths
+    if ends[0] != ends[1]:
+        raise NeecoError(f"{where}: nothing joins {child} to {frame}; their roots are {ends[0]} and {ends[1]}")
+    while ups and downs and ups[-1] == downs[-1]:
+        ups.pop()
+        downs.pop()
+    return ups, downs
+
+
+def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.ndarray:
+    """Return [N, 4, 4] mm, the pose of the first edge's child in the last one's parent; NaN where any is unknown."""
+    total = np.tile(np.eye(4), (len(seconds), 1, 1))
+    for edge in edges:
+        log = survey.poses[f"tf:{edge}"]
+        if log.static:
+            values = log.table()[-1]
+            if not (np.isfinite(values).all() and abs(np.linalg.norm(values[3:]) - 1) < NORM_TOLERANCE):
+                raise NeecoError(f"{survey.path}: tf:{edge}: is no rotation and translation; record it anew")
+            pose = rigid(Rotation.from_quat(values[3:]).as_matrix(), 1000 * values[:3])
+            poses = np.tile(pose, (len(seconds), 1, 1))
+        else:
+            # as it stands, whatever its parent's axes: those of the last frame alone matter
+            log_of_edge = read_pose_log(PoseColumns(survey.path, stream=f"tf:{edge}", frame=BASE))
+            poses, _ = poses_at(log_of_edge, seconds, 0.0)
+        total = poses @ total
+    return total
 
 
 def _camera_order(topic: str) -> tuple[bool, bool, bool, str]:

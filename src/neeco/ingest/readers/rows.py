@@ -61,7 +61,7 @@ def keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
         return
     index = column_index(table, name)
     good = {value.lower() for value in source.good}
-    states = [cells[index] if index < len(cells) else "" for cells in table.rows]
+    states = [str(cell) for cell in table.rows[:, index]]
     by_state: dict[str, list[int]] = {}
     for row, state in enumerate(states):
         if state.lower() not in good:
@@ -108,14 +108,7 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, found: Recognised
             f"{table.where}: {names[0]}: counts frames, and nothing says how many a second; say rate_hz in the "
             "recording (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
         )
-    steps = np.diff(cells[rows.keep, 0])
-    steps = steps[steps > 0]
-    hint = ""
-    if len(steps):
-        rates = {unit: 1 / (np.median(steps) * scale) for unit, scale in (("s", 1), ("ms", 1e-3), ("ns", 1e-9))}
-        likely = [f"{unit} would be {rate:.3g} Hz" for unit, rate in rates.items() if 1 <= rate <= 5000]
-        hint = f" Its steps in {', '.join(likely)}." if likely else ""
-    return cells[:, 0] * named.scale_of(table.where, names, "time", source.units.time, known.time_unit, hint)
+    return cells[:, 0] * named.scale_of(table.where, names, "time", source.units.time, known.time_unit, "")
 
 
 def read_cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
@@ -228,7 +221,7 @@ def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float
 
 def _headers(table: Table, rows: range) -> list[int]:
     """Return the lines that repeat the header."""
-    return [int(table.lines[row]) for row in rows if tuple(table.rows[row]) == tuple(table.header)]
+    return [int(table.lines[row]) for row in rows if tuple(table.rows[row]) == table.header]
 
 
 def find_gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:

@@ -6,7 +6,8 @@ each arm's own base frame, a few mm and degrees off the camera's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -14,13 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from neeco.capture.documents import as_float, printable
+from neeco.capture.documents import printable
 from neeco.errors import NeecoError
 from neeco.files import FastYamlLoader, parse_yaml, read_text, visible_entries
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.readers import (
-    HUGE,
     IMAGES,
     OTHER,
     POSES,
@@ -31,6 +31,7 @@ from neeco.ingest.readers import (
     VideoSource,
     choose_stream,
     compare_lengths,
+    file_state,
 )
 from neeco.ingest.readers.rosbag import DVRK_HINT
 from neeco.ingest.readers.rows import MAX_WRONG
@@ -38,7 +39,6 @@ from neeco.ingest.readers.video import open_images, open_video
 
 POSE_FILE, JOINT_FILE = "api_cp_data.yaml", "api_jp_data.yaml"
 FRAMES_PER_SECOND = 30.0
-MAX_FILE_BYTES = 1 << 26  # 1000 frames of two arms are 1 MB
 JOINTS_BEHIND = "_joints"  # the stream's name, after the arm's
 JOINT_NAMES = ("yaw_rad", "pitch_rad", "insertion_m", "roll_rad", "wrist_pitch_rad", "wrist_yaw_rad", "jaw_rad")
 WRIST = (("wrist_pitch", "wrist_pitch_rad"), ("wrist_yaw", "wrist_yaw_rad"), ("jaw", "jaw_rad"))
@@ -126,86 +126,55 @@ def _videos(path: Path) -> list[str]:
 
 
 def _read(path: Path) -> _Arms:
-    states = []
-    for name in (POSE_FILE, JOINT_FILE):
-        file = path / name
-        if name == JOINT_FILE and not file.exists():
-            continue  # poses can be used without joints
-        try:
-            state = file.stat()
-        except OSError as error:
-            raise NeecoError(f"{file}: cannot read: {error.strerror or error}; put the trajectory's there") from None
-        if state.st_size > MAX_FILE_BYTES:
-            raise NeecoError(
-                f"{file}: is {state.st_size >> 20} MB large, more than a trajectory has; give one trajectory"
-            )
-        states += [state.st_size, state.st_mtime_ns]
-    return _cached(path, tuple(states))
+    files = [path / name for name in (POSE_FILE, JOINT_FILE) if name == POSE_FILE or (path / name).exists()]
+    return _cached(path, file_state(*files))
 
 
 @lru_cache(maxsize=2)
-def _cached(path: Path, state: tuple[int, ...]) -> _Arms:
+def _cached(path: Path, state: tuple[object, ...]) -> _Arms:
     poses = _by_arm(path / POSE_FILE, _pose, "R (3x3) and t")
-    joints = {}
-    if (path / JOINT_FILE).exists():
-        joints = _by_arm(path / JOINT_FILE, _joints, "six or seven joints")
-    return _Arms(poses, joints)
+    return _Arms(poses, _by_arm(path / JOINT_FILE, _joints, "six or seven joints") if len(state) > 1 else {})
 
 
-def _by_arm(file: Path, parse: Any, expected: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _by_arm(file: Path, parse: Callable[[Any], np.ndarray], expected: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Frames [T] and rows [T, C] of each arm, from {frame: {arm: values}}."""
     document = parse_yaml(file, read_text(file, "states by frame"), "copy it again", FastYamlLoader)
-    if not isinstance(document, dict) or not document:
-        raise NeecoError(f"{file}: expected states by frame, as in '0': {{PSM1: ...}}; copy it again")
-    found: dict[str, list[tuple[int, Sequence[float] | None]]] = {}
-    for key, arms in document.items():
-        frame = _frame(file, key)
-        if not isinstance(arms, dict):
-            raise NeecoError(f"{file}: frame {frame}: expected the state of each arm; copy it again")
-        for arm, value in arms.items():
-            found.setdefault(str(arm), []).append((frame, parse(value)))
+    found: dict[str, dict[int, np.ndarray | None]] = {}
+    try:
+        states = {int(key): arms.items() for key, arms in document.items()}
+        if not 0 <= min(states) <= max(states) < 1e9:
+            raise ValueError("no numbers of frames")
+    except (AttributeError, ValueError, TypeError):
+        states = {}
+    for frame, arms in states.items():
+        for arm, value in arms:
+            row = None
+            with suppress(KeyError, IndexError, TypeError, ValueError, OverflowError):  # else it is missing
+                row = parse(value)
+            found.setdefault(str(arm), {})[frame] = row
     tables = {}
     for arm, rows in found.items():
-        rows.sort(key=lambda row: row[0])
-        bad = [frame for frame, row in rows if row is None]
-        if len(bad) > MAX_WRONG * len(rows):
-            raise NeecoError(f"{file}: frame {bad[0]}: {printable(arm)}: expected {expected}; copy it again")
-        lengths = {len(row) for _, row in rows if row is not None}
-        if len(lengths) > 1:
-            raise NeecoError(f"{file}: {printable(arm)}: has more joints in some frames than in others; copy it again")
-        values = np.array([row or [np.nan] * min(lengths) for _, row in rows])  # as a table has what is missing
-        values[~(np.abs(values) < HUGE)] = np.nan  # which is how a table says that a value is missing
-        tables[arm] = (np.array([frame for frame, _ in rows], np.int64), values)
+        frames, sound = sorted(rows), [row for row in rows.values() if row is not None]
+        bad = [frame for frame in frames if rows[frame] is None]
+        if len(bad) > MAX_WRONG * len(rows) or len({len(row) for row in sound}) != 1:
+            where = f"{file}: frame {(bad or frames)[0]}: {printable(arm)}"
+            raise NeecoError(f"{where}: expected {expected} in every frame; copy it again")
+        missing = np.full(len(sound[0]), np.nan)
+        filled = [missing if row is None else row for row in (rows[frame] for frame in frames)]
+        tables[arm] = (np.array(frames, np.int64), np.array(filled))
     if not tables:
-        raise NeecoError(f"{file}: holds no arm's states; copy it again")
+        raise NeecoError(f"{file}: expected states of arms by frame, as in '0': {{PSM1: ...}}; copy it again")
     return tables
 
 
-def _frame(file: Path, key: Any) -> int:
-    text = str(key)
-    if not (text.isascii() and text.isdigit() and len(text) <= 9):
-        raise NeecoError(f"{file}: {printable(key)} is no number of a frame; copy it again")
-    return int(text)
-
-
-def _pose(value: Any) -> list[float] | None:
+def _pose(value: Any) -> np.ndarray:
     """R and t as 12 numbers, row by row."""
-    if not isinstance(value, dict):
-        return None
-    turn, shift = _flat(value.get("R")), _flat(value.get("t"))
-    if turn is None or shift is None or len(turn) != 9 or len(shift) != 3:
-        return None
-    return [*turn[0:3], shift[0], *turn[3:6], shift[1], *turn[6:9], shift[2]]
+    turn, shift = np.array(value["R"], np.float64).reshape(3, 3), np.array(value["t"], np.float64).reshape(3)
+    return np.column_stack([turn, shift]).reshape(-1)
 
 
-def _joints(value: Any) -> list[float] | None:
-    numbers = _flat(value)
-    return numbers if numbers is not None and len(numbers) in (6, 7) else None
-
-
-def _flat(value: Any) -> list[float] | None:
-    if not isinstance(value, list):
-        return None
-    flat = [entry for item in value for entry in (item if isinstance(item, list) else [item])]
-    numbers = [as_float(entry) for entry in flat]
-    return None if None in numbers else [number for number in numbers if number is not None]
+def _joints(value: Any) -> np.ndarray:
+    numbers = np.array(value, np.float64).reshape(-1)
+    if len(numbers) not in (6, 7):
+        raise ValueError("other joints")
+    return numbers

@@ -388,31 +388,27 @@ def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[
     if column is None:
         raise NeecoError(f"{table_path}: header: no column of times found; call one t_s")
     scale = scale_of(table_path, (column,), "time", None, found.time_unit, "")
-    values, missing, bad = numbers(table, (column,))
-    wrong = [*[row for row, _ in bad], *np.flatnonzero(missing)]
-    if wrong:
-        raise NeecoError(f"{table_path}: line {table.lines[min(wrong)]}: {column}: no time; repair or remove the line")
-    times, rows_used = values[:, 0] * scale, list(range(len(values)))
+    times, lines = numbers(table, (column,))[0][:, 0] * scale, table.lines
     by_name = {file.name: file for file in files} | {file.stem: file for file in files}
-    for index in range(len(table.header)):
-        cells = [Path(row[index]).name if index < len(row) else "" for row in table.rows]
-        if sum(cell in by_name for cell in cells) > 0.5 * len(cells):
-            there = [row for row, cell in enumerate(cells) if cell in by_name]
-            absent = [folder / cell for cell in cells if cell not in by_name]
-            if not _are_few(len(absent), len(cells)):
-                row = next(row for row, cell in enumerate(cells) if cell not in by_name)
-                raise NeecoError(
-                    f"{table_path}: line {table.lines[row]}: {cells[row]!r} is not in {folder.name} ({len(absent)} of "
-                    f"{len(cells)} like it); correct the names"
-                )
-            notes += _left_out(folder, "are listed and not there", absent)
-            files, times, rows_used = [by_name[cells[row]] for row in there], times[there], there
-            break
-    else:
-        if len(times) != len(files):
-            raise NeecoError(f"{table_path}: has {len(times)} times for {len(files)} images; add a column of names")
-    falling = np.flatnonzero(np.diff(times) <= 0)
-    if len(falling):
-        line = table.lines[rows_used[falling[0] + 1]]
-        raise NeecoError(f"{table_path}: line {line}: {column} does not increase; keep the rows of one run, in order")
+    columns = [[Path(str(cell)).name for cell in table.rows[:, index]] for index in range(len(table.header))]
+    names = next((cells for cells in columns if sum(cell in by_name for cell in cells) > 0.5 * len(cells)), None)
+    if names is not None:
+        there = [row for row, cell in enumerate(names) if cell in by_name]
+        absent = [folder / cell for cell in names if cell not in by_name]
+        if not _are_few(len(absent), len(names)):
+            row = next(row for row, cell in enumerate(names) if cell not in by_name)
+            raise NeecoError(
+                f"{table_path}: line {lines[row]}: {names[row]!r} is not in {folder.name} ({len(absent)} of "
+                f"{len(names)} like it); correct the names"
+            )
+        notes += _left_out(folder, "are listed and not there", absent)
+        files, times, lines = [by_name[names[row]] for row in there], times[there], lines[there]
+    if len(times) != len(files):
+        raise NeecoError(f"{table_path}: has {len(times)} times for {len(files)} images; add a column of names")
+    wrong = ~(np.diff(times, prepend=-np.inf) > 0)  # NaN compares false
+    if wrong.any():
+        raise NeecoError(
+            f"{table_path}: line {lines[wrong][0]}: {column}: expected a time after the one before; keep the rows of "
+            "one run, in order"
+        )
     return files, times
