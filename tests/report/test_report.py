@@ -79,15 +79,6 @@ def test_every_picture_of_a_frame_says_whether_it_is_recorded_or_rendered(report
     }
 
 
-def test_what_training_found_is_folded_away_and_in_words(reported):
-    text = reported[-1].read_text()
-    folded = re.search(r"<details><summary>All that training found.*?</details>", text, re.DOTALL)
-    assert folded is not None
-    assert "<dd>found at mm none, iteration 600</dd>" in folded[0]
-    assert not re.search(r"<dd>[{\[]", text)
-    assert "joint &lt;found&gt;" in text.replace(folded[0], "")
-
-
 def test_tables_that_scroll_are_reached_by_the_keyboard(reported):
     assert not re.search(r'<div class="scroll[^"]*">', reported[-1].read_text())
 

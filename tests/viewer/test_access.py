@@ -14,7 +14,7 @@ from viewer_world import grasper_scene, write_recorded_images, write_run
 from neeco.errors import NeecoError
 from neeco.viewer.access import Access, is_loopback
 from neeco.viewer.panel import message_html, status_html
-from neeco.viewer.runs import WatchedRun
+from neeco.viewer.runs import ViewedRun
 from neeco.viewer.views import Picture, RunPicture
 
 pytest.importorskip("viser")
@@ -118,7 +118,7 @@ def test_names_of_a_run_stay_text(tmp_path: Path) -> None:
     scene = grasper_scene(frame_name="<b>{:06d}")
     run = write_run(scene, tmp_path / "<script>run", write_recorded_images(scene, tmp_path / "capture"))
     picture = Picture(np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6)))
-    part = RunPicture(loaded=WatchedRun(run).loaded, picture=picture, frame=2.0, exact=True, trouble=HOSTILE)
+    part = RunPicture(loaded=ViewedRun(run).loaded, picture=picture, frame=2.0, exact=True, trouble=HOSTILE)
     html = status_html(part, 0.1, HOSTILE)
     assert "<script" not in html
     assert "<img" not in html

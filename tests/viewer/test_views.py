@@ -12,7 +12,7 @@ from scene_worlds import make_nerf, make_scene
 from viewer_world import HEIGHT, WIDTH, camera, grasper_scene
 
 from neeco.labels.drawing import draw
-from neeco.viewer.runs import Timeline, WatchedRun, coarse_psnr, narrowed, score_frame, spread_order
+from neeco.viewer.runs import Timeline, ViewedRun, coarse_psnr, narrowed, score_frame, spread_order
 from neeco.viewer.views import (
     DEPTH,
     DIFFERENCE,
@@ -147,7 +147,7 @@ def test_what_cannot_be_compared_is_darker() -> None:
 
 
 def test_a_frame_that_the_scene_draws_itself_scores_best(made_run: Path) -> None:
-    loaded = WatchedRun(made_run).loaded
+    loaded = ViewedRun(made_run).loaded
     score = score_frame(loaded, 3)
     assert score.psnr > 50
     assert score.iou == pytest.approx(1.0)
@@ -155,7 +155,7 @@ def test_a_frame_that_the_scene_draws_itself_scores_best(made_run: Path) -> None
 
 
 def test_the_timeline_finds_the_worst_frame(made_run: Path) -> None:
-    loaded = WatchedRun(made_run).loaded
+    loaded = ViewedRun(made_run).loaded
     wrong = replace(loaded.frames[4], state=loaded.frames[8].state)
     timeline = Timeline(replace(loaded, frames=(*loaded.frames[:4], wrong, *loaded.frames[5:])))
     while not timeline.done:

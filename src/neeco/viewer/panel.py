@@ -40,9 +40,7 @@ class Actions:
     go_to: Callable[[int], None]  # the camera of a frame
     toggle_gizmo: Callable[[str, int, bool], None]  # an instrument's name and number, and whether its gizmo appears
     save_state: Callable[[], None]
-    remove_state: Callable[[], None]
     save_image: Callable[[], None]
-    dark: Callable[[bool], None]
 
 
 class Panel:
@@ -150,16 +148,12 @@ class Panel:
         labelled = bool(self._loaded.scene.label_names)
         with gui.add_folder("Keep"):
             keep = gui.add_button("keep this state", hint="And this camera, for neeco synthesize --states.")
-            forget = gui.add_button("forget the last kept")
             save = gui.add_button(
                 "save labelled image", disabled=not labelled, hint="As neeco synthesize writes one, from here."
             )
             self.saved = gui.add_html("")
-        dark = gui.add_checkbox("dark", True)
         keep.on_click(lambda _: self._actions.save_state())
-        forget.on_click(lambda _: self._actions.remove_state())
         save.on_click(lambda _: self._actions.save_image())
-        dark.on_update(lambda _: self._actions.dark(bool(dark.value)))
 
     def _draw_plot(self, data: tuple[np.ndarray, ...]) -> None:
         if self._plot is not None:
@@ -207,6 +201,7 @@ class InstrumentPanel:
         """changed: called when the user moved something; toggle_gizmo: when the gizmo is to appear or to go."""
         self.name = instrument.name
         self._changed, self._toggle_gizmo = changed, toggle_gizmo
+        self._joints_as_recorded = True  # until the user moves one
         self._ranges = {joint: ranges[self.name, joint] for joint in instrument.joints if (self.name, joint) in ranges}
         # what sliders show of a reading: degrees of one that turns, mm of one that slides
         self._per_unit = {joint: 1.0 if instrument.slides(joint) else math.degrees(1.0) for joint in instrument.joints}
@@ -215,9 +210,6 @@ class InstrumentPanel:
                 joint: _joint_slider(gui, joint, span, self._per_unit[joint])
                 for joint, span in list(self._ranges.items())[:MAX_JOINTS]
             }
-            self.as_recorded = gui.add_checkbox(
-                "joints as recorded", True, visible=bool(self._joints), hint="Off as soon as a joint is moved."
-            )
             about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
             self.slide = gui.add_slider("along shaft (mm)", -SLIDE_MM, SLIDE_MM, 0.5, 0.0, hint=f"Along {about}.")
             self.roll = gui.add_slider("roll (°)", -180.0, 180.0, 1.0, 0.0, hint=f"About {about}.")
@@ -231,7 +223,7 @@ class InstrumentPanel:
             self.back = gui.add_button("back to the recording")
         for slider in self._joints.values():
             slider.on_update(self._joint_moved)
-        for control in (self.slide, self.roll, self.yaw, self.pitch, self.as_recorded):
+        for control in (self.slide, self.roll, self.yaw, self.pitch):
             control.on_update(self._moved)
         self.gizmo.on_update(self._gizmo_toggled)
         self.back.on_click(lambda _: self.reset())
@@ -239,7 +231,7 @@ class InstrumentPanel:
     def controls(self, pose: np.ndarray | None) -> InstrumentControls:
         """Values of the sliders; pose [4, 4]: of the gizmo, mm, or None without one."""
         joints = {}
-        if not self.as_recorded.value:
+        if not self._joints_as_recorded:
             for joint, slider in self._joints.items():
                 span = self._ranges[joint]
                 # a degree and back may lie a hair outside the limits
@@ -255,7 +247,7 @@ class InstrumentPanel:
 
     def follow(self, state: InstrumentState) -> None:
         """Show the recorded readings, unless the user has set others."""
-        if self.as_recorded.value:
+        if self._joints_as_recorded:
             for joint, slider in self._joints.items():
                 on_step = round(state.joints[joint] * self._per_unit[joint] / slider.step) * slider.step
                 shown = min(max(round(on_step, 6), slider.min), slider.max)
@@ -263,14 +255,14 @@ class InstrumentPanel:
                     slider.value = shown
 
     def straighten(self) -> None:
-        """Reset slide and turns: the pose they led to has become the one they start from."""
+        """Reset slide and turns, as when the pose they led to has become the one they start from."""
         for slider in (self.slide, self.roll, self.yaw, self.pitch):
             slider.value = 0.0
 
     def reset(self) -> None:
         """Be as recorded again."""
         self.straighten()
-        self.as_recorded.value = True
+        self._joints_as_recorded = True
         if self.gizmo.value:
             self.gizmo.value = False
             self._toggle_gizmo(False)
@@ -279,7 +271,7 @@ class InstrumentPanel:
     def _joint_moved(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is None:  # it followed the recording
             return
-        self.as_recorded.value = False
+        self._joints_as_recorded = False
         self._changed()
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:

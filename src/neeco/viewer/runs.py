@@ -50,7 +50,6 @@ class LoadedRun:
     """
 
     name: str
-    world: str  # the capture's folder, whose world frame the scene has
     scene: DrawableScene
     recorded: Recorded
     frames: tuple[Frame, ...]  # those of `recorded`, with their images; empty: the capture is not at hand
@@ -83,8 +82,9 @@ class LoadedRun:
         return joints, self.recorded.names, tuple(self.scene.label_names), bool(self.frames)
 
 
-class WatchedRun:
-    """Reads a run folder, and again when it has changed. Any thread may ask for what was read last."""
+class ViewedRun:
+    """The run that all browsers of a server share, read again when it has changed, and what is known of its frames.
+    Any thread may use it."""
 
     def __init__(self, path: Path, device: torch.device | None = None) -> None:
         """Raises NeecoError where `path` holds no scene, finished or not."""
@@ -93,10 +93,14 @@ class WatchedRun:
         self._stamp = self._current_stamp()
         self.loaded = self._load()  # replaced as a whole: a reader never sees half of a change
         self.trouble = ""
+        self.distance = self.loaded.distance  # mm
+        self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
+        self.timeline = Timeline(self.loaded)
+        self._ended = threading.Event()
 
     def refresh(self) -> bool:
-        """Read the run again if its files have changed; whether anything new was read. A run that cannot be read
-        stays as it was, and `trouble` says why."""
+        """Read the run again if its files have changed, and score its frames anew; whether anything new was read. A run
+        that cannot be read stays as it was, and `trouble` says why."""
         with self._refreshing:
             try:
                 stamp = self._current_stamp()
@@ -109,7 +113,35 @@ class WatchedRun:
                 self.trouble = str(error)
                 return False
             self.trouble = ""
+            self.timeline = Timeline(self.loaded)
+            score_frame.cache_clear()  # or it would hold the scenes of before
             return True
+
+    def watch(self, changed: Callable[[], None]) -> None:
+        """Look at the run folder from time to time, in a thread of its own, and call `changed` where it changed or can
+        no longer be read; until `end_watch`."""
+
+        def look() -> None:
+            while not self._ended.wait(WATCH_S):
+                trouble = self.trouble
+                if self.refresh() or trouble != self.trouble:
+                    changed()
+
+        threading.Thread(target=look, name="neeco-watcher", daemon=True).start()
+
+    def end_watch(self) -> None:
+        """Look at the run folder no more."""
+        self._ended.set()
+
+    def advance_timeline(self) -> bool:
+        """Score one more frame; False: all are."""
+        timeline = self.timeline
+        if timeline.done:
+            return False
+        # of a frame whose image cannot be read the status says so to whoever goes there
+        with timeline.loaded.scene.torch_threads(), contextlib.suppress(NeecoError):
+            timeline.advance()
+        return True
 
     def _current_stamp(self) -> tuple[str, int, int, int]:
         """File, its inode, time and size."""
@@ -150,7 +182,6 @@ class WatchedRun:
         )
         return LoadedRun(
             name=self.path.resolve().name,
-            world=str(config["capture"]),
             scene=scene,
             recorded=Recorded(names, splits, states, cameras, still=scene.recorded.still),
             frames=tuple(frames[k] for k in order) if frames else (),
@@ -266,49 +297,3 @@ def spread_order(count: int) -> list[int]:
     bits = max(1, (count - 1).bit_length())
     mirrored = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))
     return [k for k in mirrored if k < count]
-
-
-class ViewedRun(WatchedRun):
-    """The run that all browsers of a server share, and what is known of its frames. Any thread may use it."""
-
-    def __init__(self, path: Path, device: torch.device | None = None) -> None:
-        """Raises NeecoError for a run folder without a scene."""
-        super().__init__(path, device)
-        self.distance = self.loaded.distance  # mm
-        self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
-        self.timeline = Timeline(self.loaded)
-        self._ended = threading.Event()
-
-    def refresh(self) -> bool:
-        """Read the run again if it has changed; whether it was. Its frames are scored anew."""
-        changed = super().refresh()
-        if changed:
-            self.timeline = Timeline(self.loaded)
-            score_frame.cache_clear()  # or it would hold the scenes of before
-        return changed
-
-    def watch(self, changed: Callable[[], None]) -> None:
-        """Look at the run folder from time to time, in a thread of its own, and call `changed` where it changed or can
-        no longer be read; until `end_watch`."""
-
-        def look() -> None:
-            while not self._ended.wait(WATCH_S):
-                trouble = self.trouble
-                if self.refresh() or trouble != self.trouble:
-                    changed()
-
-        threading.Thread(target=look, name="neeco-watcher", daemon=True).start()
-
-    def end_watch(self) -> None:
-        """Look at the run folder no more."""
-        self._ended.set()
-
-    def advance_timeline(self) -> bool:
-        """Score one more frame; False: all are."""
-        timeline = self.timeline
-        if timeline.done:
-            return False
-        # of a frame whose image cannot be read the status says so to whoever goes there
-        with timeline.loaded.scene.torch_threads(), contextlib.suppress(NeecoError):
-            timeline.advance()
-        return True

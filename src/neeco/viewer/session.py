@@ -203,7 +203,7 @@ class ClientSession:
         self._shape = 0.0  # of the window, width by height
         self._camera_frame = 0  # whose camera the window was sent to last
         self._followed: int | None = 0  # the frame that the camera went along to
-        self._set_dark(True)
+        client.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._loaded, self.overlays, self._panel = self._build(run.loaded)
         self._go_to(0)
         client.camera.on_update(lambda _: self._request())
@@ -260,9 +260,7 @@ class ClientSession:
             go_to=self._go_to,
             toggle_gizmo=self._toggle_gizmo,
             save_state=self._save_state,
-            remove_state=self._remove_state,
             save_image=self._save_image,
-            dark=self._set_dark,
         )
         points = None if loaded.capture is None else loaded.capture.points
         overlays = Overlays(self._client, loaded.recorded.cameras, points, self._run.unit, self._go_to, self._request)
@@ -326,10 +324,6 @@ class ClientSession:
         saved, loaded = self._saved, self._loaded
         self._report(lambda: f"kept: {saved.add(loaded, self._state(), self._pose())} in {saved.states_path}")
 
-    def _remove_state(self) -> None:
-        saved, loaded = self._saved, self._loaded
-        self._report(lambda: f"kept: {saved.remove_last(loaded)} in {saved.states_path}")
-
     def _save_image(self) -> None:
         if self._saving:  # or a page that asks a thousand times would be served long after it has gone
             return
@@ -352,9 +346,6 @@ class ClientSession:
             self._panel.saved.content = message_html(task())
         except NeecoError as error:
             self._panel.saved.content = message_html(f"error: {error}")
-
-    def _set_dark(self, on: bool) -> None:
-        self._client.gui.configure_theme(dark_mode=on, show_logo=False, show_share_button=False)
 
     def _send(self, picture: Picture, sharp: bool) -> None:
         depth = None
