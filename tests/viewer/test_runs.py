@@ -155,4 +155,4 @@ def test_what_is_known_of_frames_is_found_out_anew_for_a_changed_run(run: Path) 
     later(run / SCENE_FILE)
     assert viewed.refresh()
     assert score_frame(viewed.loaded, 2).psnr < before.psnr - 10
-    assert viewed.timeline.known()[0].size == 0
+    assert viewed.timeline.known.size == 0

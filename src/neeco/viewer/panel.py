@@ -79,16 +79,16 @@ class Panel:
             return
         self._plotted, self._plotted_at = so_far, now
         names, splits = self._loaded.recorded.names, self._loaded.recorded.splits
-        frames, values = timeline.known()
+        known, psnr = timeline.known, timeline.psnr
         # the names differ where the run has changed, and this panel not yet
-        if timeline.loaded.recorded.names != names or len(frames) < 2:
+        if timeline.loaded.recorded.names != names or len(known) < 2:
             return
-        self._draw_plot((frames.astype(np.float64), values))
-        worst = timeline.worst()
-        options = [f"{frame}: {psnr:.1f} dB, {splits[frame]}, {names[frame]}" for frame, psnr in worst]
-        if self.worst.value == NONE_CHOSEN and (NONE_CHOSEN, *options) != tuple(self.worst.options):
-            self._worst = [frame for frame, _ in worst]
-            self.worst.options = (NONE_CHOSEN, *options)
+        self._draw_plot((known.astype(np.float64), psnr[known]))
+        if self.worst.value == NONE_CHOSEN:
+            self._worst = timeline.worst()
+            options = [f"{frame}: {psnr[frame]:.1f} dB, {splits[frame]}, {names[frame]}" for frame in self._worst]
+            if (NONE_CHOSEN, *options) != tuple(self.worst.options):
+                self.worst.options = (NONE_CHOSEN, *options)
 
     def _add_picture(self) -> None:
         gui, views = self._gui, views_of(self._loaded.scene, bool(self._loaded.frames))

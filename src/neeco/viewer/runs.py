@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -227,50 +226,37 @@ def score_frame(loaded: LoadedRun, index: int) -> FrameScore:
 
 
 class Timeline:
-    """The PSNR of every frame of a recording, at no more than TIMELINE_WIDTH px, computed a frame at a time: first a
-    few from everywhere, then those between them. One thread computes; any may read."""
+    """The PSNR of every frame of a recording, at no more than TIMELINE_WIDTH px, computed a frame at a time. One thread
+    computes; any may read."""
 
     def __init__(self, loaded: LoadedRun) -> None:
         self.loaded = loaded
-        self._pending = spread_order(len(loaded.frames))[::-1]
-        self._psnr: dict[int, float] = {}
-        self._lock = threading.Lock()
+        self.psnr = np.full(len(loaded.frames), np.nan)  # dB; NaN: not known
+        self.count = 0  # frames that were looked at
 
     @property
     def done(self) -> bool:
         """Whether every frame is scored."""
-        return not self._pending
+        return self.count == len(self.psnr)
 
     def advance(self) -> None:
         """Score one more frame; one that cannot be read raises NeecoError and stays unknown."""
-        index = self._pending.pop()
-        value = coarse_psnr(self.loaded, index)
-        if math.isfinite(value):
-            with self._lock:
-                self._psnr[index] = value
+        self.count += 1
+        self.psnr[self.count - 1] = coarse_psnr(self.loaded, self.count - 1)
 
     @property
-    def count(self) -> int:
-        """Number of scored frames."""
-        return len(self._psnr)
+    def known(self) -> np.ndarray:
+        """Frames [K], rising, whose PSNR is known and finite."""
+        return np.flatnonzero(np.isfinite(self.psnr))
 
-    def known(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frames [K], rising, and their PSNR [K] in dB, as far as they are known."""
-        with self._lock:
-            frames = sorted(self._psnr)
-            return np.array(frames, np.int64), np.array([self._psnr[k] for k in frames], np.float64)
-
-    def worst(self) -> list[tuple[int, float]]:
-        """(frame, PSNR) of the worst known frames, worst first; of similar neighbours only the worst."""
-        frames, values = self.known()
-        apart = max(1, len(self.loaded.frames) // (4 * WORST))
-        chosen: list[tuple[int, float]] = []
-        for k in np.argsort(values, kind="stable"):
-            if all(abs(int(frames[k]) - other) >= apart for other, _ in chosen):
-                chosen.append((int(frames[k]), float(values[k])))
-            if len(chosen) == WORST:
-                break
-        return chosen
+    def worst(self) -> list[int]:
+        """The worst known frames, worst first; of similar neighbours only the worst."""
+        known, apart = self.known, max(1, len(self.psnr) // (4 * WORST))
+        chosen: list[int] = []
+        for frame in known[np.argsort(self.psnr[known], kind="stable")].tolist():
+            if all(abs(frame - other) >= apart for other in chosen):
+                chosen.append(frame)
+        return chosen[:WORST]
 
 
 @torch.no_grad()
@@ -290,10 +276,3 @@ def coarse_psnr(loaded: LoadedRun, index: int) -> float:
 def narrowed(camera: Camera, width: int) -> Camera:
     """Return the same view in an image at most `width` px wide."""
     return camera if camera.width <= width else camera.scaled(width / camera.width)
-
-
-def spread_order(count: int) -> list[int]:
-    """0 to count - 1 in bit-reversed order, so that any first few of them are from everywhere."""
-    bits = max(1, (count - 1).bit_length())
-    mirrored = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))
-    return [k for k in mirrored if k < count]

@@ -238,16 +238,6 @@ function report() {
     rows.push(term, text);
   }
   $("sure").replaceChildren(...rows);
-  const context = $("doubt").getContext("2d"), { width, height } = $("doubt");
-  context.clearRect(0, 0, width, height);
-  const style = getComputedStyle(document.documentElement), most = 40;
-  overview.deviations.forEach((value, index) => {
-    const tall = overview.done ? Math.min(1, value / most) * height : height, wide = width / overview.frames;
-    context.fillStyle = style.getPropertyValue("--line");
-    context.fillRect(index * wide, height - tall, wide + 0.5, tall);
-  });
-  context.fillStyle = style.getPropertyValue("--accent");
-  for (const item of overview.answered) context.fillRect(item.frame / overview.frames * width - 1.5, 0, 3, height);
   $("answers").replaceChildren(...overview.answered.map(item => {
     const row = document.createElement("li");
     const joints = Object.entries(item.joints).map(([name, value]) => `, ${name} ${Math.round(value)}°`).join("");
