@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from neeco.viewer.viser_scene import Overlays
 
-MAX_INSTRUMENTS, MAX_JOINTS = 8, 24  # instruments that get controls; joints of one that get a slider
 SLIDE_MM, YAW_DEG = 30.0, 45.0
 NONE_CHOSEN = "—"
 PLOTS_EVERY_S = 0.5  # while more becomes known
@@ -119,8 +118,6 @@ class Panel:
 
     def _add_instruments(self) -> list[InstrumentPanel]:
         first = self._loaded
-        if (more := len(first.scene.instruments) - MAX_INSTRUMENTS) > 0:
-            self._gui.add_html(message_html(f"{more} more instruments stay as recorded: no room for their sliders"))
         ranges = slider_ranges(first.scene.instruments, first.recorded.states)
         return [
             InstrumentPanel(
@@ -131,7 +128,7 @@ class Panel:
                 self._actions.changed,
                 partial(self._actions.toggle_gizmo, instrument.name, number),
             )
-            for number, instrument in enumerate(first.scene.instruments[:MAX_INSTRUMENTS])
+            for number, instrument in enumerate(first.scene.instruments)
         ]
 
     def _add_timeline(self) -> None:
@@ -207,8 +204,7 @@ class InstrumentPanel:
         self._per_unit = {joint: 1.0 if instrument.slides(joint) else math.degrees(1.0) for joint in instrument.joints}
         with gui.add_folder(f"Instrument {self.name}"):
             self._joints = {
-                joint: _joint_slider(gui, joint, span, self._per_unit[joint])
-                for joint, span in list(self._ranges.items())[:MAX_JOINTS]
+                joint: _joint_slider(gui, joint, span, self._per_unit[joint]) for joint, span in self._ranges.items()
             }
             about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
             self.slide = gui.add_slider("along shaft (mm)", -SLIDE_MM, SLIDE_MM, 0.5, 0.0, hint=f"Along {about}.")

@@ -33,8 +33,7 @@ MIN_PX = 32
 MOVING_S, SHARP_S = 0.15, 0.4  # that rendering may take
 REMEMBERED = 3  # renderings; a single one that had to compute something first does not count
 JPEG_MOVING, JPEG_SHARP = 80, 92
-PLAYED_PER_S = 10.0  # frames, where the recording does not say how many were taken
-SLOWEST, FASTEST = 2.0, 30.0  # frames per second of `play`
+PLAYED_PER_S = 10.0  # frames of `play`
 STATUS_EVERY_S = 0.25  # while things move
 
 log = logging.getLogger(__name__)
@@ -243,15 +242,15 @@ class ClientSession:
         if not self._panel.play.value:
             self._played_at = None
             return None
-        per_s, frames = frames_per_s(self._loaded), len(self._loaded.recorded.states)
+        frames = len(self._loaded.recorded.states)
         if self._played_at is None:
             self._played_at = now
-        ahead = int((now - self._played_at) * per_s)
+        ahead = int((now - self._played_at) * PLAYED_PER_S)
         if ahead:
-            self._played_at += ahead / per_s
+            self._played_at += ahead / PLAYED_PER_S
             self._panel.frame.value = float((int(self._panel.place) + ahead) % frames)
             self._request()
-        return self._played_at + 1 / per_s
+        return self._played_at + 1 / PLAYED_PER_S
 
     def _build(self, loaded: LoadedRun) -> tuple[LoadedRun, Overlays, Panel]:
         """Return the run, and create overlays and panel for it."""
@@ -368,11 +367,3 @@ class ClientSession:
             except NeecoError as error:
                 notes.append(str(error))
         self._panel.status.content = status_html(shown, seconds, "; ".join(notes))
-
-
-def frames_per_s(loaded: LoadedRun) -> float:
-    """Playback rate in frames per second: as recorded, between SLOWEST and FASTEST."""
-    times = [state.time for state in loaded.recorded.states]
-    if loaded.capture is None or not loaded.capture.timed or times[-1] <= times[0]:
-        return PLAYED_PER_S
-    return min(max((len(times) - 1) / (times[-1] - times[0]), SLOWEST), FASTEST)
