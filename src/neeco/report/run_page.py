@@ -22,7 +22,7 @@ from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.report.charts import SMALL, Series, line_chart, short
-from neeco.report.page import REPORT_FILE, difference, jpeg, preview_uri, split_counts, to_bytes, write_page
+from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
 from neeco.scene import DrawableScene
 
 MAX_POINTS = 300  # of a training curve
@@ -70,12 +70,11 @@ def write_report(
     capture: Capture,
     scene: DrawableScene,
     *,
-    synthesis_preview: Path | None = None,
     playable: str | None = None,
 ) -> Path:
     """Write `report.html` into the run folder and return its path. One file: style, pictures and curves are inside it.
 
-    evaluation: what `evaluate_run` returned. synthesis_preview: an image of synthesised data to show. playable: a page
+    evaluation: what `evaluate_run` returned. playable: a page
     of its own that renders the scene, shown in a frame of this one. How many threads torch takes is the caller's to set
     (`open_run`). Raises NeecoError when a picture cannot be read or the page cannot be written.
     """
@@ -107,7 +106,6 @@ def write_report(
         tints=_tints(scene),
         curves=[chart for chart in curves if chart],
         verdicts=_verdicts(getattr(scene, "diagnostics", {})),
-        preview=synthesis_preview and preview_uri(synthesis_preview),
         playable=playable,
         facts=_facts(capture, scene, rows),
         config=read_bytes(config, "settings").decode("utf-8", "replace") if config.is_file() else "",
