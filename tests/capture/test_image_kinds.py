@@ -12,7 +12,6 @@ from PIL import Image, ImageFile
 from neeco.capture.images import exif_orientation, has_alpha, image_size, open_image, read_image, read_mask
 from neeco.errors import NeecoError
 from neeco.ingest.readers.video import open_images
-from neeco.report.page import preview_uri
 from neeco.synthesis.preview import draw_tile
 
 READERS: list[Callable[[Path], object]] = [
@@ -22,7 +21,6 @@ READERS: list[Callable[[Path], object]] = [
     has_alpha,
     read_image,
     read_mask,
-    preview_uri,
     lambda path: draw_tile(path.parent, {"image": path.name, "index": 0, "labels": []}),
 ]
 

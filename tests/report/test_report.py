@@ -8,7 +8,6 @@ import matplotlib
 import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
-from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.report import write_report
 from neeco.report.charts import Series, line_chart
@@ -31,7 +30,7 @@ def reported(world, tmp_path_factory):
     (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)) + '\n{"iteration": 5')
     (folder / "config.yaml").write_text("method: tiny\nnote: <b>\n")
     evaluation = evaluate_run(world.TinyRun(folder, scene, capture), capture, align=True)
-    path = write_report(folder, evaluation, capture, scene, synthesis_preview=capture.frames[0].image_path)
+    path = write_report(folder, evaluation, capture, scene)
     return folder, capture, scene, evaluation, path
 
 
@@ -41,7 +40,7 @@ def test_the_page_is_whole_and_fetches_nothing(reported):
     page.feed(text)
     assert page.open == []
     assert all(reference.startswith("data:image/") for reference in page.references)
-    assert len(page.references) == 3 * 4 + 1  # two test frames and one unseen, four pictures each, and the preview
+    assert len(page.references) == 3 * 4  # two test frames and one unseen, four pictures each
     assert "http" not in text.replace("http-equiv", "")
     assert page.tags.count("svg") == 3
     assert "prefers-color-scheme: dark" in text
@@ -79,15 +78,6 @@ def test_every_picture_of_a_frame_says_whether_it_is_recorded_or_rendered(report
     }
 
 
-def test_what_training_found_is_folded_away_and_in_words(reported):
-    text = reported[-1].read_text()
-    folded = re.search(r"<details><summary>All that training found.*?</details>", text, re.DOTALL)
-    assert folded is not None
-    assert "<dd>found at mm none, iteration 600</dd>" in folded[0]
-    assert not re.search(r"<dd>[{\[]", text)
-    assert "joint &lt;found&gt;" in text.replace(folded[0], "")
-
-
 def test_tables_that_scroll_are_reached_by_the_keyboard(reported):
     assert not re.search(r'<div class="scroll[^"]*">', reported[-1].read_text())
 
@@ -98,11 +88,10 @@ def test_what_the_user_wrote_is_shown_as_text_not_as_markup(reported):
     assert "note: &lt;b&gt;" in text
 
 
-def test_a_run_without_metrics_or_preview_still_has_a_page(reported, tmp_path):
+def test_a_run_without_metrics_still_has_a_page(reported, tmp_path):
     _, capture, scene, evaluation, _ = reported
     text = write_report(tmp_path, evaluation, capture, scene).read_text()
     assert "<svg" not in text
-    assert "Synthesised" not in text
 
 
 def test_a_page_to_play_with_stands_in_a_frame_of_its_own_that_may_do_nothing_here(reported, tmp_path):
@@ -111,12 +100,6 @@ def test_a_page_to_play_with_stands_in_a_frame_of_its_own_that_may_do_nothing_he
     assert 'sandbox="allow-scripts allow-downloads"' in text
     assert 'srcdoc="&lt;p title=&#39;a&#39;&gt;&#34;b&#34; &amp; c&lt;/p&gt;"' in text
     assert "<iframe" not in write_report(tmp_path, evaluation, capture, scene).read_text()
-
-
-def test_a_preview_that_cannot_be_read_is_named(reported, tmp_path):
-    _, capture, scene, evaluation, _ = reported
-    with pytest.raises(NeecoError, match=r"gone\.png"):
-        write_report(tmp_path, evaluation, capture, scene, synthesis_preview=tmp_path / "gone.png")
 
 
 def test_best_median_and_worst_frame_are_shown_once_each():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import shutil
@@ -12,6 +11,7 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 import torch
@@ -19,13 +19,13 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from neeco.errors import NeecoError
-from neeco.viewer import server
+from neeco.viewer.access import MAX_MESSAGE
 from neeco.viewer.server import ViewerServer
 from neeco.viewer.session import RenderThread
 
 viser = pytest.importorskip("viser")
 import msgspec  # noqa: E402
-from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
+from websockets.exceptions import ConnectionClosed  # noqa: E402
 from websockets.sync.client import ClientConnection, connect  # noqa: E402
 
 Serve = Callable[..., ViewerServer]
@@ -53,7 +53,7 @@ def shared(made_run: Path) -> Iterator[ViewerServer]:
 
 
 def port_of(viewer: ViewerServer) -> int:
-    return int(viewer.address.split(":")[2].split("/")[0])
+    return int(urlsplit(viewer.address).port or 0)
 
 
 def answer(port: int, *lines: bytes, wait: float = 20.0) -> bytes:
@@ -63,14 +63,8 @@ def answer(port: int, *lines: bytes, wait: float = 20.0) -> bytes:
         return raw.recv(4096).partition(b"\r\n")[0]
 
 
-def cookie_of(viewer: ViewerServer) -> str:
-    return f"neeco_{port_of(viewer)}={viewer.token}"
-
-
 def opened(viewer: ViewerServer) -> ClientConnection:
-    cookie = {"Cookie": cookie_of(viewer)}
-    address = f"ws://127.0.0.1:{port_of(viewer)}/"
-    return connect(address, subprotocols=[PROTOCOL], max_size=None, additional_headers=cookie)
+    return connect(viewer.address.replace("http", "ws"), subprotocols=[PROTOCOL], max_size=None)
 
 
 def looks(connection: ClientConnection, **changed: Any) -> None:
@@ -98,7 +92,7 @@ def client_of(viewer: ViewerServer, known: Collection[Any] = ()) -> Any:
 def is_served(viewer: ViewerServer) -> bool:
     """Does a new browser get a page, and a picture?"""
     port = port_of(viewer)
-    page = f"GET /?token={viewer.token} HTTP/1.1".encode()
+    page = f"GET {urlsplit(viewer.address).path} HTTP/1.1".encode()
     assert answer(port, page, f"Host: 127.0.0.1:{port}".encode()) == b"HTTP/1.1 200 OK"
     with opened(viewer) as connection:
         before = set(viewer.render_thread.sessions)
@@ -109,34 +103,6 @@ def is_served(viewer: ViewerServer) -> bool:
                 return True
             time.sleep(0.02)
     return False
-
-
-@pytest.mark.parametrize(
-    "header",
-    [
-        b"Host: 127.0.0.1:%d\r\nHost: 127.0.0.1:%d",
-        b"Host: 127.0.0.1:%d\r\nHost: evil.example",
-        b"Host: evil.example",
-        b"Host: 127.0.0.1:%d@evil.example",
-        b"Host: 127.0.0.1; script-src *",
-        b"Host: 0.0.0.0:%d",
-        b"Host: [::1",
-        b"Host: [::ffff:7f00:1%%lo]:%d",
-        b"Host: \xff\xfe",
-        b"Host:",
-        b"X-Forwarded-Host: 127.0.0.1",
-        b"Host: 127.0.0.1:%d\r\nOrigin: http://[",
-        b"Host: 127.0.0.1:%d\r\nOrigin: \xff",
-        b"Host: 127.0.0.1:%d\r\nOrigin: http://127.0.0.1:%d\r\nOrigin: http://evil.example",
-        b"Host: 127.0.0.1:%d\r\nOrigin: null",
-        b"Host: 127.0.0.1:%d\r\nOrigin:",
-    ],
-)
-def test_odd_hosts_and_origins_are_refused(shared: ViewerServer, header: bytes, caplog) -> None:
-    port = port_of(shared)
-    sent = header.replace(b"%d", str(port).encode())
-    assert answer(port, b"GET / HTTP/1.1", sent).split(b" ")[1] == b"403"
-    assert not [record for record in caplog.records if record.exc_info]
 
 
 @pytest.mark.parametrize(
@@ -155,8 +121,8 @@ def test_odd_hosts_and_origins_are_refused(shared: ViewerServer, header: bytes, 
 )
 def test_only_the_pages_own_files_are_served(shared: ViewerServer, path: bytes, caplog) -> None:
     port = port_of(shared)
-    headers = f"Host: 127.0.0.1:{port}".encode(), f"Cookie: {cookie_of(shared)}".encode()
-    status = answer(port, b"GET " + path + b" HTTP/1.1", *headers)
+    token = urlsplit(shared.address).path.rstrip("/").encode()
+    status = answer(port, b"GET " + token + path + b" HTTP/1.1", f"Host: 127.0.0.1:{port}".encode())
     assert status.split(b" ")[1] in (b"400", b"404")
     assert not [record for record in caplog.records if record.exc_info]
 
@@ -176,28 +142,6 @@ def test_a_request_with_a_body_or_without_an_end_is_a_line_in_the_log_and_no_tro
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_connections_are_bounded(made_run: Path, serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "MAX_CONNECTIONS", 3)
-    viewer = serve(made_run)
-    held = [socket.create_connection(("127.0.0.1", port_of(viewer)), timeout=5) for _ in range(3)]
-    time.sleep(0.2)
-    further = socket.create_connection(("127.0.0.1", port_of(viewer)), timeout=5)
-    with further, contextlib.suppress(ConnectionResetError):
-        assert further.recv(1) == b""
-    for connection in held:
-        connection.close()
-    time.sleep(0.2)
-    assert is_served(viewer)
-
-
-def test_a_token_of_odd_bytes_is_wrong_and_no_trouble(made_run: Path, serve: Serve) -> None:
-    port = port_of(serve(made_run, host="0.0.0.0"))
-    host = f"Host: 127.0.0.1:{port}".encode()
-    cookie = f"Cookie: neeco_{port}=".encode() + b"\xff\xfe"
-    assert answer(port, b"GET / HTTP/1.1", host, cookie).split(b" ")[1] == b"403"
-    assert answer(port, b"GET /?token=%ff%fe HTTP/1.1", host).split(b" ")[1] == b"403"
-
-
 @pytest.mark.parametrize(
     "message",
     [
@@ -209,7 +153,7 @@ def test_a_token_of_odd_bytes_is_wrong_and_no_trouble(made_run: Path, serve: Ser
         msgspec.msgpack.encode({"no": "type"}),
         msgspec.msgpack.encode({"type": "NoSuchMessage"}),
         msgspec.msgpack.encode({"type": "ViewerCameraMessage", "wxyz": 1}),
-        b"\x00" * (server.MAX_MESSAGE + 1),
+        b"\x00" * (MAX_MESSAGE + 1),
     ],
 )
 def test_what_is_not_understood_ends_that_connection_alone(
@@ -256,15 +200,13 @@ def test_the_buttons_of_a_page_save_states_and_images(made_run: Path, serve: Ser
         for _ in range(2):
             press(connection, client, "keep this state")
         wait_until(lambda: "kept: 2 in" in session._panel.saved.content)
-        press(connection, client, "forget the last kept")
-        wait_until(lambda: "kept: 1 in" in session._panel.saved.content)
         press(connection, client, "save labelled image")
         wait_until(lambda: "written:" in session._panel.saved.content)
         press(connection, client, "show", "unobserved")
         wait_until(lambda: "magenta: unobserved" in session._panel.status.content)
         press(connection, client, "back to the recording")
         wait_until(lambda: session.overlays.gizmo_pose("grasper") is None)
-    assert len((run / "kept" / "states.jsonl").read_text().splitlines()) == 1
+    assert len((run / "kept" / "states.jsonl").read_text().splitlines()) == 2
     assert not [record for record in caplog.records if record.exc_info]
 
 
@@ -313,17 +255,6 @@ def test_a_storm_of_messages_leaves_the_others_their_pictures(shared: ViewerServ
         assert is_served(shared)
 
 
-def test_more_browsers_than_there_is_room_for_are_told_so(
-    made_run: Path, serve: Serve, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server, "MAX_BROWSERS", 2)
-    viewer = serve(made_run)
-    with opened(viewer), opened(viewer), pytest.raises(InvalidStatus) as refused:
-        opened(viewer)
-    assert refused.value.response.status_code == 503
-    assert is_served(viewer)
-
-
 def test_a_browser_for_which_time_cannot_go_on_does_not_end_the_others_pictures() -> None:
     drawn: list[bool] = []
 
@@ -358,29 +289,15 @@ def rewritten(run: Path, folder: Path, change: Callable[[dict[str, Any], dict[st
 NAN = float("nan")
 ODD_SCENES: dict[str, Callable[[dict[str, Any], dict[str, torch.Tensor]], Any]] = {
     "counts beyond all": lambda header, _: header.update(counts=[10**15, 1]),
-    "counts below none": lambda header, _: header.update(counts=[-1, 1000]),
-    "counts of many": lambda header, _: header.update(counts=[850, *[0] * 10**5]),
-    "sh_degree beyond": lambda header, _: header.update(sh_degree=10**9),
     "sh_degree below": lambda header, _: header.update(sh_degree=-1),
     "endless words": lambda header, _: header.update(background="x" * 10**6),
-    "settings that are none": lambda header, _: header.update(deformation=[]),
     "a method elsewhere": lambda header, _: header.update(method="../../evil"),
     "a huge image": lambda header, _: header["recorded"][0].update(intrinsics=[60, 60, 32, 24, 10**9, 10**9, 0.01]),
-    "an image of nothing": lambda header, _: header["recorded"][0].update(intrinsics=[60, 60, 32, 24, 0, 48, 0.01]),
-    "a lens of nothing": lambda header, _: header["recorded"][0].update(intrinsics=[0, 0, 32, 24, 64, 48, 0.01]),
     "a lens of NaN": lambda header, _: header["recorded"][0].update(intrinsics=[NAN, 60, 32, 24, 64, 48, 0.01]),
-    "a time of words": lambda header, _: header["recorded"][0].update(time="noon"),
-    "a name of none": lambda header, _: header["recorded"][0].update(name=5),
     "a joint of words": lambda header, _: header["recorded"][0].update(joints={"grasper": {"jaw_angle": "<b>"}}),
-    "a joint beyond all": lambda header, _: header["recorded"][0].update(joints={"grasper": {"jaw_angle": 1e308}}),
-    "half a limit": lambda header, _: header["instruments"][0].update(joints={"jaw_angle": [5]}),
-    "limits of words": lambda header, _: header["instruments"][0].update(joints={"jaw_angle": ["a", "b"]}),
     "limits beyond all": lambda header, _: header["instruments"][0].update(joints={"jaw_angle": [-1e308, 1e308]}),
     "instruments without poses": lambda header, _: header.update(instruments=header["instruments"] * 1000),
-    "Gaussians beyond all": lambda _, tensors: tensors["canonical.means"].fill_(1e30),
-    "endless Gaussians": lambda _, tensors: tensors["canonical.log_scales"].fill_(1e38),
     "Gaussians at NaN": lambda _, tensors: tensors["canonical.means"].fill_(NAN),
-    "doubles": lambda _, tensors: tensors.update({"canonical.means": tensors["canonical.means"].double()}),
     "cameras that are none": lambda _, tensors: tensors["recorded.cameras"].zero_(),
     "poses at NaN": lambda _, tensors: tensors["recorded.poses"].fill_(NAN),
 }

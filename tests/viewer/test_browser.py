@@ -24,7 +24,7 @@ from neeco.geometry.camera import Camera
 from neeco.labels.drawing import to_numpy
 from neeco.scene.io import save_scene
 from neeco.viewer.controls import Controls, InstrumentControls, controlled_state, shafts_of
-from neeco.viewer.runs import WatchedRun
+from neeco.viewer.runs import ViewedRun
 from neeco.viewer.server import ViewerServer
 from neeco.viewer.views import DEPTH, DIFFERENCE, IMAGE, OVERLAY, PARTS, UNOBSERVED, picture, views_of
 from neeco.viewer.viser_scene import fitting_view
@@ -106,14 +106,12 @@ def test_joints_follow_the_recording_until_one_is_moved(page: ViewerPage) -> Non
     page.set(JAW, 10.0)
     page.set("frame", 7.0)
     assert page.value(JAW) == 10.0
-    page.tick("joints as recorded")
-    page.settled()
+    page.after(lambda: page.press("back to the recording"))
     assert page.value(JAW) == pytest.approx(math.degrees(0.7), abs=0.5)
 
 
 def test_arrows_on_a_focused_slider_turn_no_camera(page: ViewerPage, scene) -> None:
     page.settled()
-    page.tick("joints as recorded")  # so that the frame is all that changes
     page._row("frame").get_by_role("slider").first.focus()
     shown = page.after(lambda: page.page.keyboard.press("ArrowRight", delay=400))
     frame = page.value("frame")
@@ -259,7 +257,7 @@ def test_kept_states_and_images_are_what_was_shown(serve: Serve, context: Any, m
     page.set("frame", 3.0)
     page.press("keep this state")
     page.wait_for("kept: 2 in")
-    loaded = WatchedRun(run).loaded
+    loaded = ViewedRun(run).loaded
     first, second = read_states(run / "kept" / "states.jsonl", loaded.scene.instruments)
     controls = [Controls(frame, {"grasper": InstrumentControls(roll=math.radians(40))}) for frame in (0.0, 3.0)]
     for kept, asked_for in zip((first, second), controls, strict=True):
@@ -267,8 +265,6 @@ def test_kept_states_and_images_are_what_was_shown(serve: Serve, context: Any, m
         assert torch.allclose(kept.state.instruments["grasper"].pose, state.instruments["grasper"].pose)
         taken_by = loaded.recorded.cameras[int(asked_for.frame)]
         assert kept.world_from_camera == pytest.approx(to_numpy(taken_by.world_from_camera), abs=1e-4)
-    page.press("forget the last kept")
-    page.wait_for("kept: 1 in")
     page.press("save labelled image")
     page.wait_for("written:")
     record = json.loads((run / "kept" / "samples" / ".records" / "000000.json").read_text())
@@ -283,22 +279,6 @@ def test_two_browsers_each_have_their_own_state(page: ViewerPage, context: Any, 
     assert alike(shown, scene, 7.0, seen_by=7) > ALIKE_DB
     assert other.value("frame") == 0.0
     assert (other.settled() == before).all()
-
-
-def test_a_page_comes_back_when_the_server_does(made_run: Path, context: Any, scene) -> None:
-    first = ViewerServer(made_run, port=18300)
-    page = ViewerPage(context, first.address)
-    page.settled()
-    page.set("frame", 4.0)
-    first.stop()
-    again = ViewerServer(made_run, port=18300)
-    try:
-        page.page.context.add_cookies([{"name": "neeco_18300", "value": again.token, "url": "http://127.0.0.1:18300"}])
-        shown = page.after(lambda: None)
-        assert alike(shown, scene) > ALIKE_DB
-        assert alike(page.set("frame", 2.0), scene, 2.0, seen_by=2) > ALIKE_DB
-    finally:
-        again.stop()
 
 
 def test_a_run_that_changes_is_shown_anew(serve: Serve, context: Any, made_run: Path, tmp_path: Path) -> None:
@@ -333,7 +313,6 @@ def test_nothing_is_asked_of_another_host(page: ViewerPage) -> None:
         page.after(lambda view=view: page.choose("show", view))
     page.tick("recorded cameras")
     page.tick("sparse points")
-    page.tick("dark")
     page.settled()
     own = urlsplit(page.address).netloc
     asked = {urlsplit(url.removeprefix("blob:")).netloc for url in page.requests if not url.startswith("data:")}
@@ -354,19 +333,6 @@ def test_a_page_that_is_told_to_go_elsewhere_may_not(page: ViewerPage) -> None:
         assert blocked == "blocked"
     told = page.response.headers["content-security-policy"]
     assert "connect-src 'self'" in told
-
-
-def test_on_another_host_the_token_opens_the_page_and_its_socket(
-    serve: Serve, made_run: Path, context: Any, chromium: Any, scene
-) -> None:
-    viewer = serve(made_run, host="0.0.0.0", port=18400)
-    port = int(viewer.address.split(":")[2].split("/")[0])
-    page = ViewerPage(context, f"http://127.0.0.1:{port}/?token={viewer.token}")
-    assert alike(page.settled(), scene) > ALIKE_DB
-    stranger = chromium.new_context()
-    answer = stranger.new_page().goto(f"http://127.0.0.1:{port}/")
-    assert answer.status == 403
-    stranger.close()
 
 
 HOSTILE = '<img src=x onerror="window.hacked=1"><script>window.hacked=2</script>{window.hacked=3}'
@@ -391,18 +357,11 @@ def test_names_of_a_hostile_run_inject_nothing(serve: Serve, context: Any, tmp_p
 
 
 @pytest.mark.parametrize(("width", "height"), [(390, 780), (1280, 800)])
-@pytest.mark.parametrize("dark", [True, False])
-def test_panel_and_picture_both_show_at_any_width(page: ViewerPage, width: int, height: int, dark: bool) -> None:
+def test_panel_and_picture_both_show_at_any_width(page: ViewerPage, width: int, height: int) -> None:
     page.page.set_viewport_size({"width": width, "height": height})
     page.settled()
-    if not dark:
-        page.tick("dark")
     page.page.wait_for_timeout(500)
-    seen = page.screenshot()
     panel = page.page.get_by_text("go to this frame's camera").bounding_box()
     assert panel["x"] >= 0
     assert panel["x"] + panel["width"] <= width
-    title = page.page.get_by_text("Recording", exact=True).bounding_box()
-    y, x = int(title["y"]) - 4, int(title["x"]) + 4
-    assert bool(seen[y, x].mean() < 90) == dark
-    assert seen[: height // 3, : width // 4].std() > 5
+    assert page.screenshot()[: height // 3, : width // 4].std() > 5

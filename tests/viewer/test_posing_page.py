@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def page(server: PosingServer, context: Any) -> Any:
 
 
 def ours(url: str, server: PosingServer) -> bool:
-    return url.startswith((server.address.partition("?")[0], "data:"))
+    return url.startswith((server.address, "data:"))
 
 
 def slide(page: Any, row: int, value: float) -> None:
@@ -176,9 +177,9 @@ def test_a_file_that_leads_to_the_address_opens_the_page_and_another_page_gets_n
     opened.locator("#strip figure").first.wait_for(timeout=30_000)
     opened.reload()
     opened.locator("#strip figure").first.wait_for(timeout=30_000)
-    address = server.address.partition("?")[0]
+    address = f"http://{urlsplit(server.address).netloc}/"
     other = context.new_page()
-    (tmp_path / "other.html").write_text(f'<!doctype html><img src="{server.address}"><a href="{address}">there</a>')
+    (tmp_path / "other.html").write_text(f'<!doctype html><img src="{address}"><a href="{address}">there</a>')
     answers: list[int] = []
     other.on("response", lambda got: answers.append(got.status) if got.url.startswith("http") else None)
     other.goto((tmp_path / "other.html").as_uri())

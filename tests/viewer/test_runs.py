@@ -17,7 +17,7 @@ from neeco.scene.io import save_scene
 from neeco.training.config import TrainConfig
 from neeco.training.run import checkpoint_path
 from neeco.training.train import train
-from neeco.viewer.runs import SCENE_FILE, ViewedRun, WatchedRun, score_frame
+from neeco.viewer.runs import SCENE_FILE, ViewedRun, score_frame
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def later(file: Path) -> None:
 
 
 def test_all_splits_are_there_in_the_order_of_their_times(run: Path) -> None:
-    loaded = WatchedRun(run).loaded
+    loaded = ViewedRun(run).loaded
     assert loaded.recorded.names == tuple(f"{k:06d}" for k in range(FRAMES))
     assert [frame.state.time for frame in loaded.frames] == sorted(frame.state.time for frame in loaded.frames)
     assert set(loaded.recorded.splits) == {"train", "test"}
@@ -45,14 +45,14 @@ def test_without_the_capture_the_training_frames_are_left(run: Path) -> None:
     config = run / "config.yaml"
     lines = [line if not line.startswith("capture:") else "capture: /gone" for line in config.read_text().splitlines()]
     config.write_text("\n".join(lines))
-    loaded = WatchedRun(run).loaded
+    loaded = ViewedRun(run).loaded
     assert set(loaded.recorded.splits) == {"train"}
     assert loaded.frames == ()
     assert "/gone no longer exists" in loaded.trouble
 
 
 def test_it_is_read_again_only_when_it_has_changed(run: Path) -> None:
-    source = WatchedRun(run)
+    source = ViewedRun(run)
     first = source.loaded
     assert not source.refresh()
     assert source.loaded is first
@@ -65,7 +65,7 @@ def test_it_is_read_again_only_when_it_has_changed(run: Path) -> None:
 
 
 def test_damage_leaves_the_last_that_could_be_read(run: Path) -> None:
-    source = WatchedRun(run)
+    source = ViewedRun(run)
     first = source.loaded
     (run / SCENE_FILE).write_bytes(b"half of it")
     later(run / SCENE_FILE)
@@ -78,7 +78,7 @@ def test_damage_leaves_the_last_that_could_be_read(run: Path) -> None:
 
 
 def test_readers_see_one_state_of_the_run_while_it_changes(run: Path) -> None:
-    source = WatchedRun(run)
+    source = ViewedRun(run)
     torn: list[str] = []
     ended = threading.Event()
 
@@ -104,22 +104,22 @@ def test_a_run_without_scene_or_checkpoint_is_refused_in_one_line(run: Path) -> 
     with pytest.raises(
         NeecoError, match="nothing to look at yet: neither a finished scene nor a checkpoint"
     ) as refused:
-        WatchedRun(run)
+        ViewedRun(run)
     assert "\n" not in str(refused.value)
 
 
 def test_no_run_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(NeecoError, match="no such run folder"):
-        WatchedRun(tmp_path / "none")
+        ViewedRun(tmp_path / "none")
     with pytest.raises(NeecoError, match="not a run folder"):
-        WatchedRun(tmp_path)
+        ViewedRun(tmp_path)
 
 
 def test_while_it_is_trained_the_checkpoint_is_shown_and_then_the_scene(made_run: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     train(made_run.parent / "capture", run, TrainConfig(method="3dgs", iterations=6, max_tissue_gaussians=200))
     scene = (run / SCENE_FILE).rename(tmp_path / "scene")
-    source = WatchedRun(run)
+    source = ViewedRun(run)
     assert source.loaded.iteration == 6
     assert source.loaded.frames
     scene.rename(run / SCENE_FILE)
@@ -133,7 +133,7 @@ def test_a_damaged_checkpoint_is_refused_in_one_line(run: Path) -> None:
     file.parent.mkdir()
     file.write_bytes(b"half of it")
     with pytest.raises(NeecoError, match=r"session\.safetensors"):
-        WatchedRun(run)
+        ViewedRun(run)
 
 
 @pytest.mark.parametrize("method", ["nps", "3dgs", "deformable-3dgs", "4dgs", "nerfies"])
@@ -155,4 +155,4 @@ def test_what_is_known_of_frames_is_found_out_anew_for_a_changed_run(run: Path) 
     later(run / SCENE_FILE)
     assert viewed.refresh()
     assert score_frame(viewed.loaded, 2).psnr < before.psnr - 10
-    assert viewed.timeline.known()[0].size == 0
+    assert viewed.timeline.known.size == 0

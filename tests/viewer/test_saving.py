@@ -21,14 +21,14 @@ from neeco.synthesis.samplers import make_sampler, moved_camera
 from neeco.synthesis.settings import SizeSettings
 from neeco.synthesis.writers.folder import LABELS, load_record
 from neeco.viewer.controls import Controls, InstrumentControls, controlled_state
-from neeco.viewer.runs import LoadedRun, WatchedRun
+from neeco.viewer.runs import LoadedRun, ViewedRun
 from neeco.viewer.saving import SavedStates
 
 
 @pytest.fixture
 def loaded(made_run: Path, tmp_path: Path) -> LoadedRun:
     shutil.copytree(made_run, tmp_path / "run")
-    return WatchedRun(tmp_path / "run").loaded
+    return ViewedRun(tmp_path / "run").loaded
 
 
 @pytest.fixture
@@ -55,18 +55,6 @@ def test_kept_states_come_back_from_the_sampler_as_they_were(saved: SavedStates,
         assert given.time == state.time
         assert camera.world_from_camera.numpy() == pytest.approx(VIEW, abs=1e-12)
         assert (camera.width, camera.fx) == (WIDTH, 60.0)
-
-
-def test_the_last_kept_is_forgotten_first(saved: SavedStates, loaded: LoadedRun) -> None:
-    for roll in (0.1, 0.2):
-        saved.add(loaded, some_state(loaded, roll=roll), VIEW)
-    assert saved.remove_last(loaded) == 1
-    (line,) = saved.read(loaded)
-    expected = some_state(loaded, roll=0.1).instruments["grasper"].pose
-    assert torch.allclose(line.state.instruments["grasper"].pose, expected)
-    assert saved.remove_last(loaded) == 0
-    assert not saved.states_path.exists()
-    assert saved.remove_last(loaded) == 0
 
 
 def test_what_was_kept_before_stays(saved: SavedStates, loaded: LoadedRun, tmp_path: Path) -> None:

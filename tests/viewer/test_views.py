@@ -12,7 +12,7 @@ from scene_worlds import make_nerf, make_scene
 from viewer_world import HEIGHT, WIDTH, camera, grasper_scene
 
 from neeco.labels.drawing import draw
-from neeco.viewer.runs import Timeline, WatchedRun, coarse_psnr, narrowed, score_frame, spread_order
+from neeco.viewer.runs import Timeline, ViewedRun, coarse_psnr, narrowed, score_frame
 from neeco.viewer.views import (
     DEPTH,
     DIFFERENCE,
@@ -147,7 +147,7 @@ def test_what_cannot_be_compared_is_darker() -> None:
 
 
 def test_a_frame_that_the_scene_draws_itself_scores_best(made_run: Path) -> None:
-    loaded = WatchedRun(made_run).loaded
+    loaded = ViewedRun(made_run).loaded
     score = score_frame(loaded, 3)
     assert score.psnr > 50
     assert score.iou == pytest.approx(1.0)
@@ -155,21 +155,14 @@ def test_a_frame_that_the_scene_draws_itself_scores_best(made_run: Path) -> None
 
 
 def test_the_timeline_finds_the_worst_frame(made_run: Path) -> None:
-    loaded = WatchedRun(made_run).loaded
+    loaded = ViewedRun(made_run).loaded
     wrong = replace(loaded.frames[4], state=loaded.frames[8].state)
     timeline = Timeline(replace(loaded, frames=(*loaded.frames[:4], wrong, *loaded.frames[5:])))
     while not timeline.done:
         timeline.advance()
-    frames, values = timeline.known()
-    assert frames.tolist() == list(range(9))
-    assert timeline.worst()[0] == (4, values[4])
-    assert values[4] < 40 < np.delete(values, 4).min()
-
-
-def test_the_first_frames_that_are_looked_at_are_from_everywhere() -> None:
-    assert sorted(spread_order(11)) == list(range(11))
-    assert sorted(k // 32 for k in spread_order(128)[:8]) == [0, 0, 1, 1, 2, 2, 3, 3]
-    assert spread_order(1) == [0]
+    assert timeline.known.tolist() == list(range(9))
+    assert timeline.worst()[0] == 4
+    assert timeline.psnr[4] < 40 < np.delete(timeline.psnr, 4).min()
 
 
 def test_a_narrower_image_is_of_the_same_view() -> None:

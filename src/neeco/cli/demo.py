@@ -50,7 +50,7 @@ def run(args: Arguments) -> int:
         networks = find_lpips()
         with open_run(run_path, device) as trained:
             _synthesize(trained, dataset)
-            report = _evaluate(trained, dataset, networks)
+            report = _evaluate(trained, networks)
     except KeyboardInterrupt:
         before = f"remove {args.output} and " if args.output.exists() else ""
         raise KeyboardInterrupt(f"{before}run the same command again") from None
@@ -111,7 +111,7 @@ def _synthesize(trained: TrainedRun, output: Path) -> None:
         synthesize(trained.gaussians("synthesize"), output, Settings(count=IMAGES), ("coco", "yolo"), False, advance)
 
 
-def _evaluate(trained: TrainedRun, dataset: Path, networks: dict[str, Lpips]) -> Path:
+def _evaluate(trained: TrainedRun, networks: dict[str, Lpips]) -> Path:
     from neeco.evaluation.evaluate import evaluate_run
     from neeco.report import write_report
     from neeco.viewer.export import embedded_page
@@ -122,6 +122,4 @@ def _evaluate(trained: TrainedRun, dataset: Path, networks: dict[str, Lpips]) ->
     for split, numbers in evaluation["given"].items():
         iou = "" if numbers["mask_iou"] is None else f", mask IoU {numbers['mask_iou']:.3f}"
         print(f"  {split}: PSNR {numbers['psnr']:.2f} dB{iou}")
-    preview = dataset / "preview.png"
-    page = embedded_page(trained)
-    return write_report(trained.path, evaluation, capture, trained.scene, synthesis_preview=preview, playable=page)
+    return write_report(trained.path, evaluation, capture, trained.scene, playable=embedded_page(trained))

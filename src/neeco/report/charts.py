@@ -195,23 +195,6 @@ def line_chart(
 
 
 @page_style()
-def residual_chart(times: np.ndarray, values: np.ndarray, title: str, level: float) -> str:
-    """Dots of values [N] >= 0 at times [N] s, and a line at `level`, as inline SVG; "" for fewer than two."""
-    if len(values) < 2:
-        return ""
-    axes = new_axes(SMALL, 46, 12, 28, 26)
-    axes.set_title(title)
-    axes.set_title(f"rms {level:.3g}, largest {values.max():.3g}", loc="right", fontsize=11, color=PALETTE["soft"])
-    draw_dots(axes, np.stack([times, values], axis=1), gid="dots", color=PALETTE["accent"], linewidth=3.2, alpha=0.65)
-    axes.axhline(level, color=PALETTE["phase"], linewidth=1, dashes=(5, 3))
-    axes.set_xlim(float(times.min()), max(float(times.max()), float(times.min()) + 1e-9))
-    axes.set_ylim(0, max(float(values.max()), level, 1e-9) * 1.05)
-    round_ticks(axes.xaxis, 5, short)
-    round_ticks(axes.yaxis, 4, short)
-    return inline_svg(axes, f"{title} over video time")
-
-
-@page_style()
 def legend(names: Sequence[str], shown: Sequence[str]) -> list[tuple[str, Markup]]:
     """(name, its line and mark as inline SVG) of every method shown; `names`: all, whose order gives them these."""
     entries = []
@@ -225,12 +208,6 @@ def legend(names: Sequence[str], shown: Sequence[str]) -> list[tuple[str, Markup
             axes.set(xlim=(0, 46), ylim=(0, 14))
             entries.append((name, inline_svg(axes, f"line of {name}")))
     return entries
-
-
-def draw_dots(axes: Axes, places: np.ndarray, **style: Any) -> None:
-    """Round dots at places [N, 2], `linewidth` across, as one path: a tenth of what so many marks take in a file."""
-    line = np.concatenate([places, places, np.full_like(places, np.nan)], axis=1).reshape(-1, 2)
-    axes.plot(line[:, 0], line[:, 1], solid_capstyle="round", **style)
 
 
 def round_ticks(axis: Axis, count: int, label: Callable[[float], str]) -> None:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.patches import PathPatch
-from matplotlib.path import Path
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Capture
 from neeco.report.charts import PALETTE, inline_svg, new_axes, page_style, round_ticks
 
 BINS = 24
-RECTANGLE = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
-SLACK = 0.02  # of the trained range: a state outside by less is not called outside
 CONSTANT = 1e-6  # mm or deg
 SPLIT_COLORS = {"train": "accent", "test": "good", "unseen": "phase"}
 
@@ -39,20 +35,12 @@ class Degree:
         values = self.of("train")
         return (float(values.min()), float(values.max())) if len(values) else None
 
-    def outside(self, split: str) -> np.ndarray:
-        """The values of a split that lie beyond the trained range."""
-        values, trained = self.of(split), self.trained
-        if trained is None:
-            return values
-        slack = SLACK * (trained[1] - trained[0])
-        return values[(values < trained[0] - slack) | (values > trained[1] + slack)]
 
-
-def degrees_of_freedom(capture: Capture, main_axes: Mapping[str, np.ndarray]) -> list[Degree]:
+def degrees_of_freedom(capture: Capture) -> list[Degree]:
     """Position x, y, z mm; pitch, yaw, roll deg about the mean direction of the training frames; each joint.
 
-    main_axes: each instrument's long axis [3] in its own frame; roll is about it. Where it is not known the tracked
-    frame's z axis stands in. Pitch, yaw and roll are intrinsic rotations in that order, away from the mean.
+    Pitch, yaw and roll are intrinsic rotations in that order about the tracked frame's x, y and z axis, away from the
+    mean.
     """
     degrees = []
     for instrument in capture.instruments:
@@ -63,7 +51,7 @@ def degrees_of_freedom(capture: Capture, main_axes: Mapping[str, np.ndarray]) ->
         splits = tuple(frame.split for frame in frames)
         poses = np.stack([state.pose.numpy() for state in states])
         columns = [(f"position {axis}", "mm", poses[:, row, 3]) for row, axis in enumerate("xyz")]
-        turns = _turns(poses[:, :3, :3], splits, main_axes.get(instrument.name, np.array([0.0, 0.0, 1.0])))
+        turns = _turns(poses[:, :3, :3], splits)
         columns += [(name, "deg", turns[:, index]) for index, name in enumerate(("pitch", "yaw", "roll"))]
         for joint in instrument.joints:
             values = np.array([state.joints.get(joint, np.nan) for state in states])
@@ -77,36 +65,12 @@ def degrees_of_freedom(capture: Capture, main_axes: Mapping[str, np.ndarray]) ->
     return degrees
 
 
-def _turns(rotations: np.ndarray, splits: Sequence[str], main_axis: np.ndarray) -> np.ndarray:
+def _turns(rotations: np.ndarray, splits: Sequence[str]) -> np.ndarray:
     """[N, 3] pitch, yaw, roll in deg of rotations [N, 3, 3] away from the mean of the training frames."""
     trained = np.array([split == "train" for split in splits])
     turns = Rotation.from_matrix(rotations)
     mean = turns[trained].mean() if trained.any() else turns.mean()
-    axis = main_axis / np.linalg.norm(main_axis)
-    helper = np.eye(3)[np.abs(axis).argmin()]
-    across = np.cross(helper, axis) / np.linalg.norm(np.cross(helper, axis))
-    basis = Rotation.from_matrix(np.stack([across, np.cross(axis, across), axis], axis=1))
-    return np.asarray((basis.inv() * mean.inv() * turns * basis).as_euler("XYZ", degrees=True))
-
-
-def extrapolations(degrees: Sequence[Degree]) -> list[str]:
-    """One sentence for every degree of freedom of which a capture's own frames leave the trained range."""
-    sentences = []
-    for name, degree in _named(degrees):
-        trained = degree.trained
-        if trained is None:
-            continue
-        parts = []
-        for split in dict.fromkeys(degree.splits):
-            outside, count = degree.outside(split), len(degree.of(split))
-            if split != "train" and len(outside):
-                reach = f"{_number(outside.min())} … {_number(outside.max())}" if len(outside) > 1 else ""
-                reach = reach or _number(float(outside[0]))
-                parts.append(f"{len(outside)} of {count} {split} frames ({reach} {degree.unit})")
-        if parts:
-            low, high = map(_number, trained)
-            sentences.append(f"{name}: trained from {low} to {high} {degree.unit}; outside it {', '.join(parts)}.")
-    return sentences
+    return np.asarray((mean.inv() * turns).as_euler("XYZ", degrees=True))
 
 
 def unvisited(degrees: Sequence[Degree]) -> list[str]:
@@ -151,16 +115,10 @@ def histogram(degree: Degree) -> str:
         if end - start > 0.0125 * (right - left):  # a thinner one would be a stroke
             axes.axvspan(start, end, color=PALETTE["phase"], alpha=0.13, linewidth=0, gid="beyond")
     edges, floor = np.linspace(low, high, BINS + 1), np.zeros(BINS)
-    gap = 0.04 * (edges[1] - edges[0])
     for name in sorted(set(degree.splits), key=lambda name: [*SPLIT_COLORS, name].index(name)):
-        count, color = np.histogram(degree.of(name), edges)[0], PALETTE[SPLIT_COLORS.get(name, "soft")]
-        filled = count > 0
-        x, y = (edges[:-1] + gap, edges[1:] - gap), (floor, floor + count)
-        corners = [(x[across][filled], y[up][filled]) for across, up in ((0, 0), (1, 0), (1, 1), (0, 1), (0, 0))]
-        # all bars as one path: matplotlib takes a third of a second to add and to draw a patch for each
-        path = Path(np.array(corners).transpose(2, 0, 1).reshape(-1, 2), RECTANGLE * int(filled.sum()))
-        axes.add_patch(PathPatch(path, color=color, linewidth=0))
-        floor += count
+        top = floor + np.histogram(degree.of(name), edges)[0]
+        axes.stairs(top, edges, baseline=floor, fill=True, color=PALETTE[SPLIT_COLORS.get(name, "soft")])
+        floor = top
     axes.set_ylim(0, max(1.0, floor.max()))
     axes.axhline(0, color=PALETTE["edge"], linewidth=1)
     round_ticks(axes.xaxis, 4, _number)

@@ -25,8 +25,7 @@ from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.result import IngestResult
 from neeco.report import ingest_figures as figures
-from neeco.report.charts import residual_chart
-from neeco.report.coverage import SPLIT_COLORS, degrees_of_freedom, extrapolations, histogram, unvisited
+from neeco.report.coverage import SPLIT_COLORS, degrees_of_freedom, histogram, unvisited
 from neeco.report.page import split_counts, write_page
 
 PAGE = "ingest.html"
@@ -109,7 +108,6 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
     it or one of the images shown cannot be read, or the page cannot be written.
     """
     capture = capture or read_capture(result.capture)
-    axes = figures.main_axes(capture, result.shapes)
     write_page(
         path,
         "ingest.html",
@@ -125,31 +123,22 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
         in_view=[
             (item.name, figures.in_view(capture, item.name)) for item in capture.instruments if capture.registered
         ],
-        **_residuals(result),
+        registration=_registration(result),
         clocks=_clocks(result, capture),
-        **_frames(result, capture, axes),
-        **_tracks(capture),
-        **_coverage(capture, axes),
+        **_frames(result, capture),
+        **_coverage(capture),
         dropped=_dropped(result),
     )
 
 
-def _residuals(result: IngestResult) -> dict[str, Any]:
-    """Return distances between cameras and the laparoscope's tracker: root mean squares and charts."""
-    registration = result.registration
-    if registration is None:
-        return {"residuals": []}
-    rows = result.registered_frames.astype(int)
-    shown = rows >= 0  # frames that helped to register but were left out of the capture afterwards have no row
-    times = result.selected_times[rows[shown]] - result.selected_times.min()
-    positions, turns = registration.position_residual, np.degrees(registration.rotation_residual)
-    position, rotation = rms(positions), rms(turns)
-    charts = [
-        residual_chart(times, positions[shown], "position residual, mm", position),
-        residual_chart(times, turns[shown], "rotation residual, deg", rotation),
-    ]
-    sensor = registration.camera_from_sensor[:3, 3]
-    return {"residuals": charts, "position_rms": position, "rotation_rms": rotation, "sensor_mm": sensor}
+def _registration(result: IngestResult) -> dict[str, Any] | None:
+    """Return distances between cameras and the laparoscope's tracker, root mean squares, and the sensor's place."""
+    found = result.registration
+    if found is None:
+        return None
+    rotation = float(np.degrees(rms(found.rotation_residual)))
+    sensor = found.camera_from_sensor[:3, 3]
+    return {"position_rms": rms(found.position_residual), "rotation_rms": rotation, "sensor_mm": sensor}
 
 
 def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
@@ -164,7 +153,7 @@ def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
     return rows
 
 
-def _frames(result: IngestResult, capture: Capture, axes: dict[str, figures.MainAxis]) -> dict[str, Any]:
+def _frames(result: IngestResult, capture: Capture) -> dict[str, Any]:
     """Return sample frames as (picture, picture before registration, frame, its second, its split), and the key to the
     overlays. The second picture is empty where there is none."""
     length = figures.axis_length(capture)
@@ -180,8 +169,8 @@ def _frames(result: IngestResult, capture: Capture, axes: dict[str, figures.Main
         shown_before += any(figures.shows(frame, pose) for pose in before.values())
         samples.append(
             (
-                figures.posed_picture(frame, poses, result.shapes, axes, length, shafts),
-                figures.posed_picture(frame, before, result.shapes, axes, length, {}) if before else "",
+                figures.posed_picture(frame, poses, result.shapes, length, shafts),
+                figures.posed_picture(frame, before, result.shapes, length, {}) if before else "",
                 frame.name if row is None else result.frame_words(int(result.selected[row])),
                 f"{frame.state.time - start:.2f}",
                 frame.split,
@@ -194,8 +183,8 @@ def _frames(result: IngestResult, capture: Capture, axes: dict[str, figures.Main
         "axis_mm": f"{length:g}",
         "axis_colors": list(zip("xyz", figures.AXIS_COLORS, strict=True)),
         "shafts": bool(shafts),
-        "shaped": any(name in result.shapes for name in axes),
-        "shape_colors": (figures.OUTLINE_COLOR, figures.MAIN_AXIS_COLOR),
+        "shaped": any(item.name in result.shapes for item in capture.instruments),
+        "shape_color": figures.OUTLINE_COLOR,
     }
 
 
@@ -207,39 +196,20 @@ def _unregistered(result: IngestResult, frame: Frame, row: int) -> dict[str, Ten
     }
 
 
-def _tracks(capture: Capture) -> dict[str, Any]:
-    """Two views of the tracks, and whose line has which colour."""
-    tracks = figures.read_tracks(capture)
-    right, down, forward = np.eye(3)
-    return {
-        "views": [
-            figures.view(tracks, "from above (away from the camera is up)", right, -forward),
-            figures.view(tracks, "from the side (away from the camera is right)", forward, down),
-        ],
-        "lines": [
-            (figures.LINE_COLORS[index % len(figures.LINE_COLORS)], name)
-            for index, name in enumerate(tracks.instruments)
-        ],
-        "measured": tracks.measured,
-    }
-
-
-def _coverage(capture: Capture, axes: dict[str, figures.MainAxis]) -> dict[str, Any]:
-    """Return the range of states: sentences on where training ends, and charts by instrument."""
-    degrees = degrees_of_freedom(capture, {name: axis.direction for name, axis in axes.items()})
+def _coverage(capture: Capture) -> dict[str, Any]:
+    """Return the range of states: stretches without a training frame, and charts by instrument."""
+    degrees = degrees_of_freedom(capture)
     named = [name for name in capture.splits if name in SPLIT_COLORS]
     others = ", ".join(name for name in capture.splits if name not in named)
     return {
         "degrees": degrees,
         "trained": any(degree.trained is not None for degree in degrees),
-        "extrapolations": extrapolations(degrees),
         "unvisited": unvisited(degrees),
         "split_colors": [*((SPLIT_COLORS[name], name) for name in named), *([("soft", others)] if others else [])],
         "instruments": [
             {
                 "name": item.name,
                 "jointed": bool(item.joints),
-                "about": "its long axis" if item.name in axes else "the z axis of its tracked frame",
                 "charts": [histogram(degree) for degree in degrees if degree.instrument == item.name],
             }
             for item in capture.instruments

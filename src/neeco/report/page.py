@@ -15,13 +15,12 @@ from PIL import Image
 from torch import Tensor
 
 import neeco
-from neeco.capture.images import open_image
 from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import difference_map, to_uint8
 from neeco.files import write_text
 
 REPORT_FILE = "report.html"
-MAX_WIDTH, PREVIEW_WIDTH = 480, 1400  # px of a picture; the page has to stay a file one can mail
+MAX_WIDTH = 480  # px of a picture; the page has to stay a file one can mail
 SPLITS = {  # what the usual names of splits mean
     "test": "states inside the recorded range",
     "unseen": "states outside the recorded range",
@@ -63,14 +62,9 @@ def jpeg(pixels: np.ndarray) -> str:
     return _data_uri(Image.fromarray(pixels), "JPEG", quality=88)
 
 
-def preview_uri(path: Path) -> str:
-    """The file of a preview of synthesised images as a data URI. Raises NeecoError when it cannot be read."""
-    return _data_uri(open_image(path).convert("RGB"), "JPEG", PREVIEW_WIDTH, quality=86)
-
-
-def _data_uri(image: Image.Image, form: str, max_width: int = MAX_WIDTH, **options: Any) -> str:
-    if image.width > max_width:
-        image = image.resize((max_width, round(image.height * max_width / image.width)), Image.Resampling.LANCZOS)
+def _data_uri(image: Image.Image, form: str, **options: Any) -> str:
+    if image.width > MAX_WIDTH:
+        image = image.resize((MAX_WIDTH, round(image.height * MAX_WIDTH / image.width)), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
     image.save(stream, form, **options)
     return f"data:image/{form.lower()};base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"

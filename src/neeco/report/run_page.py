@@ -18,12 +18,11 @@ from PIL import Image, ImageDraw
 from neeco.capture.model import Capture, Frame, State
 from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, overlay_parts, part_color
 from neeco.evaluation.mask_folders import load_reference
-from neeco.evaluation.mask_metrics import pairs_of
 from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.report.charts import SMALL, Series, line_chart, short
-from neeco.report.page import REPORT_FILE, difference, jpeg, preview_uri, split_counts, to_bytes, write_page
+from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
 from neeco.scene import DrawableScene
 
 MAX_POINTS = 300  # of a training curve
@@ -71,12 +70,11 @@ def write_report(
     capture: Capture,
     scene: DrawableScene,
     *,
-    synthesis_preview: Path | None = None,
     playable: str | None = None,
 ) -> Path:
     """Write `report.html` into the run folder and return its path. One file: style, pictures and curves are inside it.
 
-    evaluation: what `evaluate_run` returned. synthesis_preview: an image of synthesised data to show. playable: a page
+    evaluation: what `evaluate_run` returned. playable: a page
     of its own that renders the scene, shown in a frame of this one. How many threads torch takes is the caller's to set
     (`open_run`). Raises NeecoError when a picture cannot be read or the page cannot be written.
     """
@@ -87,7 +85,7 @@ def write_report(
         curve(rows, "loss", "loss (log scale)", logarithmic=True),
         curve(rows, "num_gaussians", "Gaussians"),
     ]
-    found, config = _flat(getattr(scene, "diagnostics", {})), run_path / "config.yaml"
+    config = run_path / "config.yaml"
     return write_page(
         run_path / REPORT_FILE,
         "run.html",
@@ -102,15 +100,12 @@ def write_report(
         tiles=_tiles(evaluation, kind),
         **_numbers(evaluation),
         notes=[*(f"Doubtful: {doubt}" for doubt in evaluation.get("doubts", ())), *evaluation.get("notes", ())],
-        **_parts(evaluation),
         figures=frame_figures(evaluation, capture, scene, kind),
         pose_kind=KIND_NAMES[kind],
         full_scale=FULL_SCALE,
         tints=_tints(scene),
         curves=[chart for chart in curves if chart],
-        diagnostics=[(name, _plain(value)) for name, value in found if name.split(" · ")[-1] != "verdict"],
-        verdicts=[value for name, value in found if name.split(" · ")[-1] == "verdict"],
-        preview=synthesis_preview and preview_uri(synthesis_preview),
+        verdicts=_verdicts(getattr(scene, "diagnostics", {})),
         playable=playable,
         facts=_facts(capture, scene, rows),
         config=read_bytes(config, "settings").decode("utf-8", "replace") if config.is_file() else "",
@@ -228,23 +223,6 @@ def _table(
     return columns, groups
 
 
-def _parts(evaluation: dict[str, Any]) -> dict[str, Any]:
-    """The table of per-part IoU, where any is known, and which parts images do not tell apart by name."""
-    scored = [
-        (kind, split, numbers["part_iou"]) for kind in KINDS for split, numbers in evaluation.get(kind, {}).items()
-    ]
-    names = list(dict.fromkeys(name for _, _, parts in scored for name in parts))
-    pairs = pairs_of(names)
-    rows = []
-    for kind, split, parts in scored:
-        if any(value is not None for value in parts.values()):
-            ways = evaluation["labels"]["pair_assignment"][kind][split]
-            cells = [_written(parts[name], "{:.3f}") for name in names]
-            rows.append([f"{split}, {KIND_NAMES[kind]}", *cells, *(ways.get(pair, "-") for pair in pairs)])
-    head = ["split", *(name.replace("_", " ") for name in names), *(f"{pair} matched" for pair in pairs)]
-    return {"part_head": head, "parts": rows, "pairs": [pair.replace("_", " ") for pair in pairs]}
-
-
 def _tints(scene: DrawableScene) -> list[tuple[str, str]]:
     """Colour and name of every part."""
     several = len({instrument for instrument, _ in scene.label_names}) > 1
@@ -252,23 +230,13 @@ def _tints(scene: DrawableScene) -> list[tuple[str, str]]:
     return [(part_color(part), name.replace("_", " ")) for part, name in enumerate(names, 1)]
 
 
-def _flat(value: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    items: list[tuple[str, Any]] = []
-    for key, item in value.items():
-        name = prefix + str(key).replace("_", " ")
-        items += _flat(item, name + " · ") if isinstance(item, Mapping) else [(name, item)]
-    return items
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, list | tuple):
-        between = "; " if any(isinstance(item, Mapping) for item in value) else ", "
-        return between.join(_plain(item) for item in value) or "none"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{str(key).replace('_', ' ')} {_plain(item)}" for key, item in value.items())
-    return value if isinstance(value, str) else json.dumps(value)
+def _verdicts(found: Mapping[str, Any]) -> list[str]:
+    """Every verdict in what training found, in words."""
+    return [
+        verdict
+        for name, item in found.items()
+        for verdict in (_verdicts(item) if isinstance(item, Mapping) else [str(item)] if name == "verdict" else [])
+    ]
 
 
 def _facts(capture: Capture, scene: DrawableScene, rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
@@ -348,8 +316,6 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
             (f"{median(record['trust']['value'] for record in records):.3f}", "trust, median"),
             (f"{min_trust:g}", "trust asked for"),
         ],
-        split_head=["split", "frames", "written", "trust: lowest", "median"],
-        splits=_by_split(records),
         figures=[_annotated_figure(records[k], capture.frames[k]) for k in ranked[:SHOWN]],
         total=len(records),
         instruments=[
@@ -357,16 +323,6 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
             for k, item in enumerate(capture.instruments)
         ],
     )
-
-
-def _by_split(records: Sequence[dict[str, Any]]) -> list[list[str]]:
-    rows = []
-    for split in dict.fromkeys(record["recorded_split"] for record in records):
-        here = [record for record in records if record["recorded_split"] == split]
-        trust = [record["trust"]["value"] for record in here]
-        written = sum(not record.get("skipped") for record in here)
-        rows.append([split, str(len(here)), str(written), f"{min(trust):.3f}", f"{median(trust):.3f}"])
-    return rows
 
 
 def _annotated_figure(record: dict[str, Any], frame: Frame) -> dict[str, Any]:

@@ -23,11 +23,10 @@ class Images:
 
 @dataclass(frozen=True)
 class Figure:
-    """A chart (inline SVG) with its legend; `files`: its numbers as CSV by file name."""
+    """A chart (inline SVG) with its legend."""
 
     chart: str
     legend: Sequence[tuple[str, Markup]]
-    files: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +36,6 @@ class Section:
     title: str
     split: str = ""  # of usual names the meaning is shown with the title
     level: int = 2  # of the heading
-    anchor: str = ""
     text: str = ""
     results: ResultTable | None = None
     head: Sequence[str] = ()

@@ -8,12 +8,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numpy as np
-import torch
-
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.evaluation.image_metrics import overlay_parts
-from neeco.geometry.rotations import vector_from_rotation
 from neeco.labels.drawing import draw
 from neeco.report.charts import SMALL, Level, Series, line_chart
 from neeco.report.page import jpeg, to_bytes, write_page
@@ -52,7 +48,6 @@ def write_track_page(tracked: Tracked) -> Path:
             (str(missing), "frames where nothing was found"),
             (str(sum(record["how"] in ("beside", "found") for record in records)), "times searched for again"),
         ],
-        hows=[[words, str(sum(record["how"] == how for record in records))] for how, words in HOWS.items()],
         charts=[chart for chart in _charts(tracked) if chart],
         strip=[_figure(tracked, frames[k], records[k]) for k in evenly_spaced(len(records), N_STRIP)],
         least_trusted=[_figure(tracked, frames[k], records[k]) for k in least],
@@ -60,7 +55,7 @@ def write_track_page(tracked: Tracked) -> Path:
 
 
 def _charts(tracked: Tracked) -> list[str]:
-    """Trust, then place, turn and joints of every instrument, over time, with bands of BAND standard deviations."""
+    """Trust and misfit, then the joints of every instrument with bands of BAND standard deviations, over time."""
     records, first = tracked.records, tracked.records[0]["time"]
     times = [record["time"] - first for record in records]
     trust = Series("", 0, tuple(zip(times, (record["trust"]["value"] for record in records), strict=True)))
@@ -69,36 +64,22 @@ def _charts(tracked: Tracked) -> list[str]:
         line_chart("trust", "s", [trust], levels=[Level("asked for", 1, tracked.min_trust)], size=SMALL),
         line_chart("misfit of pixels", "s", [misfit], size=SMALL),
     ]
+    rows = [k for k, record in enumerate(records) if record["how"] != "lost"]
+    at = [times[k] for k in rows]
     for item in tracked.scene.instruments:
-        found_rows = [k for k, record in enumerate(records) if record["how"] != "lost"]
-        if len(found_rows) < 2:
-            continue
-        found = [records[k]["instruments"][item.name] for k in found_rows]
-        at = [times[k] for k in found_rows]
-        poses = np.array([one["pose"] for one in found])
-        turns = _turns(poses)
-        for k, axis in enumerate("xyz"):
-            title = f"{item.name}: {axis}, mm"
-            charts.append(_banded(title, at, poses[:, k, 3], [one["deviation"]["place"] for one in found]))
-        deviations = [math.degrees(one["deviation"]["rotation"]) for one in found]
-        charts.append(_banded(f"{item.name}: turned since the first, deg", at, turns, deviations))
+        found = [records[k]["instruments"][item.name] for k in rows]
         for name in item.joints:
             unit: Callable[[float], float] = float if item.slides(name) else math.degrees
-            values = np.array([unit(one["joints"][name]) for one in found])
+            values = [unit(one["joints"][name]) for one in found]
             deviations = [unit(one["deviation"][f"joint.{name}"]) for one in found]
-            title = f"{item.name}: {name}, {'mm' if item.slides(name) else 'deg'}"
-            charts.append(_banded(title, at, values, deviations))
+            charts.append(
+                _banded(f"{item.name}: {name}, {'mm' if item.slides(name) else 'deg'}", at, values, deviations)
+            )
     return charts
 
 
-def _turns(poses: np.ndarray) -> np.ndarray:
-    """[F] deg by which poses [F, 4, 4] are turned against the first."""
-    relative = np.einsum("ji,fjk->fik", poses[0, :3, :3], poses[:, :3, :3])
-    return np.rad2deg(vector_from_rotation(torch.from_numpy(relative)).norm(dim=-1).numpy())
-
-
-def _banded(title: str, times: Sequence[float], values: np.ndarray, deviations: Sequence[float]) -> str:
-    main = tuple(zip(times, values.tolist(), strict=True))
+def _banded(title: str, times: Sequence[float], values: Sequence[float], deviations: Sequence[float]) -> str:
+    main = tuple(zip(times, values, strict=True))
     bands = tuple(tuple((t, v + way * BAND * d) for (t, v), d in zip(main, deviations, strict=True)) for way in (-1, 1))
     return line_chart(title, "s", [Series("", 0, main, bands)], size=SMALL)
 

@@ -1,104 +1,87 @@
-"""Access control: whoever asks needs the token, and pages of other sites are refused."""
+"""Addresses and access of every server of `neeco view`: whoever asks needs the token in the address.
+
+The token is the first part of the path, of the page and of its web socket. Unlike a cookie, it is added to no request
+by the browser itself: a page of another site, which does not know it, gets nothing, by whatever name it calls.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import base64
+import contextlib
+import dataclasses
 import hashlib
 import hmac
+import http
 import ipaddress
+import logging
 import re
 import secrets
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
-from urllib.parse import parse_qs
 
 from neeco.errors import NeecoError
 
-HOST_HEADER = re.compile(r"([\w.-]+|\[[0-9a-f:.]+\])(:\d+)?", re.ASCII | re.IGNORECASE)
 HOST, PORT = "127.0.0.1", 8080
 TOKEN_BYTES = 24
-OWN_SITE = frozenset({"same-origin", "none"})  # Sec-Fetch-Site of our own page, and of an address that a user opens
+MAX_MESSAGE = 2**20  # bytes; a browser's messages have some hundred
+MAX_PORTS = 100  # tried, one after another
 INLINE_SCRIPT = re.compile(rb"<script[^>]*>(.*?)</script>", re.DOTALL)
+REFUSED = "neeco view: refused: open the whole address that neeco view printed\n"
+
+log = logging.getLogger(__name__)
+quiet = log.getChild("connections")  # of websockets, which logs a traceback for every browser that goes away
+quiet.setLevel(logging.CRITICAL)
+
+Respond = Callable[[Any, Any], Any]  # (connection, request) -> response, or None: a web socket
 
 
 @dataclass(frozen=True)
-class AccessControl:
-    """Decides on every HTTP request, that for the page and that which opens the web socket."""
+class Access:
+    """The address of a server, and who gets in."""
 
+    host: str
+    port: int
     token: str
-    cookie: str = "neeco"  # that holds it; browsers send one to all ports of a host, so it should name the port
-    loopback: bool = False  # whether only this machine reaches the server; its other users do
 
     @classmethod
-    def at(cls, host: str, port: int) -> AccessControl:
-        """Return that of a server on `host` and `port`, with a new token."""
-        return cls(secrets.token_urlsafe(TOKEN_BYTES), f"neeco_{port}", is_loopback(host))
+    def at(cls, host: str, port: int) -> Access:
+        """Return that of a server on `host` and `port`, or the next that is free, with a new token. Raises
+        NeecoError."""
+        host = host.strip("[]")
+        return cls(host, _free_port(host, port), secrets.token_urlsafe(TOKEN_BYTES))
 
-    def refusal(self, path: str, headers: Mapping[str, Sequence[str]]) -> str | None:
-        """Why a request for `path` is refused, or None. headers: name in small letters -> all its values."""
-        hosts, origins = headers.get("host", ()), headers.get("origin", ())
-        if len(hosts) != 1 or len(origins) > 1 or not HOST_HEADER.fullmatch(hosts[0]):
-            return "one Host and at most one Origin are expected"
-        # DNS rebinding: another site's name that resolves to this machine appears as the Host
-        if self.loopback and not is_loopback(re.sub(r":\d*$", "", hosts[0])):
-            return "open http://127.0.0.1, not another name of this machine"
-        if origins and origins[0].partition("://")[2].lower() != hosts[0].lower():
-            return "a page of another site asks"
-        from_elsewhere = not OWN_SITE.issuperset(headers.get("sec-fetch-site", ()))
-        opened = self.in_address(path) and tuple(headers.get("sec-fetch-mode", ())) == ("navigate",)
-        if from_elsewhere and not opened:  # a link with the token may be anywhere
-            return "a page of another site asks"
-        if not (self.in_address(path) or self._in_cookie(headers)):
-            return "the token is missing or wrong; open the whole address that neeco view printed"
-        return None
+    @property
+    def address(self) -> str:
+        """Address to open in a browser."""
+        host = socket.gethostname() if self.host in ("0.0.0.0", "::", "") else self.host
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self.token}/"
 
-    def in_address(self, path: str) -> bool:
-        """Whether the address itself carries the token."""
-        return any(self._is_token(value) for value in parse_qs(path.partition("?")[2]).get("token", ()))
+    def controlled(self, respond: Respond) -> Respond:
+        """Return `respond` for those who have the token; it sees the path without it."""
 
-    def _in_cookie(self, headers: Mapping[str, Sequence[str]]) -> bool:
-        pairs = (pair.partition("=") for value in headers.get("cookie", ()) for pair in value.split(";"))
-        return any(name.strip() == self.cookie and self._is_token(value.strip()) for name, _, value in pairs)
+        def answer(connection: Any, request: Any) -> Any:
+            token, _, path = request.path.partition("?")[0].removeprefix("/").partition("/")
+            # a path holds any bytes, as surrogates
+            if not hmac.compare_digest(token.encode(errors="replace"), self.token.encode()):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, REFUSED)
+            try:
+                response = respond(connection, dataclasses.replace(request, path=f"/{path}"))
+                if response is not None:
+                    for name, value in _page_headers(response.body, request.headers["Host"]).items():
+                        response.headers[name] = value
+            except (LookupError, OSError, ValueError):  # a header given twice, a name that no file can have
+                return connection.respond(http.HTTPStatus.BAD_REQUEST, "neeco view: not understood\n")
+            return response
 
-    def _is_token(self, value: str) -> bool:
-        # headers hold any bytes, as surrogates
-        return hmac.compare_digest(value.encode(errors="replace"), self.token.encode())
-
-    def page_headers(self, path: str, page: bytes, host: str) -> dict[str, str]:
-        """Headers of the page: the browser loads and connects to nothing else, and remembers the token."""
-        headers = {
-            "Content-Security-Policy": content_security_policy(page, host),
-            "Referrer-Policy": "no-referrer",  # or the address would give the token away
-            "X-Content-Type-Options": "nosniff",
-            "Cross-Origin-Resource-Policy": "same-origin",
-            "Cache-Control": "no-store",
-        }
-        if self.in_address(path):
-            headers["Set-Cookie"] = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
-        return headers
+        return answer
 
 
-def content_security_policy(page: bytes, host: str) -> str:
-    """The Content-Security-Policy of a page whose own scripts may run, and nothing that is injected into it."""
-    scripts = [base64.b64encode(hashlib.sha256(text).digest()).decode() for text in INLINE_SCRIPT.findall(page)]
-    allowed = " ".join(f"'sha256-{digest}'" for digest in scripts)
-    return "; ".join(
-        [
-            "default-src 'none'",
-            f"script-src {allowed} 'strict-dynamic' 'wasm-unsafe-eval' blob:",
-            "worker-src blob:",
-            "style-src 'unsafe-inline'",
-            "img-src 'self' data: blob:",
-            "font-src data:",
-            # such a policy cannot name an IPv6 address; browsers that know them include web sockets in 'self'
-            f"connect-src 'self'{'' if host.startswith('[') else f' ws://{host}'} data: blob:",
-            "base-uri 'none'",
-            "form-action 'none'",
-            "frame-ancestors 'none'",
-        ]
-    )
+def family_of(host: str) -> socket.AddressFamily:
+    """Family of a host's addresses."""
+    return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 
 def is_loopback(host: str) -> bool:
@@ -109,36 +92,73 @@ def is_loopback(host: str) -> bool:
         return host.lower() == "localhost"
 
 
-def resolved(host: str, port: int) -> tuple[socket.AddressFamily, tuple[Any, ...]]:
-    """Family and socket address of `--host`. Raises NeecoError."""
+@contextlib.contextmanager
+def controlled_sockets(access: Access, changed: Callable[[bytes], bytes]) -> Iterator[list[bool]]:
+    """Inside the block, a server that is opened by `websockets` answers as `access` allows, and `changed` alters its
+    pages. viser has no setting for that, so `websockets.serve` is replaced. Yields a list that is empty as long as
+    none was opened."""
+    import websockets.asyncio.server as websocket_server
+
+    opened: list[bool] = []
+    serve = websocket_server.serve
+
+    def serve_controlled(*given: Any, process_request: Respond, **named: Any) -> Any:
+        opened.append(True)
+        # a message that asks for what cannot be fails in a task of its own
+        asyncio.get_running_loop().set_exception_handler(
+            lambda _, context: log.warning(
+                "neeco view: a browser's message was not understood (%r)", context.get("exception")
+            )
+        )
+
+        def respond(connection: Any, request: Any) -> Any:
+            request.headers.pop("Accept-Encoding", None)  # so that pages can be read
+            response = process_request(connection, request)
+            if response is not None:
+                response.body = changed(response.body)
+                del response.headers["Content-Length"]
+                response.headers["Content-Length"] = str(len(response.body))
+            return response
+
+        ours = {"process_request": access.controlled(respond), "max_size": MAX_MESSAGE, "logger": quiet}
+        return serve(*given, **named | ours)
+
+    websocket_server.serve = serve_controlled
     try:
-        found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise NeecoError(f"--host: {host!r} is unknown ({reason}); give a name or address") from None
-    return found[0][0], found[0][4]
+        yield opened
+    finally:
+        websocket_server.serve = serve
 
 
-def free_port(host: str, port: int) -> int:
+def _page_headers(page: bytes, host: str) -> dict[str, str]:
+    """Headers of a page whose own scripts may run, and nothing that is injected into it; it connects to nothing else,
+    and gives its address to nobody."""
+    scripts = [base64.b64encode(hashlib.sha256(text).digest()).decode() for text in INLINE_SCRIPT.findall(page)]
+    allowed = " ".join(f"'sha256-{digest}'" for digest in scripts)
+    policy = (
+        f"default-src 'none'; script-src {allowed} 'strict-dynamic' 'wasm-unsafe-eval' blob:; worker-src blob:; "
+        f"style-src 'unsafe-inline'; img-src 'self' data: blob:; font-src data:; "
+        f"connect-src 'self' ws://{host} data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+    return {
+        "Content-Security-Policy": policy,
+        "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff",
+        "Cache-Control": "no-store",
+    }
+
+
+def _free_port(host: str, port: int) -> int:
     """`port`, or the next one that is free on `host`. Raises NeecoError for a host or port that cannot be."""
     if not 0 < port < 65536:
         raise NeecoError(f"--port: {port} is no port; give 1 to 65535")
-    family, address = resolved(host, port)
-    last = OSError()
-    for candidate in range(port, min(port + 100, 65536)):
+    last: Exception = OSError()
+    for candidate in range(port, min(port + MAX_PORTS, 65536)):
         try:
-            with socket.socket(family, socket.SOCK_STREAM) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind((address[0], candidate, *address[2:]))
-                return candidate
+            socket.create_server((host, candidate), family=family_of(host)).close()
+            return candidate
+        except (socket.gaierror, UnicodeError) as error:
+            raise NeecoError(f"--host: {host!r} is unknown ({error}); give a name or address") from None
         except OSError as error:
             last = error
-    raise NeecoError(f"--host: {host}: --port {port} and the next ones: {last.strerror or last}; give others")
-
-
-def url_of(host: str, port: int, token: str) -> str:
-    """Address to open in a browser."""
-    if host in ("0.0.0.0", "::", ""):
-        host = socket.gethostname()
-    shown = f"[{host}]" if ":" in host and not host.startswith("[") else host
-    return f"http://{shown}:{port}/?token={token}"
+    raise NeecoError(f"--host: {host}: --port {port} and the next ones: {last}; give others")

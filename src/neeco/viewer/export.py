@@ -26,8 +26,7 @@ from torch.nn.functional import normalize
 
 import neeco
 from neeco.errors import NeecoError
-from neeco.evaluation.evaluate import EVALUATION_FILE
-from neeco.files import read_json, write_text
+from neeco.files import write_text
 from neeco.geometry.lines import frame_about
 from neeco.labels.labellers import threshold_of
 from neeco.raster.reference import SH_C0
@@ -47,11 +46,6 @@ THINNEST_MM = 0.01  # thinner than any pixel
 POSITION_STEPS = 2**20 - 1  # of a body's box: 2**16 change the order in depth of neighbours, which costs 5 dB
 NOT_FINITE = "--export: the scene holds numbers that are not finite; train again"
 BYTES = {"uint8": 1, "int8": 1, "uint16": 2, "uint24": 3}
-SCORES = (
-    ("psnr", "PSNR", "{:.1f} dB"),
-    ("psnr_instrument", "in instrument", "{:.1f} dB"),
-    ("mask_iou", "IoU", "{:.3f}"),
-)
 
 
 def export_page(run: Path, output: Path, sh_degree: int, device: torch.device) -> str:
@@ -87,7 +81,7 @@ def page_of_run(run: TrainedRun, sh_degree: int) -> str:
     iterations = scene.diagnostics.get("iterations")
     if isinstance(iterations, int):
         facts.append(("iterations", f"{iterations:,}"))
-    facts += [*_scores(Path(run.path) / EVALUATION_FILE), ("made with", f"neeco {neeco.__version__}")]
+    facts.append(("made with", f"neeco {neeco.__version__}"))
     return page_of(*pack(scene, sh_degree), Path(run.path).resolve().name, facts)
 
 
@@ -116,21 +110,6 @@ def page_of(header: dict[str, Any], planes: bytes, title: str, facts: list[tuple
             wasm=_deflated(files(__package__).joinpath(WASM).read_bytes()),
         )
     )
-
-
-def _scores(path: Path) -> list[tuple[str, str]]:
-    """A line per split of evaluation.json; none where the run was not evaluated."""
-    if not path.is_file():
-        return []
-    try:
-        lines = []
-        for split, scores in read_json(path)["given"].items():
-            known = [f"{name} {form.format(scores[key])}" for key, name, form in SCORES if scores.get(key) is not None]
-            lines.append((split, ", ".join(known)))
-        return lines
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        reason = " ".join(str(error).split())
-        raise NeecoError(f"{path}: not what `neeco evaluate` writes ({reason}); evaluate again") from None
 
 
 def _source(*names: str) -> str:

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from neeco.viewer.viser_scene import Overlays
 
-MAX_INSTRUMENTS, MAX_JOINTS = 8, 24  # instruments that get controls; joints of one that get a slider
 SLIDE_MM, YAW_DEG = 30.0, 45.0
 NONE_CHOSEN = "—"
 PLOTS_EVERY_S = 0.5  # while more becomes known
@@ -40,9 +39,7 @@ class Actions:
     go_to: Callable[[int], None]  # the camera of a frame
     toggle_gizmo: Callable[[str, int, bool], None]  # an instrument's name and number, and whether its gizmo appears
     save_state: Callable[[], None]
-    remove_state: Callable[[], None]
     save_image: Callable[[], None]
-    dark: Callable[[bool], None]
 
 
 class Panel:
@@ -81,16 +78,16 @@ class Panel:
             return
         self._plotted, self._plotted_at = so_far, now
         names, splits = self._loaded.recorded.names, self._loaded.recorded.splits
-        frames, values = timeline.known()
+        known, psnr = timeline.known, timeline.psnr
         # the names differ where the run has changed, and this panel not yet
-        if timeline.loaded.recorded.names != names or len(frames) < 2:
+        if timeline.loaded.recorded.names != names or len(known) < 2:
             return
-        self._draw_plot((frames.astype(np.float64), values))
-        worst = timeline.worst()
-        options = [f"{frame}: {psnr:.1f} dB, {splits[frame]}, {names[frame]}" for frame, psnr in worst]
-        if self.worst.value == NONE_CHOSEN and (NONE_CHOSEN, *options) != tuple(self.worst.options):
-            self._worst = [frame for frame, _ in worst]
-            self.worst.options = (NONE_CHOSEN, *options)
+        self._draw_plot((known.astype(np.float64), psnr[known]))
+        if self.worst.value == NONE_CHOSEN:
+            self._worst = timeline.worst()
+            options = [f"{frame}: {psnr[frame]:.1f} dB, {splits[frame]}, {names[frame]}" for frame in self._worst]
+            if (NONE_CHOSEN, *options) != tuple(self.worst.options):
+                self.worst.options = (NONE_CHOSEN, *options)
 
     def _add_picture(self) -> None:
         gui, views = self._gui, views_of(self._loaded.scene, bool(self._loaded.frames))
@@ -121,8 +118,6 @@ class Panel:
 
     def _add_instruments(self) -> list[InstrumentPanel]:
         first = self._loaded
-        if (more := len(first.scene.instruments) - MAX_INSTRUMENTS) > 0:
-            self._gui.add_html(message_html(f"{more} more instruments stay as recorded: no room for their sliders"))
         ranges = slider_ranges(first.scene.instruments, first.recorded.states)
         return [
             InstrumentPanel(
@@ -133,7 +128,7 @@ class Panel:
                 self._actions.changed,
                 partial(self._actions.toggle_gizmo, instrument.name, number),
             )
-            for number, instrument in enumerate(first.scene.instruments[:MAX_INSTRUMENTS])
+            for number, instrument in enumerate(first.scene.instruments)
         ]
 
     def _add_timeline(self) -> None:
@@ -150,16 +145,12 @@ class Panel:
         labelled = bool(self._loaded.scene.label_names)
         with gui.add_folder("Keep"):
             keep = gui.add_button("keep this state", hint="And this camera, for neeco synthesize --states.")
-            forget = gui.add_button("forget the last kept")
             save = gui.add_button(
                 "save labelled image", disabled=not labelled, hint="As neeco synthesize writes one, from here."
             )
             self.saved = gui.add_html("")
-        dark = gui.add_checkbox("dark", True)
         keep.on_click(lambda _: self._actions.save_state())
-        forget.on_click(lambda _: self._actions.remove_state())
         save.on_click(lambda _: self._actions.save_image())
-        dark.on_update(lambda _: self._actions.dark(bool(dark.value)))
 
     def _draw_plot(self, data: tuple[np.ndarray, ...]) -> None:
         if self._plot is not None:
@@ -207,17 +198,14 @@ class InstrumentPanel:
         """changed: called when the user moved something; toggle_gizmo: when the gizmo is to appear or to go."""
         self.name = instrument.name
         self._changed, self._toggle_gizmo = changed, toggle_gizmo
+        self._joints_as_recorded = True  # until the user moves one
         self._ranges = {joint: ranges[self.name, joint] for joint in instrument.joints if (self.name, joint) in ranges}
         # what sliders show of a reading: degrees of one that turns, mm of one that slides
         self._per_unit = {joint: 1.0 if instrument.slides(joint) else math.degrees(1.0) for joint in instrument.joints}
         with gui.add_folder(f"Instrument {self.name}"):
             self._joints = {
-                joint: _joint_slider(gui, joint, span, self._per_unit[joint])
-                for joint, span in list(self._ranges.items())[:MAX_JOINTS]
+                joint: _joint_slider(gui, joint, span, self._per_unit[joint]) for joint, span in self._ranges.items()
             }
-            self.as_recorded = gui.add_checkbox(
-                "joints as recorded", True, visible=bool(self._joints), hint="Off as soon as a joint is moved."
-            )
             about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
             self.slide = gui.add_slider("along shaft (mm)", -SLIDE_MM, SLIDE_MM, 0.5, 0.0, hint=f"Along {about}.")
             self.roll = gui.add_slider("roll (°)", -180.0, 180.0, 1.0, 0.0, hint=f"About {about}.")
@@ -231,7 +219,7 @@ class InstrumentPanel:
             self.back = gui.add_button("back to the recording")
         for slider in self._joints.values():
             slider.on_update(self._joint_moved)
-        for control in (self.slide, self.roll, self.yaw, self.pitch, self.as_recorded):
+        for control in (self.slide, self.roll, self.yaw, self.pitch):
             control.on_update(self._moved)
         self.gizmo.on_update(self._gizmo_toggled)
         self.back.on_click(lambda _: self.reset())
@@ -239,7 +227,7 @@ class InstrumentPanel:
     def controls(self, pose: np.ndarray | None) -> InstrumentControls:
         """Values of the sliders; pose [4, 4]: of the gizmo, mm, or None without one."""
         joints = {}
-        if not self.as_recorded.value:
+        if not self._joints_as_recorded:
             for joint, slider in self._joints.items():
                 span = self._ranges[joint]
                 # a degree and back may lie a hair outside the limits
@@ -255,7 +243,7 @@ class InstrumentPanel:
 
     def follow(self, state: InstrumentState) -> None:
         """Show the recorded readings, unless the user has set others."""
-        if self.as_recorded.value:
+        if self._joints_as_recorded:
             for joint, slider in self._joints.items():
                 on_step = round(state.joints[joint] * self._per_unit[joint] / slider.step) * slider.step
                 shown = min(max(round(on_step, 6), slider.min), slider.max)
@@ -263,14 +251,14 @@ class InstrumentPanel:
                     slider.value = shown
 
     def straighten(self) -> None:
-        """Reset slide and turns: the pose they led to has become the one they start from."""
+        """Reset slide and turns, as when the pose they led to has become the one they start from."""
         for slider in (self.slide, self.roll, self.yaw, self.pitch):
             slider.value = 0.0
 
     def reset(self) -> None:
         """Be as recorded again."""
         self.straighten()
-        self.as_recorded.value = True
+        self._joints_as_recorded = True
         if self.gizmo.value:
             self.gizmo.value = False
             self._toggle_gizmo(False)
@@ -279,7 +267,7 @@ class InstrumentPanel:
     def _joint_moved(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is None:  # it followed the recording
             return
-        self.as_recorded.value = False
+        self._joints_as_recorded = False
         self._changed()
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:

@@ -190,8 +190,6 @@ class PosingSession:
             ],
             "done": len(answered),
             "sure": {name: [round(value, 1) for value in pair] for name, pair in posing.deviations().items()},
-            "breaks": len(posing.breaks),
-            "deviations": posing.rolls.deviations_deg.round(1).tolist(),
             "window": self._window(posing),
             "length": posing.shafts.working_length_mm,
             "radius": posing.shafts.diameter_mm / 2,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -50,7 +49,6 @@ class LoadedRun:
     """
 
     name: str
-    world: str  # the capture's folder, whose world frame the scene has
     scene: DrawableScene
     recorded: Recorded
     frames: tuple[Frame, ...]  # those of `recorded`, with their images; empty: the capture is not at hand
@@ -83,8 +81,9 @@ class LoadedRun:
         return joints, self.recorded.names, tuple(self.scene.label_names), bool(self.frames)
 
 
-class WatchedRun:
-    """Reads a run folder, and again when it has changed. Any thread may ask for what was read last."""
+class ViewedRun:
+    """The run that all browsers of a server share, read again when it has changed, and what is known of its frames.
+    Any thread may use it."""
 
     def __init__(self, path: Path, device: torch.device | None = None) -> None:
         """Raises NeecoError where `path` holds no scene, finished or not."""
@@ -93,10 +92,14 @@ class WatchedRun:
         self._stamp = self._current_stamp()
         self.loaded = self._load()  # replaced as a whole: a reader never sees half of a change
         self.trouble = ""
+        self.distance = self.loaded.distance  # mm
+        self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
+        self.timeline = Timeline(self.loaded)
+        self._ended = threading.Event()
 
     def refresh(self) -> bool:
-        """Read the run again if its files have changed; whether anything new was read. A run that cannot be read
-        stays as it was, and `trouble` says why."""
+        """Read the run again if its files have changed, and score its frames anew; whether anything new was read. A run
+        that cannot be read stays as it was, and `trouble` says why."""
         with self._refreshing:
             try:
                 stamp = self._current_stamp()
@@ -109,7 +112,35 @@ class WatchedRun:
                 self.trouble = str(error)
                 return False
             self.trouble = ""
+            self.timeline = Timeline(self.loaded)
+            score_frame.cache_clear()  # or it would hold the scenes of before
             return True
+
+    def watch(self, changed: Callable[[], None]) -> None:
+        """Look at the run folder from time to time, in a thread of its own, and call `changed` where it changed or can
+        no longer be read; until `end_watch`."""
+
+        def look() -> None:
+            while not self._ended.wait(WATCH_S):
+                trouble = self.trouble
+                if self.refresh() or trouble != self.trouble:
+                    changed()
+
+        threading.Thread(target=look, name="neeco-watcher", daemon=True).start()
+
+    def end_watch(self) -> None:
+        """Look at the run folder no more."""
+        self._ended.set()
+
+    def advance_timeline(self) -> bool:
+        """Score one more frame; False: all are."""
+        timeline = self.timeline
+        if timeline.done:
+            return False
+        # of a frame whose image cannot be read the status says so to whoever goes there
+        with timeline.loaded.scene.torch_threads(), contextlib.suppress(NeecoError):
+            timeline.advance()
+        return True
 
     def _current_stamp(self) -> tuple[str, int, int, int]:
         """File, its inode, time and size."""
@@ -150,7 +181,6 @@ class WatchedRun:
         )
         return LoadedRun(
             name=self.path.resolve().name,
-            world=str(config["capture"]),
             scene=scene,
             recorded=Recorded(names, splits, states, cameras, still=scene.recorded.still),
             frames=tuple(frames[k] for k in order) if frames else (),
@@ -196,50 +226,37 @@ def score_frame(loaded: LoadedRun, index: int) -> FrameScore:
 
 
 class Timeline:
-    """The PSNR of every frame of a recording, at no more than TIMELINE_WIDTH px, computed a frame at a time: first a
-    few from everywhere, then those between them. One thread computes; any may read."""
+    """The PSNR of every frame of a recording, at no more than TIMELINE_WIDTH px, computed a frame at a time. One thread
+    computes; any may read."""
 
     def __init__(self, loaded: LoadedRun) -> None:
         self.loaded = loaded
-        self._pending = spread_order(len(loaded.frames))[::-1]
-        self._psnr: dict[int, float] = {}
-        self._lock = threading.Lock()
+        self.psnr = np.full(len(loaded.frames), np.nan)  # dB; NaN: not known
+        self.count = 0  # frames that were looked at
 
     @property
     def done(self) -> bool:
         """Whether every frame is scored."""
-        return not self._pending
+        return self.count == len(self.psnr)
 
     def advance(self) -> None:
         """Score one more frame; one that cannot be read raises NeecoError and stays unknown."""
-        index = self._pending.pop()
-        value = coarse_psnr(self.loaded, index)
-        if math.isfinite(value):
-            with self._lock:
-                self._psnr[index] = value
+        self.count += 1
+        self.psnr[self.count - 1] = coarse_psnr(self.loaded, self.count - 1)
 
     @property
-    def count(self) -> int:
-        """Number of scored frames."""
-        return len(self._psnr)
+    def known(self) -> np.ndarray:
+        """Frames [K], rising, whose PSNR is known and finite."""
+        return np.flatnonzero(np.isfinite(self.psnr))
 
-    def known(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frames [K], rising, and their PSNR [K] in dB, as far as they are known."""
-        with self._lock:
-            frames = sorted(self._psnr)
-            return np.array(frames, np.int64), np.array([self._psnr[k] for k in frames], np.float64)
-
-    def worst(self) -> list[tuple[int, float]]:
-        """(frame, PSNR) of the worst known frames, worst first; of similar neighbours only the worst."""
-        frames, values = self.known()
-        apart = max(1, len(self.loaded.frames) // (4 * WORST))
-        chosen: list[tuple[int, float]] = []
-        for k in np.argsort(values, kind="stable"):
-            if all(abs(int(frames[k]) - other) >= apart for other, _ in chosen):
-                chosen.append((int(frames[k]), float(values[k])))
-            if len(chosen) == WORST:
-                break
-        return chosen
+    def worst(self) -> list[int]:
+        """The worst known frames, worst first; of similar neighbours only the worst."""
+        known, apart = self.known, max(1, len(self.psnr) // (4 * WORST))
+        chosen: list[int] = []
+        for frame in known[np.argsort(self.psnr[known], kind="stable")].tolist():
+            if all(abs(frame - other) >= apart for other in chosen):
+                chosen.append(frame)
+        return chosen[:WORST]
 
 
 @torch.no_grad()
@@ -259,56 +276,3 @@ def coarse_psnr(loaded: LoadedRun, index: int) -> float:
 def narrowed(camera: Camera, width: int) -> Camera:
     """Return the same view in an image at most `width` px wide."""
     return camera if camera.width <= width else camera.scaled(width / camera.width)
-
-
-def spread_order(count: int) -> list[int]:
-    """0 to count - 1 in bit-reversed order, so that any first few of them are from everywhere."""
-    bits = max(1, (count - 1).bit_length())
-    mirrored = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))
-    return [k for k in mirrored if k < count]
-
-
-class ViewedRun(WatchedRun):
-    """The run that all browsers of a server share, and what is known of its frames. Any thread may use it."""
-
-    def __init__(self, path: Path, device: torch.device | None = None) -> None:
-        """Raises NeecoError for a run folder without a scene."""
-        super().__init__(path, device)
-        self.distance = self.loaded.distance  # mm
-        self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
-        self.timeline = Timeline(self.loaded)
-        self._ended = threading.Event()
-
-    def refresh(self) -> bool:
-        """Read the run again if it has changed; whether it was. Its frames are scored anew."""
-        changed = super().refresh()
-        if changed:
-            self.timeline = Timeline(self.loaded)
-            score_frame.cache_clear()  # or it would hold the scenes of before
-        return changed
-
-    def watch(self, changed: Callable[[], None]) -> None:
-        """Look at the run folder from time to time, in a thread of its own, and call `changed` where it changed or can
-        no longer be read; until `end_watch`."""
-
-        def look() -> None:
-            while not self._ended.wait(WATCH_S):
-                trouble = self.trouble
-                if self.refresh() or trouble != self.trouble:
-                    changed()
-
-        threading.Thread(target=look, name="neeco-watcher", daemon=True).start()
-
-    def end_watch(self) -> None:
-        """Look at the run folder no more."""
-        self._ended.set()
-
-    def advance_timeline(self) -> bool:
-        """Score one more frame; False: all are."""
-        timeline = self.timeline
-        if timeline.done:
-            return False
-        # of a frame whose image cannot be read the status says so to whoever goes there
-        with timeline.loaded.scene.torch_threads(), contextlib.suppress(NeecoError):
-            timeline.advance()
-        return True

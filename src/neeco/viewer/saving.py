@@ -13,9 +13,9 @@ import torch
 from neeco.capture.model import State
 from neeco.capture.readers import StateLine, read_states
 from neeco.capture.writer import camera_to_json, state_to_json
-from neeco.files import LOCK_WAIT_S, own_folder, write_text
+from neeco.files import LOCK_WAIT_S, own_folder, read_text, write_text
 from neeco.labels.annotation import annotate
-from neeco.labels.drawing import draw_layers, to_numpy
+from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene.gaussian_scene import require_gaussians
 from neeco.synthesis.cameras import DrawnCameras
@@ -48,12 +48,10 @@ class SavedStates:
         NeecoError where the file cannot be written, or holds states of another scene."""
         line = json.dumps(state_to_json(state) | {"camera": camera_to_json(world_from_camera)}, allow_nan=False)
         with self._lock, own_folder(self.folder, wait_s=LOCK_WAIT_S):
-            return self._write([*self._lines(loaded), line])
-
-    def remove_last(self, loaded: LoadedRun) -> int:
-        """Take the last one out again; returns how many are left. Raises NeecoError."""
-        with self._lock, own_folder(self.folder, wait_s=LOCK_WAIT_S):
-            return self._write(self._lines(loaded)[:-1])
+            count = len(self.read(loaded))
+            before = read_text(self.states_path, "states").splitlines() if count else []
+            write_text(self.states_path, "".join(f"{entry}\n" for entry in [*before, line]))
+            return count + 1
 
     def read(self, loaded: LoadedRun) -> list[StateLine]:
         """Read the saved states, checked against the scene. Raises NeecoError."""
@@ -77,20 +75,3 @@ class SavedStates:
                 index += 1
             record = encoded_sample(index, drawing, labels).write(root)
         return root / record["image"]
-
-    def _lines(self, loaded: LoadedRun) -> list[str]:
-        """The lines that are there, of this scene's states."""
-        lines = []
-        for line in self.read(loaded):
-            entry = state_to_json(line.state)
-            if line.world_from_camera is not None:
-                entry["camera"] = camera_to_json(to_numpy(torch.from_numpy(line.world_from_camera)))
-            lines.append(json.dumps(entry, allow_nan=False))
-        return lines
-
-    def _write(self, lines: list[str]) -> int:
-        if lines:
-            write_text(self.states_path, "".join(f"{line}\n" for line in lines))
-        else:
-            self.states_path.unlink(missing_ok=True)
-        return len(lines)

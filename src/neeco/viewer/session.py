@@ -33,8 +33,7 @@ MIN_PX = 32
 MOVING_S, SHARP_S = 0.15, 0.4  # that rendering may take
 REMEMBERED = 3  # renderings; a single one that had to compute something first does not count
 JPEG_MOVING, JPEG_SHARP = 80, 92
-PLAYED_PER_S = 10.0  # frames, where the recording does not say how many were taken
-SLOWEST, FASTEST = 2.0, 30.0  # frames per second of `play`
+PLAYED_PER_S = 10.0  # frames of `play`
 STATUS_EVERY_S = 0.25  # while things move
 
 log = logging.getLogger(__name__)
@@ -203,7 +202,7 @@ class ClientSession:
         self._shape = 0.0  # of the window, width by height
         self._camera_frame = 0  # whose camera the window was sent to last
         self._followed: int | None = 0  # the frame that the camera went along to
-        self._set_dark(True)
+        client.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._loaded, self.overlays, self._panel = self._build(run.loaded)
         self._go_to(0)
         client.camera.on_update(lambda _: self._request())
@@ -243,15 +242,15 @@ class ClientSession:
         if not self._panel.play.value:
             self._played_at = None
             return None
-        per_s, frames = frames_per_s(self._loaded), len(self._loaded.recorded.states)
+        frames = len(self._loaded.recorded.states)
         if self._played_at is None:
             self._played_at = now
-        ahead = int((now - self._played_at) * per_s)
+        ahead = int((now - self._played_at) * PLAYED_PER_S)
         if ahead:
-            self._played_at += ahead / per_s
+            self._played_at += ahead / PLAYED_PER_S
             self._panel.frame.value = float((int(self._panel.place) + ahead) % frames)
             self._request()
-        return self._played_at + 1 / per_s
+        return self._played_at + 1 / PLAYED_PER_S
 
     def _build(self, loaded: LoadedRun) -> tuple[LoadedRun, Overlays, Panel]:
         """Return the run, and create overlays and panel for it."""
@@ -260,9 +259,7 @@ class ClientSession:
             go_to=self._go_to,
             toggle_gizmo=self._toggle_gizmo,
             save_state=self._save_state,
-            remove_state=self._remove_state,
             save_image=self._save_image,
-            dark=self._set_dark,
         )
         points = None if loaded.capture is None else loaded.capture.points
         overlays = Overlays(self._client, loaded.recorded.cameras, points, self._run.unit, self._go_to, self._request)
@@ -326,10 +323,6 @@ class ClientSession:
         saved, loaded = self._saved, self._loaded
         self._report(lambda: f"kept: {saved.add(loaded, self._state(), self._pose())} in {saved.states_path}")
 
-    def _remove_state(self) -> None:
-        saved, loaded = self._saved, self._loaded
-        self._report(lambda: f"kept: {saved.remove_last(loaded)} in {saved.states_path}")
-
     def _save_image(self) -> None:
         if self._saving:  # or a page that asks a thousand times would be served long after it has gone
             return
@@ -353,9 +346,6 @@ class ClientSession:
         except NeecoError as error:
             self._panel.saved.content = message_html(f"error: {error}")
 
-    def _set_dark(self, on: bool) -> None:
-        self._client.gui.configure_theme(dark_mode=on, show_logo=False, show_share_button=False)
-
     def _send(self, picture: Picture, sharp: bool) -> None:
         depth = None
         if self.overlays.shown:
@@ -377,11 +367,3 @@ class ClientSession:
             except NeecoError as error:
                 notes.append(str(error))
         self._panel.status.content = status_html(shown, seconds, "; ".join(notes))
-
-
-def frames_per_s(loaded: LoadedRun) -> float:
-    """Playback rate in frames per second: as recorded, between SLOWEST and FASTEST."""
-    times = [state.time for state in loaded.recorded.states]
-    if loaded.capture is None or not loaded.capture.timed or times[-1] <= times[0]:
-        return PLAYED_PER_S
-    return min(max((len(times) - 1) / (times[-1] - times[0]), SLOWEST), FASTEST)

@@ -3,43 +3,46 @@ const $ = id => document.getElementById(id);
 const STRIP = [-12, -6, -3, -1, 0, 1, 3, 6, 12];  // frames about the asked one
 const STEP = 2, LEAP = 10;  // degrees of a key
 const HINGE = 0.36, SHARE = 50;  // of the working length; percent: where lines begin
+const GONE = "neeco does not answer: is it still running?";
 const PIN = "#35b6ff", JAW = "#ff9a1f";
 
 let overview, frame, pose, shown, picture = null, hidden = false, ghost = null, ghosted = false, busy = false, skipped = new Set(), timer = null;
 const lines = { hinge: null, share: SHARE };
 
-async function ask(path, body) {
-  const options = body === undefined ? {} : { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
-  let answer, value;
-  try {
-    answer = await fetch(path, options);
-    value = await answer.json();
-  } catch (error) {
-    throw new Error("neeco does not answer: is it still running?");
-  }
-  if (!answer.ok) throw new Error(value.error || answer.statusText);
-  return value;
-}
+// one question after another over the web socket; answers come in their order
+const socket = new WebSocket(location.href.split("#")[0].replace("http", "ws")), waiting = [];
+const opened = new Promise(done => { socket.onopen = socket.onerror = done; });
+socket.onmessage = event => waiting.shift()(JSON.parse(event.data));
+socket.onclose = () => waiting.splice(0).forEach(done => done({ error: GONE }));
 
-const query = (index, more = "") => `?instrument=${encodeURIComponent(overview.instrument)}&index=${index}${more}`;
+async function ask(what, fields = {}) {
+  await opened;
+  if (socket.readyState !== WebSocket.OPEN) throw new Error(GONE);
+  socket.send(JSON.stringify({ ask: what, instrument: overview ? overview.instrument : "", ...fields }));
+  const answer = await new Promise(done => waiting.push(done));
+  if (answer.error) throw new Error(answer.error);
+  return answer;
+}
 
 function fail(error) {
   $("failed").textContent = error.message;
   $("failed").hidden = false;
 }
 
-function image(index) {
-  return new Promise((done, failed) => {
-    const loaded = new Image();
-    loaded.onload = () => done(loaded);
-    loaded.onerror = () => failed(new Error("the picture could not be loaded"));
-    loaded.src = "picture" + query(index);
-  });
+async function loadedImage(uri) {
+  const loaded = new Image();
+  loaded.src = uri;
+  await loaded.decode();
+  return loaded;
+}
+
+async function image(index, small = false) {
+  return loadedImage((await ask("picture", { index, small })).picture);
 }
 
 async function go(index, reason) {
   stop();
-  frame = await ask("frame" + query(index));
+  frame = await ask("frame", { index });
   pose = { roll: frame.roll.value, joints: {} };
   for (const [name, known] of Object.entries(frame.joints)) pose.joints[name] = known.value;
   picture = await image(index);
@@ -60,12 +63,7 @@ async function haunt() {
   haunting = true;
   while (wished) {
     wished = false;
-    const state = encodeURIComponent(JSON.stringify(pose)), loaded = new Image();
-    await new Promise(done => {
-      loaded.onload = loaded.onerror = done;
-      loaded.src = "ghost" + query(frame.index, `&state=${state}`);
-    });
-    ghost = loaded.naturalWidth ? loaded : null;
+    ghost = await ask("ghost", { index: frame.index, ...pose }).then(answer => loadedImage(answer.picture)).catch(() => null);
     draw();
   }
   haunting = false;
@@ -183,13 +181,12 @@ function turn(what, degrees) {
 function strip() {
   const indices = STRIP.map(step => frame.index + step).filter(index => index >= 0 && index < overview.frames);
   $("strip").replaceChildren(...indices.map(index => {
-    const figure = document.createElement("figure"), small = document.createElement("img"), caption = document.createElement("figcaption");
-    small.src = "picture" + query(index, "&small=1");
-    small.alt = `frame ${index}`;
+    const figure = document.createElement("figure"), caption = document.createElement("figcaption");
+    image(index, true).then(small => figure.prepend(Object.assign(small, { alt: `frame ${index}` }))).catch(fail);
     const apart = index - frame.index;
     caption.textContent = apart ? (apart > 0 ? `+${apart}` : `${apart}`) : "this frame";
     figure.dataset.index = index;
-    figure.append(small, caption);
+    figure.append(caption);
     figure.onclick = () => show(index);
     return figure;
   }));
@@ -241,16 +238,6 @@ function report() {
     rows.push(term, text);
   }
   $("sure").replaceChildren(...rows);
-  const context = $("doubt").getContext("2d"), { width, height } = $("doubt");
-  context.clearRect(0, 0, width, height);
-  const style = getComputedStyle(document.documentElement), most = 40;
-  overview.deviations.forEach((value, index) => {
-    const tall = overview.done ? Math.min(1, value / most) * height : height, wide = width / overview.frames;
-    context.fillStyle = style.getPropertyValue("--line");
-    context.fillRect(index * wide, height - tall, wide + 0.5, tall);
-  });
-  context.fillStyle = style.getPropertyValue("--accent");
-  for (const item of overview.answered) context.fillRect(item.frame / overview.frames * width - 1.5, 0, 3, height);
   $("answers").replaceChildren(...overview.answered.map(item => {
     const row = document.createElement("li");
     const joints = Object.entries(item.joints).map(([name, value]) => `, ${name} ${Math.round(value)}°`).join("");
@@ -274,7 +261,7 @@ async function act(work) {
 const save = () => act(async () => {
   say("saving");
   const name = frame.name;
-  overview = await ask("save", { instrument: overview.instrument, frame: frame.index, roll: pose.roll, joints: pose.joints });
+  overview = await ask("save", { index: frame.index, ...pose });
   skipped.clear();
   report();
   say(overview.said.length ? `${name} is saved, but its ${overview.said.join("; ")}. Undo to look again.` : `${name} is saved.`, overview.said.length);
@@ -288,7 +275,7 @@ const skip = () => act(async () => {
 });
 
 const undo = () => act(async () => {
-  overview = await ask("undo", { instrument: overview.instrument });
+  overview = await ask("undo");
   report();
   if (overview.frame === null) return;
   say("the last answer is gone");
