@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-from forked import TESTS, Child, hasten_ingest, import_modules, module_at
+from forked import DRAW, TESTS, Child, hasten_ingest, import_modules, module_at
 
 STEPS = 40
 FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")
@@ -23,7 +23,6 @@ class Verb:
     shelf: Path
     touched: Path | None = None
     resume: tuple[str, ...] = ()
-    workers: bool = False
 
     @property
     def output(self) -> Path:
@@ -66,7 +65,7 @@ def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
     settings = ("--iterations", str(STEPS), "--set", "density_start=10", "--set", "max_tissue_gaussians=200")
     settings += ("--set", "log_interval=5", "--set", "checkpoint_interval=20")
     train = ("train", str(capture), *settings)
-    if {"synthesize", "annotate", "workers"} & set(names):
+    if {"synthesize", "annotate"} & set(names):
         ended = Child((*train, "--output", str(run)), work).wait()
         assert ended.status == 0, ended.told
     recording = work / "recording"
@@ -82,23 +81,10 @@ def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
         shelf.mkdir()
         return Verb(name, (*words, "--output", str(shelf / "out")), shelf, **more)  # type: ignore[arg-type]
 
-    draw = (
-        "synthesize",
-        str(run),
-        "--no-tissue-check",
-        "--min-share",
-        "0",
-        "--max-unobserved",
-        "1",
-        "--force",
-        "--count",
-    )
-    made = {
+    synthesize = ("synthesize", str(run), *DRAW, "--count", "8", "--formats", *FORMATS)
+    made: dict[str, Callable[[], Verb]] = {
         "train": lambda: verb("train", *train, touched=image, resume=("--resume",)),
-        "synthesize": lambda: verb(
-            "synthesize", *draw, "8", "--formats", *FORMATS, touched=run / "scene.safetensors", resume=("--resume",)
-        ),
-        "workers": lambda: verb("workers", *draw, "10", "--workers", "2", resume=("--resume",), workers=True),
+        "synthesize": lambda: verb("synthesize", *synthesize, touched=run / "scene.safetensors", resume=("--resume",)),
         "annotate": lambda: verb(
             "annotate", "annotate", str(run), "--min-trust", "0", "--force", touched=image, resume=("--resume",)
         ),
