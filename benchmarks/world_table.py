@@ -1,8 +1,8 @@
-"""What builds do on worlds: scores of each, paired differences with intervals, strata; as a table and as pictures."""
+"""What builds do on worlds: scores of each, paired differences with intervals; as a table and as pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -152,37 +152,6 @@ def _parts_of(result: Result) -> float | None:
     found = [rows["part_iou"].get(part) for rows in splits for part in PARTS if rows.get("part_iou")]
     known = [iou for iou in found if iou is not None]
     return float(np.mean(known)) if known else None
-
-
-STRATA: dict[str, Callable[[dict[str, Any]], str]] = {
-    "shaft": lambda world: world["finish"],
-    "background": lambda world: world["background"],
-    "dark shaft over": lambda world: world["background"] if world["finish"] in ("black", "dark grey") else "",
-    "frames": lambda world: f"{world['frames']:3d}",
-    "states": lambda world: world["states"],
-    "links": lambda world: f"{world['kind']}, links {world['links'] if world['joints'] else 'without joints'}",
-    "scope": lambda world: world["scope"],
-    "scale": lambda world: str(world["scale"]),
-}
-
-
-def strata_of(by_build: dict[str, list[Result]]) -> str:
-    """Markdown: mean IoU and failures of each build, by what was drawn."""
-    lines = [f"| | worlds | {' | '.join(by_build)} |", f"|---|---|{'---|' * len(by_build)}"]
-    for title, key in STRATA.items():
-        groups: dict[str, list[int]] = {}
-        for row, result in enumerate(next(iter(by_build.values()))):
-            if name := key(result["world"]):
-                groups.setdefault(name, []).append(row)
-        for name in sorted(groups):
-            rows = groups[name]
-            cells = []
-            for results in by_build.values():
-                here = [results[row] for row in rows]
-                failed = sum(map(has_failed, here))
-                cells.append(f"{np.mean([iou_of(r) for r in here]):.3f}" + (f", {failed} failed" if failed else ""))
-            lines.append(f"| {title}: {name.strip()} | {len(rows)} | {' | '.join(cells)} |")
-    return "\n".join(lines)
 
 
 def worst_of(results: Sequence[Result], count: int) -> str:

@@ -16,7 +16,7 @@ writes DIR/table.md: per build the label IoU with aligned poses (mean of the spl
 the worst tenth of the worlds; a refused run counts 0), failures (IoU below .80 or recall on shafts below .90), silent
 ones (neither refused nor called doubtful), false alarms (doubts about runs of IoU above .90), paired differences of IoU
 against the first build (95 % intervals, worlds resampled), errors of right states over their stated standard deviations
-(rms; near 1 is right), CPU seconds of training, peak memory; the same by strata; the worst worlds, each with a picture
+(rms; near 1 is right), CPU seconds of training, peak memory; the worst worlds, each with a picture
 (outline of the truth green, of the label magenta). --quick trains 1,000 iterations of worlds at 192x144.
 
 `ablate` runs --quick: a build as it is, and less each mechanism (or those of `--without`), each on the first --worlds
@@ -39,7 +39,7 @@ import torch
 from rendered.draws import draw_world
 from rendered.world_capture import write_world
 from world_runs import ROOT, WITHOUT, builds_of, capture_path, result_path, run_all, run_path, worlds_of
-from world_table import Result, ablations_of, pictures_of, strata_of, table_of, worst_of
+from world_table import Result, ablations_of, pictures_of, table_of, worst_of
 
 from neeco.errors import NeecoError
 from neeco.files import read_json, write_text
@@ -124,7 +124,7 @@ def write_table(titles: list[str], seeds: range, work: Path) -> None:
     if not done:
         raise NeecoError(f"{work}: no world has a result of every build yet; call `run` first")
     by_build = {title: [read_json(result_path(work, title, seed)) for seed in done] for title in titles}
-    text = [f"{len(done)} worlds from seed {seeds.start}", table_of(by_build), strata_of(by_build)]
+    text = [f"{len(done)} worlds from seed {seeds.start}", table_of(by_build)]
     for title, results in by_build.items():
         text.append(f"Worst worlds of {title}:\n\n{worst_of(results, WORST)}")
     write_text(work / "table.md", "\n\n".join(text) + "\n")
