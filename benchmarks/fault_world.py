@@ -16,12 +16,11 @@ FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")
 
 @dataclass(frozen=True)
 class Verb:
-    """A command on small data. `shelf`: the folder that its output lies in; `touched`: a file of its capture."""
+    """A command on small data. `shelf`: the folder that its output lies in."""
 
     name: str
     words: tuple[str, ...]
     shelf: Path
-    touched: Path | None = None
     resume: tuple[str, ...] = ()
 
     @property
@@ -74,7 +73,6 @@ def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
     recorded = world.Recorded(world.World(recording))
     recorded.frames = 14
     recorded.write()
-    image = capture / "images" / "000003.png"
 
     def verb(name: str, *words: str, **more: object) -> Verb:
         shelf = work / f"shelf-{name}"
@@ -83,14 +81,10 @@ def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
 
     synthesize = ("synthesize", str(run), *DRAW, "--count", "8", "--formats", *FORMATS)
     made: dict[str, Callable[[], Verb]] = {
-        "train": lambda: verb("train", *train, touched=image, resume=("--resume",)),
-        "synthesize": lambda: verb("synthesize", *synthesize, touched=run / "scene.safetensors", resume=("--resume",)),
-        "annotate": lambda: verb(
-            "annotate", "annotate", str(run), "--min-trust", "0", "--force", touched=image, resume=("--resume",)
-        ),
-        "compare": lambda: verb(
-            "compare", "compare", str(capture), "--methods", "3dgs", "kinematic", *settings[:2], touched=image
-        ),
+        "train": lambda: verb("train", *train, resume=("--resume",)),
+        "synthesize": lambda: verb("synthesize", *synthesize, resume=("--resume",)),
+        "annotate": lambda: verb("annotate", "annotate", str(run), "--min-trust", "0", "--force", resume=("--resume",)),
+        "compare": lambda: verb("compare", "compare", str(capture), "--methods", "3dgs", "kinematic", *settings[:2]),
         "ingest": lambda: verb("ingest", "ingest", str(recording / "recording.yaml")),
     }
     return [made[name]() for name in names]

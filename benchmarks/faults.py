@@ -8,9 +8,9 @@ each file there that is not a temporary one by its name must be whole; then the 
 where it has one) and must end in the files that an undisturbed run writes, byte for byte, with no temporary one left
 beside them. The clocks that durations are taken from stand still, so that no file has to be left out of this.
 
-Then the other faults, for every verb: a full disk (RLIMIT_FSIZE), an I/O error (a failing fsync), a capture that
-changes between kill and resumption, two processes at once on one output. Each must end in exit status 1 and one line on
-stderr, or in the same files, and lose nothing. Exit status 1 where anything did.
+Then the other faults, for every verb: a full disk (RLIMIT_FSIZE), an I/O error (a failing fsync), two processes at once
+on one output. Each must end in exit status 1 and one line on stderr, or in the same files, and lose nothing. Exit
+status 1 where anything did.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from pathlib import Path
 
 from fault_world import Verb, make_verbs, prepare
 from forked import Child, Ended
-from PIL import Image
 from whole_files import clear, differences, digests, half_files
 
 LAST = 0.34  # share of kills in the last tenth
@@ -193,29 +192,6 @@ def input_output_error(verb: Verb, whole: Undisturbed, work: Path, pick: random.
     return refused(Child(verb.words, work, begin).wait(), verb.shelf) + resumed(verb, whole, work)
 
 
-def changed_capture(verb: Verb, whole: Undisturbed, work: Path, pick: random.Random) -> list[str]:
-    """What it reads is another one when it goes on; then it is as it was."""
-    if verb.touched is None:
-        return []
-    clear(verb.shelf)
-    ended = Child(verb.words, work, counting(verb.shelf, round(pick.uniform(0.6, 0.9) * whole.operations))).wait()
-    assert ended.status == -signal.SIGKILL
-    content = verb.touched.read_bytes()
-    if verb.touched.suffix == ".png":
-        Image.new("RGB", Image.open(verb.touched).size, (10, 200, 30)).save(verb.touched)
-    else:
-        verb.touched.write_bytes(content.replace(b'"cx"', b'"cy"')[:-4] + b"\0\0\0\1")
-    before = digests(verb.shelf)
-    try:
-        ended = Child([*verb.words, *verb.resume], work).wait()
-        found = [complaint] if (complaint := ended.in_one_line()) else []
-        now = {name: digest for name, digest in digests(verb.shelf).items() if name in before}
-        found += [f"changed by a refusal: {name}" for name in now if now[name] != before[name]]
-    finally:
-        verb.touched.write_bytes(content)
-    return found + resumed(verb, whole, work)
-
-
 def holds_a_lock(pid: int) -> bool:
     """Whether a process has locked a file; one that is only there may not be locked yet."""
     return any(f" {pid} " in line and "FLOCK" in line for line in Path("/proc/locks").read_text().splitlines())
@@ -241,7 +217,6 @@ def two_at_once(verb: Verb, whole: Undisturbed, work: Path, pick: random.Random)
 FAULTS = {
     "full-disk": full_disk,
     "input-output-error": input_output_error,
-    "changed-capture": changed_capture,
     "two-at-once": two_at_once,
 }
 
