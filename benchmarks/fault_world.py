@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-from forked import TESTS, Child, hasten_ingest, import_modules, module_at
+from forked import DRAW, TESTS, Child, hasten_ingest, import_modules, module_at
 
 STEPS = 40
 FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")
@@ -16,14 +16,12 @@ FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")
 
 @dataclass(frozen=True)
 class Verb:
-    """A command on small data. `shelf`: the folder that its output lies in; `touched`: a file of its capture."""
+    """A command on small data. `shelf`: the folder that its output lies in."""
 
     name: str
     words: tuple[str, ...]
     shelf: Path
-    touched: Path | None = None
     resume: tuple[str, ...] = ()
-    workers: bool = False
 
     @property
     def output(self) -> Path:
@@ -66,7 +64,7 @@ def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
     settings = ("--iterations", str(STEPS), "--set", "density_start=10", "--set", "max_tissue_gaussians=200")
     settings += ("--set", "log_interval=5", "--set", "checkpoint_interval=20")
     train = ("train", str(capture), *settings)
-    if {"synthesize", "annotate", "workers"} & set(names):
+    if {"synthesize", "annotate"} & set(names):
         ended = Child((*train, "--output", str(run)), work).wait()
         assert ended.status == 0, ended.told
     recording = work / "recording"
@@ -75,36 +73,18 @@ def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
     recorded = world.Recorded(world.World(recording))
     recorded.frames = 14
     recorded.write()
-    image = capture / "images" / "000003.png"
 
     def verb(name: str, *words: str, **more: object) -> Verb:
         shelf = work / f"shelf-{name}"
         shelf.mkdir()
         return Verb(name, (*words, "--output", str(shelf / "out")), shelf, **more)  # type: ignore[arg-type]
 
-    draw = (
-        "synthesize",
-        str(run),
-        "--no-tissue-check",
-        "--min-share",
-        "0",
-        "--max-unobserved",
-        "1",
-        "--force",
-        "--count",
-    )
-    made = {
-        "train": lambda: verb("train", *train, touched=image, resume=("--resume",)),
-        "synthesize": lambda: verb(
-            "synthesize", *draw, "8", "--formats", *FORMATS, touched=run / "scene.safetensors", resume=("--resume",)
-        ),
-        "workers": lambda: verb("workers", *draw, "10", "--workers", "2", resume=("--resume",), workers=True),
-        "annotate": lambda: verb(
-            "annotate", "annotate", str(run), "--min-trust", "0", "--force", touched=image, resume=("--resume",)
-        ),
-        "compare": lambda: verb(
-            "compare", "compare", str(capture), "--methods", "3dgs", "kinematic", *settings[:2], touched=image
-        ),
+    synthesize = ("synthesize", str(run), *DRAW, "--count", "8", "--formats", *FORMATS)
+    made: dict[str, Callable[[], Verb]] = {
+        "train": lambda: verb("train", *train, resume=("--resume",)),
+        "synthesize": lambda: verb("synthesize", *synthesize, resume=("--resume",)),
+        "annotate": lambda: verb("annotate", "annotate", str(run), "--min-trust", "0", "--force", resume=("--resume",)),
+        "compare": lambda: verb("compare", "compare", str(capture), "--methods", "3dgs", "kinematic", *settings[:2]),
         "ingest": lambda: verb("ingest", "ingest", str(recording / "recording.yaml")),
     }
     return [made[name]() for name in names]

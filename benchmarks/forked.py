@@ -5,17 +5,23 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
+import pkgutil
 import resource
 import signal
 import sys
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
-TESTS = Path(__file__).resolve().parents[1] / "tests"
+from neeco.cli import VERBS
+
+ROOT = Path(__file__).resolve().parents[1]
+TESTS, SOURCE = ROOT / "tests", ROOT / "src" / "neeco"
+DRAW = ("--no-tissue-check", "--min-share", "0", "--max-unobserved", "1", "--force")  # of a run of 20 iterations
 NO_PROGRESS = ("Traceback", "Warning", "neeco: error")  # words of lines that tell of no progress
 
 
@@ -126,40 +132,12 @@ def module_at(path: Path, name: str = "") -> ModuleType:
 
 def import_modules() -> None:
     """Import what the verbs use, most of which they import only when they run, once for all children."""
-    for verb in (
-        "check",
-        "train",
-        "evaluate",
-        "render",
-        "synthesize",
-        "annotate",
-        "view",
-        "export",
-        "score_masks",
-        "compare",
-    ):
-        importlib.import_module(f"neeco.cli.{verb}")
-    for module in (
-        "rich.progress",
-        "neeco.studies.sweep",
-        "neeco.studies.downstream.experiment",
-        "neeco.ingest.pipeline",
-        "neeco.ingest.convert",
-        "neeco.report.run_page",
-        "neeco.report.sweep_page",
-        "neeco.report.downstream_page",
-        "neeco.report.ingest_page",
-        "neeco.synthesis.annotated",
-        "neeco.synthesis.dataset",
-        "neeco.synthesis.rendered_views",
-        "neeco.viewer.export",
-        "neeco.viewer.splats",
-        "neeco.evaluation.mask_scores",
-        "neeco.report",
-        "matplotlib.pyplot",
-        "av",
-    ):
-        importlib.import_module(module)
+    for verb in VERBS:
+        importlib.import_module(f"neeco.cli.{verb.replace('-', '_')}")
+    for package in ("ingest", "report", "studies", "synthesis"):
+        for module in pkgutil.walk_packages([str(SOURCE / package)], f"neeco.{package}."):
+            with suppress(ImportError):  # of extras that are not installed
+                importlib.import_module(module.name)
 
 
 def hasten_ingest() -> None:

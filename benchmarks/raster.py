@@ -1,4 +1,4 @@
-"""Times rendering on a CPU: stages, forward, forward + backward, and the arithmetic floor of compositing.
+"""Times rendering on a CPU: stages, forward, forward + backward.
 
 python benchmarks/raster.py [--threads N] [--repeats N]
 """
@@ -20,7 +20,6 @@ from neeco.raster.cpu_backend import last_statistics
 from neeco.raster.losses import photometric_loss
 from neeco.raster.native import keep_freed_memory, set_threads, simd
 from neeco.raster.optimizer import adam_step
-from neeco.raster.reference import camera_from_world, project
 
 WORKLOADS = {
     "20k, 256x192": (20_000, 256, 192),
@@ -28,7 +27,6 @@ WORKLOADS = {
     "300k, 960x540": (300_000, 960, 540),
 }
 STAGES = ("project", "bin", "composite", "composite_backward", "project_backward")
-FLOPS_FORWARD, FLOPS_BACKWARD = 35, 60  # per Gaussian and pixel, 4 composited values
 Timings = dict[str, list[float]]
 
 
@@ -81,29 +79,6 @@ class Runner:
             timings[stage].append(value)
 
 
-def peak_flops(threads: int) -> float:
-    """Floating-point operations a second that this machine reaches, by a matrix product in cache."""
-    torch.set_num_threads(threads)
-    a = torch.rand(512, 512)
-    times = []
-    for _ in range(20):
-        start = time.perf_counter()
-        a @ a
-        times.append(time.perf_counter() - start)
-    return 2 * 512**3 / min(times)
-
-
-def blended_pairs(gaussians: Gaussians, camera: Camera) -> float:
-    """Gaussians with alpha >= 1/255 summed over pixels, from the areas of their ellipses (what is hidden included)."""
-    rotation, translation = camera_from_world(camera.world_from_camera)
-    camera_means = gaussians.means @ rotation.T + translation
-    projection = project(gaussians, camera, camera_means, rotation, torch.zeros(len(gaussians), 2))
-    x, y = projection.centers.unbind(-1)
-    inside = (projection.depths > 0) & (x > 0) & (x < camera.width) & (y > 0) & (y < camera.height)
-    squared_reach = 2 * torch.log(255 * gaussians.opacities).clamp(min=0)
-    return float((math.pi * squared_reach * torch.linalg.det(projection.covariances).sqrt())[inside].sum())
-
-
 def median_of(call: Callable[[], object], repeats: int) -> float:
     times = []
     for _ in range(repeats):
@@ -113,7 +88,7 @@ def median_of(call: Callable[[], object], repeats: int) -> float:
     return statistics.median(times)
 
 
-def run_workload(name: str, arguments: argparse.Namespace, flops: float) -> None:
+def run_workload(name: str, arguments: argparse.Namespace) -> None:
     count, width, height = WORKLOADS[name]
     gaussians, camera = make_surface(count, width, height, arguments.sh)
     g = torch.Generator().manual_seed(1)
@@ -130,11 +105,6 @@ def run_workload(name: str, arguments: argparse.Namespace, flops: float) -> None
     print(f"\n{name}, SH {arguments.sh}: ms, median of {arguments.repeats} ({drawn})")
     print("  " + "  ".join(f"{stage} {median[stage]:.1f}" for stage in STAGES))
     print(f"  forward {median['forward']:.1f}, forward+backward {median['forward+backward']:.1f}")
-    work = blended_pairs(gaussians, camera)
-    floors = [work * each / flops * 1e3 for each in (FLOPS_FORWARD, FLOPS_BACKWARD)]
-    print(
-        f"  floor of compositing at {flops / 1e9:.0f} GF/s, hidden Gaussians counted: {floors[0]:.1f}, {floors[1]:.1f}"
-    )
 
 
 def run_training_kernels(repeats: int) -> None:
@@ -156,10 +126,9 @@ def main() -> None:
     arguments = parser.parse_args()
     set_threads(arguments.threads)
     keep_freed_memory()  # as training does
-    flops = peak_flops(arguments.threads)
     print(f"{simd()}, {arguments.threads} threads")
     for name in arguments.workload or WORKLOADS:
-        run_workload(name, arguments, flops)
+        run_workload(name, arguments)
     run_training_kernels(arguments.repeats)
 
 

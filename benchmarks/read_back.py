@@ -4,8 +4,8 @@
     python benchmarks/read_back.py DATASET
 
 One line per format and tool; exit status 1 where any of them reads something else than was written. Needs NumPy, Pillow
-and PyYAML, and of the tools whichever are to read (pip install pycocotools datumaro webdataset datasets ultralytics;
-bop_toolkit from its repository), in an environment of its own: neeco itself is not needed. A tool that is not installed
+and PyYAML, and of the tools whichever are to read (pip install pycocotools webdataset datasets; bop_toolkit from its
+repository), in an environment of its own: neeco itself is not needed. A tool that is not installed
 is said so.
 """
 
@@ -79,39 +79,8 @@ def _of(coco: Any, annotation: dict[str, Any], parts: np.ndarray, ids: dict[int,
     return np.isin(parts, [number for number, part in ids.items() if part.startswith(f"{name}/")])
 
 
-def read_datumaro(root: Path) -> str:
-    """Both splits with all images and instruments."""
-    import datumaro
-
-    found = datumaro.Dataset.import_from(str(root / "coco"), "coco")
-    counts = {name: len(subset) for name, subset in found.subsets().items()}
-    require(counts == document(root / "dataset.json")["splits"], f"its splits are {counts}")
-    for item in found:
-        require(
-            np.array_equal(item.media.data[..., ::-1], pixels(root / "images" / Path(item.media.path).name)), item.id
-        )
-    return ", ".join(f"{count} {name}" for name, count in counts.items())
-
-
-def read_ultralytics(root: Path) -> str:
-    """Its own check of every image and label file, for all tasks."""
-    from ultralytics.data.utils import check_det_dataset, verify_image_label
-
-    count = 0
-    for variant in (name for name in VARIANTS if (root / "yolo" / name / "data.yaml").is_file()):
-        data = check_det_dataset(str(root / "yolo" / variant / "data.yaml"), autodownload=False)
-        points = data.get("kpt_shape", (0, 0)) if variant == "pose" else (0, 0)
-        for image, label in _yolo_files(root / "yolo" / variant):
-            found = verify_image_label(
-                (str(image), str(label), "", variant == "pose", len(data["names"]), *points, False)
-            )
-            require(found[0] and not found[5] and not found[9], f"{label}: {found[9] or 'is missing'}")
-            count += 1
-    return f"{count} label files"
-
-
 def read_yolo_rules(root: Path) -> str:
-    """What its checker asks for, restated: columns, ranges, classes, and a label file of every image."""
+    """What ultralytics' checker asks for, restated: columns, ranges, classes, and a label file of every image."""
     count = 0
     for variant in (name for name in VARIANTS if (root / "yolo" / name / "data.yaml").is_file()):
         data = yaml.safe_load((root / "yolo" / variant / "data.yaml").read_text())
@@ -220,8 +189,6 @@ def _bop_box(mask: np.ndarray) -> list[int]:
 
 READERS: dict[tuple[str, str], Callable[[Path], str]] = {
     ("coco", "pycocotools"): read_pycocotools,
-    ("coco", "datumaro"): read_datumaro,
-    ("yolo", "ultralytics"): read_ultralytics,
     ("yolo", "its rules"): read_yolo_rules,
     ("webdataset", "webdataset"): read_webdataset,
     ("imagefolder", "datasets"): read_datasets,

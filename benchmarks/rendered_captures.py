@@ -1,12 +1,11 @@
 """Renders named captures with exact truth: other organs and instruments than the samples.
 
-    python benchmarks/rendered_captures.py NAME OUT [--size WxH] [--every N] [--workers N]
-        [--still] [--video] [--exact] [--frames N]
+    python benchmarks/rendered_captures.py NAME OUT [--size WxH] [--every N] [--still] [--video] [--exact] [--frames N]
 
 Writes a complete `neeco-capture/1` folder of 275 frames: images, `transforms.json` and `sparse.ply` with the errors
 that a tracker, structure from motion and a jaw sensor make, and `truth/` (part masks, masks of tissue that the
 instrument's shadow darkens by more than 15 %, depth, exact `transforms.json`, `hinge.json` or `kinematics.json`). The
-same command gives the same pixels on the same machine, with any number of workers.
+same command gives the same pixels on the same machine.
 
 How it works (`rendered/`): the organ is a height field with procedural colour (`tissue.py`, `noise.py`), the instrument
 a distance function (`instrument.py`, `wristed.py`); rays meet both, 2 x 2 a pixel, lit by lamps beside the lens
@@ -53,7 +52,6 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
     parser.add_argument("output", type=Path)
     parser.add_argument("--size", type=_lens, default=Lens(), metavar="WxH", help="of the images (320x256)")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="keep one frame in so many")
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that render")
     parser.add_argument("--still", action="store_true", help="the scope stands still in the middle of its path")
     parser.add_argument("--video", action="store_true", help="also recording/: video and logs for `neeco ingest`")
     parser.add_argument("--exact", action="store_true", help="cameras, poses and readings without errors")
@@ -78,7 +76,6 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
         frames=arguments.frames,
         video=arguments.video,
         still=arguments.still,
-        workers=arguments.workers,
     )
     if arguments.still:
         spec = spec.with_still_camera()

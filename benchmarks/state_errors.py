@@ -16,8 +16,6 @@ training frames are chosen evenly, all others stay.
     --outliers SHARE so many training states are wrong altogether: in turn mirrored in the view (depth, and the sign of
                      what bends) and exchanged with another frame's. OUT/truth/outliers.json names them
     --stated         write these standard deviations as the states' `uncertainty`
-    --kinematics FILE, --points FILE.ply
-                     links and sparse points of a capture that has none
     --seed N
 """
 
@@ -41,11 +39,9 @@ from neeco.capture import (
     KinematicTree,
     Uncertainty,
     evenly_spaced,
-    kinematics_of,
     read_capture,
     write_capture,
 )
-from neeco.capture.points import read_ply
 from neeco.errors import NeecoError
 from neeco.files import read_json, write_json
 from neeco.geometry.trocar import ShaftLine, line_through_trocar
@@ -64,15 +60,13 @@ def main() -> int:
     parser.add_argument("--smooth", type=float, default=0.0, metavar="S")
     parser.add_argument("--outliers", type=float, default=0.0, metavar="SHARE")
     parser.add_argument("--stated", action="store_true")
-    parser.add_argument("--kinematics", type=Path)
-    parser.add_argument("--points", type=Path)
     parser.add_argument("--seed", type=int, default=0)
     words = parser.parse_args()
     sizes = (0.0,) * 5 if words.errors is None else tuple(words.errors or USUAL)
     if len(sizes) != 5:
         parser.error("--errors: give none, or five numbers: tilt, roll, across, depth, joints")
     rng = np.random.default_rng(words.seed)
-    capture = with_links(with_true_states(read_capture(words.capture)), words.kinematics, words.points)
+    capture = with_true_states(read_capture(words.capture))
     capture = with_errors(thinned(capture, words.frames), sizes, words.smooth, words.stated, rng)
     capture, wrong = with_outliers(capture, words.outliers, rng)
     write_capture(capture, words.output)
@@ -111,15 +105,6 @@ def with_true_states(capture: Capture) -> Capture:
         frames.append(replace(frame, camera=camera, state=replace(frame.state, instruments=true[frame.name])))
     places = {tuple(frame.camera.world_from_camera.flatten().tolist()) for frame in frames}
     return replace(capture, frames=tuple(frames), registered=True, still=capture.still or len(places) == 1)
-
-
-def with_links(capture: Capture, kinematics: Path | None, points: Path | None) -> Capture:
-    """The capture with links of a file, {"links": …}, and points of another, where these are given."""
-    if kinematics is not None:
-        (only,) = capture.instruments
-        tree = kinematics_of(read_json(kinematics), str(kinematics))
-        capture = replace(capture, instruments=(replace(only, kinematics=tree),))
-    return capture if points is None else replace(capture, points=read_ply(points))
 
 
 def thinned(capture: Capture, count: int | None) -> Capture:

@@ -14,7 +14,7 @@ fits best (a larger instrument farther away). Prints a row per instrument, root 
     / sd             errors over the standard deviations that the run states, near 1 if right: of turns, shifts,
                      joints
 
-and with --frames a line per frame. Frames of truth/outliers.json have a row of their own.
+Frames of truth/outliers.json have a row of their own.
 """
 
 from __future__ import annotations
@@ -53,12 +53,11 @@ def main() -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("paths", nargs="+", type=Path)
-    parser.add_argument("--frames", action="store_true")
     words = parser.parse_args()
     for path in words.paths:
         found = of_run(path) if (path / "config.yaml").exists() else of_capture(path)
         for instrument in found.capture.instruments:
-            print_rows(path.name, found, instrument, words.frames)
+            print_rows(path.name, found, instrument)
     return 0
 
 
@@ -101,7 +100,7 @@ def of_run(path: Path) -> States:
         return States(capture, states, sds)
 
 
-def print_rows(title: str, found: States, instrument: Instrument, each: bool) -> None:
+def print_rows(title: str, found: States, instrument: Instrument) -> None:
     """Print the table's rows of one instrument."""
     capture, errors = found.capture, errors_of(found, instrument)
     frames, file = capture.split("train"), capture.root / "truth" / "outliers.json"
@@ -126,9 +125,6 @@ def print_rows(title: str, found: States, instrument: Instrument, each: bool) ->
             parts = (over[:, :3], over[:, 3:6], over[:, 6:])
             shown += "; / sd " + " ".join(f"{rms(part[np.isfinite(part)]):.2f}" for part in parts)
         print(f"{title} {instrument.name}{kind} ({int(rows.sum())} frames): {shown}")
-    for k, frame in enumerate(frames) if each else ():
-        numbers = (*errors.shifts[k], *tilt[k], roll[k], *(errors.values[k] * units))
-        print(f"  {frame.name} {' '.join(f'{n:7.2f}' for n in numbers)}{' wrong' if wrong[k] else ''}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,10 +3,9 @@
     python benchmarks/tracking.py footage CAPTURE OUT [--splits test unseen] [--every N] [--from N] [--count N]
         [--first-state]
     python benchmarks/tracking.py score RUN CAPTURE TRACKED
-    python benchmarks/tracking.py single RUN CAPTURE [--splits test] [--every N]
 
 `footage` makes a capture of CAPTURE's images and cameras whose instruments' states are withheld (`--first-state`: all
-but that of the first frame). `single` finds the state in each frame for itself, nothing known before.
+but that of the first frame).
 `score` compares TRACKED, what `neeco track RUN OUT` made of it, with CAPTURE's truth/:
 all frames of its track.json, whether they were trusted or not. Where the sensors of RUN's capture and of CAPTURE sit
 otherwise on the instrument (footage over another tissue), only the rows without the constant offset say something;
@@ -27,7 +26,6 @@ import argparse
 import json
 import math
 import re
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,11 +43,8 @@ from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, vector_from_rotation
 from neeco.labels.drawing import draw
-from neeco.tracking.follow import Follower
-from neeco.tracking.parameters import fitter_of
 from neeco.tracking.track import state_of
-from neeco.tracking.trust import Reference
-from neeco.training.run import load_run, open_gaussian_run, open_run
+from neeco.training.run import load_run, open_run
 
 DEG = math.pi / 180
 TIP_BEYOND = 15.0  # mm beyond the hinge along the shaft: a point near the tips
@@ -166,7 +161,6 @@ def compared(
         "found": camera_from_instrument(frame.camera.world_from_camera, state.pose),
         "true": truth.camera_from_instrument[frame.name],
         "joints": [values[name] - value for name, value in true_values.items()],
-        "inside": True,
     }
 
 
@@ -236,24 +230,6 @@ def footage(given: argparse.Namespace) -> None:
     print(f"{given.output}: {len(bare)} frames without states")
 
 
-def single(given: argparse.Namespace) -> None:
-    """Find the state in each of some frames, nothing known before, and print errors."""
-    capture, truth, rows, seconds = read_capture(given.capture), Truth.read(given.capture), [], 0.0
-    chosen = [frame for frame in capture.frames if not given.splits or frame.split in given.splits][:: given.every]
-    with open_gaussian_run(given.run, "track") as opened, torch.no_grad():
-        scene = opened.scene
-        fitter = fitter_of(scene)
-        follower = Follower.of(chosen, fitter, Reference.of(fitter, opened.capture().split("train")))
-        for k, frame in enumerate(chosen):
-            began = time.process_time()
-            step = follower.find(k)
-            seconds += time.process_time() - began
-            state = next(iter(step.motion.state.instruments.values()))
-            rows.append(compared(frame, state, step.trust.value, truth, (given.capture, given.capture)))
-    print_tables(rows, truth)
-    print(f"{seconds / len(rows):.2f} s of processor time a frame")
-
-
 def main() -> None:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -267,17 +243,11 @@ def main() -> None:
     scored = commands.add_parser("score")
     for name in ("run", "capture", "tracked"):
         scored.add_argument(name, type=Path)
-    alone = commands.add_parser("single")
-    alone.add_argument("run", type=Path)
-    alone.add_argument("capture", type=Path)
-    for command in (made, alone):
-        command.add_argument("--splits", nargs="*", default=())
-        command.add_argument("--every", type=int, default=1)
+    made.add_argument("--splits", nargs="*", default=())
+    made.add_argument("--every", type=int, default=1)
     given = parser.parse_args()
     if given.command == "footage":
         footage(given)
-    elif given.command == "single":
-        single(given)
     else:
         score(given.run, given.capture, given.tracked)
 

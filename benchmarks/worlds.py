@@ -58,7 +58,6 @@ def main() -> int:
     drawn = verbs.add_parser("draw", help="render one world")
     drawn.add_argument("seed", type=int)
     drawn.add_argument("output", type=Path)
-    drawn.add_argument("--workers", type=int, default=1)
     for name, words in (
         ("run", "train builds on worlds, and write the table"), ("table", "write the table"),
         ("ablate", "train a build less each of its mechanisms, and write what each gains"),
@@ -76,7 +75,7 @@ def main() -> int:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     if arguments.verb == "draw":
-        capture = write_world(draw_world(arguments.seed), arguments.output, arguments.workers)
+        capture = write_world(draw_world(arguments.seed), arguments.output)
         print(f"{arguments.output}: {len(capture.frames)} frames")
         return 0
     first = fresh_seed() if arguments.seed == "fresh" else int(arguments.seed)

@@ -189,7 +189,6 @@ class World:
             ),
             joint=Joint(zero=float(rng.uniform(-0.2, 0.2)), sign=int(rng.choice((-1, 1))), limits=(-1.8, 1.8)),
             seed=self.seed % 2**31,
-            words=f"{self.kind}, {self.finish} over {self.background}",
             world_turn=tuple(rng.uniform(-1.5, 1.5, 3).tolist()),
             world_shift=tuple(rng.uniform(-200, 200, 3).tolist()),
             errors=tracked,

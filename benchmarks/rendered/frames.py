@@ -1,14 +1,10 @@
-"""Render a recording's frames, one after the other or in several processes, and write their files."""
+"""Render a recording's frames and write their files."""
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from PIL import Image
@@ -43,7 +39,6 @@ class Settings:
     still: bool = False  # the scope stands still
     stereo: bool = False  # right/: the images of a second camera beside it
     processor: Processor = field(default_factory=Processor)
-    workers: int = 1
 
     def place(self, spec: SceneSpec) -> Place:
         """Tissue, instrument, lamps and lens."""
@@ -129,30 +124,6 @@ def beside(shot: Shot) -> Shot:
     """A shot as the right camera takes it."""
     camera = shot.moment.scene_from_camera @ np.linalg.inv(RIGHT_FROM_LEFT)
     return replace(shot, moment=replace(shot.moment, scene_from_camera=camera))
-
-
-def render_all(renderer: Renderer, shots: list[Shot]) -> Iterator[Rendered]:
-    """All frames in order, rendered by `settings.workers` processes; the same bytes for any number of them."""
-    if renderer.settings.workers == 1:
-        yield from map(renderer.render, shots)
-        return
-    context = multiprocessing.get_context("spawn")  # a forked process would share threads' locks
-    arguments = (renderer.spec, renderer.settings, renderer.path, renderer.gains)
-    with ProcessPoolExecutor(renderer.settings.workers, context, _start, arguments) as pool:
-        yield from pool.map(_render, shots)
-
-
-_renderers: list[Renderer] = []  # of this worker
-
-
-def _start(spec: SceneSpec, settings: Settings, path: Path, gains: Gains) -> None:
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    _renderers.append(Renderer(spec, settings, path, settings.place(spec), gains))
-
-
-def _render(shot: Shot) -> Rendered:
-    return _renderers[0].render(shot)
 
 
 def _add_noise(color: Tensor, factor: float, generator: np.random.Generator) -> Array:

@@ -22,25 +22,17 @@ def truth_ids(spec: SceneSpec) -> tuple[int, int]:
 
 
 def describe_hinge(spec: SceneSpec) -> dict[str, Any]:
-    """truth/hinge.json: hinge and shaft in the true sensor frame (mm), and how the jaws turn (rad per rad)."""
-    mechanical_from_sensor = spec.mount.mechanical_from_sensor()
-    sensor_from_mechanical = np.linalg.inv(mechanical_from_sensor)
+    """truth/hinge.json: hinge and shaft in the true sensor frame (mm)."""
+    sensor_from_mechanical = np.linalg.inv(spec.mount.mechanical_from_sensor())
     rotation, shift = sensor_from_mechanical[:3, :3], sensor_from_mechanical[:3, 3]
-    sign, (first, _) = _sign(spec), truth_ids(spec)
-    # about the axis with its sign, the left jaw turns by minus its share of the opening, the right one by plus
-    left, right = spec.design.shares if first == JAW_LEFT else spec.design.shares[::-1]
     return {
         "instrument": spec.design.name,
         "frame": "tracked sensor (truth), mm",
-        "hinge_axis": (sign * rotation[:, 0]).tolist(),
+        "hinge_axis": (_sign(spec) * rotation[:, 0]).tolist(),
         "hinge_pivot": (rotation @ [0, 0, spec.design.hinge] + shift).tolist(),
         "shaft_origin": shift.tolist(),
         "shaft_direction": rotation[:, 2].tolist(),
         "shaft_radius_mm": spec.design.radius,
-        "wrist_starts_mm": 0.0,
-        "hinge_along_shaft_mm": spec.design.hinge,
-        "jaw_lengths_mm": {"jaw_left": _length(spec, JAW_LEFT), "jaw_right": _length(spec, JAW_RIGHT)},
-        "turn_per_opening": {"jaw_left": -left, "jaw_right": right},
         "joint": {
             "jaw_angle": {
                 "zero": spec.joint.zero,
@@ -48,12 +40,7 @@ def describe_hinge(spec: SceneSpec) -> dict[str, Any]:
                 "meaning": "reading = zero + sign * opening; opening = angle between the jaws, 0 closed",
             }
         },
-        "mechanical_from_sensor": mechanical_from_sensor.tolist(),
     }
-
-
-def _length(spec: SceneSpec, part: int) -> float:
-    return spec.design.jaws[truth_ids(spec).index(part)].length
 
 
 def _sign(spec: SceneSpec) -> int:

@@ -55,7 +55,6 @@ class SceneSpec:
     mount: Mount
     joint: Joint
     seed: int
-    words: str
     world_turn: tuple[float, float, float]  # the tracker's world against the scene: rotation vector …
     world_shift: tuple[float, float, float]  # … and shift
     errors: ErrorModel = field(default_factory=ErrorModel)
@@ -155,8 +154,6 @@ SCENES = {
         mount=Mount((2.9, -2.2, -26.0), spin=2.45, tilt=9 * DEGREE, tilt_towards=0.7),
         joint=Joint(zero=0.22, sign=1, limits=(0.2, 1.7)),
         seed=11,
-        words="folded pale small-bowel loops with fine red vessels and fat in the creases; a 5 mm black shaft with a "
-        "gold wrist and long thin scissors, curved along the hinge's axis, 64/36 of the opening per blade",
         world_turn=(0.9, -1.4, 0.5),
         world_shift=(-85.0, 140.0, 310.0),
     ),
@@ -183,8 +180,6 @@ SCENES = {
         mount=Mount((-4.2, 1.6, -9.0), spin=-0.95, tilt=16 * DEGREE, tilt_towards=2.5),
         joint=Joint(zero=0.0, sign=-1, limits=(-1.0, 0.05)),
         seed=23,
-        words="smooth reddish stomach wall with soft thick folds, mucus and dark veins; an 8 mm grey shaft with short "
-        "fat grasper jaws of which only one moves",
         world_turn=(-2.1, 0.3, 1.1),
         world_shift=(60.0, -35.0, -190.0),
     ),
@@ -229,7 +224,6 @@ SCENES |= {
         joint=Joint(zero=0.0, sign=1, limits=(-0.1, 1.5)),
         encoders=encoders,
         seed=seed,
-        words=f"{organ} under an 8 mm black shaft whose steel wrist pitches and, 9 mm further, yaws two unequal jaws",
     )
     for organ, seed, encoders in (
         ("bowel", 71, Encoders((1.6 * DEGREE, -1.1 * DEGREE), 0.8 * DEGREE, 0.3 * DEGREE)),
@@ -262,8 +256,6 @@ SCENES["cloth-wristed"] = replace(
     ),
     encoders=Encoders((1.3 * DEGREE, -1.7 * DEGREE), 0.8 * DEGREE, 0.3 * DEGREE),
     seed=113,
-    words="surgical drapes, blue-green and white, under lamps 13 mm to both sides of the lens, which cast two shadows; "
-    "an 8 mm black shaft whose mirror-like steel wrist pitches and, 9 mm further, yaws two unequal jaws",
     world_turn=(0.3, 0.7, -1.2),
     world_shift=(25.0, -60.0, 150.0),
 )

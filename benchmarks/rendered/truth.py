@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from neeco.geometry.conventions import swap_camera_axes
 from rendered.frames import DEPTH_STRIDE, DEPTH_UNIT_MM, Shot, has_depth, image_name
 from rendered.motion import Array, Moment
@@ -39,18 +37,15 @@ def truth_document(world: World, lens: Lens) -> dict[str, Any]:
     header |= {"cx": lens.width / 2, "cy": lens.height / 2, "w": lens.width, "h": lens.height, "fps": 25}
     header |= {"units": "mm", "world_frame": "em_tracker", "ply_file_path": "../sparse.ply"}
     header |= {"depth_unit_mm": DEPTH_UNIT_MM, "depth_stride": DEPTH_STRIDE}
-    middle = _mean_direction(world.shots)
-    header["frames"] = [_truth_frame(world, shot, middle) for shot in world.shots]
+    header["frames"] = [_truth_frame(world, shot) for shot in world.shots]
     return header
 
 
-def _truth_frame(world: World, shot: Shot, middle: Array) -> dict[str, Any]:
+def _truth_frame(world: World, shot: Shot) -> dict[str, Any]:
     spec, moment = world.spec, shot.moment
     joints = {JOINT: round(spec.joint.reading(moment.opening), 6)}
     if moment.wrist:
         joints |= {name: round(v, 6) for name, v in zip(spec.design.wrist_joints, moment.wrist, strict=True)}
-    yaw, pitch, insertion = _trocar_state(spec, moment, middle)
-    state = {"yaw": yaw, "pitch": pitch, "insertion_mm": insertion, "roll": moment.roll, **joints}
     entry: dict[str, Any] = {
         "file_path": f"../{image_name(shot)}",
         "transform_matrix": swap_camera_axes(world.camera(moment)).tolist(),
@@ -58,23 +53,8 @@ def _truth_frame(world: World, shot: Shot, middle: Array) -> dict[str, Any]:
         "time": shot.time,
         "instruments": [{"name": spec.design.name, "pose": world.sensor(moment).tolist(), "joints": joints}],
         "part_mask_path": f"masks/{shot.number:06d}.png",
-        "state": {**{name: round(value, 6) for name, value in state.items()}, "opening": round(moment.opening, 6)},
+        "state": {"roll": round(moment.roll, 6), "opening": round(moment.opening, 6)},
     }
     if has_depth(shot):
         entry["depth_file_path"] = f"depth/{shot.number:06d}.png"
     return entry
-
-
-def _mean_direction(shots: list[Shot]) -> Array:
-    total = sum((shot.moment.scene_from_mechanical[:3, 2] for shot in shots), np.zeros(3))
-    return total / np.linalg.norm(total)
-
-
-def _trocar_state(spec: SceneSpec, moment: Moment, middle: Array) -> tuple[float, float, float]:
-    """Yaw and pitch (rad) of the shaft about the trocar against the mean direction, and how far the hinge is in, mm."""
-    direction = moment.scene_from_mechanical[:3, 2]
-    side = np.cross([0.0, 0.0, 1.0], middle)
-    side /= np.linalg.norm(side)
-    yaw = float(np.arctan2(direction @ side, direction @ middle))
-    pitch = float(np.arcsin(np.clip(direction @ np.cross(middle, side), -1, 1)))
-    return yaw, pitch, float(np.linalg.norm(moment.hinge - np.array(spec.path.trocar)))

@@ -23,7 +23,6 @@ from rendered.frames import (
     Settings,
     Shot,
     image_name,
-    render_all,
     right_name,
 )
 from rendered.kinematics import describe_kinematics, stated_kinematics
@@ -43,7 +42,7 @@ RIGHT = "right_"  # begins the names of the right camera's images
 BASE_MM, BASE_RAD = 3.0, math.radians(1.2)  # of a robot's base, times the world's scale of errors
 
 
-def write_world(world: World, path: Path, workers: int = 1) -> Capture:
+def write_world(world: World, path: Path) -> Capture:
     """Render `world` into the folder `path`; return the capture. Raises NeecoError where one lies there already."""
     if (path / "transforms.json").exists():
         raise NeecoError(f"{path}: already holds a capture; choose another folder")
@@ -56,11 +55,12 @@ def write_world(world: World, path: Path, workers: int = 1) -> Capture:
         red, green, blue = (a * b for a, b in zip(own, world.processor.gains, strict=True))
         gains[shot.number] = (red, green, blue)
     stereo = world.scope == "stereo"
-    settings = Settings(world.lens, still=stereo, stereo=stereo, processor=world.processor, workers=workers)
+    settings = Settings(world.lens, still=stereo, stereo=stereo, processor=world.processor)
     renderer = Renderer(spec, settings, path, place, gains)
     generator = np.random.default_rng((world.seed, 1))
     sampler = PointSampler(len(shots), generator)
-    for shot, rendered in zip(shots, render_all(renderer, shots), strict=True):
+    for shot in shots:
+        rendered = renderer.render(shot)
         sampler.take(shot.moment, rendered.drawing, rendered.pixels, world.lens)
     true = TrueWorld(spec, shots)
     truth = truth_document(true, world.lens)

@@ -14,7 +14,7 @@ from neeco.errors import NeecoError
 from neeco.files import write_json
 from neeco.geometry.camera import Camera
 from rendered import errors
-from rendered.frames import Renderer, Settings, Shot, image_name, render_all, take_shots
+from rendered.frames import Renderer, Settings, Shot, image_name, take_shots
 from rendered.hinge import describe_hinge
 from rendered.kinematics import describe_kinematics, stated_kinematics
 from rendered.motion import THINNINGS, Array, Moment, Trajectory, plan, slowed
@@ -38,11 +38,12 @@ def write_recording(spec: SceneSpec, path: Path, settings: Settings) -> None:
         trajectory = slowed(trajectory, settings.frames)
     shots = take_shots(trajectory, spec, settings.every)
     if (gap := clearance(place, shots)) < LEAST_GAP_MM:
-        raise NeecoError(f"{spec.words}: the instrument comes within {gap:.1f} mm of the tissue; raise its path")
+        raise NeecoError(f"{spec.organ}: the instrument comes within {gap:.1f} mm of the tissue; raise its path")
     generator = np.random.default_rng(spec.seed + 1)
     sampler = PointSampler(len(shots), generator)
     renderer = Renderer(spec, settings, path, place, {})
-    for shot, rendered in zip(shots, render_all(renderer, shots), strict=True):
+    for shot in shots:
+        rendered = renderer.render(shot)
         sampler.take(shot.moment, rendered.drawing, rendered.pixels, settings.lens)
     world = World(spec, shots)
     write_json(path / "truth" / "transforms.json", truth_document(world, settings.lens))

@@ -41,7 +41,7 @@ def test_commands_killed_at_random_moments_end_in_the_same_bytes() -> None:
 
 
 def test_damaged_files_are_refused_in_one_line() -> None:
-    verbs = ("check", "check-others", "render --states", "export", "score-masks", "train --resume")
+    verbs = ("check", "render --states", "export", "score-masks", "train --resume", "ingest")
     told = played("mutations.py", "--cases", "18", "--verbs", *verbs)
     assert "18 cases, 0 wrong" in told
 

@@ -91,21 +91,6 @@ def test_the_recording_holds_the_same_frames_and_states(capture: Path) -> None:
         assert np.linalg.norm(shift) < 4
 
 
-@pytest.mark.slow
-def test_workers_write_the_same_bytes(benchmarks: ModuleType, tmp_path: Path) -> None:
-    from rendered.frames import Settings
-    from rendered.render import Lens
-    from rendered.scenes import SCENES
-    from rendered.writing import write_recording
-
-    for workers in (1, 2):
-        settings = Settings(Lens(WIDTH, HEIGHT, 54.0), RESOLUTION, every=50, workers=workers)
-        write_recording(SCENES["bowel"], tmp_path / str(workers), settings)
-    files = sorted(path.relative_to(tmp_path / "1") for path in (tmp_path / "1").rglob("*") if path.is_file())
-    assert len(files) > 15
-    assert all((tmp_path / "1" / file).read_bytes() == (tmp_path / "2" / file).read_bytes() for file in files)
-
-
 def test_slowed_recordings_share_the_states_of_what_they_are_multiples_of(world: dict) -> None:
     from rendered.frames import take_shots
     from rendered.motion import slowed
