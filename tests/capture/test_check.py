@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import math
 import re
@@ -162,19 +161,18 @@ def _scale(pose, factor):
     return pose
 
 
-MISTAKES = [
-    ("poses", lambda pose: _scale(pose, 1e-3), "metres?"),
-    ("cameras", lambda pose: pose * [1, -1, -1, 1], "camera axes are OpenCV's"),
-    ("cameras", np.linalg.inv, "world-to-camera"),
-    ("cameras", lambda pose: np.linalg.inv(pose * [1, -1, -1, 1]), "world-to-camera with OpenCV axes"),
-    ("cameras", lambda pose: _scale(pose, 1e-3), "positions of the cameras are in metres"),
-]
+@pytest.mark.parametrize(
+    "mistake",
+    [lambda pose: pose * [1, -1, -1, 1], np.linalg.inv, lambda pose: _scale(pose, 1e-3)],
+)
+def test_cameras_without_points_in_view_are_an_error(folder, mistake):
+    folder.edit_cameras(mistake)
+    assert_found(folder, "frames[*].transform_matrix", "no camera has any point in its image")
 
 
-@pytest.mark.parametrize(("what", "mistake", "words"), MISTAKES)
-def test_mistakes_of_units_and_axes_are_named(folder, what, mistake, words):
-    (folder.edit_poses if what == "poses" else folder.edit_cameras)(mistake)
-    assert any(words in problem.message for problem in problems(folder)), [str(one) for one in problems(folder)]
+def test_positions_in_metres_are_an_error(folder):
+    folder.edit_poses(lambda pose: _scale(pose, 1e-3))
+    assert_found(folder, "frames[*].instruments[*].pose", "metres?")
 
 
 def test_a_whole_capture_in_metres_is_noticed(folder):
@@ -195,7 +193,7 @@ def sample(folder, tmp_path):
     ("mistake", "words"),
     [
         (np.linalg.inv, "instrument-from-world"),
-        (lambda pose: np.diag([1.0, -1, -1, 1]) @ pose, "y and z flipped"),
+        (lambda pose: np.diag([1.0, -1, -1, 1]) @ pose, "(x, y, z) should be (x, -y, -z)"),
         (lambda pose: _scale(pose, 1e3), "metres"),
     ],
 )
@@ -271,20 +269,6 @@ def test_the_same_picture_under_two_names_is_an_error(folder):
     assert_found(folder, "frames[5].file_path", "same pixels as frames[1]")
 
 
-def test_a_picture_coded_again_under_other_states_is_a_frozen_video(folder):
-    pixels = np.array(Image.open(folder.root / "images/000002.png"))
-    for row, name in enumerate(("000003", "000004")):
-        pixels[row, 4] ^= 1
-        Image.fromarray(pixels).save(folder.root / f"images/{name}.png")
-    message = "shows the picture before it while camera or state changed (2 of 8 frames do)"
-    assert_found(folder, "frames[3].file_path", message, "warning")
-    resting = folder.document["frames"][2]
-    for index in (3, 4):
-        folder.edit(_frame(index, "transform_matrix", resting["transform_matrix"]))
-        folder.edit(_frame(index, "instruments", resting["instruments"]))
-    assert not [problem for problem in check_capture(folder.root) if "picture before" in problem.message]
-
-
 def test_a_mask_that_ignores_everything_is_an_error_and_missing_ones_a_warning(folder):
     Image.new("L", (32, 24), 1).save(folder.root / "mask.png")
     folder.edit(_frame(2, "mask_path", "mask.png"))
@@ -298,30 +282,10 @@ def test_a_link_out_of_the_folder_is_an_error(folder, tmp_path):
     assert_found(folder, "frames[1].file_path", "leaves the capture's folder")
 
 
-@pytest.mark.parametrize("time_", [None, -1.0])
-def test_missing_or_backward_time_is_only_a_warning(folder, time_):
-    folder.edit(_frame(3, "time", time_))
+def test_a_missing_time_is_only_a_warning(folder):
+    folder.edit(_frame(3, "time", None))
     assert problems(folder) == []
     assert any("time" in problem.message for problem in problems(folder, "warning"))
-
-
-def _seen_again(document, shift_mm, later_mm=0.0):
-    """Every frame once more, after all others, by a camera `shift_mm` beside; the instrument `later_mm` on."""
-    for frame in copy.deepcopy(document["frames"]):
-        frame["file_path"] = frame["file_path"].replace(".png", "_again.png")
-        frame["transform_matrix"][0][3] += shift_mm
-        frame["instruments"][0]["pose"][0][3] += later_mm
-        document["frames"].append(frame)
-
-
-@pytest.mark.parametrize(("shift_mm", "later_mm", "warned"), [(4.0, 0.0, False), (0.0, 0.0, True), (4.0, 1.0, True)])
-def test_time_does_not_go_back_where_another_camera_sees_the_same_instants(folder, shift_mm, later_mm, warned):
-    for image in sorted((folder.root / "images").glob("*.png")):
-        pixels = np.asarray(Image.open(image)).copy()
-        pixels[0, 0] ^= 1
-        Image.fromarray(pixels).save(image.with_name(f"{image.stem}_again.png"))
-    folder.edit(lambda document: _seen_again(document, shift_mm, later_mm))
-    assert warned == any("time goes backwards" in problem.message for problem in problems(folder, "warning"))
 
 
 def test_bad_points_are_errors_and_few_a_warning(folder):
@@ -481,7 +445,7 @@ def _tree(**changes):
     ("changes", "field", "words", "severity"),
     [
         ({"value": {"elbow": 1}}, "instruments", "'elbow' is no joint of it (recorded: jaw_angle)", "error"),
-        ({"offset": 50.0, "limits": [-1, 1]}, "instruments", "8 frames, outside its limits -1 .. 1", "warning"),
+        ({"offset": 50.0, "limits": [-1, 1]}, "instruments", "8 frames, outside its limits", "warning"),
         ({"parent": "wrist"}, "instruments[0].kinematics.links", "joined in a circle", "error"),
         ({"type": "hinge"}, "instruments[0].kinematics.links[1].type", "is 'hinge'", "error"),
     ],

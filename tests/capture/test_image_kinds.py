@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFile
 
-from neeco.capture.images import exif_orientation, has_alpha, image_size, open_image, read_image, read_mask
+from neeco.capture.images import has_alpha, image_size, open_image, read_image, read_mask
 from neeco.errors import NeecoError
 from neeco.ingest.readers.video import open_images
 from neeco.synthesis.preview import draw_tile
@@ -17,7 +17,6 @@ from neeco.synthesis.preview import draw_tile
 READERS: list[Callable[[Path], object]] = [
     open_image,
     image_size,
-    exif_orientation,
     has_alpha,
     read_image,
     read_mask,

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from PIL import ExifTags, Image
+from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -102,12 +102,6 @@ def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from an image file's header. Raises NeecoError."""
     with _opened(path) as image:
         return image.size
-
-
-def exif_orientation(path: Path) -> int:
-    """EXIF orientation of an image file, 1 (upright) to 8; 1 where it states none. Raises NeecoError."""
-    with _opened(path) as image:
-        return int(image.getexif().get(ExifTags.Base.Orientation, 1))
 
 
 def has_alpha(path: Path) -> bool:

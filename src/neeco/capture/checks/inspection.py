@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from neeco.capture.checks import colors, motion_evidence
-from neeco.capture.checks.colors import check_colors
-from neeco.capture.checks.frames import MIN_TRAIN_FRAMES, check_frames, check_image_files
-from neeco.capture.checks.motion import check_motion
-from neeco.capture.checks.pictures import Pictures, Size
+from neeco.capture.checks.frames import check_frames, check_pictures
+from neeco.capture.checks.pictures import read_pictures
 from neeco.capture.checks.placement import check_placement
 from neeco.capture.checks.states import check_states
 from neeco.capture.checks.truth import check_truth
+from neeco.capture.checks.verdicts import ImageVerdicts
 from neeco.capture.documents import Problem, ProblemReport, condensed, errors_only, key_name
 from neeco.capture.model import Capture
 from neeco.capture.readers import capture_of, parse_capture
@@ -84,24 +82,17 @@ def inspect_capture(
         report.error(transforms, "frames", "holds no usable frame", "list images and their cameras there")
     capture = None if errors_only(report.problems) else capture_of(parsed)
     if parsed.frames:
-        pictures = Pictures()
+        pictures = read_pictures(parsed)
+        verdicts = ImageVerdicts(parsed, pictures)
         check_frames(parsed)
-        check_image_files(parsed, pictures, _compared(parsed) if motion else {})
+        check_pictures(parsed, pictures)
         check_states(parsed)
         if truth:
-            check_truth(parsed, report)
-        known = check_placement(parsed, pictures)
-        if motion and not errors_only(report.problems) and check_colors(parsed, pictures):
-            check_motion(parsed, known, pictures)  # motion in images that check_colors refuses proves nothing
+            check_truth(parsed)
+        check_placement(parsed, verdicts)
+        if motion and not errors_only(report.problems):
+            verdicts.report()
     return Checked(condensed(report.problems), _summary(parsed), capture)
-
-
-def _compared(parsed: Parsed) -> dict[Path, set[Size]]:
-    """Sizes of the images that colours and motion are compared in, by the file."""
-    sizes: dict[Path, set[Size]] = {}
-    for frame, size in (*colors.compared_pictures(parsed), *motion_evidence.compared_pictures(parsed)):
-        sizes.setdefault(frame.image_path, set()).add(size)
-    return sizes
 
 
 def _summary(parsed: Parsed) -> CaptureSummary:
@@ -126,26 +117,3 @@ def _summary(parsed: Parsed) -> CaptureSummary:
         travel_mm=travel,
         still=parsed.still,
     )
-
-
-# Training frames -> label IoU on seen and on unseen states, of the capture that looks most like a real recording.
-# Measured once: `train --iterations 3000` on `cloth-wristed` thinned by benchmarks/state_errors.py, then `evaluate`.
-LABEL_IOU = {10: (0.91, 0.82), 15: (0.94, 0.88), 60: (0.97, 0.93)}
-
-
-def expected_labels(frames: int) -> str | None:
-    """Return one line on what labels so many training frames gave, and a larger number; None where no more are needed,
-    and where they are too few to train on.
-
-    The numbers are those of the nearest measured count that is not larger, or of the smallest.
-    """
-    counts = sorted(LABEL_IOU)
-    if not MIN_TRAIN_FRAMES <= frames < counts[-1]:
-        return None
-    index = max(0, sum(count <= frames for count in counts) - 1)
-    gave = [
-        f"{count} training frames gave IoU {LABEL_IOU[count][0]:.2f} on seen and {LABEL_IOU[count][1]:.2f} on unseen "
-        "states"
-        for count in counts[index : index + 2]
-    ]
-    return f"labels to expect: with exact states, {', '.join(gave)}"

@@ -1,21 +1,40 @@
-"""Images and masks of a capture, reduced to the sizes at which checks compare them: each file is read once."""
+"""One pass over a capture's images and masks: faults of each file, and the reduced images that are compared."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 
-from neeco.capture.images import byte_pixels
-from neeco.capture.model import Frame
+from neeco.capture.checks.settings import SETTINGS
+from neeco.capture.images import Hidden, byte_pixels, measure_hidden
+from neeco.capture.model import Frame, evenly_spaced
+from neeco.capture.points import measured_sample
+from neeco.capture.readers.parsed import Parsed
+from neeco.errors import NeecoError
 
-Size = tuple[int, int]  # width and height, px
 Result = TypeVar("Result")
+
+
+@dataclass(kw_only=True)
+class Picture:
+    """A frame's image and mask, decoded once. Errors name files without their folders."""
+
+    digest: bytes | None = None  # of the pixels; None when not readable
+    image: np.ndarray | None = None  # uint8 [h, w, 3], at most SETTINGS.compared_width px wide; None: not compared
+    mask: np.ndarray | None = None  # float32 [h, w], share of each pixel that counts; None: all
+    grey: np.ndarray | None = None  # uint8 [h, w], every few pixels
+    uniform: bool = False  # one colour
+    hidden: Hidden | None = None  # by the mask; None: there is no usable one
+    image_error: str = ""
+    mask_error: str = ""
 
 
 def in_threads(function: Callable[..., Result], *arguments: Iterable[Any]) -> list[Result]:
@@ -24,38 +43,49 @@ def in_threads(function: Callable[..., Result], *arguments: Iterable[Any]) -> li
         return list(pool.map(function, *arguments))
 
 
-class Pictures:
-    """Reduced images and masks, kept from when the files were checked or read on demand."""
-
-    def __init__(self) -> None:
-        self._images: dict[tuple[Path, Size], np.ndarray] = {}
-        self._masks: dict[tuple[Path, Size], np.ndarray] = {}
-
-    def keep(self, frame: Frame, pixels: np.ndarray, mask: np.ndarray | None, sizes: Iterable[Size]) -> None:
-        """Reduce a frame's pixels [H, W, 3], uint8 or in [0, 1], and its mask bool [H, W] to some sizes."""
-        for size in sizes:
-            self._images[frame.image_path, size] = _reduced(byte_pixels(pixels), size)
-            if mask is not None and frame.mask_path is not None:
-                self._masks[frame.mask_path, size] = _reduced(mask.astype(np.float32), size)
-
-    def image(self, frame: Frame, size: Size) -> np.ndarray:
-        """A frame's image, uint8 [h, w, 3]. Raises NeecoError when it cannot be read."""
-        key = frame.image_path, size
-        if key not in self._images:
-            self._images[key] = _reduced(byte_pixels(frame.load_pixels()), size)
-        return self._images[key]
-
-    def mask(self, frame: Frame, size: Size) -> np.ndarray | None:
-        """Share of each pixel that counts, float32 [h, w]; None where the frame has no mask. Raises NeecoError."""
-        if frame.mask_path is None:
-            return None
-        key = frame.mask_path, size
-        if key not in self._masks:
-            mask = frame.load_mask_pixels()
-            assert mask is not None
-            self._masks[key] = _reduced(mask.astype(np.float32), size)
-        return self._masks[key]
+def compared_rows(parsed: Parsed) -> np.ndarray:
+    """[F] frames whose images are compared with points and states."""
+    return np.array(evenly_spaced(len(parsed.frames), SETTINGS.max_images))
 
 
-def _reduced(image: np.ndarray, size: Size) -> np.ndarray:
+def read_pictures(parsed: Parsed) -> list[Picture]:
+    """Decode the image and the mask of every frame."""
+    compared = set(compared_rows(parsed).tolist())
+    points = measured_sample(parsed.points)
+    return in_threads(partial(_read, parsed, compared, points), range(len(parsed.frames)))
+
+
+def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """An image area-averaged to (width, height)."""
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def _read(parsed: Parsed, compared: set[int], points: np.ndarray, row: int) -> Picture:
+    frame, picture, pixels = parsed.frames[row], Picture(), None
+    try:
+        pixels = frame.load_pixels()
+        picture.digest = hashlib.blake2b(pixels.tobytes(), digest_size=16).digest()
+        picture.uniform = bool((pixels[0] == pixels[0, 0]).all() and (pixels == pixels[0, 0]).all())
+        step = max(1, pixels.shape[1] // SETTINGS.compared_width)
+        picture.grey = np.rint(byte_pixels(pixels[::step, ::step]).mean(-1)).astype(np.uint8)
+        if row in compared:
+            picture.image = resized(byte_pixels(pixels), reduced_size(frame))
+    except NeecoError as error:
+        picture.image_error = str(error).replace(str(frame.image_path), frame.image_path.name)
+    try:
+        mask = frame.load_mask_pixels()
+        if mask is not None and not mask.any():
+            picture.mask_error = "ignores every pixel; black is ignored: invert it, or write 255 instead of 1"
+        elif mask is not None and pixels is not None:
+            camera = None if row in parsed.without_camera else frame.camera
+            picture.hidden = measure_hidden(pixels, mask, camera, points)
+            picture.mask = resized(mask.astype(np.float32), reduced_size(frame)) if row in compared else None
+    except NeecoError as error:
+        picture.mask_error = str(error).replace(str(frame.mask_path), frame.mask_path.name if frame.mask_path else "")
+    return picture
+
+
+def reduced_size(frame: Frame) -> tuple[int, int]:
+    """(width, height) px to which a frame's image is reduced."""
+    factor = min(1.0, SETTINGS.compared_width / frame.camera.width)
+    return round(frame.camera.width * factor), max(1, round(frame.camera.height * factor))

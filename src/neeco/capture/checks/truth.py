@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
-from neeco.capture.documents import ProblemReport
-from neeco.capture.images import open_image, read_labels, read_mask
+from neeco.capture.images import read_labels, read_mask
 from neeco.capture.readers.parsed import Parsed
 from neeco.errors import NeecoError
-from neeco.files import read_json, require_file, require_inside, visible_entries
+from neeco.files import read_json, require_inside, visible_entries
 
 PARTS_FILE = "parts.json"  # names of the ids of masks in a folder
 USUAL_NAMES: Mapping[int, str] = {1: "shaft", 2: "wrist", 3: "jaw_left", 4: "jaw_right"}  # in folders without one
@@ -32,48 +29,28 @@ def stated_names(path: Path) -> dict[int, str] | None:
         raise NeecoError(f"{file}: ids: {expected}; correct it or give --classes") from None
 
 
-def check_truth(parsed: Parsed, report: ProblemReport) -> None:
-    """Warn of files of the truth that evaluation would refuse, misread or pass over. They keep no capture from being
-    trained on."""
-    root, cameras = parsed.root, {frame.name: frame.camera for frame in parsed.with_cameras().frames}
+def check_truth(parsed: Parsed) -> None:
+    """Warn of masks of the truth that evaluation would refuse or pass over. They keep no capture from being trained
+    on."""
+    root, report = parsed.root, parsed.places[0].report
+    cameras = {frame.name: frame.camera for frame in parsed.with_cameras().frames}
     names = {frame.name for frame in parsed.frames}
     for folder in (*MASK_FOLDERS, SHADOW_FOLDER):
-        known = USUAL_NAMES
-        try:
-            known = (folder == MASK_FOLDERS[0] and stated_names(root / folder)) or USUAL_NAMES
-        except NeecoError as error:
-            report.warning(f"{folder}/{PARTS_FILE}", "", str(error).rpartition(f"{PARTS_FILE}: ")[2])
         files = visible_entries(root / folder) if (root / folder).is_dir() else []
-        read = tuple(f"{file.stem}_" for file in files if file.stem in names)
+        further = tuple(f"{file.stem}_" for file in files if file.stem in names)  # 000003_label.png of 000003.png
         for file in files:
-            place = f"{folder}/{file.name}"
-            if file.name == PARTS_FILE or file.stem.startswith(read):  # 000003_label.png beside 000003.png
-                continue
-            if file.suffix != ".png":
-                report.warning(place, "", "is not read: masks are PNG files", "save it as NAME_OF_THE_IMAGE.png")
-            elif file.stem not in names:
-                report.warning(place, "", "no frame has an image of this name", "name it as its image, or remove it")
-            elif file.stem in cameras:
-                size = cameras[file.stem].width, cameras[file.stem].height
-                try:
+            problem = ""
+            try:
+                if file.name == PARTS_FILE:
+                    stated_names(file.parent)
+                elif file.stem in cameras and file.suffix == ".png":
+                    size = cameras[file.stem].width, cameras[file.stem].height
                     require_inside(file, root)
-                    require_file(file, "a mask")
-                    fault = _ids_fault(file, size, known if folder == MASK_FOLDERS[0] else None)
-                except NeecoError as error:
-                    fault = str(error).replace(f"{file}: ", "")
-                message, _, remedy = fault.partition("; ")
-                if message:
-                    report.warning(place, "", message, remedy)
-
-
-def _ids_fault(file: Path, size: tuple[int, int], known: Mapping[int, str] | None) -> str:
-    """Return what is wrong with the values of a mask, and what to do; "" where nothing is. known: parts by id; None: it
-    is 0 and 255. Raises NeecoError for a file that cannot be read or has another size (width, height)."""
-    if known is None:
-        read_mask(file, size)
-        values = np.unique(np.asarray(open_image(file, size).convert("L")))
-        dim = 0 < values.max(initial=0) < 128
-        return f"its largest value is {values.max()}, which reads as black; write 255 instead" if dim else ""
-    unknown = sorted(set(np.unique(read_labels(file, size).numpy()).tolist()) - {0, *known})
-    meaning = ", ".join(f"{number} {part}" for number, part in known.items())
-    return f"id {unknown[0]} is not among {meaning}; correct it, or name it in {PARTS_FILE}" if unknown else ""
+                    (read_labels if folder == MASK_FOLDERS[0] else read_mask)(file, size)
+                elif (file.stem not in names or file.suffix != ".png") and not file.stem.startswith(further):
+                    problem = "no frame has this mask; masks are PNG files with the names of the images"
+            except NeecoError as error:
+                problem = str(error).replace(f"{file}: ", "")
+            if problem:
+                message, _, remedy = problem.partition("; ")
+                report.warning(f"{folder}/{file.name}", "", message, remedy)
