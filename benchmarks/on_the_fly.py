@@ -87,7 +87,7 @@ def to_example(sample: dict[str, Any]) -> Example:
     """A sample of `neeco.LabelledImages` as the trainings of `neeco downstream` take it, one class."""
     image = (sample["image"].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
     classes = (sample["parts"] > 0).to(torch.uint8).numpy()
-    return Example(np.ascontiguousarray(image), classes, classes)
+    return Example(np.ascontiguousarray(image), classes)
 
 
 @dataclass(frozen=True)
@@ -140,13 +140,13 @@ def train_on_the_fly(args: OnTheFly, capture_folder: Path, folder: Path) -> dict
         progress=lambda share, text: print(f"{share:6.1%}  {text}", flush=True),
     )
     started = time.perf_counter()
-    trained = UNet().fit(task)
+    predict = UNet().fit(task)
     seconds = time.perf_counter() - started
     scores: dict[str, Any] = {}
     for split in capture.splits:
         if split != "train" and has_labels(capture, split):
             truth = [sample.load() for sample in recorded_samples(capture, split, "instrument")]
-            masks = trained.predict([example.image for example in truth])
+            masks = predict([example.image for example in truth])
             rows = [mask_scores(mask, example, ("instrument",)) for mask, example in zip(masks, truth, strict=True)]
             scores[split] = mean_scores(rows)
             print(f"{split}: IoU {scores[split]['iou']:.3f} over {len(truth)} frames")

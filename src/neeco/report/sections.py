@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from markupsafe import Markup
 
@@ -37,14 +36,10 @@ class Section:
     title: str
     split: str = ""  # of usual names the meaning is shown with the title
     level: int = 2  # of the heading
-    anchor: str = ""
     text: str = ""
     results: ResultTable | None = None
-    head: Sequence[str] = ()
-    rows: Sequence[Sequence[Any]] = ()
     images: Sequence[Images] = ()
     figures: Sequence[Figure] = ()
     files: Mapping[str, str] = field(default_factory=dict)  # CSV by file name
     notes: Sequence[str] = ()
     facts: Sequence[tuple[str, str]] = ()
-    listings: Sequence[tuple[str, str]] = ()
