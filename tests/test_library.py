@@ -234,7 +234,7 @@ def test_the_recipe_for_the_next_operation_runs_as_the_page_says(
     )
     study = json.loads(Path("HELPS/downstream.json").read_text(encoding="utf-8"))
     assert {job["condition"] for job in study["jobs"]} == {"real", "real+strong", "next+strong"}
-    assert study["sets"][0]["made_by"]["settings"]["match_colors"]
+    assert json.loads(Path("SET/dataset.json").read_text(encoding="utf-8"))["settings"]["match_colors"]
     code = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0]
     code = code.replace('"RUN", 8000', '"RUN", 4, min_share=0.0').replace("num_workers=2", "num_workers=0")
     code = code.replace("batch_size=8", "batch_size=2")

@@ -80,8 +80,8 @@ export RUN --states states.jsonl --output liver.usdc
 export RUN --output liver.spz
 ingest --formats
 score-masks PREDICTED TRUTH --classes shaft=1 wrist=2 jaws=3 jaws=4 --truth-classes shaft=1 wrist=2 jaws=3 jaws=4
-downstream CAPTURE --sets few=dataset:2 many=dataset:4 --frame-selection spread --steps 1 --batch 2 --output OUT
-downstream CAPTURE --sets few=dataset:2 --frame-selection first --classes parts --output OUT --workers 1
+downstream CAPTURE --sets few=dataset:2 many=dataset:4 --steps 1 --batch 2 --output OUT
+downstream CAPTURE --sets few=dataset:2 --classes parts --output OUT --workers 1
 downstream CAPTURE --sets few=dataset:2 --backgrounds PLATES --output OUT
 sweep CAPTURE STUDY.yaml --splits unseen --output DIR
 """
@@ -90,7 +90,6 @@ ELSEWHERE = {
     "--push-to-hub": "an account of a hub; tests/synthesis/test_hub_upload.py has a hub that answers",
     "--lpips-weights": "weights of LPIPS; tests/evaluation/test_lpips.py makes some",
     "--cpu-minutes": "a budget of time, run by `compare` with --iterations instead; tests/studies/test_jobs.py",
-    "--weights": "weights of a network; tests/studies/downstream makes some",
 }
 # Commands that no test can run to the end here: what they need.
 NOT_HERE = {

@@ -1,4 +1,4 @@
-"""What tables say of known numbers, in Markdown, LaTeX, CSV and on a terminal."""
+"""What tables say of known numbers, in Markdown, CSV and on a terminal."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import pytest
 from rich.console import Console
 
 from neeco.cli._output import fitted
-from neeco.studies.downstream.table_files import latex_document, latex_escape, summary_csv
 from neeco.studies.study import spread
-from neeco.studies.tables import Column, ResultTable, SummaryRow, markdown_document, summary_table
+from neeco.studies.tables import Column, ResultTable, SummaryRow, csv_text, markdown_document, summary_table
 
 COLUMNS = (
     Column("psnr", "PSNR", 2, "high"),
@@ -52,35 +51,9 @@ def test_markdown_escapes_names_and_reports_failures(table: ResultTable) -> None
     assert "- lpips: a note" in page
 
 
-def test_latex_escapes_everything_and_stays_balanced(table: ResultTable) -> None:
-    text = latex_document("{}. Two seeds.", [table], ["C & U_1"], ["5 %"])
-    assert r"a\_b & \textbf{21.00} $\pm$ 1.41 & \textbf{0.100} $\pm$ 0.000 & 1.00 $\pm$ 0.00 \\" in text
-    assert r"c\textbar{}d & " in text
-    assert r"lost & failed &  &  \\" in text
-    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == text.count(r"\bottomrule") == 1
-    body = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
-    assert body.count("{") == body.count("}")
-    assert r"my\_capture" in body
-
-
-@pytest.mark.parametrize(
-    ("text", "escaped"),
-    [
-        ("3dgs+dta", "3dgs+dta"),
-        ("a_b & 5% #1 $x {y}", r"a\_b \& 5\% \#1 \$x \{y\}"),
-        (r"C:\x~^", r"C:\textbackslash{}x\textasciitilde{}\textasciicircum{}"),
-    ],
-)
-def test_latex_escaping(text: str, escaped: str) -> None:
-    assert latex_escape(text) == escaped
-
-
 def test_csv_keeps_every_digit_and_leaves_unknown_empty() -> None:
-    text = summary_csv(["name"], ["psnr"], [{"name": name} | numbers(name) for name in PSNR])
-    rows = list(csv.DictReader(io.StringIO(text)))
-    assert [row["name"] for row in rows] == ["a_b", "c|d", "lost"]
-    assert float(rows[0]["psnr_std"]) == 2**0.5
-    assert rows[2]["psnr_mean"] == ""
+    rows = list(csv.DictReader(io.StringIO(csv_text(["name", "psnr"], [{"name": "a", "psnr": 2**0.5}, {"name": "b"}]))))
+    assert [float(rows[0]["psnr"]), rows[1]["psnr"]] == [2**0.5, ""]
 
 
 @pytest.mark.parametrize("width", [40, 200])

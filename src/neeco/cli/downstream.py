@@ -14,7 +14,7 @@ from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
     from neeco.studies.downstream.job import DownstreamSettings
-    from neeco.studies.downstream.samples import ImageSet, OtherCapture
+    from neeco.studies.downstream.samples import ImageSet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class Downstream:
     sets: tuple[str, ...] = ()
     """NAME=DATASET, folders that `neeco synthesize` wrote; NAME=DATASET:COUNT takes its first COUNT images."""
     models: tuple[str, ...] = ("unet",)
-    """unet (a residual U-Net, masks), dfine (a small D-FINE, boxes), yolo (your own ultralytics program, boxes)."""
+    """unet (a residual U-Net, masks), dfine (a small D-FINE, boxes)."""
     test: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """NAME=CAPTURE or CAPTURE, another recording with masks of the same kind of instrument to test on; repeatable."""
     num_real: tuple[str, ...] = ()
@@ -50,8 +50,6 @@ class Downstream:
     """Folder of masks named as the frames, for the recorded training frames. Default: the capture's truth."""
     classes: Literal["instrument", "parts"] = "instrument"
     """One class, or shaft, wrist and jaws."""
-    frame_selection: Literal["spread", "first"] = "spread"
-    """Which frames are labelled: spread over the recording, or its first."""
     splits: tuple[str, ...] = ()
     """Splits to test on. Default: all but train that have true masks."""
     steps: int | None = None
@@ -60,8 +58,6 @@ class Downstream:
     """Longer side in pixels of a model's input images; scores are at full size. Default: the model's own."""
     batch: int | None = None
     """Images in a step. Default: the model's own."""
-    weights: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """MODEL=FILE.safetensors to begin from instead of from scratch; repeatable."""
     workers: int = 1
     """Trainings at once, which share the GPUs; RAY_ADDRESS names a Ray cluster (needs the extra `cluster`)."""
     transforms: str = "transforms.json"
@@ -81,13 +77,12 @@ def run(args: Downstream) -> int:
         experiment = run_downstream(plan, bars.job)
         write_tables(args.output, experiment)
         bars.stage("report", 0, 1)
-        page = write_downstream_report(args.output, experiment, plan.capture)
+        page = write_downstream_report(plan, experiment)
         bars.stage("report", 1, 1)
-    files = {"tables": "downstream.md, .csv, .tex", "all numbers": "downstream.json, data/"}
     return print_outcome(
-        {what: f"{args.output}/: {names}" for what, names in files.items()} | {"report": page},
+        {"tables": f"{args.output}/: downstream.md, .csv, .json", "report": page},
         tables_of(experiment),
-        sentences=experiment["answers"],
+        sentences=experiment["findings"],
         notes=experiment["notes"],
         failed=failed_jobs(experiment),
         runs=f"{len(experiment['jobs'])} trainings",
@@ -95,30 +90,26 @@ def run(args: Downstream) -> int:
 
 
 def _settings(args: Downstream) -> DownstreamSettings:
-    """The study that these words describe. Raises NeecoError for sets and weights that cannot be understood."""
+    """The study that these words describe. Raises NeecoError for sets and tests that cannot be understood."""
     from neeco.studies.downstream.job import DownstreamSettings
 
-    weights = dict(name_and_value("--weights", word, "unet=unet.safetensors") for word in args.weights)
+    tests: dict[str, Path] = {}
+    for word in args.test:  # NAME=CAPTURE, or a capture that goes by its folder's name
+        name, equals, place = word.partition("=")
+        if not equals or Path(word).exists():
+            name, place = Path(word).resolve().name, word
+        if name in tests:
+            raise NeecoError(f"--test {name}: results go by this name; name it otherwise: --test NAME={place}")
+        tests[name] = Path(place)
     given = vars(args) | {
         "sets": tuple(_data_set(word) for word in args.sets),
         "models": tuple(dict.fromkeys(args.models)),
         "num_real": tuple(dict.fromkeys(args.num_real)) or None,
-        "tests": tuple(_test(word) for word in args.test),
+        "tests": tests,
         "conditions": args.conditions or None,
-        "weights": {name: Path(file) for name, file in weights.items()},
     }
     del given["test"]
     return DownstreamSettings(**given)
-
-
-def _test(word: str) -> OtherCapture:
-    """`NAME=CAPTURE`, or a capture that goes by its folder's name."""
-    from neeco.studies.downstream.samples import OtherCapture
-
-    name, equals, place = word.partition("=")
-    if not equals or Path(word).exists():
-        return OtherCapture(Path(word).resolve().name, Path(word))
-    return OtherCapture(name, Path(place))
 
 
 def _data_set(word: str) -> ImageSet:

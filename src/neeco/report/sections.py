@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from markupsafe import Markup
 
@@ -38,11 +37,8 @@ class Section:
     level: int = 2  # of the heading
     text: str = ""
     results: ResultTable | None = None
-    head: Sequence[str] = ()
-    rows: Sequence[Sequence[Any]] = ()
     images: Sequence[Images] = ()
     figures: Sequence[Figure] = ()
     files: Mapping[str, str] = field(default_factory=dict)  # CSV by file name
     notes: Sequence[str] = ()
     facts: Sequence[tuple[str, str]] = ()
-    listings: Sequence[tuple[str, str]] = ()

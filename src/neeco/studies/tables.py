@@ -6,7 +6,7 @@ rounded, the best of each column marked; `markdown_document` writes several.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -119,18 +119,26 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 def markdown_table(table: ResultTable) -> list[str]:
     """The table's lines in Markdown under its title; the best of a column is bold."""
-    headings, rows = cell_texts(table, markdown_escape, "**{}**", "failed: {}")
+    headings = [markdown_escape(text) for text in (*table.keys, *(column.heading for column in table.columns))]
+    rows = []
+    for row in table.rows:
+        cells = (
+            [f"failed: {markdown_escape(row.failed)}", *[""] * (len(row.cells) - 1)] if row.failed is not None else []
+        )
+        for cell in () if cells else row.cells:
+            text = markdown_escape(cell.text)
+            cells.append((f"**{text}**" if cell.best else text) + (f" ± {cell.std}" if cell.std else ""))
+        rows.append([*map(markdown_escape, row.keys), *cells])
+    width = max(map(len, [headings, *rows]))  # no run has a number: the reasons have a column without heading
+    headings += [""] * (width - len(headings))
     rule = "|" + "---|" * len(table.keys) + "---:|" * (len(headings) - len(table.keys))
     lines = [f"| {' | '.join(texts)} |" for texts in (headings, *rows)]
     return [f"## {markdown_escape(table.title)}", "", lines[0], rule, *lines[1:]]
 
 
-def markdown_document(
-    title: str, lead: str, tables: Sequence[ResultTable], over: str, notes: Sequence[str], findings: Sequence[str] = ()
-) -> str:
-    """Markdown: a heading, a sentence, findings, the tables and notes. over: what their means are taken over."""
+def markdown_document(title: str, lead: str, tables: Sequence[ResultTable], over: str, notes: Sequence[str]) -> str:
+    """Markdown: a heading, a sentence, the tables and notes. over: what their means are taken over."""
     parts = [f"# {markdown_escape(title)}", "", markdown_escape(lead), ""]
-    parts += [*(f"- {markdown_escape(finding)}" for finding in findings), *([""] if findings else [])]
     for table in tables:
         parts += [*markdown_table(table), ""]
     parts += [f"Mean ± standard deviation over {over}; the best of a column is bold.", ""]
@@ -143,21 +151,3 @@ def markdown_escape(text: str) -> str:
     for character in "\\|*_<`":
         text = text.replace(character, "\\" + character)
     return text
-
-
-def cell_texts(
-    table: ResultTable, escape: Callable[[str], str], bold: str, failed: str
-) -> tuple[list[str], list[list[str]]]:
-    """Headings and rows as texts; bold, failed: the markup of a best entry and of a row without numbers, with {}."""
-    rows = []
-    for row in table.rows:
-        cells = [bold.format(escape(cell.text)) if cell.best else escape(cell.text) for cell in row.cells]
-        cells = [
-            text + (escape(f" ± {cell.std}") if cell.std else "") for text, cell in zip(cells, row.cells, strict=True)
-        ]
-        if row.failed is not None:
-            cells = [failed.format(escape(row.failed)), *[""] * (len(row.cells) - 1)]
-        rows.append([*map(escape, row.keys), *cells])
-    headings = [escape(text) for text in (*table.keys, *(column.heading for column in table.columns))]
-    width = max(map(len, [headings, *rows]))  # no run has a number: the reasons have a column without heading
-    return headings + [""] * (width - len(headings)), rows

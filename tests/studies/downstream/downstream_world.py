@@ -78,7 +78,7 @@ def square(seed: int, side: int = 64) -> Example:
     x, y = random.integers(2, side // 2 - 2, 2)
     classes[y : y + height, x : x + width] = 1
     image[classes > 0] += 180
-    return Example(image, classes, classes.copy())
+    return Example(image, classes)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ def coloured(half_valid: bool = False) -> Example:
     image[20:48, 44:70], classes[20:48, 44:70] = (10, 230, 10), 2
     valid = np.ones(SIZE, bool)
     valid[:, :20] = False
-    return Example(image, classes, (classes > 0).astype(np.uint8), valid if half_valid else None)
+    return Example(image, classes, valid if half_valid else None)
 
 
 def planes(example: Example) -> Tensor:

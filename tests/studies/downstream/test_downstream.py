@@ -21,12 +21,12 @@ from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
 from neeco.studies.downstream import model as models_module
 from neeco.studies.downstream.experiment import plan_downstream, run_downstream
-from neeco.studies.downstream.job import JOB_SCHEMA, DownstreamSettings, job_folder
+from neeco.studies.downstream.job import JOB_SCHEMA, DownstreamSettings, predictions_file, read_predictions
 from neeco.studies.downstream.results import failed_jobs, tables_of, write_tables
-from neeco.studies.downstream.samples import ImageSet, OtherCapture
+from neeco.studies.downstream.samples import ImageSet
 from neeco.studies.downstream.scores import Detections
 
-TIMES = ("seconds", "processor_seconds", "machine")
+TIMES = ("seconds", "machine")
 
 
 class Corners(Pixels):
@@ -82,9 +82,9 @@ def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamSettings) -> Non
     stages = []
     result = trained(spec, lambda news: stages.append((news.index, news.stage)))
     assert result == json.loads((spec.output / "downstream.json").read_text())
-    assert result["schema"] == "neeco-downstream/2"
+    assert result["schema"] == "neeco-downstream/3"
     assert result["complete"]
-    assert result["splits"] == ["test", "unseen"]
+    assert result["tests"] == ["test", "unseen"]
     assert result["labelled"] == 10
     assert [(job["condition"], job["real"], job["fold"]) for job in result["jobs"]] == [
         (condition, real, fold)
@@ -92,7 +92,7 @@ def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamSettings) -> Non
         for condition, real in (("real", 6), ("real", 10), ("kin", 0), ("kin+real", 6), ("kin+real", 10))
     ]
     for job in result["jobs"]:
-        folder = job_folder(spec.output, job["model"], job["condition"], job["real"], job["fold"])
+        folder = spec.job_folder(job["model"], job["condition"], job["real"], job["fold"])
         assert json.loads((folder / "job.json").read_text()) == job
         kept = {"weights.safetensors", "predictions"} if job["fold"] == 0 else set()
         assert {path.name for path in folder.iterdir()} == {"job.json"} | kept
@@ -106,20 +106,19 @@ def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamSettings) -> Non
     assert result["sets"][0]["images"] == 6
     assert len(result["sets"][0]["sha256"]) == 64
     assert result["models"][0]["input"] == [48, 40]
-    assert len(result["answers"]) == 3 * 2
+    assert len(result["findings"]) == 3 * 2
     assert any("fewer than three folds" in note for note in result["notes"])
 
 
 def test_a_jobs_scores_are_of_what_it_answered(spec: DownstreamSettings, recorded: Path) -> None:
     job = trained(replace(spec, conditions=("real",), num_real=("all",), folds=1))["jobs"][0]
-    folder = job_folder(spec.output, "pixels", "real", 10, 0) / "predictions" / "test"
+    answers = read_predictions(predictions_file(spec.job_folder("pixels", "real", 10, 0), "test"))
     values = []
     for row in job["splits"]["test"]["per_frame"]:
-        answer = np.load(folder / "masks.npz")[f"mask_{row['frame']}"]
+        answer = answers[row["frame"]]
         truth = read_grey(recorded / "truth" / "masks" / f"{row['frame']}.png")
         values.append(iou(answer > 0, truth > 0))
         assert row["iou"] == pytest.approx(values[-1], abs=1e-5)
-        assert row["iou_jaws"] is not None
     assert job["splits"]["test"]["iou"] == pytest.approx(np.mean(values))
     assert [row["frame"] for row in job["splits"]["test"]["per_frame"]] == ["006", "007"]
 
@@ -128,7 +127,9 @@ def test_the_same_words_give_the_same_bits(spec: DownstreamSettings, tmp_path: P
     small = replace(spec, conditions=("kin+real+strong",), num_real=("6",), folds=1)
     first, second = (trained(replace(small, output=tmp_path / name)) for name in ("one", "two"))
     assert without_times(first) == without_times(second)
-    folders = [job_folder(tmp_path / name, "pixels", "kin+real+strong", 6, 0) for name in ("one", "two")]
+    folders = [
+        replace(spec, output=tmp_path / name).job_folder("pixels", "kin+real+strong", 6, 0) for name in ("one", "two")
+    ]
     assert len({(folder / "weights.safetensors").read_bytes() for folder in folders}) == 1
 
 
@@ -142,7 +143,7 @@ def test_every_condition_and_model_of_a_fold_has_the_same_labelled_frames(spec: 
         learned = tuple(sample.name for sample in task.batches.sources[0])
         assert len(learned) == 6
         assert {"006", "007", "012"}.isdisjoint(learned)
-        assert list(learned) == job.labelled(plan.capture)
+        assert list(learned) == [sample.name for sample in job.labelled(plan.capture)]
         assert len(task.batches.sources) == 1 + len(job.condition.sets)
         chosen.setdefault(job.fold, set()).add(learned)
     assert [len(chosen[fold]) for fold in range(3)] == [1, 1, 1]
@@ -159,17 +160,17 @@ def test_permuted_labels_are_all_of_other_images(spec: DownstreamSettings) -> No
 
 
 def test_pasted_images_are_of_the_labelled_frames_alone(spec: DownstreamSettings) -> None:
-    plan = plan_downstream(replace(spec, conditions=("real+paste",), num_real=("6",), folds=1, pasted=7))
+    plan = plan_downstream(replace(spec, conditions=("real+paste",), num_real=("6",), folds=1))
     (job,) = plan.jobs
     labelled, pasted = job.task(plan.capture).batches.sources
-    assert len(pasted) == 7
-    assert {source.name for source in pasted[0].sources} == {sample.name for sample in labelled}
+    assert len(pasted) == 400
+    assert {source.name for source in pasted[0].backgrounds.samples} == {sample.name for sample in labelled}
 
 
 def test_by_default_counts_are_nested_and_as_many_as_there_are(spec: DownstreamSettings) -> None:
     plan = plan_downstream(replace(spec, num_real=None, conditions=("real", "kin"), folds=1))
     assert [job.real for job in plan.jobs] == [5, 10, 0]
-    few, every = (set(job.labelled(plan.capture)) for job in plan.jobs[:2])
+    few, every = ({sample.name for sample in job.labelled(plan.capture)} for job in plan.jobs[:2])
     assert few < every
 
 
@@ -177,15 +178,15 @@ def test_by_default_counts_are_nested_and_as_many_as_there_are(spec: DownstreamS
 
 
 def test_another_recording_is_tested_on_all_its_frames(spec: DownstreamSettings, capture: Path) -> None:
-    far = replace(spec, tests=(OtherCapture("far", capture),), conditions=("real",), num_real=("6",), folds=2)
+    far = replace(spec, tests={"far": capture}, conditions=("real",), num_real=("6",), folds=2)
     (capture / "truth" / "masks" / "003.png").unlink()
     result = trained(far)
-    assert result["splits"] == ["test", "unseen", "far"]
-    assert result["tests"] == {"far": str(capture)}
+    assert result["tests"] == ["test", "unseen", "far"]
+    assert result["captures"] == {"far": str(capture)}
     scores = result["jobs"][0]["splits"]["far"]
     assert [row["frame"] for row in scores["per_frame"]] == [f"{k:03d}" for k in range(13) if k != 3]
-    assert (spec.output / "jobs" / "pixels-real-real6-fold0" / "predictions" / "far" / "masks.npz").is_file()
-    assert {row["split"] for row in result["summary"]} == {"test", "unseen", "far"}
+    assert (spec.output / "jobs" / "pixels-real-real6-fold0" / "predictions" / "far.npz").is_file()
+    assert {row["test"] for row in result["summary"]} == {"test", "unseen", "far"}
     assert any(table.title.startswith("pixels, far") for table in tables_of(result))
 
 
@@ -194,10 +195,10 @@ def test_a_recording_is_added_to_a_study_and_another_by_its_name_is_refused(
 ) -> None:
     small = replace(spec, conditions=("kin",), folds=1)
     one = trained(small)["jobs"][0]
-    both = trained(replace(small, tests=(OtherCapture("far", capture),)))["jobs"][0]
+    both = trained(replace(small, tests={"far": capture}))["jobs"][0]
     assert without_times(both["splits"]["test"]) == without_times(one["splits"]["test"])
-    with refused("job.json: --test far: capture: begun with", "give another --output"):
-        plan_downstream(replace(small, tests=(OtherCapture("far", recorded),)))
+    with refused("job.json: --test: far: begun with", "give another --output"):
+        plan_downstream(replace(small, tests={"far": recorded}))
 
 
 @pytest.mark.parametrize(
@@ -207,12 +208,12 @@ def test_names_of_recordings_that_mean_something_are_refused(
     spec: DownstreamSettings, capture: Path, name: str, told: str
 ) -> None:
     with refused(f"--test {name}: ", told):
-        plan_downstream(replace(spec, tests=(OtherCapture(name, capture),)))
+        plan_downstream(replace(spec, tests={name: capture}))
 
 
 def test_recordings_without_truth_or_with_other_parts_are_refused(spec: DownstreamSettings, capture: Path) -> None:
     (capture / "truth" / "masks" / "parts.json").write_text(json.dumps({"ids": [{"id": 1, "part": "grip"}]}))
-    far = replace(spec, tests=(OtherCapture("far", capture),))
+    far = replace(spec, tests={"far": capture})
     with refused("--test far: ", "has other parts than", "--classes instrument"):
         plan_downstream(replace(far, classes="parts"))
     shutil.rmtree(capture / "truth")
@@ -238,7 +239,7 @@ def test_what_is_finished_is_not_done_again(spec: DownstreamSettings, monkeypatc
     monkeypatch.setattr(Pixels, "fit", lambda *_: pytest.fail("taught again"))
     assert trained(spec) == first
     assert job_files(spec.output) == before
-    assert trained(replace(spec, splits=("unseen",)))["splits"] == ["unseen"]
+    assert trained(replace(spec, splits=("unseen",)))["tests"] == ["unseen"]
 
 
 def test_more_folds_sets_conditions_models_and_frames_are_added(spec: DownstreamSettings, tmp_path: Path) -> None:
@@ -256,32 +257,6 @@ def test_more_folds_sets_conditions_models_and_frames_are_added(spec: Downstream
     assert len(after) == len(result["jobs"])
     assert {name: after[name] for name in before} == before
     assert [entry["images"] for entry in result["sets"]] == [6, 3]
-
-
-def test_other_conditions_of_a_folder_stay_in_its_results(spec: DownstreamSettings) -> None:
-    """Two commands, each with its own number of folds, give the results of one; jobs of other steps are left out."""
-    few = trained(replace(spec, conditions=("kin",), num_real=("0",), folds=1))
-    assert few["labelled"] == 0
-    trained(replace(spec, conditions=("real",), num_real=("6",), steps=2, output=spec.output.with_name("other")))
-    shutil.copytree(spec.output.with_name("other") / "jobs", spec.output / "jobs", dirs_exist_ok=True)
-    assert len(trained(replace(spec, conditions=("kin",), num_real=("0",)))["jobs"]) == 2  # not those of 2 steps
-    for wrong in spec.output.glob("jobs/pixels-real-*"):
-        shutil.rmtree(wrong)
-    trained(replace(spec, conditions=("real",)))
-    last = trained(replace(spec, conditions=("kin",), num_real=("0",), folds=1))
-    assert (last["folds"], last["labelled"]) == (2, 10)
-    by_hand = trained(replace(spec, conditions=("real", "kin"), output=spec.output.with_name("whole")))
-    for key in ("summary", "paired", "answers"):
-        assert sorted(map(str, last[key])) == sorted(map(str, by_hand[key]))
-
-
-def test_more_splits_are_tested_after_teaching_again(spec: DownstreamSettings) -> None:
-    small = replace(spec, conditions=("kin",), folds=1)
-    one = trained(replace(small, splits=("unseen",)))["jobs"][0]
-    both = trained(small)["jobs"][0]
-    assert list(one["splits"]) == ["unseen"]
-    assert without_times(both["splits"]["unseen"]) == without_times(one["splits"]["unseen"])
-    assert set(both["splits"]) == {"test", "unseen"}
 
 
 @pytest.mark.parametrize("stopped", [0, 3])
@@ -313,7 +288,7 @@ def test_interrupted_it_goes_on_to_the_same_numbers(
     else:
         assert not spec.output.exists()
     result = trained(spec)
-    for key in ("jobs", "summary", "paired", "answers", "notes", "sets", "models"):
+    for key in ("jobs", "summary", "findings", "notes", "sets", "models"):
         assert without_times(result[key]) == without_times(expected[key])
 
 
@@ -336,9 +311,8 @@ def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSettings, m
     assert job["error"] == "pixels: its loss is not finite at step 3; begin anew"
     assert job["splits"] == {}
     assert len(failed_jobs(result)) == len(failed)
-    assert any(note.startswith("failed: pixels, ") for note in result["notes"])
     write_tables(spec.output, result)
-    assert "not finite" in (spec.output / "data" / "jobs.csv").read_text()
+    assert "not finite" in (spec.output / "downstream.md").read_text()
     if failing == "all":
         assert "failed: pixels" in (spec.output / "downstream.md").read_text()
     again = trained(replace(spec, num_real=("0", "6")))
@@ -360,8 +334,7 @@ def test_a_failure_that_nobody_foresaw_leaves_its_traceback(spec: DownstreamSett
     [
         ({"steps": 7}, "steps: begun with 6, now 7"),
         ({"batch": 3}, "batch: begun with 2, now 3"),
-        ({"size": 24}, "side: begun with 48, now 24"),
-        ({"frame_selection": "first"}, "pick: begun with 'spread', now 'first'"),
+        ({"size": 24}, "size: begun with 48, now 24"),
         ({"classes": "parts"}, "classes: begun with 'instrument', now 'parts'"),
     ],
 )
@@ -403,7 +376,7 @@ def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSettings, capture:
         (spec.output / "downstream.json").write_text(text)
         with refused(f"downstream.json: {reason}"):
             plan_downstream(small)
-    (spec.output / "downstream.json").write_text('{"schema": "neeco-downstream/2"}')
+    (spec.output / "downstream.json").write_text('{"schema": "neeco-downstream/3"}')
     with refused("downstream.json: capture", "give another --output"):
         plan_downstream(small)
 
@@ -420,13 +393,19 @@ def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSettings, capture:
         ({"models": ("segformer",)}, "--models: 'segformer' is unknown; choose of"),
         ({"num_real": ("some",)}, "--num-real: 'some' is neither a number of labelled frames nor all"),
         ({"num_real": ("11",)}, "--num-real: 11 labelled frames are asked for, the capture has 10; use all"),
-        ({"num_real": ()}, "--num-real: leaves nothing to train"),
-        ({"num_real": ("6",), "conditions": ("kin",)}, "--num-real: leaves nothing to train kin on; add 0"),
-        ({"num_real": ("0",), "conditions": ("real",)}, "--num-real: leaves nothing to train real on; add a number"),
-        ({"num_real": ("6",), "conditions": ("real", "kin")}, "--num-real: leaves nothing to train kin on; add 0"),
+        (
+            {"num_real": ("6",), "conditions": ("kin",)},
+            "--num-real: leaves nothing to train kin on; add 0 for sets alone",
+        ),
+        (
+            {"num_real": ("0",), "conditions": ("real",)},
+            "--num-real: leaves nothing to train real on; add 0 for sets alone, a number for real",
+        ),
+        (
+            {"num_real": ("6",), "conditions": ("real", "kin")},
+            "--num-real: leaves nothing to train kin on; add 0 for sets alone",
+        ),
         ({"conditions": ("kim",)}, "--conditions kim: 'kim' is neither"),
-        ({"weights": {"unet": Path("x")}}, "--weights: 'unet' is not among --models pixels"),
-        ({"weights": {"pixels": Path("/nowhere/w")}}, "--weights pixels: /nowhere/w: no such file"),
     ],
 )
 def test_what_cannot_be_done_is_refused(spec: DownstreamSettings, change, told: str) -> None:
@@ -442,8 +421,8 @@ def test_what_cannot_be_done_is_refused(spec: DownstreamSettings, change, told: 
         ({"size": -1}, "--size: -1 is none at all"),
         ({"batch": 0}, "--batch: 0 is none at all"),
         ({"device": "tpu"}, "--device: 'tpu' is unknown"),
-        ({"splits": ("tset",)}, "has no split 'tset'; it has train, test, unseen"),
-        ({"splits": ("train",)}, "--splits: train: what is learned from is not tested"),
+        ({"splits": ("tset",)}, "--splits: tset: "),
+        ({"splits": ("train",)}, "--splits: train: "),
         ({"capture": Path("/nowhere")}, "/nowhere"),
     ],
 )
@@ -455,12 +434,12 @@ def test_what_cannot_be_taught_is_refused(spec: DownstreamSettings, change, told
 @pytest.mark.parametrize("name", ["real", "strong", "paste", "a+b", "", "../up", "a/b"])
 def test_names_of_sets_that_mean_something_are_refused(spec: DownstreamSettings, name: str) -> None:
     data = replace(spec.sets[0], name=name)
-    with refused(f"--sets {name}: ", "call the set"):
+    with refused(f"--sets {name}: conditions and folders go by this name"):
         plan_downstream(replace(replace(spec, conditions=None), sets=(data,)))
 
 
 def test_names_of_sets_stand_once(spec: DownstreamSettings) -> None:
-    with refused("--sets: a name stands twice in kin kin"):
+    with refused("--sets kin: ", "give each set one of its own"):
         plan_downstream(replace(spec, sets=spec.sets * 2))
 
 
@@ -468,11 +447,11 @@ def test_captures_without_truth_to_test_on_are_refused(spec: DownstreamSettings,
     there = replace(spec, capture=capture)
     (capture / "truth" / "masks" / "012.png").unlink()
     assert plan_downstream(there).settings.splits == ("test",)
-    with refused("--splits: unseen: no frame of it has a true mask"):
+    with refused("--splits: unseen: ", "has true masks of test"):
         plan_downstream(replace(there, splits=("unseen",)))
     for name in ("006", "007"):
         (capture / "truth" / "masks" / f"{name}.png").unlink()
-    with refused(str(capture), "no frame outside of split train has a true mask"):
+    with refused(str(capture), "has no true mask outside of split train"):
         plan_downstream(there)
 
 
@@ -483,7 +462,7 @@ def test_sets_alone_need_no_labelled_frame(spec: DownstreamSettings, capture: Pa
     result = trained(alone)
     assert result["labelled"] == 0
     assert "error" not in result["jobs"][0]
-    with refused("split train: no frame has a label; give --labels FOLDER"):
+    with refused("train: no frame has a label; give --labels FOLDER"):
         plan_downstream(replace(alone, conditions=("kin+real",)))
 
 
@@ -523,7 +502,9 @@ def test_boxes_of_instruments_that_labels_do_not_tell_apart_are_refused(
     file.write_text(json.dumps(stated))
     two = replace(spec, capture=capture)
     plan_downstream(two)
-    with refused("--models corners", "labels do not tell the 2 instruments apart", "a model that predicts masks"):
+    with refused(
+        "--models corners", "has several instruments, and labels do not tell them apart", "a model that predicts masks"
+    ):
         plan_downstream(replace(two, models=("corners",)))
 
 
@@ -533,11 +514,11 @@ def test_boxes_of_instruments_that_labels_do_not_tell_apart_are_refused(
 def test_boxes_are_scored_and_kept(spec: DownstreamSettings) -> None:
     job = trained(replace(spec, models=("corners",), conditions=("kin",), folds=1))["jobs"][0]
     scores = job["splits"]["test"]
-    assert {"ap", "ap50", "ap75", "box_precision", "box_recall", "frames"} == set(scores)
-    file = job_folder(spec.output, "corners", "kin", 0, 0) / "predictions" / "test" / "boxes.json"
-    kept = json.loads(file.read_text())
+    assert {"ap", "ap50", "ap75", "frames", "per_frame"} == set(scores)
+    kept = read_predictions(predictions_file(spec.job_folder("corners", "kin", 0, 0), "test"))
     assert list(kept) == ["006", "007"]
-    assert kept["006"] == {"boxes": [[0, 0, 24, 20]], "classes": [1], "scores": [0.9]}
+    assert isinstance(kept["006"], Detections)
+    assert kept["006"].boxes.tolist() == [[0, 0, 24, 20]]
 
 
 def test_parts_are_scored_apart_and_take_more_steps(spec: DownstreamSettings) -> None:
@@ -545,7 +526,7 @@ def test_parts_are_scored_apart_and_take_more_steps(spec: DownstreamSettings) ->
     assert {job["iterations"] for job in result["jobs"]} == {15}  # not six
     assert result["classes"] == ["shaft", "wrist", "jaws"]
     scores = result["jobs"][0]["splits"]["test"]
-    assert {"iou", "shaft.iou", "wrist.iou", "jaws.iou", "iou_jaws"} <= set(scores)
+    assert {"iou", "shaft.iou", "wrist.iou", "jaws.iou"} <= set(scores)
     titles = [column.title for table in tables_of(result) for column in table.columns]
     assert "jaws IoU" in titles
 
@@ -566,30 +547,12 @@ def test_a_wrong_file_in_a_set_fails_its_jobs_alone(spec: DownstreamSettings, dr
 def test_tables_hold_the_numbers(spec: DownstreamSettings) -> None:
     result = trained(spec)
     write_tables(spec.output, result)
-    rows = {(row["condition"], row["real"], row["split"]): row for row in result["summary"]}
     with (spec.output / "downstream.csv").open(newline="") as stream:
         lines = list(csv.DictReader(stream))
-    assert len(lines) == 10
-    for line in lines:
-        value = rows[line["condition"], int(line["real"]), line["split"]]["iou"]
-        assert float(line["iou_mean"]) == value["mean"]
-        assert float(line["iou_std"]) == value["std"]
-        assert line["iou_n"] == "2"
-    markdown, latex = ((spec.output / f"downstream.{kind}").read_text() for kind in ("md", "tex"))
-    mean = rows["kin+real", 10, "test"]["iou"]["mean"]
-    assert f"{mean:.3f}" in markdown
-    assert f"{mean:.3f}" in latex
+    assert [float(line["iou"]) for line in lines] == [row["iou"] for row in result["summary"]]
+    markdown = (spec.output / "downstream.md").read_text()
+    assert all(f"{row['iou']:.3f}" in markdown for row in result["summary"])
     assert "pixels: 6 steps of 2 images of 48x40; 2 folds" in markdown
-    assert all(sentence.split(":")[0] in markdown for sentence in result["answers"])
-    assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == len(tables_of(result)) == 6
-    counts = {}
-    for file in (spec.output / "data").glob("*.csv"):
-        with file.open(newline="") as stream:
-            counts[file.name] = len(list(csv.DictReader(stream)))
-    assert counts["scores.csv"] == 20
-    assert counts["frames.csv"] == 30
-    assert counts["jobs.csv"] == 10
-    assert counts["paired.csv"] == len(result["paired"]) > 0
 
 
 def test_jobs_are_handed_the_capture(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -602,7 +565,6 @@ def test_jobs_are_handed_the_capture(spec: DownstreamSettings, monkeypatch: pyte
 def test_a_set_of_others_is_no_less_a_set(spec: DownstreamSettings, tmp_path: Path) -> None:
     root = write_set(tmp_path / "others", info=False)
     result = trained(replace(replace(spec, conditions=("kin",), folds=1), sets=(ImageSet("kin", root),)))
-    assert result["sets"][0]["made_by"] is None
     assert "error" not in result["jobs"][0]
 
 

@@ -11,7 +11,7 @@ from downstream_world import Held, batch_of, squares
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neeco.studies.downstream import batches
+from neeco.studies.downstream import batches, samples
 from neeco.studies.downstream.batches import BatchSampler, training_image
 from neeco.studies.downstream.samples import Example, LeastRecentlyUsed
 
@@ -74,7 +74,8 @@ def test_the_seed_decides_the_order_whatever_the_batches() -> None:
 
 def test_images_are_read_once_unless_they_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     def reads(limit: int) -> list[int]:
-        monkeypatch.setattr(batches, "IMAGES", LeastRecentlyUsed(limit))
+        monkeypatch.setattr(batches, "IMAGES", LeastRecentlyUsed())
+        monkeypatch.setattr(samples, "CACHE_BYTES", limit)
         source = [Held(sample.example, sample.name, []) for sample in squares(4, 0, 16)]
         for _ in range(3):
             for sample in source:
@@ -91,7 +92,7 @@ def test_targets_are_shares_of_area() -> None:
     classes[:2, :1], classes[:, 4:6] = 1, 2
     counted = np.ones((4, 8), bool)
     counted[2:, 6:] = False
-    example = Example(np.full((4, 8, 3), 51, np.uint8), classes, classes, counted)
+    example = Example(np.full((4, 8, 3), 51, np.uint8), classes, counted)
     batch = batch_of([example], (4, 2), 2)
     assert batch.images.shape == (1, 3, 2, 4)
     assert batch.images.numpy() == pytest.approx(np.full((1, 3, 2, 4), 0.2), abs=1e-6)
@@ -105,13 +106,11 @@ def test_targets_are_shares_of_area() -> None:
 def test_boxes_of_a_batch_are_those_of_its_examples() -> None:
     classes = np.zeros((40, 80), np.uint8)
     classes[10:20, 20:60], classes[25:26, 3:4] = 2, 1
-    example = Example(np.zeros((40, 80, 3), np.uint8), classes, (classes > 0).astype(np.uint8))
-    (boxes, numbers), (nothing, none) = batch_of(
-        [example, Example(example.image, classes * 0, classes * 0)], (20, 20)
-    ).boxes()
-    expected, classes_expected = example.relative_boxes()
-    assert boxes == pytest.approx(expected, abs=1e-6)
-    assert numbers.tolist() == classes_expected.tolist() == [1, 2]
+    example = Example(np.zeros((40, 80, 3), np.uint8), classes)
+    (boxes, numbers), (nothing, none) = batch_of([example, Example(example.image, classes * 0)], (20, 20)).boxes()
+    expected = [[3.5 / 80, 25.5 / 40, 1 / 80, 1 / 40], [0.5, 15 / 40, 0.5, 0.25]]  # centre and size
+    assert boxes == pytest.approx(np.array(expected), abs=1e-6)
+    assert numbers.tolist() == [1, 2]
     assert nothing.shape == (0, 4)
     assert none.shape == (0,)
     assert torch.equal(batch_of([example], (20, 20)).images, torch.zeros(1, 3, 20, 20))

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import torch
 from downstream_world import Held, Pixels, batch_of, square, squares, task_of
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
 from neeco.studies.downstream.batches import BatchSampler
-from neeco.studies.downstream.model import WEIGHTS_FILE, find_models, input_size, load_weights, model_class
+from neeco.studies.downstream.model import WEIGHTS_FILE, find_models, input_size, model_class
 from neeco.studies.downstream.models import dfine
 from neeco.studies.downstream.models.dfine import DFine
 from neeco.studies.downstream.models.unet import ResidualUNet, UNet
@@ -40,8 +40,8 @@ def test_a_unet_learns_bright_rectangles_and_repeats_bit_for_bit(tmp_path: Path)
     folders = [tmp_path / "one", tmp_path / "two"]
     for folder in folders:
         task = task_of(folder, steps=40, batch=3, progress=lambda share, text: told.append((share, text)))
-        fitted = UNet().fit(task)
-    answers = fitted.predict([example.image for example in tested])
+        predict = UNet().fit(task)
+    answers = predict([example.image for example in tested])
     assert all(answer.dtype == np.uint8 and answer.shape == (64, 64) for answer in answers)
     assert np.mean([iou(a > 0, e.classes > 0) for a, e in zip(answers, tested, strict=True)]) > 0.7
     first, second = ((folder / WEIGHTS_FILE).read_bytes() for folder in folders)
@@ -80,9 +80,9 @@ def test_a_dfine_learns_where_rectangles_are(small_dfine, tmp_path: Path, monkey
         return value
 
     monkeypatch.setattr(DFine, "loss", watched)
-    fitted = DFine().fit(task_of(tmp_path, batches=BatchSampler(squares(2), seed=0), steps=40))
+    predict = DFine().fit(task_of(tmp_path, batches=BatchSampler(squares(2), seed=0), steps=40))
     assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:5])
-    (answer,) = fitted.predict([square(0).image])
+    (answer,) = predict([square(0).image])
     assert isinstance(answer, Detections)
     assert answer.boxes.shape == (6, 4)
 
@@ -101,24 +101,12 @@ def test_dfines_answers_are_boxes_of_each_image_best_first() -> None:
 
 
 def test_a_dfine_repeats_bit_for_bit_and_bears_images_without_an_instrument(small_dfine, tmp_path: Path) -> None:
-    empty = replace(square(0), classes=np.zeros((64, 64), np.uint8), instruments=np.zeros((64, 64), np.uint8))
+    empty = replace(square(0), classes=np.zeros((64, 64), np.uint8))
     for name in ("one", "two"):
         feed = BatchSampler([Held(empty), Held(empty), *squares(1)], seed=0, augmented=True)
         DFine().fit(task_of(tmp_path / name, batches=feed, steps=3))
     first, second = ((tmp_path / name / WEIGHTS_FILE).read_bytes() for name in ("one", "two"))
     assert first == second
-
-
-def test_a_dfine_begins_from_its_own_weights_exactly(small_dfine, tmp_path: Path) -> None:
-    DFine().fit(task_of(tmp_path, steps=2))
-    with torch.random.fork_rng():
-        torch.manual_seed(9)
-        module = DFine().build(1)
-    load_weights(module, tmp_path / WEIGHTS_FILE)
-    stored, own = load_file(tmp_path / WEIGHTS_FILE), module.state_dict()
-    assert all(torch.equal(value, own[name]) for name, value in stored.items())
-    shared = {value.data_ptr() for name, value in own.items() if name in stored}
-    assert all(value.data_ptr() in shared for value in own.values())  # what is not stored is tied to what is
 
 
 def test_what_dfine_is_told_of_an_image() -> None:
@@ -189,41 +177,12 @@ def test_a_loss_that_is_not_finite_is_told(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_many_images_are_answered_in_pieces_the_same(tmp_path: Path) -> None:
-    fitted = Pixels().fit(task_of(tmp_path))
+    predict = Pixels().fit(task_of(tmp_path))
     images = [square(k).image for k in range(35)]
-    together = fitted.predict(images)
+    together = predict(images)
     assert len(together) == 35
-    assert all(
-        np.array_equal(fitted.predict([image])[0], answer) for image, answer in zip(images, together, strict=True)
-    )
-    assert fitted.predict([]) == []
-
-
-# weights to begin from
-
-
-def test_weights_are_begun_from(tmp_path: Path) -> None:
-    Pixels().fit(task_of(tmp_path / "first", steps=30))
-    begun = Pixels.learning_rate
-    try:
-        Pixels.learning_rate = 0.0
-        Pixels().fit(task_of(tmp_path / "second", seed=3, weights=tmp_path / "first" / WEIGHTS_FILE))
-    finally:
-        Pixels.learning_rate = begun
-    first, second = (load_file(tmp_path / name / WEIGHTS_FILE) for name in ("first", "second"))
-    assert first.keys() == second.keys()
-    assert all(torch.equal(first[name], second[name]) for name in first)
-
-
-def test_weights_of_other_models_or_none_are_refused(tmp_path: Path) -> None:
-    save_file({"weight": torch.zeros(2, 3, 1, 1), "else": torch.zeros(3)}, tmp_path / "half.safetensors")
-    Pixels().fit(task_of(tmp_path / "job", weights=tmp_path / "half.safetensors"))  # one of two tensors fits
-    save_file({"weight": torch.zeros(5, 3, 1, 1), "bias": torch.zeros(5)}, tmp_path / "other.safetensors")
-    (tmp_path / "text.safetensors").write_text("not weights at all, but a text of some length")
-    for name, told in (("other", "0 of 2 tensors fit; give weights of this model"), ("text", "cannot be read as")):
-        with pytest.raises(NeecoError, match=f"--weights: .*{name}.safetensors: {told}") as refused:
-            Pixels().fit(task_of(tmp_path / "job", weights=tmp_path / f"{name}.safetensors"))
-        assert "\n" not in str(refused.value)
+    assert all(np.array_equal(predict([image])[0], answer) for image, answer in zip(images, together, strict=True))
+    assert predict([]) == []
 
 
 # what a unet learns of every pixel
@@ -263,9 +222,9 @@ def test_a_unet_answers_at_its_inputs_size_for_any_channels() -> None:
 
 
 def test_models_are_found_by_their_names() -> None:
-    assert list(find_models()) == ["dfine", "unet", "yolo"]
+    assert list(find_models()) == ["dfine", "unet"]
     assert model_class("unet") is UNet
-    with pytest.raises(NeecoError, match=re.escape("--models: 'u-net' is unknown; choose of dfine, unet, yolo")):
+    with pytest.raises(NeecoError, match=re.escape("--models: 'u-net' is unknown; choose of dfine, unet")):
         model_class("u-net")
 
 

@@ -5,14 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from downstream_world import save_rgb
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.studies.downstream.paste import Backgrounds, covered, filled, pasted_samples
-from neeco.studies.downstream.samples import RecordedSample, recorded_samples
+from neeco.studies.downstream.paste import Backgrounds, pasted_samples
+from neeco.studies.downstream.samples import Example, RecordedSample, recorded_samples
+
+
+def covered(example: Example) -> np.ndarray:
+    """The instruments and what is about them, by the rule of the settings: 2 % of the longer side."""
+    return cv2.dilate((example.classes > 0).astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))) > 0
 
 
 @pytest.fixture(scope="module")
@@ -22,11 +28,10 @@ def labelled(recorded: Path) -> tuple[RecordedSample, ...]:
 
 def test_pasted_instruments_are_whole_frames_labels_over_other_pixels(labelled, tmp_path: Path) -> None:
     save_rgb(tmp_path / "plain" / "a.png", np.full((20, 30, 3), (7, 200, 7)))  # of another size than the frames
-    for sample in pasted_samples(labelled, tmp_path / "plain", 0, 12):
+    for sample in pasted_samples(labelled, tmp_path / "plain", 0)[:12]:
         example = sample.load()
         assert example.image.shape == (40, 48, 3)
         assert set(np.unique(example.classes)) <= {0, 1, 2, 3}
-        assert np.array_equal(example.classes > 0, example.instruments > 0)
         away = ~covered(example)
         away[:, [0, -1]] = away[[0, -1]] = False
         assert away.any()
@@ -36,13 +41,13 @@ def test_pasted_instruments_are_whole_frames_labels_over_other_pixels(labelled, 
 
 
 def test_the_same_number_gives_the_same_pixels_others_differ_and_so_do_seeds(labelled) -> None:
-    one, again, other = (pasted_samples(labelled, None, seed, 3) for seed in (0, 0, 1))
+    one, again, other = (pasted_samples(labelled, None, seed)[:3] for seed in (0, 0, 1))
     images = [sample.load().image for sample in one]
     assert all(np.array_equal(image, sample.load().image) for image, sample in zip(images, again, strict=True))
     assert not np.array_equal(images[0], images[1])
     assert not np.array_equal(images[0], other[0].load().image)
     assert one[0].key == again[0].key
-    assert len({one[0].key, one[1].key, other[0].key, pasted_samples(labelled[:3], None, 0, 1)[0].key}) == 4
+    assert len({one[0].key, one[1].key, other[0].key, pasted_samples(labelled[:3], None, 0)[0].key}) == 4
 
 
 def test_without_backgrounds_instruments_are_filled_in(labelled) -> None:
@@ -52,19 +57,6 @@ def test_without_backgrounds_instruments_are_filled_in(labelled) -> None:
         made, hole = backgrounds.image(index, (48, 40)), covered(example)
         assert np.array_equal(made[~hole], example.image[~hole])
         assert not np.array_equal(made[hole], example.image[hole])
-
-
-def test_a_hole_takes_what_is_behind_it_where_that_is_known() -> None:
-    image, hole = np.full((30, 40, 3), 90, np.uint8), np.zeros((30, 40), bool)
-    hole[5:20, 10:30] = True
-    image[hole] = 250
-    plate = np.full((30, 40, 3), 40, np.uint8)
-    plate[:12] = 0  # never seen
-    made = filled(image, hole, plate)
-    assert (made[hole & plate.any(2)] == 40).all()
-    assert (made[6:10, 12:28] < 120).all()  # inpainted from around it
-    assert np.array_equal(filled(image, ~hole & False), image)
-    assert np.abs(filled(image, hole)[hole].astype(int) - 90).max() < 5
 
 
 def test_a_still_cameras_background_is_the_median_of_frames_that_show_it(labelled) -> None:
@@ -82,8 +74,7 @@ def test_a_still_cameras_background_is_the_median_of_frames_that_show_it(labelle
 
 
 def test_a_folder_without_images_is_refused(labelled, tmp_path: Path) -> None:
-    with pytest.raises(NeecoError, match=r"--backgrounds .*nowhere: no such folder"):
-        pasted_samples(labelled, tmp_path / "nowhere", 0)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(NeecoError, match=r"--backgrounds .*empty: has no image"):
-        pasted_samples(labelled, tmp_path / "empty", 0)
+    for name in ("nowhere", "empty"):
+        with pytest.raises(NeecoError, match=rf"--backgrounds .*{name}: has no image"):
+            pasted_samples(labelled, tmp_path / name, 0)

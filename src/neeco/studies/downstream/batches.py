@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -12,8 +12,6 @@ from torch import Tensor
 
 from neeco.studies.downstream.samples import Example, LeastRecentlyUsed, Sample
 from neeco.synthesis.augmentation import Outline, augment, moved
-
-REAL_ALONE_FROM = 0.6  # share of the steps after which recorded frames alone are learned
 
 
 @dataclass(frozen=True)
@@ -43,16 +41,20 @@ class Batch:
 
     def boxes(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return each image's boxes [n, 4] (centre x, y, width, height; shares of its sides) and their classes."""
-        return [_boxes(outlines) for outlines in self.outlines]
+        found = []
+        for outlines in self.outlines:
+            ends = np.array([(*points.min(0), *points.max(0)) for _, points in outlines], np.float64).reshape(-1, 4)
+            boxes = np.concatenate([(ends[:, :2] + ends[:, 2:]) / 2, ends[:, 2:] - ends[:, :2]], 1)
+            found.append((boxes, np.array([number for number, _ in outlines], np.int64)))
+        return found
 
 
-IMAGES: LeastRecentlyUsed[Hashable, TrainingImage] = LeastRecentlyUsed()
+IMAGES = LeastRecentlyUsed[TrainingImage]()
 
 
 def training_image(sample: Sample, size: tuple[int, int], classes: int, outlines: bool = False) -> TrainingImage:
     """The sample at this size (width, height), kept for as long as there is room. outlines: with them, for boxes."""
-    key = (sample.key, size, classes, outlines)
-    return IMAGES.get(key, lambda: shrink(sample.load(), size, classes, outlines), lambda image: image.bytes)
+    return IMAGES.get((sample.key, size, classes, outlines), lambda: shrink(sample.load(), size, classes, outlines))
 
 
 def shrink(example: Example, size: tuple[int, int], classes: int, outlines: bool = False) -> TrainingImage:
@@ -72,9 +74,7 @@ def shrink(example: Example, size: tuple[int, int], classes: int, outlines: bool
 
 def collate(images: Sequence[TrainingImage], device: torch.device, rng: torch.Generator | None = None) -> Batch:
     """The batch of these images; rng (of that device): strongly augmented at random by it."""
-    fields = ("image", "shares", "valid")
-    arrays = [np.stack([getattr(item, name) for item in images]) for name in fields]
-    count = arrays[1].shape[1]
+    arrays = [np.stack([getattr(item, name) for item in images]) for name in ("image", "shares", "valid")]
     planes = torch.from_numpy(np.concatenate(arrays, 1)).to(device).float() / 255  # [B, 3 + C + 1, h, w]
     outlines = [item.outlines for item in images]
     if rng is not None:
@@ -82,54 +82,40 @@ def collate(images: Sequence[TrainingImage], device: torch.device, rng: torch.Ge
         if any(outlines):
             placed = zip(outlines, matrices.double().cpu().numpy(), strict=True)
             outlines = [moved(some, matrix) for some, matrix in placed]
-    shares = planes[:, 3 : 3 + count]
-    tissue = 1 - shares.sum(1, keepdim=True)
+    shares = planes[:, 3:-1]
     colors = planes[:, :3].contiguous(memory_format=torch.channels_last)
+    tissue = 1 - shares.sum(1, keepdim=True)
     return Batch(colors, torch.cat([tissue, shares], 1), planes[:, -1], tuple(outlines))
-
-
-def _boxes(outlines: Sequence[Outline]) -> tuple[np.ndarray, np.ndarray]:
-    ends = np.array([(*points.min(0), *points.max(0)) for _, points in outlines], np.float64).reshape(-1, 4)
-    boxes = np.concatenate([(ends[:, :2] + ends[:, 2:]) / 2, ends[:, 2:] - ends[:, :2]], 1)
-    return boxes, np.array([number for number, _ in outlines], np.int64)
 
 
 class BatchSampler:
     """Draws samples from sources without end. A source is shuffled anew after each pass.
 
     sources: recorded frames where there are any, then the synthetic ones, of which each has an equal share. Where there
-    are both, synthetic ones are drawn until REAL_ALONE_FROM, then recorded ones alone. The seed decides the order.
+    are both, synthetic ones are drawn until `real_alone_from`, then recorded ones alone. The seed decides the order.
     augmented: whether a batch is to be strongly augmented.
     """
 
+    real_alone_from = 0.6  # share of the steps after which recorded frames alone are learned
+
     def __init__(
-        self,
-        real: Sequence[Sample],
-        synthetic: Sequence[Sequence[Sample]] = (),
-        *,
-        seed: int,
-        augmented: bool = False,
+        self, real: Sequence[Sample], synthetic: Sequence[Sequence[Sample]] = (), *, seed: int, augmented: bool = False
     ) -> None:
         self.sources = [source for source in (real, *synthetic) if source]
-        self._fine_tunes = bool(real) and len(self.sources) > 1
         self.augmented = augmented
-        self.rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
+        self._rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
         self._orders = [self._shuffled(source) for source in self.sources]
-        self._turn = int(self._fine_tunes)  # the second synthetic source, if there is one, comes first
+        self._real = int(bool(real))
+        self._turn = 0
 
     def draw(self, count: int, done: float) -> list[Sample]:
         """Return the next `count` samples. done: share of the training that is done, in [0, 1]."""
-        return [next(self._next_source(done)) for _ in range(count)]
-
-    def _next_source(self, done: float) -> Iterator[Sample]:
-        """The source whose turn it is."""
-        orders = self._orders
-        if self._fine_tunes:
-            orders = orders[:1] if done >= REAL_ALONE_FROM else orders[1:]
-        self._turn += 1
-        return orders[(self._turn - 1) % len(orders)]
+        real, synthetic = self._orders[: self._real], self._orders[self._real :]
+        orders = real if real and (done >= self.real_alone_from or not synthetic) else synthetic
+        self._turn += count
+        return [next(orders[turn % len(orders)]) for turn in range(self._turn - count, self._turn)]
 
     def _shuffled(self, source: Sequence[Sample]) -> Iterator[Sample]:
         while True:
-            for index in self.rng.permutation(len(source)).tolist():
+            for index in self._rng.permutation(len(source)).tolist():
                 yield source[index]

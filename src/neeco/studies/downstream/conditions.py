@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -14,48 +13,35 @@ RESERVED = REAL, STRONG, PASTE, PERMUTED = "real", "strong", "paste", "permuted"
 BASELINES = (REAL, f"{REAL}+{STRONG}")  # without synthetic images: the better of them is the reference
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 
-FrameSelection = Literal["spread", "first"]
 
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Condition:
-    """The training data of a model: a sum of words, `SET+real+strong`."""
+    """The training data of a model: a sum of words, `SET+real+strong`. `word in condition` asks for one of them.
+
+    sets: names of data sets. real: with labelled recorded frames; strong: strong augmentation of every image; paste:
+    with the labelled instruments pasted over backgrounds; permuted: the sets' labels belong to other images.
+    """
 
     name: str
-    sets: tuple[str, ...] = ()  # names of data sets
-    real: bool = False  # with labelled recorded frames
-    strong: bool = False  # with strong augmentation of every image
-    paste: bool = False  # with the labelled instruments pasted over backgrounds
-    permuted: bool = False  # the sets' labels belong to other images
+    sets: tuple[str, ...] = ()
+
+    def __contains__(self, word: str) -> bool:
+        return word in self.name.split("+")
 
 
 def parse_condition(name: str, sets: Collection[str]) -> Condition:
     """`kinematic+real+strong`. Raises NeecoError for a word that is none of `sets` nor known, or a lack of images."""
-
-    def refuse(problem: str) -> NeecoError:
-        return NeecoError(f"--conditions {name}: {problem}")
-
     words = name.split("+")
     for word in words:
         if word not in RESERVED and word not in sets:
-            raise refuse(f"{word!r} is neither {', '.join(RESERVED)} nor a set; name it in --sets")
-    if len(set(words)) < len(words):
-        raise refuse("a word stands in it twice")
-    chosen = tuple(word for word in words if word in sets)
-    if PERMUTED in words and not chosen:
-        raise refuse(f"{PERMUTED} only together with a set, whose labels it permutes")
-    if PASTE in words and REAL not in words:
-        raise refuse(f"{PASTE} only together with {REAL}, whose instruments it pastes")
-    if not chosen and REAL not in words:
-        raise refuse("nothing to learn from; add real or a set")
-    return Condition(
-        name=name,
-        sets=chosen,
-        real=REAL in words,
-        strong=STRONG in words,
-        paste=PASTE in words,
-        permuted=PERMUTED in words,
-    )
+            known = ", ".join(RESERVED)
+            raise NeecoError(f"--conditions {name}: {word!r} is neither {known} nor a set; name it in --sets")
+    condition = Condition(name, tuple(word for word in words if word in sets))
+    lacks_real = REAL not in condition and (PASTE in condition or not condition.sets)
+    if len(set(words)) < len(words) or lacks_real or (PERMUTED in condition and not condition.sets):
+        rule = "real or a set is needed, paste needs real, permuted needs a set, and no word stands twice"
+        raise NeecoError(f"--conditions {name}: {rule}; correct it")
+    return condition
 
 
 def default_conditions(sets: Sequence[str]) -> list[str]:
@@ -76,16 +62,13 @@ def labelled_count(word: str, frames: int) -> int:
     return int(word)
 
 
-def labelled_frames(frames: int, count: int, fold: int, selection: FrameSelection) -> list[int]:
+def labelled_frames(frames: int, count: int, fold: int) -> list[int]:
     """Choose the `count` of so many recorded frames that are labelled in a fold, in their order.
 
-    Those of a smaller count are among those of a larger one. spread: the additive recurrence of the golden ratio from a
-    start of the fold's own, whose first points are spread evenly whatever their number (Steinhaus' three-gap theorem);
-    of a frame taken already the next one. first: the recording's first, the same in every fold. The same for every
-    condition and model of a fold.
+    Those of a smaller count are among those of a larger one, and the same for every condition and model of a fold: the
+    additive recurrence of the golden ratio from a start of the fold's own, whose first points are spread evenly
+    whatever their number (Steinhaus' three-gap theorem); of a frame taken already the next one.
     """
-    if selection == "first":
-        return list(range(count))
     start = np.random.default_rng(np.random.SeedSequence([fold, 0])).random()
     free = np.ones(frames, bool)
     for k in range(count):

@@ -1,4 +1,4 @@
-"""The interface of downstream models, and the training loop of all that are PyTorch modules."""
+"""Downstream models: their interface, and the training loop that all share."""
 
 from __future__ import annotations
 
@@ -14,20 +14,18 @@ from typing import Any, ClassVar, Literal
 import cv2
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from neeco.errors import NeecoError, install_hint
 from neeco.files import write_atomically
-from neeco.placeholders import placeholder
 from neeco.registry import plugins
 from neeco.studies.downstream.batches import Batch, BatchSampler, collate, training_image
 from neeco.studies.downstream.scores import Prediction
 
 WEIGHTS_FILE = "weights.safetensors"
-PREDICTION_BATCH = 16  # images
 REPORT_EVERY = 10  # steps
+Predict = Callable[[Sequence[np.ndarray]], list[Prediction]]  # of uint8 images [H, W, 3], at their size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,20 +40,18 @@ class TrainingTask:
     seed: int
     device: torch.device
     folder: Path  # the job's, for what training writes
-    weights: Path | None = None  # to start from; None: from scratch
     keep_weights: bool = True  # write those that it ends with to the folder
     progress: Callable[[float, str], None] = lambda share, text: None
 
 
-@dataclass(frozen=True)
-class TrainedModel:
-    """`predict` maps uint8 images [H, W, 3] to predictions at their size."""
+class TorchModel(ABC):
+    """A detector or segmenter: its attributes, which are known before anything is imported, a module, a loss and its
+    predictions; `fit` is the same for all.
 
-    predict: Callable[[Sequence[np.ndarray]], list[Prediction]]
-
-
-class Model(ABC):
-    """A detector or segmenter. Its class attributes are what is known before anything is imported."""
+    AdamW, the same number of steps in every condition; the learning rate rises over the first steps and falls to 0 as
+    a cosine (Loshchilov and Hutter, "SGDR", 2017). The weights after the last step are the model: nothing is chosen, so
+    that no label is spent on a choice.
+    """
 
     model: ClassVar[str]
     predicts: ClassVar[Literal["masks", "boxes"]]
@@ -63,7 +59,11 @@ class Model(ABC):
     multiple: ClassVar[int]  # both sides are multiples of it
     steps: ClassVar[int]  # that suffice for a few hundred images
     batch: ClassVar[int]
-    accepts_weights: ClassVar[bool] = True
+    learning_rate: ClassVar[float]
+    weight_decay: ClassVar[float] = 1e-4
+    gradient_clip: ClassVar[float] = 0.1  # norm, as in D-FINE
+    warmup: ClassVar[float] = 0.1  # of the steps: the learning rate rises
+    prediction_batch: ClassVar[int] = 16  # images
 
     @classmethod
     @abstractmethod
@@ -74,55 +74,6 @@ class Model(ABC):
     def is_too_small(cls, size: tuple[int, int]) -> bool:
         """Return whether images of this size (width, height), at its input, are too small for it."""
         return False
-
-    @abstractmethod
-    def fit(self, task: TrainingTask) -> TrainedModel:
-        """Train it. The same task gives the same model on the CPU. Raises NeecoError for weights that do not fit."""
-
-
-def missing_packages(*packages: str) -> str | None:
-    """`missing_requirement` of a model that needs packages of the extra `downstream`."""
-    absent = [name for name in packages if importlib.util.find_spec(name) is None]
-    return f"needs {' and '.join(absent)}; {install_hint('downstream')}" if absent else None
-
-
-@cache
-def find_models() -> dict[str, type[Model]]:
-    """Return every class with a `model` name of its own, by that name: those of `models/`, and those of entry points in
-    `neeco.models`. Raises NeecoError when two share a name, or one cannot be loaded."""
-    return plugins(Model, "model", "neeco.studies.downstream.models", "neeco.models")  # type: ignore[type-abstract]
-
-
-def model_class(name: str) -> type[Model]:
-    """The model of that name. Raises NeecoError when there is none."""
-    known = find_models()
-    if name not in known:
-        raise NeecoError(
-            f"--models: {name!r} is unknown; choose of {', '.join(known)}, or install the package that has it"
-        )
-    return known[name]
-
-
-def input_size(frame: tuple[int, int], longer_side: int, multiple: int) -> tuple[int, int]:
-    """Return the input (width, height) of a model for frames of this size: at most `longer_side`, both multiples of
-    `multiple`, the nearest to the frame's shape."""
-    scale = min(1.0, max(multiple, longer_side - longer_side % multiple) / max(frame))
-    width, height = (max(multiple, multiple * round(edge * scale / multiple)) for edge in frame)
-    return width, height
-
-
-class TorchModel(Model):
-    """A model given as a module, a loss and its predictions; `fit` is the same for all.
-
-    AdamW, the same number of steps in every condition; the learning rate rises over the first steps and falls to 0 as
-    a cosine (Loshchilov and Hutter, "SGDR", 2017). The weights after the last step are the model: nothing is chosen, so
-    that no label is spent on a choice.
-    """
-
-    learning_rate: ClassVar[float]
-    weight_decay: ClassVar[float] = 1e-4
-    gradient_clip: ClassVar[float] = 0.1  # norm, as in D-FINE
-    warmup: ClassVar[float] = 0.1  # of the steps: the learning rate rises
 
     @abstractmethod
     def build(self, classes: int) -> nn.Module:
@@ -136,22 +87,23 @@ class TorchModel(Model):
     def predictions(self, module: Any, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Prediction]:
         """Return the predictions of images [B, 3, h, w]; sizes: (height, width) of each prediction."""
 
-    def fit(self, task: TrainingTask) -> TrainedModel:
-        """Train it (see `Model.fit`); writes the kept weights to the folder's weights.safetensors.
+    def fit(self, task: TrainingTask) -> Predict:
+        """Train it; writes the kept weights to the folder's weights.safetensors. Raises NeecoError where it diverges.
 
-        Torch's random numbers start at the task's seed, and continue afterwards as if this had not run.
+        The same task gives the same model on the CPU. Torch's random numbers start at the task's seed, and continue
+        afterwards as if this had not run.
         """
         with torch.random.fork_rng():
             torch.manual_seed(task.seed)
             module = self.build(len(task.classes)).to(task.device)
             module = module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # faster on a CPU
-            if task.weights is not None:
-                load_weights(module, task.weights)
             self._train(module, task)
         if task.keep_weights:
             state = {name: value.detach().contiguous().cpu() for name, value in module.state_dict().items()}
-            write_atomically(task.folder / WEIGHTS_FILE, lambda path: save_file(_without_aliases(state), path))
-        return TrainedModel(lambda images: self._predict(module, images, task))
+            first = {value.data_ptr(): name for name, value in reversed(state.items())}  # tied tensors once each
+            stored = {name: state[name] for name in reversed(first.values())}
+            write_atomically(task.folder / WEIGHTS_FILE, lambda path: save_file(stored, path))
+        return lambda images: self._predict(module.eval(), images, task)
 
     def _train(self, module: nn.Module, task: TrainingTask) -> None:
         fused = task.device.type == "cuda"
@@ -174,55 +126,51 @@ class TorchModel(Model):
             if step % REPORT_EVERY == 0 or step == task.steps:  # a GPU waits here for its numbers
                 value = loss.item()
                 if not math.isfinite(value):
-                    raise NeecoError(
-                        f"{self.model}: its loss is not finite at step {step}; "
-                        "train with more images or other --weights"
-                    )
+                    raise NeecoError(f"{self.model}: its loss is not finite at step {step}; train with more images")
                 task.progress(step / task.steps, f"step {step}  loss {value:.3f}")
 
     def _rate(self, step: int, steps: int) -> float:
         """The learning rate at a step, as a share of the highest."""
         return min((step + 1) / (1 + self.warmup * steps), (1 + math.cos(math.pi * step / steps)) / 2)
 
+    @torch.inference_mode()
     def _predict(self, module: nn.Module, images: Sequence[np.ndarray], task: TrainingTask) -> list[Prediction]:
-        training = module.training
-        module.eval()
         found: list[Prediction] = []
-        with torch.inference_mode():
-            for start in range(0, len(images), PREDICTION_BATCH):
-                batch = images[start : start + PREDICTION_BATCH]
-                sizes = [(image.shape[0], image.shape[1]) for image in batch]
-                found += self.predictions(module, to_input(batch, task), sizes)
-        module.train(training)
+        for start in range(0, len(images), self.prediction_batch):
+            some = images[start : start + self.prediction_batch]
+            shrunk = np.stack([cv2.resize(image, task.size, interpolation=cv2.INTER_AREA) for image in some])
+            batch = torch.from_numpy(shrunk).permute(0, 3, 1, 2).to(task.device, torch.float32) / 255
+            batch = batch.contiguous(memory_format=torch.channels_last)
+            found += self.predictions(module, batch, [(image.shape[0], image.shape[1]) for image in some])
         return found
 
 
-def to_input(images: Sequence[np.ndarray], task: TrainingTask) -> Tensor:
-    """[B, 3, h, w] float32 in [0, 1] on the task's device, of uint8 images [H, W, 3]; shrunk by area."""
-    shrunk = np.stack([cv2.resize(image, task.size, interpolation=cv2.INTER_AREA) for image in images])
-    batch = torch.from_numpy(shrunk).permute(0, 3, 1, 2).to(task.device, torch.float32) / 255
-    return batch.contiguous(memory_format=torch.channels_last)
+def missing_packages(*packages: str) -> str | None:
+    """`missing_requirement` of a model that needs packages of the extra `downstream`."""
+    absent = [name for name in packages if importlib.util.find_spec(name) is None]
+    return f"needs {' and '.join(absent)}; {install_hint('downstream')}" if absent else None
 
 
-def load_weights(module: nn.Module, path: Path) -> None:
-    """Take what fits from a safetensors file: tensors of a name and shape that the module has. Raises NeecoError for a
-    file that cannot be read, or of which less than half of the module's tensors are found."""
-    if problem := placeholder(path):
-        raise NeecoError(f"--weights: {path}: {problem}")
-    try:
-        stored = load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise NeecoError(f"--weights: {path}: cannot be read as safetensors: {error}") from error
-    own = module.state_dict()
-    fitting = {name: value for name, value in stored.items() if name in own and own[name].shape == value.shape}
-    if 2 * len(fitting) < len(own):
-        raise NeecoError(f"--weights: {path}: {len(fitting)} of {len(own)} tensors fit; give weights of this model")
-    module.load_state_dict(fitting, strict=False)
+@cache
+def find_models() -> dict[str, type[TorchModel]]:
+    """Return every class with a `model` name of its own, by that name: those of `models/`, and those of entry points in
+    `neeco.models`. Raises NeecoError when two share a name, or one cannot be loaded."""
+    return plugins(TorchModel, "model", "neeco.studies.downstream.models", "neeco.models")  # type: ignore[type-abstract]
 
 
-def _without_aliases(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Tied tensors once each: safetensors refuses memory that is stored twice."""
-    first: dict[int, str] = {}
-    for name, value in state.items():
-        first.setdefault(value.data_ptr(), name)
-    return {name: state[name] for name in first.values()}
+def model_class(name: str) -> type[TorchModel]:
+    """The model of that name. Raises NeecoError when there is none."""
+    known = find_models()
+    if name not in known:
+        raise NeecoError(
+            f"--models: {name!r} is unknown; choose of {', '.join(known)}, or install the package that has it"
+        )
+    return known[name]
+
+
+def input_size(frame: tuple[int, int], longer_side: int, multiple: int) -> tuple[int, int]:
+    """Return the input (width, height) of a model for frames of this size: at most `longer_side`, both multiples of
+    `multiple`, the nearest to the frame's shape."""
+    scale = min(1.0, max(multiple, longer_side - longer_side % multiple) / max(frame))
+    width, height = (max(multiple, multiple * round(edge * scale / multiple)) for edge in frame)
+    return width, height

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neeco.evaluation.mask_metrics import boundary_f, box_ious, dice, distances_to, iou, mean_of
+from neeco.evaluation.mask_metrics import boundary_f, box_ious, dice, iou, mean_of, precision
 from neeco.studies.downstream.samples import Example
 
 MASK_SCORES = ("iou", "dice", "precision", "recall", "boundary_f")
-BOX_SCORES = ("ap", "ap50", "ap75", "box_precision", "box_recall")
-MIN_SCORE = 0.5  # confidence from which a box counts as a detection, for precision and recall
-MIN_OVERLAP = 0.5  # IoU from which a detection is correct
+BOX_SCORES = ("ap", "ap50", "ap75")
 MAX_DETECTIONS = 100  # per image, as COCO
 
 
@@ -50,19 +48,13 @@ def mask_scores(predicted: np.ndarray, truth: Example, classes: Sequence[str]) -
 
 
 def _class_scores(mask: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float]:
-    hits, predicted, labelled = (int((pixels & valid).sum()) for pixels in (mask & truth, mask, truth))
     return {
         "iou": iou(mask, truth, valid),
         "dice": dice(mask, truth, valid),
-        "precision": hits / predicted if predicted else (0.0 if labelled else math.nan),
-        "recall": hits / labelled if labelled else math.nan,
+        "precision": precision(mask, truth, valid),
+        "recall": precision(truth, mask, valid),
         "boundary_f": boundary_f(mask, truth, valid),
     }
-
-
-def near(pixels: np.ndarray, distance: float) -> np.ndarray:
-    """bool [H, W]: within `distance` px of any of `pixels` [H, W]."""
-    return distances_to(pixels) <= distance if pixels.any() else np.zeros_like(pixels)
 
 
 def mean_scores(frames: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
@@ -75,42 +67,28 @@ def mean_scores(frames: Sequence[Mapping[str, float]]) -> dict[str, float | None
 def box_scores(
     predictions: Sequence[Detections], truth: Sequence[Example], classes: Sequence[str]
 ) -> dict[str, float | None]:
-    """AP of boxes as COCO's (mean over IoU .5 to .95, at .5, at .75), and precision and recall at a score of .5 and an
-    IoU of .5; of several classes their mean, and `CLASS.ap`. None where the truth has no box."""
+    """AP of boxes as COCO's, mean over IoU .5 to .95, at .5 and at .75; of several classes their mean, and `CLASS.ap`.
+    None where the truth has no box."""
     labelled = [example.boxes() for example in truth]
     per_class = {}
     for number, name in enumerate(classes, 1):
         true = [boxes[numbers == number] for boxes, numbers in labelled]
         if any(len(boxes) for boxes in true):
-            per_class[name] = _detection_scores([found.of_class(number) for found in predictions], true)
+            per_class[name] = _coco_ap([found.of_class(number) for found in predictions], true)
     if not per_class:
         return dict.fromkeys(BOX_SCORES)
-    scores: dict[str, float | None] = {
-        key: float(np.mean([row[key] for row in per_class.values()])) for key in BOX_SCORES
-    }
-    return scores | ({f"{name}.ap": row["ap"] for name, row in per_class.items()} if len(classes) > 1 else {})
+    means = np.mean(list(per_class.values()), axis=0).tolist()
+    scores: dict[str, float | None] = dict(zip(BOX_SCORES, means, strict=True))
+    return scores | ({f"{name}.ap": row[0] for name, row in per_class.items()} if len(classes) > 1 else {})
 
 
-def _detection_scores(found: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.ndarray]) -> dict[str, float]:
-    """BOX_SCORES of one class; found: boxes and scores of each image."""
-    confident = [boxes[scores >= MIN_SCORE] for boxes, scores in found]
-    correct = sum(_matches(boxes, others) for boxes, others in zip(confident, true, strict=True))
-    detections = sum(map(len, confident))
-    precision, recall = correct / detections if detections else 0.0, correct / sum(map(len, true))
-    return dict(zip(BOX_SCORES, (*_coco_ap(found, true), precision, recall), strict=True))
-
-
-def _matches(found: np.ndarray, true: np.ndarray) -> int:
-    """Count the true boxes that are found; each detection (best first) takes the one it fits best."""
-    if not len(found) or not len(true):
-        return 0
-    ious, matches = box_ious(found, true), 0
-    for row in range(len(found)):
-        column = int(ious[row].argmax())
-        if ious[row, column] >= MIN_OVERLAP:
-            matches += 1
-            ious[:, column] = -1
-    return matches
+def box_iou(found: Detections, truth: Example) -> float:
+    """Mean IoU of every true box with the most confident box of its class; NaN where the truth has none."""
+    values = []
+    for box, number in zip(*truth.boxes(), strict=True):
+        boxes, scores = found.of_class(number)
+        values.append(float(box_ious(boxes[[scores.argmax()]], box[None])[0, 0]) if len(scores) else 0.0)
+    return mean_of(values)
 
 
 def _coco_ap(found: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.ndarray]) -> tuple[float, float, float]:
