@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from neeco.files import parse_yaml
+from neeco.base.files import parse_yaml
 
 SCRIPT = "<script>alert(1)</script>"
 DELETE = object()

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from PIL import Image
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json
 from neeco.capture.model import evenly_spaced
-from neeco.errors import NeecoError
 from neeco.evidence.foreground import Comparison, Foreground
 from neeco.evidence.label_quality import learned_foreground
-from neeco.files import read_json
 from neeco.training.run import open_run
 
 BINS = 10

@@ -29,9 +29,9 @@ from same_bits import TIMES, files_of, read_fields, read_safetensors
 from scipy.spatial.transform import Rotation
 from world_runs import ROOT, Build, builds_of
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json, write_json, write_text
 from neeco.capture import read_capture
-from neeco.errors import NeecoError
-from neeco.files import read_json, write_json, write_text
 
 sys.path.append(str(ROOT / "tests"))
 from bagwriter import BagWriter
@@ -171,7 +171,15 @@ def digest(path: Path) -> str:
     return hashed.hexdigest()
 
 
-ASIDE = (*TIMES, "prepared", "capture", "run", "created", "command")  # fields of times, and of where things lie
+ASIDE = (
+    *TIMES,
+    "prepared",
+    "scene_sha256",
+    "capture",
+    "run",
+    "created",
+    "command",
+)  # of times and places
 
 
 def table(digests: dict[str, dict[str, dict[str, str]]]) -> tuple[str, bool]:

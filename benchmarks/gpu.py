@@ -35,9 +35,9 @@ from stages import Stages
 from torch import Tensor
 
 from neeco import __version__
+from neeco.base.errors import NeecoError
+from neeco.base.files import write_json, write_text
 from neeco.capture.model import Instrument, InstrumentState, State
-from neeco.errors import NeecoError
-from neeco.files import write_json, write_text
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.raster import Camera, Gaussians, rasterize
 from neeco.raster.devices import device_of, readable_failures

@@ -35,7 +35,7 @@ from damage import EDITORS, SCRIPT, edit_bytes, edit_file
 from forked import DRAW, Child, Ended, limit_memory
 from mutated_world import make_world, prepare
 
-from neeco.files import LOCK, TEMPORARY
+from neeco.base.files import LOCK, TEMPORARY
 
 SECONDS = 10.0  # of the processor
 GIB = 2.0

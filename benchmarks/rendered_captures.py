@@ -29,7 +29,7 @@ from rendered.render import Lens
 from rendered.scenes import SCENES, SceneSpec
 from rendered.writing import write_recording
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 
 
 def main() -> int:

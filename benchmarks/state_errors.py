@@ -32,6 +32,8 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json, write_json
 from neeco.capture import (
     Capture,
     Frame,
@@ -42,8 +44,6 @@ from neeco.capture import (
     read_capture,
     write_capture,
 )
-from neeco.errors import NeecoError
-from neeco.files import read_json, write_json
 from neeco.geometry.trocar import ShaftLine, line_through_trocar
 
 OPENGL_FROM_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))

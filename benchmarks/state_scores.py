@@ -29,10 +29,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from state_errors import shaft_of, true_states
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json
 from neeco.capture import Capture, State, read_capture
 from neeco.capture.model import Instrument
-from neeco.errors import NeecoError
-from neeco.files import read_json
 from neeco.fitting.refinement import Refinement
 from neeco.training.run import open_run, read_checkpoint, stored_config
 

@@ -12,8 +12,8 @@ import yaml
 from PIL import Image
 from safetensors import safe_open
 
+from neeco.base.files import LOCK, TEMPORARY
 from neeco.capture.points import read_ply
-from neeco.files import LOCK, TEMPORARY
 
 
 def files_in(folder: Path) -> list[Path]:

@@ -26,8 +26,8 @@ import torch
 from rendered.draws import SIZES, World, draw_world
 from rendered.world_capture import write_world
 
-from neeco.errors import NeecoError
-from neeco.files import finite, read_json, write_json
+from neeco.base.errors import NeecoError
+from neeco.base.files import finite, read_json, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 METHOD = "import neeco.methods.kinematic.deformation as m; "

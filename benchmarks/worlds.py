@@ -41,8 +41,8 @@ from rendered.world_capture import write_world
 from world_runs import ROOT, WITHOUT, builds_of, capture_path, result_path, run_all, run_path, worlds_of
 from world_table import Result, ablations_of, pictures_of, strata_of, table_of, worst_of
 
-from neeco.errors import NeecoError
-from neeco.files import read_json, write_text
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json, write_text
 
 QUICK = ("--iterations", "1000")
 WORST = 5

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 
 
 def refusals(files: Sequence[Path], reads: Sequence[Callable[[], object]], cases: int) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from lerobotwriter import Episode, LeRobotWriter
 from scipy.spatial.transform import Rotation
 
-from neeco.files import write_text
+from neeco.base.files import write_text
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording

@@ -19,11 +19,8 @@ import pytest
 import torch
 import yaml
 
-from neeco.capture.images import open_image
-from neeco.capture.points import read_ply
-from neeco.capture.readers import read_urdf
-from neeco.errors import NeecoError
-from neeco.files import (
+from neeco.base.errors import NeecoError
+from neeco.base.files import (
     LOCK,
     MAX_VALUES,
     TEMPORARY,
@@ -43,6 +40,9 @@ from neeco.files import (
     write_text,
     write_unsynced,
 )
+from neeco.capture.images import open_image
+from neeco.capture.points import read_ply
+from neeco.capture.readers import read_urdf
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers import read_table
 from neeco.ingest.readers.plus import PlusSequence
@@ -52,7 +52,7 @@ from neeco.synthesis.writers.folder import link
 
 HOLD = """\
 import sys, time
-from neeco.files import own_folder
+from neeco.base.files import own_folder
 with own_folder(sys.argv[1]):
     print(flush=True)
     time.sleep(60)
@@ -93,7 +93,7 @@ def test_a_killed_process_holds_no_folder_and_what_it_left_is_swept(tmp_path: Pa
 WRITE = """\
 import sys, time
 from pathlib import Path
-from neeco.files import write_atomically
+from neeco.base.files import write_atomically
 def write(temporary):
     temporary.write_text("whole")
     print(flush=True)

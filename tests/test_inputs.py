@@ -1,4 +1,4 @@
-"""Every input is opened by `neeco.files`, which refuses what is no regular file and what is too large to read whole."""
+"""Every input is opened by `neeco.base.files`, which refuses what is no regular file or too large to read whole."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from source_trees import module_trees
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import MAX_BYTES, open_file, read_bytes, read_json, read_text
+from neeco.base.placeholders import placeholder, read_head
 from neeco.cli import main
-from neeco.errors import NeecoError
-from neeco.files import MAX_BYTES, open_file, read_bytes, read_json, read_text
 from neeco.ingest.readers import format_of, read_table, recording_formats
-from neeco.placeholders import placeholder, read_head
 
 HELPERS = {"open_file", "read_bytes", "read_text", "read_head", "require_file", "require_content", "placeholder"}
 GUARDS = HELPERS | {"is_file"}  # a function that calls one of these may hand the file to a library
@@ -51,9 +51,9 @@ OPENED = {
     "_unpacked",
 }  # no files of the user's
 ALLOWED = {
-    "neeco.files": "holds the helpers",
-    "neeco.locks": "opens files of neeco's own",
-    "neeco.placeholders": "holds the helpers",
+    "neeco.base.files": "holds the helpers",
+    "neeco.base.locks": "opens files of neeco's own",
+    "neeco.base.placeholders": "holds the helpers",
     "neeco.ingest.cameras._sfm_worker": "a program of its own, which reads the job that its parent wrote",
     "neeco.ingest.cameras.sfm": "reads what its own worker wrote into a temporary folder",
     "neeco.studies.machine": "reads /proc, and nothing else",

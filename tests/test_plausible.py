@@ -12,9 +12,8 @@ from scene_worlds import CAMERA, grasper_state, make_scene, pose_of
 
 import neeco
 from neeco.api import Scene
-from neeco.capture.model import Instrument, InstrumentState, State
-from neeco.errors import NeecoError
-from neeco.plausible import (
+from neeco.base.errors import NeecoError
+from neeco.base.plausible import (
     center_fault,
     focal_fault,
     joint_fault,
@@ -23,6 +22,7 @@ from neeco.plausible import (
     size_fault,
     time_fault,
 )
+from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.synthesis.settings import Settings
 
 POSE = pose_of(0.1, 0.2, 0.0, 1.0, 2.0, 60.0)

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from neeco.errors import NeecoError
-from neeco.workers import cpu_share, joined, node_problem, require_shared
+from neeco.base.errors import NeecoError
+from neeco.base.workers import cpu_share, joined, node_problem, require_shared
 
 
 @pytest.fixture

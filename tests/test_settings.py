@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neeco.errors import NeecoError
-from neeco.settings import described, plain, structure, with_fields
+from neeco.base.errors import NeecoError
+from neeco.base.settings import described, plain, structure, with_fields
 
 
 @dataclass(frozen=True)

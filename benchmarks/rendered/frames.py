@@ -11,8 +11,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from neeco.base.files import write_atomically
 from neeco.capture.images import write_labels
-from neeco.files import write_atomically
 from rendered import instrument
 from rendered.hinge import truth_ids
 from rendered.motion import Array, Moment, Trajectory, is_unseen, rigid

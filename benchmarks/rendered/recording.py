@@ -13,7 +13,7 @@ import yaml
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from neeco.files import write_atomically, write_json, write_text
+from neeco.base.files import write_atomically, write_json, write_text
 from rendered import errors
 from rendered.frames import Settings, image_name
 from rendered.kinematics import stated_kinematics

@@ -12,9 +12,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from state_errors import USUAL, with_errors, with_outliers
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import write_json
 from neeco.capture import Capture, Frame, InstrumentState, evenly_spaced, write_capture
-from neeco.errors import NeecoError
-from neeco.files import write_json
 from rendered.draws import World
 from rendered.exposure import meter
 from rendered.frames import (

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import write_json
 from neeco.capture import Capture, Frame, Instrument, InstrumentState, PointCloud, State, write_capture
-from neeco.errors import NeecoError
-from neeco.files import write_json
 from neeco.geometry.camera import Camera
 from rendered import errors
 from rendered.frames import Renderer, Settings, Shot, image_name, take_shots

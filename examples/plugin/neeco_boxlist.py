@@ -1,6 +1,6 @@
 """Box list: a data set writer, format `boxlist`; a line per instrument and image: file, name, left, top, size (px)."""
 
-from neeco.files import write_text
+from neeco.base.files import write_text
 from neeco.synthesis.writers import Writer, WrittenImages
 
 

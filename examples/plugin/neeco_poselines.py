@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.errors import NeecoError
-from neeco.files import read_text
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_text
 from neeco.ingest.readers import RecordingFormat, Table
 
 HEADER = ("t_s", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")  # names with units need no more in recording.yaml

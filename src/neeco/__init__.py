@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from neeco.api import Run, Scene, check, ingest, load, synthesize, track, train
+    from neeco.base.errors import NeecoError
     from neeco.capture import Camera, State, read_capture
-    from neeco.errors import NeecoError
     from neeco.synthesis.torch_datasets import LabelledImages, sample_states
 
 __version__ = "0.3.0"
@@ -37,7 +37,7 @@ __all__ = [
 _MODULES = {
     "neeco.api": ("Run", "Scene", "check", "ingest", "load", "synthesize", "track", "train"),
     "neeco.capture": ("Camera", "State", "read_capture"),
-    "neeco.errors": ("NeecoError",),
+    "neeco.base.errors": ("NeecoError",),
     "neeco.synthesis.torch_datasets": ("LabelledImages", "sample_states"),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

@@ -12,14 +12,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
+from neeco.base.errors import NeecoError, naming_arguments
+from neeco.base.plausible import Fault, focal_fault
 from neeco.capture import Camera, Capture, Problem, State, check_capture, read_capture
 from neeco.capture.model import Instrument
-from neeco.errors import NeecoError, naming_arguments
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.evaluation.image_metrics import find_lpips
 from neeco.geometry.rotations import rigid_fault
 from neeco.labels.annotation import LabelledImage, RGBDImage, draw_labelled
-from neeco.plausible import Fault, focal_fault
 from neeco.raster.devices import device_of
 from neeco.scene.drawable import DrawableScene
 from neeco.scene.io import load_scene

@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 from PIL import Image
 
-from neeco.files import LOCK, TEMPORARY
+from neeco.base.files import LOCK, TEMPORARY
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 

@@ -20,9 +20,9 @@ from rendered.world_capture import write_world
 from world_runs import WITHOUT
 from world_table import ablations_of, interval, summary_of, table_of
 
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.capture.checks import check_capture
-from neeco.errors import NeecoError
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 SMALL_WORLD = "9026"  # its seed

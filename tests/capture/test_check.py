@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, errors_only, read_capture
 from neeco.capture.checks import read_checked
 from neeco.capture.points import read_ply, write_ply
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.cli import check as check_verb
 from neeco.cli import main
-from neeco.errors import NeecoError
 
 LENS = {"w": 32, "h": 24, "fl_x": 30, "fl_y": 30, "cx": 16, "cy": 12}
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"

@@ -9,8 +9,8 @@ import pytest
 import torch
 from PIL import Image
 
+from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, errors_only, read_capture
-from neeco.errors import NeecoError
 
 COUNT, WIDTH, HEIGHT, FOCAL = 10, 32, 24, 40.0
 LLFF_FROM_OPENCV = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # columns: down, right, backwards

@@ -9,8 +9,8 @@ from typing import Any
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, errors_only, read_capture
-from neeco.errors import NeecoError
 
 DELETE = object()
 NUMBERS = [-1, 0, 1e-300, 1e300, 10**400, float("nan"), float("inf")]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFile
 
+from neeco.base.errors import NeecoError
 from neeco.capture.images import has_alpha, image_size, open_image, read_image, read_mask
-from neeco.errors import NeecoError
 from neeco.ingest.readers.video import open_images
 from neeco.synthesis.preview import draw_tile
 

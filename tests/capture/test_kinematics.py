@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kinematic_trees import at_rest, kinematic_trees, turned
 
+from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.readers import kinematics_of, read_dvrk_tool
-from neeco.errors import NeecoError
 from neeco.raster.articulated import ArticulatedBody, pose_bodies
 
 WRISTED = {

@@ -10,10 +10,10 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, errors_only, read_capture
 from neeco.capture.readers import read_states
 from neeco.capture.writer import camera_to_json
-from neeco.errors import NeecoError
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.rotations import RIGID_TOLERANCE, rigid_fault, rotation_error
 

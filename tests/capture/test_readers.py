@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, errors_only, read_capture, write_capture
 from neeco.capture.images import read_image, read_labels, read_mask, write_image, write_labels
 from neeco.capture.model import (
@@ -31,7 +32,6 @@ from neeco.capture.model import (
 )
 from neeco.capture.points import points_in_view, read_ply
 from neeco.capture.writer import fingerprint
-from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import load_reference
 from neeco.geometry.lens import Lens
 from neeco.raster import Camera

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from capture_folders import Folder
 
+from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, read_capture
-from neeco.errors import NeecoError
 from neeco.ingest.convert import convert_folder
 
 ADVICE = "make one capture for each tissue, train each, and mix with `neeco synthesize --tissue RUN`"

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from neeco.base.errors import NeecoError
 from neeco.capture.readers import read_urdf
-from neeco.errors import NeecoError
 from tests.capture.test_kinematics import turned
 
 pytest.importorskip("urdf_parser_py")

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from neeco.base.errors import NeecoError
 from neeco.cli import _progress
 from neeco.cli._progress import Bars, counting
-from neeco.errors import NeecoError
 from neeco.studies.study import JobEvent
 from neeco.training.train import ProgressRow
 

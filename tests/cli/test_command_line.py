@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from neeco import __version__, cli
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 
 MISSING = "/nowhere/at/all"
 WITH_BAD_PATH = {

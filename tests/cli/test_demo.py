@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from neeco.base.errors import NeecoError
 from neeco.cli.demo import Arguments, run, sample_capture
-from neeco.errors import NeecoError
 
 
 def test_the_bundled_sample_is_found_with_its_masks() -> None:

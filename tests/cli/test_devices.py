@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from neeco.base.errors import NeecoError
 from neeco.capture import Capture
 from neeco.capture.writer import write_capture
 from neeco.cli import main
 from neeco.cli._progress import resumable
-from neeco.errors import NeecoError
 from neeco.raster import devices
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_session import StepResult

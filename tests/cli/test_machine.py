@@ -16,10 +16,10 @@ from PIL import Image
 from rich.console import Console
 
 from neeco import cli
+from neeco.base.errors import NeecoError, memory_failure
+from neeco.base.files import new_folder
 from neeco.capture import read_capture
 from neeco.capture.images import read_image_bytes
-from neeco.errors import NeecoError, memory_failure
-from neeco.files import new_folder
 from neeco.raster.devices import readable_failures
 from neeco.training.run import load_run
 

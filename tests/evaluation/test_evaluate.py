@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from neeco.base.errors import NeecoError
 from neeco.capture.images import write_labels
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.evaluation import evaluate
 from neeco.evaluation.evaluate import evaluate_run
 

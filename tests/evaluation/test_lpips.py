@@ -7,8 +7,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from neeco.base.errors import NeecoError
 from neeco.capture.images import read_image
-from neeco.errors import NeecoError
 from neeco.evaluation.image_metrics import NETWORKS, Lpips, find_lpips, load_lpips
 
 WEIGHTS = os.environ.get("NEECO_LPIPS_WEIGHTS", "")

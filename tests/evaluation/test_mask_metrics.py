@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from neeco.base.errors import NeecoError
 from neeco.capture.checks.truth import USUAL_NAMES
-from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import truth_file
 from neeco.evaluation.mask_metrics import PartTally, dice, iou, mean_of, pairs_of, to_truth_ids
 from neeco.labels.labellers import composited_parts

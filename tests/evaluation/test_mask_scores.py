@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from neeco import cli
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.evaluation.mask_folders import parse_classes, read_ids
 from neeco.evaluation.mask_metrics import average_precision, boundary_f, boundary_pixels, box_ious, boxes_of
 from neeco.evaluation.mask_scores import score_masks

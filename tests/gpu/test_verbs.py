@@ -14,8 +14,8 @@ from device_params import SLOW_ON_CPU
 from PIL import Image
 from viewer_world import grasper_scene, write_recorded_images, write_run
 
+from neeco.base.errors import NeecoError
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.viewer.controls import Controls
 from neeco.viewer.runs import ViewedRun

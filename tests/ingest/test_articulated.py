@@ -11,8 +11,8 @@ from ingest.base_world import FINE, FOCAL, HEIGHT, INTRINSICS, TRUE_CLOCK_S, WID
 from scipy.spatial.transform import Rotation
 from wristed_world import shifted
 
+from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
-from neeco.errors import NeecoError
 from neeco.fitting.link_silhouette import ArticulatedModel, joint_values, with_motion
 from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.articulated import (

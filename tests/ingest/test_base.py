@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, WORLD_FROM_BASE, disturbed, errors, make_world
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
 from neeco.ingest.registration import silhouette_search
 from neeco.ingest.registration.base import find_base

@@ -11,7 +11,7 @@ import pytest
 from ingest.base_world import episodes, silent, views_of
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.geometry.trocar import line_through_trocar
 from neeco.ingest.readers.logs import PoseLog

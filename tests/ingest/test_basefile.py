@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.recording.base import read_dvrk_registration
 from neeco.ingest.recording.file import read_recording
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 from PIL import Image
 
+from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, errors_only, read_capture
-from neeco.errors import NeecoError
 from neeco.ingest.convert import convert_folder
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"

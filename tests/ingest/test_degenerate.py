@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
-from neeco.errors import NeecoError
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.result import IngestResult

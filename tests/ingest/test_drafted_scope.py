@@ -11,8 +11,8 @@ import yaml
 from bag_world import BagWriter
 from ingest.still_world import BASELINE, FOCAL, HEIGHT, WIDTH, Theatre
 
+from neeco.base.errors import NeecoError
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.ingest.cameras.still_scene import video_stands_still
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import Recording

@@ -9,10 +9,10 @@ import pytest
 import yaml
 from ingest.still_world import FRAMES, RATE, Theatre
 
+from neeco.base.errors import NeecoError
 from neeco.capture import Capture, read_capture
 from neeco.capture.checks import inspect_capture
 from neeco.cli.ingest import Ingest, run
-from neeco.errors import NeecoError
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.recording.compatibility import episode_names, separate

@@ -23,8 +23,8 @@ from ingest.base_world import (
 )
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
-from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.readers.logs import PoseLog, ReadingLog
 from neeco.ingest.recording.base import StatedBase

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers.columns import BASE, CAMERA, PoseColumns
 from neeco.ingest.readers.frame_names import meaning_in, meaning_of, without_frame
 from neeco.ingest.readers.logs import PoseLog, read_pose_log

@@ -10,11 +10,11 @@ import torch
 import yaml
 from ingest.shaft_world import FOCAL, HEAD, HEIGHT, INTRINSICS, RADIUS, RATE, WIDTH, ShaftWorld
 
+from neeco.base.errors import NeecoError
 from neeco.capture import errors_only, read_capture
 from neeco.capture.checks import check_capture
 from neeco.capture.images import write_image
 from neeco.capture.model import State
-from neeco.errors import NeecoError
 from neeco.geometry.lines import unit
 from neeco.ingest.assessment import assess_ingest
 from neeco.ingest.pipeline import ingest

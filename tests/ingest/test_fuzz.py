@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers.columns import JointColumns, PoseColumns
 from neeco.ingest.readers.interpolate import poses_at, readings_at

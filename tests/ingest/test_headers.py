@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers import read_table
 from neeco.ingest.readers.columns import JointColumns, PoseColumns, Units
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import read_lens
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.cli.ingest import Ingest, run
-from neeco.errors import NeecoError
 from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.columns import CAMERA as CAMERA_FRAME
 from neeco.ingest.readers.columns import PoseColumns, Units

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
-from neeco.errors import NeecoError
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.interpolate import poses_at, readings_at

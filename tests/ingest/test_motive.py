@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers.columns import PoseColumns
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.readers.motive import MotiveExport

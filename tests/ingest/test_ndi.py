@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers.columns import PoseColumns, Units
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.recording.file import read_recording

@@ -13,9 +13,9 @@ from PIL import Image
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, read_capture
 from neeco.capture.documents import errors_only
-from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.file import read_recording

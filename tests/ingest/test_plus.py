@@ -9,7 +9,7 @@ import pytest
 from damaged_files import refusals
 from pluswriter import frame_fields, write_mha, write_nrrd
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers import IMAGES, OTHER, POSES, format_of
 from neeco.ingest.readers.columns import PoseColumns
 from neeco.ingest.readers.logs import read_pose_log

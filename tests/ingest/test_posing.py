@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from posing_world import JOINT, NAME, PosingWorld, measured_world
 
+from neeco.base.errors import NeecoError
 from neeco.capture.readers import read_capture
-from neeco.errors import NeecoError
 from neeco.ingest.posing.along_shaft import Shafts, crop
 from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
 from neeco.ingest.posing.measurements import FILE, measure, read_measurements, write_measurements

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from plugin_site import install_plugin
 
+from neeco.base.errors import NeecoError
 from neeco.capture.readers import read_capture
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.ingest.readers import read_table, recording_formats
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.recording.file import read_recording

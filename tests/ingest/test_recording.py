@@ -9,7 +9,7 @@ import pytest
 from ingest.conftest import POSE_HEADER
 from PIL import Image
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers.columns import Units
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording

@@ -10,7 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.registration.hand_eye import register_with_laparoscope
 from neeco.ingest.timing.clock_search import (

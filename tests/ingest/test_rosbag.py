@@ -11,7 +11,7 @@ import pytest
 from bag_world import KINDS, BagWriter
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers import IMAGES, OTHER, POSES, READINGS, VideoSource, format_of, read_table
 from neeco.ingest.readers.columns import BASE, CAMERA, JointColumns, PoseColumns
 from neeco.ingest.readers.interpolate import poses_at

@@ -15,9 +15,9 @@ from damaged_files import refusals
 from ingest.still_world import HEIGHT, RATE, WIDTH, Theatre
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError, install_hint
 from neeco.capture import read_capture
 from neeco.cli import main
-from neeco.errors import NeecoError, install_hint
 from neeco.ingest.cameras.still_scene import read_right_camera
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers import format_of, read_table

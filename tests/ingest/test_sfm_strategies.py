@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.cameras import sfm
 from neeco.ingest.cameras.sfm import StructureFromMotion

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from neeco.errors import NeecoError
-from neeco.files import TEMPORARY
+from neeco.base.errors import NeecoError
+from neeco.base.files import TEMPORARY
 from neeco.ingest.staging import staged
 
 

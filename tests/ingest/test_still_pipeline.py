@@ -12,9 +12,9 @@ import pytest
 import torch
 from ingest.still_world import BAR, BASELINE, FOCAL, HEIGHT, RATE, TISSUE, WIDTH, Theatre
 
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture, write_capture
 from neeco.capture.checks import inspect_capture
-from neeco.errors import NeecoError
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.result import IngestResult
 from neeco.ingest.timing import reading

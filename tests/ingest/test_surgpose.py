@@ -7,7 +7,7 @@ import pytest
 import yaml
 from damaged_files import refusals
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers import format_of
 from neeco.ingest.readers.columns import JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers import read_table, recording_formats
 from neeco.ingest.readers.rows import Rows
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, errors_only, read_capture
 from neeco.capture.model import Capture
-from neeco.errors import NeecoError
 from neeco.geometry.distortion import undistorted
 from neeco.ingest.convert import convert_folder
 

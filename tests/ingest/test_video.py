@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.frames.images import read_lens
 from neeco.ingest.readers import video
 from neeco.ingest.readers.video import open_images, open_video

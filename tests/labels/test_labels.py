@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.labels.annotation import annotate, place_in_image, visibility
 from neeco.labels.drawing import draw, draw_layers

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 sys.path.insert(0, str(Path(__file__).parent))
 from articulated_worlds import Tree, assert_same_as_definition, hinges, make_world, posed, trees
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import kernels
 from neeco.raster.articulated import MAX_JOINTS, ArticulatedBody, pose_bodies

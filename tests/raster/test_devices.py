@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster import devices
 from neeco.raster.devices import device_failure, device_of, readable_failures
 

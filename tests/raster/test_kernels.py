@@ -12,7 +12,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 from raster_scenes import draw, leaves, make_scene
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster import kernels, rasterize
 from neeco.raster.losses import photometric_loss
 from neeco.raster.native import Family, runs_native, torch_threads

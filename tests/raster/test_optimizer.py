@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster import kernels
 from neeco.raster.native import Family, set_threads
 from neeco.raster.optimizer import adam_step

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 sys.path.insert(0, str(Path(__file__).parent))
 from raster_scenes import Scene, assert_same_as_reference, decided_pixels, draw, error, leaves, make_scene, on_cuda
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster import rasterize
 from neeco.raster.native import native, set_threads
 
@@ -265,7 +265,7 @@ def test_unknown_and_missing_backends_are_named() -> None:
 
 def test_an_instruction_set_that_is_not_there_is_refused() -> None:
     code = """
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster.native import simd
 try:
     simd()

@@ -19,7 +19,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 from raster_scenes import Scene, draw, error, leaves, make_scene, on_cuda
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster import rasterize
 from neeco.raster.triton import ready
 

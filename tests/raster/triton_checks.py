@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 sys.path.insert(0, str(Path(__file__).parent))
 from raster_scenes import TOLERANCE, Scene, assert_same_as_reference, decided_pixels, draw, error, leaves, make_scene
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster import rasterize
 from neeco.raster import triton_backend as backend
 from neeco.raster.triton import binning

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster import losses, optimizer
 from neeco.raster.losses import photometric_loss, photometric_loss_reference
 from neeco.raster.optimizer import Adam, Update, adam_step, adam_steps

@@ -16,12 +16,12 @@ import torch
 from html_page import HOSTILE, Page, check_hostile_names
 from PIL import Image
 
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.capture.documents import Problem
 from neeco.capture.images import write_image
 from neeco.capture.kinematics import KinematicTree, Link
 from neeco.capture.model import Frame, State
-from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.ingest.assessment import MAX_SHOWN, assess_ingest
 from neeco.ingest.foreground.rough_shape import RoughShape

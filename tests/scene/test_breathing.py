@@ -11,7 +11,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from scene_worlds import TISSUE, grasper_state, make_scene, pose_of
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.methods.breathing import N_HARMONICS, Breathing
 from neeco.scene import GaussianScene

@@ -11,8 +11,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 from scene_worlds import GRASPER, grasper_state, pose_of, random_canonical
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Instrument, State
-from neeco.errors import NeecoError
 from neeco.methods.nps import INITIAL_LOGIT, MEMBER_LOGITS, NPS, NPSSettings, members
 from neeco.scene.deformation import Posed
 

@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 from scene_worlds import make_scene
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.scene import GaussianScene
 from neeco.scene.io import load_scene, pack_scene, save_scene, save_tensors

@@ -11,8 +11,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 from scene_worlds import SURE, TISSUE, grasper_state, pose_of
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State
-from neeco.errors import NeecoError
 from neeco.geometry.rotations import quat_to_matrix, rigid_from_vector, rotate_about
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.kinematic.deformation import Kinematic, Spin

@@ -10,8 +10,8 @@ import torch
 from scene_worlds import make_nerf, rounding
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import State
-from neeco.errors import NeecoError
 from neeco.geometry.rotations import skew
 from neeco.methods.nerfies.field import (
     PUBLISHED,

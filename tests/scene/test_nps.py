@@ -12,8 +12,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 from scene_worlds import GRASPER, TISSUE, grasper_state, pose_of, random_canonical, rounding
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State
-from neeco.errors import NeecoError
 from neeco.methods.networks import encode
 from neeco.methods.nps import NPS, NPSSettings
 from neeco.raster.devices import fast_bfloat16, processor_has

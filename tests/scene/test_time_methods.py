@@ -15,8 +15,8 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).parent))
 from scene_worlds import GRASPER, SMALL, TISSUE, grasper_state, make_scene, pose_of, random_canonical, rounding
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import State
-from neeco.errors import NeecoError
 from neeco.methods.hexplane import HexPlane, HexPlaneSettings
 from neeco.methods.time_mlp import NoisyTime, TimeMLP, TimeMLPSettings, octaves
 from neeco.scene import GaussianScene

@@ -21,11 +21,11 @@ import pytest
 import torch
 from worker_tasks import seen_gpu
 
-from neeco import workers
+from neeco.base import workers
+from neeco.base.errors import NeecoError
+from neeco.base.settings import with_fields
 from neeco.capture import read_capture
-from neeco.errors import NeecoError
 from neeco.scene.training_session import UNLIMITED
-from neeco.settings import with_fields
 from neeco.studies import study
 from neeco.studies import training_job as module
 from neeco.studies.machine import threads_per_worker

@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from neeco import workers
+from neeco.base import workers
+from neeco.base.errors import NeecoError
+from neeco.base.settings import plain
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.raster.devices import fast_bfloat16
 from neeco.scene.method_registry import method_settings
-from neeco.settings import plain
 from neeco.studies import training_job as jobs_module
 from neeco.studies.configurations import Configuration, Study, SweepRequest, Table, TableRow, ablations, read_study
 from neeco.studies.study import spread

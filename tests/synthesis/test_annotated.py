@@ -16,10 +16,10 @@ import torch
 from PIL import Image
 from rod_world import CAMERA, FakeRun, make_scene, rod_state
 
+from neeco.base.errors import NeecoError
 from neeco.capture.images import read_image, read_labels, write_image
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.evaluation.trust import TypicalErrors, estimate_trust, typical_errors_of
 from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid_from_vector

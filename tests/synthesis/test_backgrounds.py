@@ -16,7 +16,7 @@ from PIL import Image
 from rod_world import CAMERA, FakeRun, rod_state
 from torch import nn
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene import GaussianScene

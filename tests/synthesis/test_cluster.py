@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from ball_world import ball_scene, run_of
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster.native import torch_threads
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings

@@ -9,9 +9,9 @@ from PIL import Image
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import LOCK, TEMPORARY
 from neeco.capture.writer import state_to_json
-from neeco.errors import NeecoError
-from neeco.files import LOCK, TEMPORARY
 from neeco.labels.labellers import LABEL_THRESHOLD
 from neeco.synthesis import dataset
 from neeco.synthesis.dataset import synthesize

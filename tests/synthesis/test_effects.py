@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from PIL import Image
 from rod_world import CAMERA, FakeRun, rod_state
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import State
-from neeco.errors import NeecoError
 from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels

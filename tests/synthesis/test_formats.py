@@ -16,7 +16,7 @@ from ball_world import RADIUS, at, ball_scene, run_of
 from PIL import Image
 from rod_world import CAMERA, FakeRun
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.projection import project
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.synthesis.writers.hub import check_hub, push_to_hub
 
 TOKEN = "hf_of_nobody"

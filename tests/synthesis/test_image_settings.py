@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 
 import neeco
+from neeco.base.errors import NeecoError
 from neeco.capture.images import read_image, read_labels
-from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.labels.annotation import annotate, draw_labelled
 from neeco.labels.drawing import draw, draw_layers

@@ -13,9 +13,9 @@ from ball_world import RADIUS, at, ball_scene, ball_state, run_of
 from PIL import Image
 from rod_world import CAMERA
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels

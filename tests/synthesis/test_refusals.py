@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import neeco.files
+import neeco.base.files
+from neeco.base.errors import NeecoError
 from neeco.capture.writer import state_to_json
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import Acceptance, SampleGenerator
 from neeco.synthesis.settings import Settings
@@ -140,7 +140,7 @@ def test_a_full_disk_is_told_with_the_file_and_gone_on_from(run, tmp_path, monke
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             real(source, target)
 
-        patched.setattr(neeco.files.os, "replace", full)
+        patched.setattr(neeco.base.files.os, "replace", full)
         with pytest.raises(NeecoError, match=r"000001.*: cannot write: No space left on device"):
             synthesize(run, cut, SETTINGS)
     assert not [path for path in cut.rglob(".*") if path.is_file()]  # no half-written file

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.capture.readers import read_states
 from neeco.capture.writer import state_to_json
-from neeco.errors import NeecoError
 from neeco.geometry.rotations import rigid
 from neeco.synthesis.samplers import N_SIMILAR, OrbitViews, PerturbedViews, RecordedViews, instrument_axes, make_sampler
 from neeco.synthesis.states import (

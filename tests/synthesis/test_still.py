@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rod_world import make_scene
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.scene import GaussianScene
 from neeco.synthesis.samplers import make_sampler
 

@@ -16,8 +16,8 @@ from PIL import Image
 from rod_world import CAMERA, rod_state
 from torch.utils.data import DataLoader
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State
-from neeco.errors import NeecoError
 from neeco.labels.annotation import MIN_COMPONENT, LabelledImage, draw_labelled
 from neeco.raster.native import torch_threads
 from neeco.synthesis.dataset import synthesize

@@ -12,9 +12,9 @@ import torch
 from rod_world import CAMERA, FakeRun, rod_state
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture.images import to_bytes
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.labels.drawing import draw
 from neeco.synthesis.rendered_views import View
 from neeco.synthesis.settings import ImageSettings

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from ball_world import ball_scene, run_of
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
+from neeco.base.workers import Processes
 from neeco.raster.native import torch_threads
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
-from neeco.workers import Processes
 
 SETTINGS = Settings(count=10, seed=1, tissue_tolerance_mm=2.0)
 

@@ -12,11 +12,11 @@ from grasper_world import CAMERA, RecordedRun, grasper_state, make_scene, moving
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture.images import write_image
 from neeco.capture.model import Capture, PointCloud, State
 from neeco.capture.writer import write_capture
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.fitting.crop_rendering import InstrumentRenderer, TissueRenderer
 from neeco.fitting.parameters import DEG
 from neeco.geometry.camera import Camera

@@ -10,10 +10,10 @@ import pytest
 import torch
 from grasper_world import RecordedRun, moving, record
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import write_json
 from neeco.capture import read_capture, write_capture
 from neeco.capture.model import Capture, InstrumentState, State
-from neeco.errors import NeecoError
-from neeco.files import write_json
 from neeco.tracking import refine
 from neeco.training.session import trust_of
 

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from wristed_world import make_driver
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State, Uncertainty
-from neeco.errors import NeecoError
 from neeco.fitting.crop_rendering import FrameView
 from neeco.fitting.parameters import StateParameters
 from neeco.fitting.state_fitter import Fitter, StateFit

@@ -14,12 +14,12 @@ import pytest
 import torch
 from grasper_world import CAMERA, FRAMES, GRASPER, RecordedRun, grasper_state, moving, record, withheld
 
+from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, errors_only, read_capture
 from neeco.capture.images import write_image
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Capture, State
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.evaluation.trust import TypicalErrors
 from neeco.fitting.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer, color_matched, view_of
 from neeco.fitting.parameters import DEG

@@ -15,15 +15,15 @@ import torch
 from capture_files import write_capture
 
 import neeco.methods
+from neeco.base.errors import NeecoError
+from neeco.base.settings import plain
 from neeco.capture.images import write_image
 from neeco.capture.model import Capture, Frame, PointCloud, State
 from neeco.capture.writer import write_capture as write_folder
-from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.raster import Camera, Gaussians, rasterize
 from neeco.scene.io import load_scene
 from neeco.scene.method_registry import methods
-from neeco.settings import plain
 from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import train

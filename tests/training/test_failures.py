@@ -16,11 +16,11 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-import neeco.files
+import neeco.base.files
 import neeco.training.session
+from neeco.base.errors import NeecoError
+from neeco.base.files import LOCK, TEMPORARY
 from neeco.cli import main
-from neeco.errors import NeecoError
-from neeco.files import LOCK, TEMPORARY
 from neeco.training import train as training
 from neeco.training.config import training_config
 from neeco.training.run import checkpoint_path, load_run, read_checkpoint
@@ -54,7 +54,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             real(descriptor)
 
-        patched.setattr(neeco.files.os, "fsync", full)
+        patched.setattr(neeco.base.files.os, "fsync", full)
         assert main(words) == 1
     told = capsys.readouterr().err.strip().splitlines()[-1]
     assert told.startswith("neeco: error: ")

@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 import neeco
+from neeco.base.errors import NeecoError
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.scene.method_registry import current_name
 from neeco.training.config import config_to_dict, training_config
 from neeco.training.run import stored_config

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
-from neeco.errors import NeecoError
 from neeco.geometry.rotations import rigid_from_vector
 from neeco.methods.kinematic.hinge_search import hinge_joints
 from neeco.training.config import TrainConfig

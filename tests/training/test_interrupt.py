@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from neeco.base.errors import NeecoError
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.training import train as module
 from neeco.training.config import training_config
 from neeco.training.run import load_run, read_checkpoint

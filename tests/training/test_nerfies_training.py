@@ -11,8 +11,8 @@ from capture_files import write_capture, write_grasper
 from PIL import Image
 from safetensors.torch import load_file, save_file
 
+from neeco.base.errors import NeecoError
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.methods.nerfies.field import NerfScene
 from neeco.scene.io import load_scene, save_scene
 from neeco.training.config import training_config

@@ -13,7 +13,7 @@ from capture_files import write_capture
 from torch import Tensor
 
 import neeco.methods
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.scene import CanonicalGaussians
 from neeco.scene.deformation import Posed
 from neeco.scene.io import load_scene

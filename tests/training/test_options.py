@@ -9,8 +9,8 @@ from typing import get_args, get_type_hints
 import pytest
 import yaml
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Instrument
-from neeco.errors import NeecoError
 from neeco.scene.method_registry import method_class, method_settings, methods
 from neeco.training.config import (
     config_from_dict,

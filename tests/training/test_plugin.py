@@ -16,10 +16,10 @@ from capture_files import write_grasper
 from plugin_site import install_plugin
 
 import neeco
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.capture.images import write_labels
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.scene.method_registry import methods
 from neeco.studies.downstream.model import find_models
 from neeco.synthesis.dataset import writers

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from capture_files import write_grasper
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
-from neeco.errors import NeecoError
 from neeco.geometry.projection import project_world
 from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews

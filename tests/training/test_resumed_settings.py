@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 
 import neeco
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.capture.writer import fingerprint
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.training.config import training_config
 from neeco.training.run import write_config
 

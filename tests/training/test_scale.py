@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
 from neeco.training.run import load_run

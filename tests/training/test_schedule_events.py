@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from capture_files import write_capture
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.methods.kinematic.deformation import Kinematic
 from neeco.training.config import method_defaults, training_config
 from neeco.training.schedule import Event

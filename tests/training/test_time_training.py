@@ -9,7 +9,7 @@ import pytest
 import torch
 from capture_files import write_capture
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.methods.hexplane import HexPlane
 from neeco.methods.time_mlp import TimeMLP
 from neeco.scene.deformation import UNPERTURBED

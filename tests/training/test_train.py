@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import neeco.training.session
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train

@@ -11,8 +11,8 @@ import pytest
 from capture_files import write_capture
 
 from neeco.api import load, synthesize
+from neeco.base.errors import NeecoError
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.scene.training_session import UNLIMITED, RunLength
 from neeco.training.config import training_config
 from neeco.training.run import load_run, verdict_on

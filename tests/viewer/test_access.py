@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from viewer_world import grasper_scene, write_recorded_images, write_run
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.viewer.access import Access, is_loopback
 from neeco.viewer.panel import message_html, status_html
 from neeco.viewer.runs import ViewedRun

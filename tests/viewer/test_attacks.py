@@ -18,7 +18,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.viewer.access import MAX_MESSAGE
 from neeco.viewer.server import ViewerServer
 from neeco.viewer.session import RenderThread

@@ -16,7 +16,7 @@ import torch
 from scene_worlds import make_scene
 
 import neeco
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.scene.canonical import SH_C0
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.viewer.export import export_page, pack, page_of

@@ -24,9 +24,9 @@ from PIL import Image
 from posing_world import JOINT, NAME, PosingWorld, measured_world
 from viewer_world import grasper_scene, write_run
 
+from neeco.base.errors import NeecoError
 from neeco.capture.readers import read_capture
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.ingest.posing.hand_posed import read_answers
 from neeco.viewer.access import Access
 from neeco.viewer.posing_server import PosingServer

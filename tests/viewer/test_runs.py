@@ -12,7 +12,7 @@ import torch
 from scene_worlds import make_nerf, make_scene
 from viewer_world import FRAMES, brighter, grasper_scene, write_recorded_images, write_run
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.scene.io import save_scene
 from neeco.training.config import TrainConfig
 from neeco.training.run import checkpoint_path

@@ -15,7 +15,7 @@ from PIL import Image
 from scene_worlds import make_scene, pose_of
 from viewer_world import HEIGHT, WIDTH
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.labels.drawing import draw
 from neeco.synthesis.samplers import make_sampler, moved_camera
 from neeco.synthesis.settings import SizeSettings

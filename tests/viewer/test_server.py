@@ -15,8 +15,8 @@ from urllib.request import url2pathname
 
 import pytest
 
+from neeco.base.errors import NeecoError
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.viewer import server
 from neeco.viewer.server import ViewerServer
 from neeco.viewer.session import MOVING_PX, SHARP_PX, AdaptiveResolution, RenderThread

@@ -17,8 +17,8 @@ from ball_world import ball_scene
 from scene_worlds import CAMERA, grasper_state, make_scene, pose_of
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.evaluation.image_metrics import psnr
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians

@@ -11,10 +11,10 @@ from typing import Any, Literal, NoReturn, Self
 
 import numpy as np
 
-from neeco.errors import NeecoError, visible
+from neeco.base.errors import NeecoError, visible
+from neeco.base.settings import Fault, Place, printable
+from neeco.base.settings import key_name as key_name
 from neeco.geometry.rotations import rigid_fault
-from neeco.settings import Fault, Place, printable
-from neeco.settings import key_name as key_name
 
 MIN_CONDENSED = 3  # problems similar to another one, from which they are counted instead of listed
 VARYING = re.compile(
@@ -109,7 +109,7 @@ class Node(Place):
     """A value of a JSON or YAML file and its place. A reading that fails reports one error and returns None.
 
     Whether that ends the reading is the report's choice: `ProblemReport` collects; `RaisingReport` raises, as does
-    `FaultReport`, for `neeco.settings.read`.
+    `FaultReport`, for `neeco.base.settings.read`.
     """
 
     report: ProblemReport = field(default_factory=FaultReport)

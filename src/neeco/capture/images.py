@@ -15,11 +15,11 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from neeco.errors import NeecoError
-from neeco.files import require_file, write_atomically
+from neeco.base.errors import NeecoError
+from neeco.base.files import require_file, write_atomically
+from neeco.base.plausible import Fault, mask_fault
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_world
-from neeco.plausible import Fault, mask_fault
 
 # Pillow warns of images beyond 90 million pixels, and refuses them beyond twice that: both are refused here
 warnings.simplefilter("error", Image.DecompressionBombWarning)

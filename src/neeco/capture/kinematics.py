@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.rotations import rigid, rigid_fault, rotation_from_vector
 
 FIXED, REVOLUTE, PRISMATIC = "fixed", "revolute", "prismatic"

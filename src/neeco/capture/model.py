@@ -17,14 +17,14 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
+from neeco.base.plausible import Fault, joint_fault
 from neeco.capture.images import area_averaged_bytes, byte_pixels, read_mask_pixels, read_pixels
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.points import PointCloud
-from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import as_pose, number_text, position_text, rigid_fault
-from neeco.plausible import Fault, joint_fault
 
 SCHEMA = "neeco-capture/1"  # of the folder that holds a capture
 SEPARATE_TISSUES = "make one capture for each tissue, train each, and mix with `neeco synthesize --tissue RUN`"
@@ -182,7 +182,7 @@ class Instrument:
 
     def joint_fault(self, joint: str, value: float, slack: float = 0.0) -> Fault | None:
         """Return what is wrong with a value, rad or mm, of a joint, and what to do; None: it may be right. slack: see
-        `neeco.plausible.joint_fault`."""
+        `neeco.base.plausible.joint_fault`."""
         if joint in self.joints:
             return joint_fault(value, self.joints[joint], self.slides(joint), slack)
         if joint in self.left_out:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.errors import NeecoError
-from neeco.files import read_bytes, write_atomically
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_bytes, write_atomically
 from neeco.geometry.lines import across_projectors, nearest_point
 
 MAX_SAMPLED_POINTS = 500

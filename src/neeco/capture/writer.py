@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_bytes, sync_disk, write_json, write_unsynced
 from neeco.capture.images import encoded_image, has_alpha
 from neeco.capture.model import SCHEMA, Capture, Frame, FromVideo, Instrument, State, Uncertainty
 from neeco.capture.points import write_ply
-from neeco.errors import NeecoError
-from neeco.files import read_bytes, sync_disk, write_json, write_unsynced
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.rotations import rigid_fault
 

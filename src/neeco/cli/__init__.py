@@ -20,8 +20,8 @@ from dataclasses import is_dataclass, make_dataclass
 from typing import Any, get_type_hints
 
 from neeco import __version__
-from neeco.errors import NeecoError, memory_failure, nearest, visible
-from neeco.files import FOLLOW_LINKS, require_utf8
+from neeco.base.errors import NeecoError, memory_failure, nearest, visible
+from neeco.base.files import FOLLOW_LINKS, require_utf8
 
 VERBS = {
     "demo": "The whole main job on the bundled sample capture, in five minutes.",

@@ -22,9 +22,9 @@ from rich.table import Column, Table
 from rich.text import Text
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from neeco.errors import NeecoError, nearest
-from neeco.files import finite, new_folder, require_replaceable, write_json
-from neeco.settings import WORDS, described, field_texts, value_words
+from neeco.base.errors import NeecoError, nearest
+from neeco.base.files import finite, new_folder, require_replaceable, write_json
+from neeco.base.settings import WORDS, described, field_texts, value_words
 
 if TYPE_CHECKING:
     from neeco.studies.tables import ResultTable

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
+from neeco.base.errors import NeecoError, visible
+from neeco.base.files import is_vacant
 from neeco.cli._output import whole_lines
-from neeco.errors import NeecoError, visible
-from neeco.files import is_vacant
 from neeco.raster.devices import device_failure
 
 if TYPE_CHECKING:

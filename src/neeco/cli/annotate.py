@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from neeco.settings import Device
+from neeco.base.settings import Device
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, formats_help
 
 

@@ -10,8 +10,8 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
+from neeco.base.errors import counted
 from neeco.cli._output import JsonTarget, ready_for_json, write_numbers
-from neeco.errors import counted
 
 if TYPE_CHECKING:
     from neeco.capture.checks import CaptureSummary

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from neeco.base.errors import NeecoError
 from neeco.cli.sweep import run_study
-from neeco.errors import NeecoError
 from neeco.studies.configurations import Configuration, Study, SweepRequest
 
 

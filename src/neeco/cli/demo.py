@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neeco.errors import NeecoError
-from neeco.settings import Device
+from neeco.base.errors import NeecoError
+from neeco.base.settings import Device
 
 if TYPE_CHECKING:
     import torch

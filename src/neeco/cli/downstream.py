@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from neeco.base.errors import NeecoError
+from neeco.base.settings import Device, name_and_value
 from neeco.cli._output import print_outcome
-from neeco.errors import NeecoError
-from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
     from neeco.studies.downstream.job import DownstreamSettings

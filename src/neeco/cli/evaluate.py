@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import tyro
 from rich.table import Column, Table
 
+from neeco.base.settings import Device
 from neeco.cli._output import JsonTarget, ready_for_json, whole_lines, write_numbers
-from neeco.settings import Device
 
 COLUMNS = (
     ("PSNR", "psnr", "{:.2f}"),
@@ -51,10 +51,10 @@ class Evaluate:
 
 def run(args: Evaluate) -> int:
     """Evaluate, write the report, print a table."""
+    from neeco.base.files import new_folder
     from neeco.cli._progress import Bars
     from neeco.evaluation.evaluate import evaluate_run
     from neeco.evaluation.image_metrics import find_lpips
-    from neeco.files import new_folder
     from neeco.raster.devices import device_of
     from neeco.report import write_report
     from neeco.training.run import open_run

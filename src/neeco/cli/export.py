@@ -8,8 +8,8 @@ from typing import Literal, cast, get_args
 
 import tyro
 
-from neeco.errors import NeecoError
-from neeco.settings import Device
+from neeco.base.errors import NeecoError
+from neeco.base.settings import Device
 
 Format = Literal["ply", "spz", "usdc"]
 

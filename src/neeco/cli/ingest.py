@@ -7,8 +7,8 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+from neeco.base.errors import NeecoError, visible
 from neeco.cli._output import JsonTarget, whole_lines
-from neeco.errors import NeecoError, visible
 from neeco.ingest.request import IngestRequest
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import tyro
 
-from neeco.errors import NeecoError
-from neeco.settings import Device
+from neeco.base.errors import NeecoError
+from neeco.base.settings import Device
 
 
 @dataclass(frozen=True)

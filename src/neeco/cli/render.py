@@ -7,8 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from neeco.errors import NeecoError
-from neeco.settings import Device
+from neeco.base.errors import NeecoError
+from neeco.base.settings import Device
 from neeco.synthesis.settings import AS_RECORDED, MAX_IMAGES, ImageSettings
 
 

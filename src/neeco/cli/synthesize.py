@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from neeco.errors import NeecoError, counted
-from neeco.settings import Device
+from neeco.base.errors import NeecoError, counted
+from neeco.base.settings import Device
 from neeco.synthesis.settings import DEFAULT_FORMATS, Settings, formats_help
 
 # by `views`, for a scene that was recorded from one place

@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from neeco.settings import Device
+from neeco.base.settings import Device
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from neeco.settings import Device
+from neeco.base.settings import Device
 
 
 @dataclass(frozen=True, kw_only=True)

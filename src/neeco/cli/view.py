@@ -13,8 +13,8 @@ from typing import Annotated
 
 import tyro
 
-from neeco.errors import NeecoError
-from neeco.settings import Device
+from neeco.base.errors import NeecoError
+from neeco.base.settings import Device
 from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 
 POLL_S = 0.5  # between two looks for Ctrl-C

@@ -14,10 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import finite, require_inside, write_json
 from neeco.capture.checks.truth import SHADOW_FOLDER
 from neeco.capture.images import read_mask
 from neeco.capture.model import Capture, Frame, State
-from neeco.errors import NeecoError
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
 from neeco.evaluation.mask_folders import ReferenceMask, load_reference, truth_names
@@ -33,7 +34,6 @@ from neeco.evaluation.mask_metrics import (
 )
 from neeco.evidence.foreground import Comparison, Foreground
 from neeco.evidence.label_quality import label_counts, learned_foreground, quality_of
-from neeco.files import finite, require_inside, write_json
 from neeco.fitting.alignment import align_frame, pose_changes
 from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import field_pinhole

@@ -19,8 +19,8 @@ from scipy.ndimage import binary_erosion
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, conv2d, interpolate, max_pool2d, relu
 
-from neeco.errors import NeecoError
-from neeco.files import require_content
+from neeco.base.errors import NeecoError
+from neeco.base.files import require_content
 from neeco.raster.native import torch_threads
 
 Pixels = NDArray[np.uint8]  # [H, W, 3]

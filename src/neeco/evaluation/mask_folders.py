@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import require_inside, visible_entries
 from neeco.capture.checks.truth import MASK_FOLDERS, REFERENCE_FOLDER, USUAL_NAMES, stated_names
 from neeco.capture.images import open_image, read_labels, read_mask
 from neeco.capture.model import Capture, Frame
 from neeco.capture.readers import read_capture
-from neeco.errors import NeecoError
-from neeco.files import require_inside, visible_entries
 
 PARTS_SUFFIX, MASK_SUFFIX = "_parts", "_mask"  # of files that `neeco render` writes
 

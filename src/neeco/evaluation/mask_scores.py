@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neeco import __version__
+from neeco.base.errors import NeecoError
+from neeco.base.files import finite
 from neeco.capture.model import Capture, Frame
-from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, read_truth
 from neeco.evaluation.mask_metrics import (
     assigned_pairs,
@@ -23,7 +24,6 @@ from neeco.evaluation.mask_metrics import (
     mean_of,
     pairs_of,
 )
-from neeco.files import finite
 
 SCHEMA = "neeco-mask-scores/1"
 OVERLAPS = ("iou", "dice", "boundary_f")  # of each image

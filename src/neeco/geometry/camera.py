@@ -12,9 +12,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
+from neeco.base.plausible import camera_fault
 from neeco.geometry.rotations import as_pose, number_text, position_text
-from neeco.plausible import camera_fault
 
 COEFFICIENT_COUNTS = (0, 4, 5, 8, 12, 14)  # of OpenCV's distortion models
 

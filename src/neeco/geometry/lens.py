@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import torch
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
+from neeco.base.plausible import center_fault, focal_fault
 from neeco.geometry.camera import Camera
-from neeco.plausible import center_fault, focal_fault
 
 COEFFICIENT_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy")

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 
 Array = TypeVar("Array", Tensor, np.ndarray)
 

@@ -9,13 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from neeco.base.plausible import FEW_TRAIN_FRAMES
 from neeco.capture.documents import Problem
 from neeco.capture.model import HOW_TO_REGISTER, UNKNOWN_DEG, Capture
 from neeco.geometry.lines import frame_about
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import PLACED_DEG, PLACED_MM, Registration
 from neeco.ingest.result import IngestResult
-from neeco.plausible import FEW_TRAIN_FRAMES
 
 # Limits above which there is a warning: conventions, not measurements.
 POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.015, 0.5

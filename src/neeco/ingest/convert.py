@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
 from neeco.capture.documents import ProblemReport, condensed
 from neeco.capture.images import masks_fault, measure_hidden, read_mask, write_image, write_labels
 from neeco.capture.model import Capture, Frame, evenly_spaced
@@ -18,7 +19,6 @@ from neeco.capture.readers import capture_of, parse_capture
 from neeco.capture.readers.endonerf import MASKS, folder_images
 from neeco.capture.readers.parsed import Parsed
 from neeco.capture.writer import write_capture
-from neeco.errors import NeecoError
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.staging import staged

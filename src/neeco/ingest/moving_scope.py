@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import SEPARATE_TISSUES, PointCloud
-from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.cameras.sfm import StructureFromMotion
 from neeco.ingest.foreground.masks import passing_masks

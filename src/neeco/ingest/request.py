@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from neeco.errors import NeecoError
-from neeco.settings import Place, faults_in, read
+from neeco.base.errors import NeecoError
+from neeco.base.settings import Place, faults_in, read
 
 
 @dataclass(frozen=True, kw_only=True)

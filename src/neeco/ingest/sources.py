@@ -8,8 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from neeco.errors import NeecoError
-from neeco.files import write_text
+from neeco.base.errors import NeecoError
+from neeco.base.files import write_text
+from neeco.base.settings import Fault
 from neeco.ingest.cameras.still_scene import video_stands_still
 from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.columns import recognise_time
@@ -18,7 +19,6 @@ from neeco.ingest.recording.file import read_recording, recording_of
 from neeco.ingest.recording.model import MIN_FRAMES, Recording
 from neeco.ingest.recording.template import open_questions, write_template
 from neeco.ingest.request import IngestRequest
-from neeco.settings import Fault
 
 RECORDING = "recording.yaml"
 _OPTIONS = {

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.recording.model import Splits
 from neeco.ingest.timing.episodes import Episodes, States
 

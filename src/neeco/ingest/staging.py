@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from neeco.errors import NeecoError
-from neeco.files import LOCK, TEMPORARY, cannot_write, new_folder, own_folder
+from neeco.base.errors import NeecoError
+from neeco.base.files import LOCK, TEMPORARY, cannot_write, new_folder, own_folder
 
 
 @contextmanager

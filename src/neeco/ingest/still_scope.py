@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import SEPARATE_TISSUES, PointCloud, evenly_spaced
-from neeco.errors import NeecoError
 from neeco.ingest.cameras.still_scene import (
     N_FRAMES,
     RightCamera,

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import State, evenly_spaced
-from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians, Rendering

@@ -28,8 +28,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Instrument, State
-from neeco.errors import NeecoError
 from neeco.methods.networks import RecordedTimes, check_warm_up, robust_bounds
 from neeco.raster.devices import tf32_products
 from neeco.raster.types import Rendering

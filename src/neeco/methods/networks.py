@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import State
-from neeco.errors import NeecoError
 from neeco.raster.devices import fast_bfloat16
 
 HALF_BY_DEFAULT: Mapping[str, Any] = {"deformation.half": None}  # decided by `half_resolved` where training starts

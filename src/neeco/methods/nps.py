@@ -16,8 +16,8 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Instrument, State
-from neeco.errors import NeecoError
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
 from neeco.methods.networks import HALF_BY_DEFAULT, check_warm_up, encode, half_resolved, octave_weights, robust_bounds
 from neeco.methods.space_carving import CarvingSettings

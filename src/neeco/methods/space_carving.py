@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import HOW_TO_REGISTER, Frame, evenly_spaced
-from neeco.errors import NeecoError
 from neeco.geometry.projection import project
 from neeco.methods.shaft_search import SETTINGS as SHAFT
 from neeco.methods.shaft_search import CylinderViews, find_shaft

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.rotations import axis_angle_quat, matrix_to_quat, quat_multiply, rotate_about
 from neeco.raster.devices import constant
 from neeco.raster.native import all_run_native, native

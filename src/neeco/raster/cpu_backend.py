@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.raster.native import native
 from neeco.raster.types import Gaussians, Layer, Rendering, differentiable

@@ -11,7 +11,7 @@ from functools import cache, lru_cache
 import torch
 from torch import Tensor
 
-from neeco.errors import NeecoError, memory_failure
+from neeco.base.errors import NeecoError, memory_failure
 from neeco.raster.triton.ready import missing, require_triton
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster.native import all_run_native, native
 from neeco.raster.triton.ready import runs_triton
 

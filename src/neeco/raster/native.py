@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 
 Family = Literal["native", "torch"]
 _family: ContextVar[Family] = ContextVar("family of kernels", default="native")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster.native import all_run_native, native
 from neeco.raster.triton.ready import runs_triton
 

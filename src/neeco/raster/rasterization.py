@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.raster.native import runs_native
 from neeco.raster.resampling import draw_through, of_learned_size, widened

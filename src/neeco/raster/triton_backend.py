@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.raster.triton.binning import Lists, Tiles, list_per_tile
 from neeco.raster.triton.composite import Images, composite, composite_backward

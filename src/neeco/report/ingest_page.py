@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neeco.base.errors import counted
+from neeco.base.files import finite
 from neeco.capture import read_capture
 from neeco.capture.checks import inspect_capture
 from neeco.capture.documents import Problem, errors_only
 from neeco.capture.model import Capture, Frame
-from neeco.errors import counted
-from neeco.files import finite
 from neeco.ingest.assessment import VERDICTS, Assessment, assess_ingest, clock_cost_mm, rms
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.pipeline import ingest

@@ -15,9 +15,9 @@ from PIL import Image
 from torch import Tensor
 
 import neeco
+from neeco.base.files import write_text
 from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import difference_map, to_uint8
-from neeco.files import write_text
 
 REPORT_FILE = "report.html"
 MAX_WIDTH = 480  # px of a picture; the page has to stay a file one can mail

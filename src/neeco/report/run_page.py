@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
+from neeco.base.files import read_bytes
 from neeco.capture.model import Capture, Frame, State
 from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, overlay_parts, part_color
 from neeco.evaluation.mask_folders import load_reference
-from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.report.charts import SMALL, Series, line_chart, short

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Instrument, InstrumentState, State
-from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians

@@ -14,8 +14,8 @@ from typing import Any, TypeGuard
 import torch
 from torch import Tensor, nn
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
-from neeco.errors import NeecoError
 from neeco.geometry.rotations import rigid_from_vector
 from neeco.raster import rasterize
 from neeco.raster.devices import CachedPredicate

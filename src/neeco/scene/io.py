@@ -14,19 +14,19 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from neeco import __version__
+from neeco.base.errors import NeecoError
+from neeco.base.files import HALVES, finite, require_content, require_like, write_atomically
+from neeco.base.settings import plain
 from neeco.capture.documents import Node, RaisingReport
 from neeco.capture.model import SEPARATE_TISSUES, Camera, Instrument, InstrumentState, State, share_lamps
 from neeco.capture.readers import kinematics_of
 from neeco.capture.readers.cameras import parse_lens
-from neeco.errors import NeecoError
-from neeco.files import HALVES, finite, require_content, require_like, write_atomically
 from neeco.geometry.rotations import rigid_fault
 from neeco.scene.deformation import Deformation
 from neeco.scene.drawable import DrawableScene, Recorded
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.method import Stored
 from neeco.scene.method_registry import current_name, method_class, method_settings, without_removed
-from neeco.settings import plain
 
 SCHEMA = "neeco-scene/2"
 OLD_SCHEMA = "neeco-scene/1"  # read as scenes without shadows, with readings relative to zero

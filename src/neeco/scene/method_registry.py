@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
+from neeco.base.errors import NeecoError
+from neeco.base.registry import plugins
+from neeco.base.settings import structure
 from neeco.capture.model import Capture, Instrument
-from neeco.errors import NeecoError
-from neeco.registry import plugins
 from neeco.scene.deformation import Deformation
 from neeco.scene.method import Method
-from neeco.settings import structure
 
 DEFAULT = "kinematic"
 PACKAGE = "neeco.methods"  # our package, and the entry point group of others

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster.optimizer import Adam
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import DrawableScene

@@ -11,9 +11,9 @@ from typing import Annotated
 
 import tyro
 
-from neeco.errors import NeecoError, nearest
-from neeco.files import parse_yaml, read_text
-from neeco.settings import Device, structure
+from neeco.base.errors import NeecoError, nearest
+from neeco.base.files import parse_yaml, read_text
+from neeco.base.settings import Device, structure
 from neeco.studies.tables import Column
 
 SCORES = (  # of one split

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from neeco.errors import counted
+from neeco.base.errors import counted
 from neeco.raster.native import simd, threads
 
 

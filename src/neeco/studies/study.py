@@ -20,14 +20,14 @@ from typing import Any, Protocol
 
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import TEMPORARY, read_begun, require_same, write_text
+from neeco.base.workers import Workers, address, check_gpus, run_tasks
+from neeco.base.workers import check_workers as check_reachable
 from neeco.capture import Capture
-from neeco.errors import NeecoError
-from neeco.files import TEMPORARY, read_begun, require_same, write_text
 from neeco.raster.devices import device_of, readable_failures
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.studies.machine import threads_per_worker
-from neeco.workers import Workers, address, check_gpus, run_tasks
-from neeco.workers import check_workers as check_reachable
 
 CHECKPOINT_S = 60.0  # that interrupted jobs get to write their checkpoints
 REMEDY = "give another --output"  # where a folder holds other work

@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from neeco import __version__
+from neeco.base.errors import NeecoError
+from neeco.base.files import own_folder, require_same, write_json, write_text
+from neeco.base.settings import name_and_value, plain
 from neeco.capture import Capture
 from neeco.capture.checks import read_checked
 from neeco.capture.writer import fingerprint
-from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import held_out_splits
 from neeco.evaluation.image_metrics import WEIGHTS_VARIABLE, find_lpips
-from neeco.files import own_folder, require_same, write_json, write_text
 from neeco.raster.devices import device_of
 from neeco.scene.method_registry import method_class, unmet_need
 from neeco.scene.training_session import UNLIMITED
-from neeco.settings import name_and_value, plain
 from neeco.studies.configurations import MEASURES, Study, SweepRequest
 from neeco.studies.machine import machine
 from neeco.studies.study import REMEDY, JobEvent, Result, check_output, check_workers, run_jobs

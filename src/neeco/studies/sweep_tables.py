@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from neeco.errors import counted
-from neeco.files import write_text
+from neeco.base.errors import counted
+from neeco.base.files import write_text
 from neeco.studies.configurations import COSTS, MEASURES, Study, Table, TableRow
 from neeco.studies.machine import machine_words
 from neeco.studies.study import spread

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import finite, read_json, read_json_lines, require_like, require_same, write_json, write_text
 from neeco.capture import Capture, read_capture
 from neeco.capture.checks import read_checked
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.writer import fingerprint
-from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.image_metrics import find_lpips, psnr
-from neeco.files import finite, read_json, read_json_lines, require_like, require_same, write_json, write_text
 from neeco.labels.drawing import draw
 from neeco.raster.devices import device_of
 from neeco.scene.method_registry import method_class

@@ -17,9 +17,9 @@ import cv2
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Capture, Frame, State
 from neeco.capture.writer import fingerprint
-from neeco.errors import NeecoError
 from neeco.evaluation.trust import Trust, TypicalErrors, estimate_trust, typical_errors_of
 from neeco.evidence.foreground import Comparison, Foreground
 from neeco.evidence.label_quality import QUALITY, label_counts, learned_foreground, quality_of

@@ -17,9 +17,9 @@ import torch
 from numpy.random import Generator
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_bytes
 from neeco.capture.images import image_files, image_size, read_image_bytes
-from neeco.errors import NeecoError
-from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.raster import rasterize
 from neeco.raster.reference import SH_C0

@@ -18,10 +18,10 @@ import torch
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import parse_yaml, read_text
 from neeco.capture.documents import as_float
 from neeco.capture.model import InstrumentState, State
-from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text
 from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid
 from neeco.labels.annotation import place_in_image, working_ends

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
 from neeco.scene.drawable import Recorded

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from neeco.files import write_text
+from neeco.base.files import write_text
 from neeco.synthesis.settings import ImageSettings, Settings
 from neeco.synthesis.writers.folder import split_of
 from neeco.synthesis.writers.hub import SPLITS, ImageFolder, WebDataset

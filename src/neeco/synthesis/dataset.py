@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import neeco
-from neeco.errors import NeecoError
-from neeco.files import own_folder, read_begun, require_same, sync_disk, write_json
+from neeco.base.errors import NeecoError
+from neeco.base.files import own_folder, read_begun, require_same, sync_disk, write_json
+from neeco.base.registry import plugins
+from neeco.base.workers import address, check_workers
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.drawing import EDGE_WIDTH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels, instruments_of
-from neeco.registry import plugins
 from neeco.synthesis.backgrounds import ImageFolder
 from neeco.synthesis.camera_effects import read_effects
 from neeco.synthesis.card import write_card
@@ -51,7 +52,6 @@ from neeco.synthesis.writers.folder import (
     write_states,
 )
 from neeco.training.run import SCENE_FILE, scene_digest
-from neeco.workers import address, check_workers
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene

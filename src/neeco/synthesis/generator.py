@@ -18,8 +18,8 @@ import torch
 from numpy.random import Generator
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import State, evenly_spaced
-from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends_of
 from neeco.labels.drawing import MAX_UNOBSERVED, LayeredDrawing, draw_layers

@@ -16,8 +16,8 @@ import torch
 from numpy.random import Generator
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State
-from neeco.errors import NeecoError
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project
 from neeco.labels.annotation import working_ends_or_origins

@@ -17,8 +17,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from neeco.errors import NeecoError
-from neeco.files import read_bytes, sweep_unfinished
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_bytes, sweep_unfinished
+from neeco.base.workers import Workers, address, run_tasks
 from neeco.raster.devices import readable_failures
 from neeco.raster.native import threads
 from neeco.synthesis.backgrounds import ImageFolder
@@ -26,7 +27,6 @@ from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_encod
 from neeco.synthesis.samplers import states_file
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS
 from neeco.synthesis.writers.folder import Encoded, Record
-from neeco.workers import Workers, address, run_tasks
 
 TASK_SIZE = 8  # images of a cluster's task
 

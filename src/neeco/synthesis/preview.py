@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from neeco.base.files import write_atomically
 from neeco.capture.images import open_image
 from neeco.capture.model import evenly_spaced
 from neeco.evaluation.image_metrics import PART_COLORS, outline, part_color
-from neeco.files import write_atomically
 from neeco.labels.annotation import OCCLUDED
 from neeco.synthesis.writers.folder import Record, stem
 

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import write_json
 from neeco.capture import read_capture
 from neeco.capture.checks.truth import PARTS_FILE
 from neeco.capture.images import write_image, write_labels
 from neeco.capture.model import State
 from neeco.capture.readers import read_states
-from neeco.errors import NeecoError
-from neeco.files import write_json
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.synthesis.cameras import DrawnCameras

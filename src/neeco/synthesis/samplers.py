@@ -16,10 +16,10 @@ import torch
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_bytes
 from neeco.capture.model import RecordedStates, State, evenly_spaced
 from neeco.capture.readers import read_states
-from neeco.errors import NeecoError
-from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import rays_of_pixels
 from neeco.geometry.rotations import rigid

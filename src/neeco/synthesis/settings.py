@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass, fields
 from importlib.metadata import entry_points
 from typing import Any, Literal, get_args
 
-from neeco.errors import NeecoError
-from neeco.settings import structure
+from neeco.base.errors import NeecoError
+from neeco.base.settings import structure
 
 LabelWay = Literal["composited", "threshold"]
 Views = Literal["recorded", "perturbed", "orbit"]

@@ -15,8 +15,8 @@ import torch
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Instrument, InstrumentState, State
-from neeco.errors import NeecoError
 from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
 

@@ -37,8 +37,8 @@ from typing import Any
 import numpy as np
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
+from neeco.base.errors import naming_arguments
 from neeco.capture.model import State
-from neeco.errors import naming_arguments
 from neeco.geometry.camera import Camera
 from neeco.labels.annotation import LabelledImage, keypoint_names
 from neeco.labels.labellers import instruments_of

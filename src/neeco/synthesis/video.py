@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import write_atomically
 from neeco.capture.images import to_bytes
-from neeco.errors import NeecoError, install_hint
-from neeco.files import write_atomically
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw, to_numpy
 from neeco.synthesis.cameras import DrawnCameras

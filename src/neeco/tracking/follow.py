@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import torch
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Frame, State
-from neeco.errors import NeecoError
 from neeco.fitting.crop_rendering import FrameView
 from neeco.fitting.state_fitter import StateFit, loose_prior
 from neeco.tracking.motion import MAX_GAP_S, MotionModel, MotionState

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Instrument, State
-from neeco.errors import NeecoError
 from neeco.fitting.crop_rendering import InstrumentRenderer, TissueRenderer
 from neeco.fitting.parameters import InstrumentParameters, StateParameters
 from neeco.fitting.state_fitter import Fitter

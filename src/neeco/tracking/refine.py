@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import own_folder, read_begun, read_bytes, read_json, require_same, write_json
+from neeco.base.settings import with_fields
 from neeco.capture.model import Capture, Frame
 from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
-from neeco.errors import NeecoError
-from neeco.files import own_folder, read_begun, read_bytes, read_json, require_same, write_json
 from neeco.fitting.state_fitter import loose_prior
 from neeco.scene import GaussianScene
-from neeco.settings import with_fields
 from neeco.tracking.parameters import fitter_of
 from neeco.tracking.track import INFO
 from neeco.training.run import scene_digest, stored_config

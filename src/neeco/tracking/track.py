@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 import neeco
+from neeco.base.errors import NeecoError
+from neeco.base.files import own_folder, read_begun, read_json, require_same, write_json
 from neeco.capture.model import Capture, Frame, InstrumentState, State
 from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
-from neeco.errors import NeecoError
-from neeco.files import own_folder, read_begun, read_json, require_same, write_json
 from neeco.scene import Recorded
 from neeco.scene.io import save_scene
 from neeco.synthesis.mixing import merged_scene

@@ -24,8 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Frame, State, evenly_spaced
-from neeco.errors import NeecoError
 from neeco.evaluation.trust import NEIGHBOURHOOD, TypicalErrors, estimate_trust, typical_errors_of
 from neeco.fitting.crop_rendering import composite
 from neeco.fitting.parameters import DEG

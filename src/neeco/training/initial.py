@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
 from neeco.capture.images import has_alpha
 from neeco.capture.model import Capture, Frame, Instrument, PointCloud
-from neeco.errors import NeecoError
 from neeco.scene.canonical import neighbour_spacing, seed_gaussians
 from neeco.scene.drawable import DrawableScene, Recorded
 from neeco.scene.gaussian_scene import GaussianScene

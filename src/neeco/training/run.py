@@ -19,10 +19,8 @@ from safetensors import safe_open
 from torch import Tensor
 
 from neeco import __version__
-from neeco.capture import Capture, fingerprint, read_capture
-from neeco.errors import NeecoError
-from neeco.evidence.label_quality import LABEL_QUALITY, LabelQuality
-from neeco.files import (
+from neeco.base.errors import NeecoError
+from neeco.base.files import (
     YamlDumper,
     parse_yaml,
     read_bytes,
@@ -33,7 +31,9 @@ from neeco.files import (
     require_utf8,
     write_text,
 )
-from neeco.placeholders import misplaced
+from neeco.base.placeholders import misplaced
+from neeco.capture import Capture, fingerprint, read_capture
+from neeco.evidence.label_quality import LABEL_QUALITY, LabelQuality
 from neeco.scene.drawable import DrawableScene
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import DAMAGED, load_scene, pack_scene, require_numbers, save_tensors, unpack_scene

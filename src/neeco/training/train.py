@@ -14,12 +14,12 @@ from pathlib import Path
 
 import torch
 
+from neeco.base.errors import NeecoError, memory_failure
+from neeco.base.files import cannot_write, own_folder, read_begun, read_text, require_same, write_json, write_text
 from neeco.capture import Capture
 from neeco.capture.checks import read_checked
 from neeco.capture.model import Frame
 from neeco.capture.writer import fingerprint
-from neeco.errors import NeecoError, memory_failure
-from neeco.files import cannot_write, own_folder, read_begun, read_text, require_same, write_json, write_text
 from neeco.scene.io import pack_scene, require_numbers, save_scene
 from neeco.scene.method_registry import method_class, unmet_need
 from neeco.scene.training_session import Session, StepResult

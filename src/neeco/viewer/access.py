@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 
 HOST, PORT = "127.0.0.1", 8080
 TOKEN_BYTES = 24

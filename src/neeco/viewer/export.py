@@ -25,8 +25,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 import neeco
-from neeco.errors import NeecoError
-from neeco.files import write_text
+from neeco.base.errors import NeecoError
+from neeco.base.files import write_text
 from neeco.geometry.lines import frame_about
 from neeco.labels.labellers import threshold_of
 from neeco.raster.reference import SH_C0

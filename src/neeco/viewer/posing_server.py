@@ -14,8 +14,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from neeco.errors import NeecoError, install_hint
-from neeco.files import require_like
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import require_like
 from neeco.viewer.access import HOST, MAX_MESSAGE, PORT, Access, family_of, quiet
 from neeco.viewer.posing_session import PosingSession
 

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import LOCK_WAIT_S, own_folder
 from neeco.capture.images import open_image
-from neeco.errors import NeecoError
-from neeco.files import LOCK_WAIT_S, own_folder
 from neeco.ingest.posing.along_shaft import crop
 from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
 from neeco.ingest.posing.posed_capture import N_SUGGESTED, PosedCapture, SolvedPosing, half_turn

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.capture.model import Capture, Frame
-from neeco.errors import NeecoError
 from neeco.labels.drawing import to_numpy
 from neeco.viewer.access import HOST, PORT
 from neeco.viewer.panel import message_html

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.capture.model import Capture, Frame
-from neeco.errors import NeecoError
 from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou

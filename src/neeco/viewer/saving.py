@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from neeco.base.files import LOCK_WAIT_S, own_folder, read_text, write_text
 from neeco.capture.model import State
 from neeco.capture.readers import StateLine, read_states
 from neeco.capture.writer import camera_to_json, state_to_json
-from neeco.files import LOCK_WAIT_S, own_folder, read_text, write_text
 from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels

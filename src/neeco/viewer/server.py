@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Self
 
 import torch
 
-from neeco.errors import NeecoError, install_hint
+from neeco.base.errors import NeecoError, install_hint
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import to_numpy
 from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import State
-from neeco.errors import NeecoError
 from neeco.labels.drawing import to_numpy
 from neeco.viewer.controls import Controls, controlled_state, interpolated_state
 from neeco.viewer.panel import Actions, Panel, message_html, status_html

@@ -18,11 +18,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import write_atomically
 from neeco.capture.model import Camera, State
 from neeco.capture.readers import read_states
-from neeco.errors import NeecoError, install_hint
 from neeco.evaluation.image_metrics import to_uint8
-from neeco.files import write_atomically
 from neeco.geometry.rotations import quat_to_matrix, spread_directions
 from neeco.raster import depth_maps
 from neeco.raster.reference import brightened, headlight_factor, sh_basis

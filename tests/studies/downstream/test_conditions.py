@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.studies.downstream.conditions import (
     RESERVED,
     Condition,

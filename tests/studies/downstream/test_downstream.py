@@ -17,7 +17,7 @@ import pytest
 from downstream_world import Pixels, bar_parts, read_grey, save_grey, write_set
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
 from neeco.studies.downstream import model as models_module
 from neeco.studies.downstream.experiment import plan_downstream, run_downstream

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from downstream_world import read_grey, save_grey
 
+from neeco.base.errors import NeecoError
 from neeco.cli import main
-from neeco.errors import NeecoError
 from neeco.studies.downstream.models.unet import UNet
 
 SHORT = ["--steps", "2", "--batch", "2", "--size", "48", "--folds", "1", "--device", "cpu"]

@@ -15,7 +15,7 @@ from downstream_world import Held, Pixels, batch_of, square, squares, task_of
 from safetensors.torch import load_file
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
 from neeco.studies.downstream.batches import BatchSampler
 from neeco.studies.downstream.model import WEIGHTS_FILE, find_models, input_size, model_class

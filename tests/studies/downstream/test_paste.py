@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from downstream_world import save_rgb
 
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
-from neeco.errors import NeecoError
 from neeco.studies.downstream.paste import Backgrounds, pasted_samples
 from neeco.studies.downstream.samples import Example, RecordedSample, recorded_samples
 

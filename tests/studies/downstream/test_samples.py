@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from downstream_world import bar_parts, picture_of, read_grey, save_grey, save_rgb, write_ids, write_set
 
+from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
-from neeco.errors import NeecoError
 from neeco.studies.downstream.samples import (
     WHOLE,
     Example,

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import torch
 
+from neeco.base.plausible import FEW_TRAIN_FRAMES
 from neeco.capture.checks.pictures import Picture
 from neeco.capture.checks.settings import SETTINGS
 from neeco.capture.documents import Node, printable
 from neeco.capture.images import masks_fault
 from neeco.capture.model import Frame
 from neeco.capture.readers.parsed import Parsed
-from neeco.plausible import FEW_TRAIN_FRAMES
 
 
 def check_frames(parsed: Parsed) -> None:

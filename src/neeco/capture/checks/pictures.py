@@ -13,12 +13,12 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 
+from neeco.base.errors import NeecoError
 from neeco.capture.checks.settings import SETTINGS
 from neeco.capture.images import Hidden, byte_pixels, measure_hidden
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.points import measured_sample
 from neeco.capture.readers.parsed import Parsed
-from neeco.errors import NeecoError
 
 Result = TypeVar("Result")
 

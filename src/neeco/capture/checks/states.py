@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from neeco.base.plausible import Fault, exceeds_limits, joint_fault, limits_fault
 from neeco.capture.checks.settings import SETTINGS
 from neeco.capture.documents import Node, printable
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import MIN_DEVIATION, Instrument
 from neeco.capture.readers.parsed import Parsed
-from neeco.plausible import Fault, exceeds_limits, joint_fault, limits_fault
 
 
 def check_states(parsed: Parsed) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json, require_inside, visible_entries
 from neeco.capture.images import read_labels, read_mask
 from neeco.capture.readers.parsed import Parsed
-from neeco.errors import NeecoError
-from neeco.files import read_json, require_inside, visible_entries
 
 PARTS_FILE = "parts.json"  # names of the ids of masks in a folder
 USUAL_NAMES: Mapping[int, str] = {1: "shaft", 2: "wrist", 3: "jaw_left", 4: "jaw_right"}  # in folders without one

@@ -17,6 +17,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_bytes
+from neeco.base.plausible import center_fault, focal_fault, size_fault
 from neeco.capture.documents import Node, Problem, ProblemReport, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import TEST_EVERY, Frame, PointCloud, State
@@ -30,12 +33,9 @@ from neeco.capture.readers.parsed import (
     natural_order,
     relative_name,
 )
-from neeco.errors import NeecoError
-from neeco.files import read_bytes
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import COLMAP
 from neeco.geometry.rotations import quat_to_matrix, rigid
-from neeco.plausible import center_fault, focal_fault, size_fault
 
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),

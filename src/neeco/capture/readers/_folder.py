@@ -10,6 +10,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import require_utf8
+from neeco.base.placeholders import misplaced
+from neeco.base.plausible import other_size_fault
 from neeco.capture.documents import Node, ProblemReport, errors_only
 from neeco.capture.model import Capture, Instrument, State, share_lamps
 from neeco.capture.points import points_in_view
@@ -17,11 +21,7 @@ from neeco.capture.readers._colmap import find_models, parse_colmap
 from neeco.capture.readers._transforms import is_blender, load_document, parse_blender, parse_transforms
 from neeco.capture.readers.endonerf import is_endonerf_folder, parse_endonerf
 from neeco.capture.readers.parsed import Parsed, inside
-from neeco.errors import NeecoError
-from neeco.files import require_utf8
 from neeco.geometry.lens import Lens
-from neeco.placeholders import misplaced
-from neeco.plausible import other_size_fault
 
 
 def read_capture(path: Path | str, transforms: str = "transforms.json", *, background: float = 1.0) -> Capture:

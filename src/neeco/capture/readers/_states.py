@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import RepeatedKeyError, distinct_keys, read_text
 from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.capture.model import BaseUncertainty, Frame, FromVideo, Instrument, InstrumentState, State, Uncertainty
 from neeco.capture.readers.kinematics import parse_kinematics
-from neeco.errors import NeecoError
-from neeco.files import RepeatedKeyError, distinct_keys, read_text
 from neeco.geometry.conventions import swap_camera_axes
 
 Limits = tuple[float, float] | None

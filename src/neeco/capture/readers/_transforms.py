@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json
+from neeco.base.plausible import time_fault
 from neeco.capture.documents import Node, ProblemReport, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import SCHEMA, SEPARATE_TISSUES, TEST_EVERY, Frame, Instrument, State
@@ -17,11 +20,8 @@ from neeco.capture.points import random_points, read_ply
 from neeco.capture.readers._states import all_instruments, declared_instruments, parse_instruments
 from neeco.capture.readers.cameras import CameraFields, parse_lens, placeholder_camera
 from neeco.capture.readers.parsed import NOWHERE, Parsed, inside, instants, missing_file, relative_name
-from neeco.errors import NeecoError
-from neeco.files import read_json
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
-from neeco.plausible import time_fault
 
 BLENDER_HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there
 STATE_LIKE = ("instrument", "instrument_pose", "instrument_states", "tool", "tools", "joints", "states")  # frames' keys

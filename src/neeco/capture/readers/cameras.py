@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.plausible import MAX_SIZE_PX, focal_fault, size_fault
 from neeco.capture.documents import Node, as_float, printable
 from neeco.capture.images import image_size
 from neeco.capture.readers.parsed import Parsed
-from neeco.errors import NeecoError
 from neeco.geometry.camera import COEFFICIENT_COUNTS, Camera
 from neeco.geometry.lens import BORDER, COEFFICIENT_NAMES, INTRINSICS, Border, Lens
-from neeco.plausible import MAX_SIZE_PX, focal_fault, size_fault
 
 MAX_PX = 65_536.0  # beyond any image
 MAX_COEFFICIENT = 1e6  # beyond any lens

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import distinct_keys, read_text
 from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.capture.kinematics import REVOLUTE, Array, KinematicTree, Link
-from neeco.errors import NeecoError
-from neeco.files import distinct_keys, read_text
 
 READINGS = ("wrist_pitch", "wrist_yaw", "jaw")  # what drives the joints beyond the roll
 MM = 1000.0  # per m

@@ -13,17 +13,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import visible_entries
+from neeco.base.placeholders import placeholder
+from neeco.base.plausible import focal_fault, size_fault
 from neeco.capture.documents import Node, ProblemReport, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import TEST_EVERY, Frame, PointCloud, State
 from neeco.capture.points import random_points
 from neeco.capture.readers.parsed import Parsed, inside
-from neeco.errors import NeecoError
-from neeco.files import visible_entries
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import LLFF
-from neeco.placeholders import placeholder
-from neeco.plausible import focal_fault, size_fault
 
 POSES_FILE = "poses_bounds.npy"
 MASKS = "masks"

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
 from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.capture.kinematics import FIXED, JOINT_TYPES, Array, KinematicTree, Link
-from neeco.errors import NeecoError
 
 MAX_MM = 1e4  # beyond any instrument
 MAX_GAIN = 1e3

@@ -10,14 +10,14 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import follows_links
+from neeco.base.plausible import Fault
 from neeco.capture.documents import Node, Problem, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, Instrument, InstrumentState
 from neeco.capture.points import PointCloud
-from neeco.errors import NeecoError
-from neeco.files import follows_links
 from neeco.geometry.lens import Lens
-from neeco.plausible import Fault
 
 NOWHERE = "put it there or correct the path"
 

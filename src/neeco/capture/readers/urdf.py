@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import read_text
 from neeco.capture.kinematics import FIXED, PRISMATIC, REVOLUTE, KinematicTree, Link
-from neeco.errors import NeecoError, install_hint
-from neeco.files import read_text
 from neeco.geometry.rotations import rigid
 
 MM = 1000.0  # per m

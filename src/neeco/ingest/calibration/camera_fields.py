@@ -16,9 +16,9 @@ from typing import Any
 import cv2
 import yaml
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import YamlLoader, parse_yaml, read_json, read_text
 from neeco.capture.documents import as_float, printable
-from neeco.errors import NeecoError
-from neeco.files import YamlLoader, parse_yaml, read_json, read_text
 
 EXPECTED = "camera_matrix and distortion_coefficients, as OpenCV writes them"
 FISHEYE = {"fisheye", "equidistant", "equi", "kannalabrandt", "kannalabrandt8", "opencvfisheye"}

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import require_file
+from neeco.base.plausible import size_fault
 from neeco.capture.documents import Node, RaisingReport, as_float, printable
 from neeco.capture.readers.cameras import opencv_distortion, stated_distortion
-from neeco.errors import NeecoError
-from neeco.files import require_file
 from neeco.geometry.camera import COEFFICIENT_COUNTS
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.camera_fields import EXPECTED, CameraNumbers, cameras_in, read_calibration
-from neeco.plausible import size_fault
 
 FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
 FISHEYE_MODEL = "OPENCV_FISHEYE"

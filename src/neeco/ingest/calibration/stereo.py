@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_text, require_file, visible_entries
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError
-from neeco.files import read_text, require_file, visible_entries
 from neeco.geometry.camera import COEFFICIENT_COUNTS
 from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid, rotation_error

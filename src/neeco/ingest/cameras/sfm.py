@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json
 from neeco.capture.images import open_image
-from neeco.errors import NeecoError
-from neeco.files import read_json
 from neeco.geometry.lens import Lens
 from neeco.ingest.cameras.sfm_strategies import (
     Attempt,

@@ -9,7 +9,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 import cv2
 import numpy as np
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.lens import Lens
 
 FIELDS_OF_VIEW = (70.0, 100.0)  # degrees across the round image of laparoscopes, and of wide ones

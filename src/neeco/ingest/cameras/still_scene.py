@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import write_unsynced
 from neeco.capture.images import encoded_rgb, open_image, write_labels
 from neeco.capture.model import evenly_spaced
-from neeco.errors import NeecoError
-from neeco.files import write_unsynced
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.cameras.tissue_surface import TissueSurface, epipolar_error, surface_behind, surface_from_stereo

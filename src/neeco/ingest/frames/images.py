@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import write_unsynced
 from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, encoded_rgb, is_repeated, open_image, write_labels
 from neeco.capture.model import evenly_spaced
-from neeco.errors import NeecoError
-from neeco.files import write_unsynced
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
 from neeco.ingest.frames.views import StageProgress, Views

@@ -14,8 +14,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Capture, Instrument
-from neeco.errors import NeecoError
 from neeco.geometry.lines import unit
 from neeco.geometry.projection import project
 

@@ -16,11 +16,11 @@ from typing import Annotated, Any
 
 import yaml
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import YamlDumper, parse_yaml, read_text, write_text
+from neeco.base.settings import Fault, faults_in, printable, read
 from neeco.capture.documents import Node
-from neeco.errors import NeecoError
-from neeco.files import YamlDumper, parse_yaml, read_text, write_text
 from neeco.ingest.recording.sections import Name
-from neeco.settings import Fault, faults_in, printable, read
 
 FILE = "hand_posed.yaml"
 HEADER = """\

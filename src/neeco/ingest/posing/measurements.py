@@ -16,10 +16,10 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import require_content, require_like, write_atomically
 from neeco.capture.images import open_image
 from neeco.capture.model import Capture
-from neeco.errors import NeecoError
-from neeco.files import require_content, require_like, write_atomically
 from neeco.ingest.posing.along_shaft import Load, Shafts, crop
 from neeco.ingest.posing.roll_pairs import RollPairs, roll_pairs, unrolled_textures
 

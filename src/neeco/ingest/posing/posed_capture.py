@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json, write_json
 from neeco.capture.model import UNKNOWN_DEG, Capture, Instrument
 from neeco.capture.readers import read_capture
-from neeco.errors import NeecoError
-from neeco.files import read_json, write_json
 from neeco.ingest.posing.along_shaft import Load, Shafts
 from neeco.ingest.posing.angles import HAND_SD_DEG, AnglePosterior, chain_breaks, solve_joint, solve_rolls
 from neeco.ingest.posing.hand_posed import HandPose, answers_for, read_answers

@@ -18,11 +18,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.registry import plugins
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError, install_hint
 from neeco.geometry.lens import Lens
 from neeco.ingest.readers.frame_names import NamedFrame
-from neeco.registry import plugins
 
 MISSING = {"", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"}
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large

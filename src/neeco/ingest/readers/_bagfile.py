@@ -29,13 +29,13 @@ from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from neeco.base.errors import NeecoError, counted
+from neeco.base.files import require_content, visible_entries
+from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
-from neeco.errors import NeecoError, counted
-from neeco.files import require_content, visible_entries
 from neeco.ingest.readers import OTHER, Stream, VideoSource
 from neeco.ingest.readers.rows import restarts
-from neeco.placeholders import read_head
 
 if sys.version_info >= (3, 14):
     from compression import zstd

@@ -15,9 +15,9 @@ from typing import BinaryIO
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import open_file, require_content
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError
-from neeco.files import open_file, require_content
 from neeco.ingest.readers import VideoSource
 
 META, NRRD = (".mha", ".mhd"), (".nrrd", ".nhdr")

@@ -9,8 +9,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated
 
+from neeco.base.errors import NeecoError
 from neeco.capture.documents import Node, printable
-from neeco.errors import NeecoError
 
 TRACKER_CLOCK = "em"  # what a tracker's clock is called unless the recording names it
 VIDEO_CLOCK = "video"  # that of the images, and of logs that stand in the same file

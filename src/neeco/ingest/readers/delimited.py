@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_bytes
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError
-from neeco.files import read_bytes
 from neeco.ingest.readers import DELIMITED, MISSING, RecordingFormat, Table, parse_number
 from neeco.ingest.readers.columns import UNITS, canonical_unit
 from neeco.ingest.readers.ndi import find_tools

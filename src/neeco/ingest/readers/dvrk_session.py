@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json, visible_entries
+from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.capture.images import open_image
-from neeco.errors import NeecoError
-from neeco.files import read_json, visible_entries
 from neeco.ingest.readers import (
     IMAGES,
     OTHER,
@@ -35,7 +36,6 @@ from neeco.ingest.readers.delimited import DelimitedText, unique_names
 from neeco.ingest.readers.frame_names import meaning_of
 from neeco.ingest.readers.rosbag import DVRK_HINT, POSE_HEADER, RosBag, joint_column, wrist_joints
 from neeco.ingest.readers.video import ChosenFrames, ImageFiles, open_video
-from neeco.placeholders import read_head
 
 INDEX, TYPES = "index.json", ("dc_index_v1", "dc::index@", "dvrk_data:index@")
 TOPIC = "# Topic: /"  # begins a CSV file of `extract`

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
+from neeco.base.placeholders import read_head
 from neeco.ingest.readers import POSES, RecordingFormat, Stream, Table, choose_stream, parse_number
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.delimited import read_cells
 from neeco.ingest.readers.frame_names import NamedFrame
-from neeco.placeholders import read_head
 
 ARMS = ("master left", "master right", "slave left", "slave right")  # in the order of their columns
 COLUMNS = 19  # of an arm

@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from neeco.base.errors import NeecoError
+from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
-from neeco.errors import NeecoError
 from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import (
     IMAGES,
@@ -56,7 +57,6 @@ from neeco.ingest.readers.lerobot_files import (
     read_data_set,
 )
 from neeco.ingest.readers.video import ChosenFrames, open_video
-from neeco.placeholders import read_head
 
 TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json, read_text, require_content, require_inside, visible_entries
 from neeco.capture.documents import as_float, printable
-from neeco.errors import NeecoError
-from neeco.files import read_json, read_text, require_content, require_inside, visible_entries
 
 INFO = "meta/info.json"
 EPISODES_2, EPISODES_3 = "meta/episodes.jsonl", "meta/episodes"

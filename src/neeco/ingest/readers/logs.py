@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError, counted
+from neeco.base.errors import NeecoError, counted
 from neeco.geometry.conventions import OPENCV
 from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Table, column_index, numbers, parse_number, read_table

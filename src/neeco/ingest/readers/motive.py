@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
+from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError
 from neeco.ingest.readers import Body, RecordingFormat, Table, numbers, parse_number
 from neeco.ingest.readers.columns import UNITS, canonical_unit
 from neeco.ingest.readers.delimited import read_cells, unique_names
-from neeco.placeholders import read_head
 
 FIRST = b"Format Version"  # words of a file
 BODY_TYPE = "rigid body"

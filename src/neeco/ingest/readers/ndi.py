@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError
 from neeco.ingest.readers import Body, Table
 from neeco.ingest.readers.columns import PoseColumns
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from neeco.base.errors import NeecoError, counted
+from neeco.base.files import require_content
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError, counted
-from neeco.files import require_content
 from neeco.ingest.readers import (
     IMAGES,
     OTHER,

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError, counted
+from neeco.base.files import visible_entries
+from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError, counted
-from neeco.files import visible_entries
 from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid
 from neeco.ingest.calibration.camera_fields import cameras_in
@@ -39,7 +40,6 @@ from neeco.ingest.readers.columns import BASE, CAMERA, PoseColumns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, meaning_of, of_dvrk
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import NORM_TOLERANCE, read_pose_log
-from neeco.placeholders import read_head
 
 if TYPE_CHECKING:
     from neeco.ingest.readers._bagfile import Joints, Samples, Survey

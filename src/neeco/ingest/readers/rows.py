@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neeco.errors import NeecoError, counted
+from neeco.base.errors import NeecoError, counted
 from neeco.ingest.readers import Table, column_index, numbers
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.columns import JointColumns, PoseColumns, RecognisedColumns

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import FastYamlLoader, parse_yaml, read_text, visible_entries
 from neeco.capture.documents import printable
-from neeco.errors import NeecoError
-from neeco.files import FastYamlLoader, parse_yaml, read_text, visible_entries
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.readers import (

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import require_content, visible_entries
 from neeco.capture.images import FORMATS, open_image
 from neeco.capture.readers.parsed import natural_order
-from neeco.errors import NeecoError, install_hint
-from neeco.files import require_content, visible_entries
 from neeco.ingest.readers import VideoSource, numbers, read_table
 from neeco.ingest.readers.columns import recognise_time, scale_of
 

@@ -11,15 +11,15 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import parse_yaml, read_text
+from neeco.base.settings import Fault, faults_in, join_places, printable, read
 from neeco.capture.documents import Node, RaisingReport
-from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text
 from neeco.geometry.conventions import DVRK_ECM
 from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_of
 from neeco.ingest.recording.sections import Positive, existing_file, word
-from neeco.settings import Fault, faults_in, join_places, printable, read
 
 BASE_KEY, WORLD_KEY = "camera_from_base", "world_from_base"  # to a still camera; to the laparoscope's tracker
 UNKNOWN = "unknown"

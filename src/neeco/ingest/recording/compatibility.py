@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers import format_of
 from neeco.ingest.readers.columns import JointColumns, PoseColumns
 from neeco.ingest.recording.model import IngestSettings, InstrumentLogs, Recording, StereoPartner, VideoFile

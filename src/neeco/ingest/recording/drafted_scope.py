@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.readers import IMAGES, VideoSource, format_of
 from neeco.ingest.recording.model import STILL, ImageFolder, VideoFile

@@ -8,14 +8,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
+from neeco.base.errors import NeecoError, nearest
+from neeco.base.files import parse_yaml, read_json, read_text, require_file
+from neeco.base.settings import Fault, faults_in, join_places, printable, read
 from neeco.capture.documents import Node, as_float
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import SEPARATE_TISSUES
 from neeco.capture.readers import read_dvrk_tool, read_urdf
 from neeco.capture.readers.dvrk import READINGS as DVRK_READINGS
 from neeco.capture.readers.kinematics import parse_kinematics
-from neeco.errors import NeecoError, nearest
-from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers import format_of
 from neeco.ingest.readers.columns import FORMS, TRACKER_CLOCK, VIDEO_CLOCK, JointColumns, PoseColumns, Units
@@ -48,7 +49,6 @@ from neeco.ingest.recording.sections import (
     text,
     word,
 )
-from neeco.settings import Fault, faults_in, join_places, printable, read
 
 _OFFSET_SUFFIX = "_minus_video_s"  # of clocks' names in sync files
 _EULER = re.compile(r"(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})")  # no axis twice in a row

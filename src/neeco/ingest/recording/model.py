@@ -9,9 +9,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from neeco.base.errors import NeecoError
+from neeco.base.settings import Fault
 from neeco.capture.documents import Node
 from neeco.capture.kinematics import KinematicTree
-from neeco.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.calibration.stereo import read_stereo
@@ -20,7 +21,6 @@ from neeco.ingest.readers.columns import JointColumns, PoseColumns
 from neeco.ingest.readers.video import open_images, open_video
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.sections import Count, File, Name, Positive, columns, integer, number, ranges
-from neeco.settings import Fault
 
 STILL, MOVING = "still", "moving"  # what `camera` may say of a scope
 MIN_FRAMES = 10  # from which cameras can be found

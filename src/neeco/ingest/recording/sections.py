@@ -1,4 +1,4 @@
-"""Parsers of values of recording.yaml, for the types of fields of frozen dataclasses (`neeco.settings.read`)."""
+"""Parsers of values of recording.yaml, for the types of fields of frozen dataclasses (`neeco.base.settings.read`)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+from neeco.base.settings import Fault, printable
 from neeco.capture.documents import Node
-from neeco.settings import Fault, printable
 
 Parser = Callable[[Node], Any]
 MAX_NUMBER = 1e12  # of any key: more is a slip, and overflows what is computed from it

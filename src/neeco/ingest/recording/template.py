@@ -10,8 +10,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from neeco.errors import NeecoError, visible
-from neeco.files import read_json, require_content
+from neeco.base.errors import NeecoError, visible
+from neeco.base.files import read_json, require_content
+from neeco.base.placeholders import placeholder
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers import IMAGES as IMAGE_STREAMS
 from neeco.ingest.readers import POSES, READINGS, Stream, format_of, read_table
@@ -33,7 +34,6 @@ from neeco.ingest.readers.ndi import tool_columns, tool_names
 from neeco.ingest.readers.rosbag import DVRK_WRIST
 from neeco.ingest.readers.video import IMAGES, VIDEOS
 from neeco.ingest.recording.drafted_scope import FoundFrames, StandsStill, draft_scope
-from neeco.placeholders import placeholder
 
 MAX_FILES = 400  # looked at; a folder with more is not one recording
 MIN_IMAGES = 10  # in a folder of frames

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
-from neeco.errors import NeecoError
 from neeco.fitting.link_silhouette import ArticulatedModel, bends, joint_values, with_motion
 from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.articulated_fit import (

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import BaseUncertainty, evenly_spaced
-from neeco.errors import NeecoError
 from neeco.geometry.trocar import ShaftLine
 from neeco.ingest.foreground.silhouettes import ShaftLines, silhouettes_of
 from neeco.ingest.registration.axial_texture import with_marks

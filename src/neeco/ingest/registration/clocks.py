@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.foreground.residual_flow import ResidualFlow
 from neeco.ingest.frames.views import StageProgress, Views
 from neeco.ingest.readers.logs import PoseLog

@@ -9,9 +9,9 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
-from neeco.errors import NeecoError
 from neeco.geometry.rotations import rigid
 from neeco.geometry.trocar import line_through_trocar
 from neeco.ingest.frames.views import StageProgress, Views, reduced

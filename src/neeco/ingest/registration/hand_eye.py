@@ -16,8 +16,8 @@ import numpy as np
 from scipy.optimize import least_squares, nnls
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import BaseUncertainty
-from neeco.errors import NeecoError
 from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import UNKNOWN_DEG, Uncertainty, evenly_spaced
-from neeco.errors import NeecoError
 from neeco.geometry.lines import distances_to_lines, unit
 from neeco.ingest.foreground.silhouettes import shaft_lines
 from neeco.ingest.shaft.axis import ShaftAxes, ShaftEdges, ShaftVideo, across_axes, edge_distances, solve_axes

@@ -7,8 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import FromVideo, Instrument, Uncertainty
-from neeco.errors import NeecoError
 from neeco.ingest.frames.views import SfmResult, Views, reduced
 from neeco.ingest.recording.model import InstrumentLogs, Recording
 from neeco.ingest.shaft.axis import ShaftVideo

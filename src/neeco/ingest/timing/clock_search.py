@@ -12,7 +12,7 @@ import numpy as np
 from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation, Slerp
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog
 

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import PoseLog, ReadingLog

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_lengths, format_of
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK

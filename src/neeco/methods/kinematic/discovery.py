@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import evenly_spaced
-from neeco.errors import NeecoError
 from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
 from neeco.methods.kinematic.hinge_search import start_hinges

@@ -31,8 +31,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Camera, Instrument, State
-from neeco.errors import NeecoError
 from neeco.methods.networks import octave_angles, octave_weights
 from neeco.raster.devices import tf32_products
 from neeco.raster.resampling import draw_through

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import Capture, Frame
-from neeco.errors import NeecoError
 from neeco.methods.nerfies.field import NerfiesSettings, NerfScene, RayRendering, Rays, ray_directions
 from neeco.raster.devices import tf32_products
 from neeco.raster.optimizer import Adam

@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 
 BLOCK = 128  # pairs per program
 ELLIPSE = tl.constexpr(8)  # floats of an ellipse: x, y, half height, slope, k0, k1, peak, nothing

@@ -14,7 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 from neeco.raster.triton.ready import working_on
 
 BLOCK = 256  # numbers per program

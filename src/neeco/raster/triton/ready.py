@@ -10,7 +10,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from neeco.errors import NeecoError, install_hint
+from neeco.base.errors import NeecoError, install_hint
 
 OLDEST = (7, 0)  # compute capability that Triton compiles for
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 
 RESERVED = REAL, STRONG, PASTE, PERMUTED = "real", "strong", "paste", "permuted"
 BASELINES = (REAL, f"{REAL}+{STRONG}")  # without synthetic images: the better of them is the reference

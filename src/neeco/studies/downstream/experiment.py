@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from neeco import __version__
+from neeco.base.errors import NeecoError
+from neeco.base.files import own_folder, write_json
 from neeco.capture import Capture
 from neeco.capture.checks import read_checked
-from neeco.errors import NeecoError
-from neeco.files import own_folder, write_json
 from neeco.raster.devices import device_of
 from neeco.studies.downstream.conditions import REAL, RESERVED, default_conditions, labelled_count, parse_condition
 from neeco.studies.downstream.job import DownstreamJob, DownstreamSettings, absolute

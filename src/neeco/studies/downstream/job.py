@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import torch
 
+from neeco.base.files import read_json, require_like, require_same, write_atomically, write_json
 from neeco.capture import Capture, read_capture
-from neeco.files import read_json, require_like, require_same, write_atomically, write_json
 from neeco.raster.devices import device_of
 from neeco.studies.downstream.batches import BatchSampler
 from neeco.studies.downstream.conditions import PASTE, PERMUTED, REAL, STRONG, Condition, labelled_frames

@@ -17,9 +17,9 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from neeco.errors import NeecoError, install_hint
-from neeco.files import write_atomically
-from neeco.registry import plugins
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import write_atomically
+from neeco.base.registry import plugins
 from neeco.studies.downstream.batches import Batch, BatchSampler, collate, training_image
 from neeco.studies.downstream.scores import Prediction
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from neeco.base.errors import NeecoError
 from neeco.capture.images import image_files, read_image_bytes
-from neeco.errors import NeecoError
 from neeco.studies.downstream.samples import Example, RecordedSample, loaded
 
 

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neeco.errors import counted
-from neeco.files import write_text
+from neeco.base.errors import counted
+from neeco.base.files import write_text
 from neeco.studies.downstream.conditions import BASELINES, PERMUTED, REAL
 from neeco.studies.downstream.intervals import Arm, Scores, arms_of
 from neeco.studies.downstream.scores import BOX_SCORES, MASK_SCORES

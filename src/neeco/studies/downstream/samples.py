@@ -12,13 +12,13 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 import cv2
 import numpy as np
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_bytes, read_json, read_json_lines, require_inside, require_like
 from neeco.capture.checks.truth import PARTS_FILE
 from neeco.capture.images import image_files, image_size, read_image_bytes, read_labels
 from neeco.capture.model import Capture, Frame
-from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, truth_file, truth_names
 from neeco.evaluation.mask_metrics import boxes_of, pairs_of
-from neeco.files import read_bytes, read_json, read_json_lines, require_inside, require_like
 
 ClassNames = Literal["instrument", "parts"]
 WHOLE = ("instrument",)  # the classes where an instrument is one

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from neeco.base.files import write_json, write_unsynced
 from neeco.capture.images import encoded_png, open_image, read_labels
 from neeco.capture.model import InstrumentState, State
-from neeco.files import write_json, write_unsynced
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import INTRINSICS

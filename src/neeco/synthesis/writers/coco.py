@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from neeco.files import write_json
+from neeco.base.files import write_json
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import Record, link
 

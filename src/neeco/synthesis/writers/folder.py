@@ -18,10 +18,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.capture.images import encoded_image, encoded_png
-from neeco.capture.writer import camera_to_json, state_to_json
-from neeco.errors import NeecoError
-from neeco.files import (
+from neeco.base.errors import NeecoError
+from neeco.base.files import (
     read_bytes,
     read_text,
     require_replaceable,
@@ -29,6 +27,8 @@ from neeco.files import (
     write_text,
     write_unsynced,
 )
+from neeco.capture.images import encoded_image, encoded_png
+from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.geometry.lens import Lens
 from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import LayeredDrawing, to_numpy

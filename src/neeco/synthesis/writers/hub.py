@@ -18,8 +18,8 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-from neeco.errors import NeecoError, install_hint
-from neeco.files import read_bytes, write_atomically, write_text
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import read_bytes, write_atomically, write_text
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import Record, link, public_record, stem
 

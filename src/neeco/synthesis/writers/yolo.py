@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from neeco.files import write_text, write_unsynced
+from neeco.base.files import write_text, write_unsynced
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import Record, link, stem
 

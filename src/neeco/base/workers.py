@@ -25,8 +25,8 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Literal
 
-from neeco.errors import NeecoError, install_hint
-from neeco.placeholders import read_head
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.placeholders import read_head
 
 MAX_RETRIES = 3  # of a task whose worker died
 CONNECT_S = 5.0  # that a cluster's head gets to answer

@@ -8,7 +8,7 @@ from importlib.metadata import entry_points
 from types import ModuleType
 from typing import TypeVar
 
-from neeco.errors import NeecoError
+from neeco.base.errors import NeecoError
 
 T = TypeVar("T")
 

@@ -18,9 +18,9 @@ from typing import Any
 
 import yaml
 
-from neeco.errors import NeecoError
-from neeco.locks import LOCK, LOCKING, TEMPORARY, begin_file, locked, remove_abandoned
-from neeco.placeholders import placeholder
+from neeco.base.errors import NeecoError
+from neeco.base.locks import LOCK, LOCKING, TEMPORARY, begin_file, locked, remove_abandoned
+from neeco.base.placeholders import placeholder
 
 LOCK_WAIT_S = 20.0  # for a person who clicks, while another process writes
 FOLLOW_LINKS = "NEECO_FOLLOW_LINKS"  # environment variable

@@ -25,7 +25,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from neeco.errors import NeecoError, nearest
+from neeco.base.errors import NeecoError, nearest
 
 Device = Annotated[str, tyro.conf.arg(help="cpu, cuda, cuda:N, or auto: a CUDA device where there is one.")]
 T = TypeVar("T")
