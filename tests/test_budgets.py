@@ -1,0 +1,85 @@
+"""The source does not grow: lines of each room, files, functions and numbers at module level have a limit.
+
+A limit is what was reached last; who deletes lowers it. `pytest tests/test_budgets.py -s` prints what there is, beside
+the limit and the aim.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+
+import pytest
+from source_trees import module_paths, module_trees
+
+# lines of Python: the limit, and the aim
+ROOMS = {
+    "cli": (2100, 1700),
+    "viewer": (2850, 2100),
+    "report": (2100, 1500),
+    "studies": (4150, 2600),
+    "ingest": (18_000, 10_500),
+    "tracking": (1350, 1200),
+    "synthesis": (4400, 3200),
+    "evaluation": (1550, 1200),
+    "labels": (950, 800),
+    "methods": (6200, 3500),
+    "training": (2050, 1700),
+    "fitting": (2600, 2600),
+    "evidence": (300, 1200),
+    "scene": (2000, 1800),
+    "capture": (5100, 3900),
+    "raster": (4050, 3800),
+    "geometry": (950, 1000),
+    "base": (1600, 1500),
+}
+FILES, FUNCTIONS, NUMBERS = (345, 240), (3800, 3000), (1750, 300)
+
+
+def lines_of_rooms() -> Counter[str]:
+    found: Counter[str] = Counter()
+    for module, path in module_paths().items():
+        if path.parent.name != "neeco":
+            found[module.split(".")[1]] += len(path.read_text(encoding="utf-8").splitlines())
+    return found
+
+
+def numbers_at_module_level() -> int:
+    """Numbers in constants, tuples of them and arithmetic, which are no fields of settings."""
+    kinds = (ast.Constant, ast.Tuple, ast.UnaryOp, ast.BinOp)
+    values = [
+        statement.value
+        for tree in module_trees().values()
+        for statement in tree.body
+        if isinstance(statement, ast.Assign | ast.AnnAssign) and isinstance(statement.value, kinds)
+    ]
+    return sum(
+        isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool)
+        for value in values
+        for node in ast.walk(value)
+    )
+
+
+def require(what: str, there: int, limit: int, aim: int) -> None:
+    print(f"{what:12} {there:6} limit {limit:6} aim {aim:6}")
+    assert there <= limit, f"{what}: {there} are more than {limit}; delete as much as was added"
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_is_no_larger_than_it_was(room: str) -> None:
+    require(room, lines_of_rooms()[room], *ROOMS[room])
+
+
+def test_every_room_has_a_limit() -> None:
+    assert lines_of_rooms().keys() == ROOMS.keys()
+
+
+def test_files_functions_and_numbers_at_module_level_are_no_more_than_they_were() -> None:
+    functions = sum(
+        isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        for tree in module_trees().values()
+        for node in ast.walk(tree)
+    )
+    require("files", len(module_paths()), *FILES)
+    require("functions", functions, *FUNCTIONS)
+    require("numbers", numbers_at_module_level(), *NUMBERS)
