@@ -56,5 +56,5 @@ def test_a_stored_setting_that_was_removed_is_read_where_it_was_off_and_refused_
     stored = config_to_dict(config)
     off, on = ({"gate_mm": mm, "carried_places": mm is not None} for mm in (None, 20.0))
     assert stored_config(tmp_path, stored | {"deformation": stored["deformation"] | off}) == config
-    with pytest.raises(NeecoError, match="carried_places"):
+    with pytest.raises(NeecoError, match="gate_mm"):
         stored_config(tmp_path, stored | {"deformation": stored["deformation"] | on})

@@ -38,7 +38,7 @@ class ShaftSettings:
     n_bins: int = 96  # along it
     n_likely: int = 96  # candidates that are also tried with exchanged poses
     n_best: int = 12  # of them that are improved
-    least_share: float = 0.12  # of the evidence, that a cylinder must gain; shafts gain 0.16 and more, else it was 0.09
+    least_share: float = 0.14  # of the evidence, that a cylinder must gain; shafts gained 0.16 and more, bent ones 0.12
     solid: float = 0.9  # of the largest mean evidence of a point, from which it counts for the principal axis
     n_rounds: int = 4  # of random steps, each half as large as the one before
     n_steps: int = 24  # tried in a round for each candidate
