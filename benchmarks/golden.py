@@ -12,8 +12,6 @@ can say how two files differ. Five minutes a build.
 from __future__ import annotations
 
 import argparse
-import hashlib
-import json
 import shutil
 import subprocess
 import sys
@@ -25,7 +23,7 @@ import torch
 from PIL import Image
 from rendered.draws import SIZES, World, draw_world
 from rendered.world_capture import write_world
-from same_bits import TIMES, files_of, read_fields, read_safetensors
+from same_bits import digests_of
 from scipy.spatial.transform import Rotation
 from world_runs import ROOT, Build, builds_of
 
@@ -140,50 +138,11 @@ def _run(build: Build, verb: str, words: tuple[str, ...], written: Path) -> dict
     ended = subprocess.run(build.words(verb, *words), env=build.environment, capture_output=True, text=True)
     if ended.returncode:
         return {"failed": ended.stderr.splitlines()[-1] if ended.stderr else f"exit status {ended.returncode}"}
-    files = files_of(written) if written.is_file() or verb == "train" else _all_files(written)
-    if not files:
-        return {"failed": "nothing was written"}
-    return {str(file): digest(written / file) for file in sorted(files) if file.name not in STATING_PATHS}
-
-
-def _all_files(folder: Path) -> set[Path]:
-    return {file.relative_to(folder) for file in folder.rglob("*") if file.is_file() and file.suffix != ".html"}
-
-
-STATING_PATHS = ("README.md",)  # files that state where the run lies
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file; of JSON, YAML and safetensors of what they hold, times and versions left aside."""
-    hashed = hashlib.sha256()
-    fields: dict[str, str] = {}
-    if path.suffix == ".safetensors":
-        tensors, fields = read_safetensors(path)
-        for name, tensor in sorted(tensors.items()):
-            hashed.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
-            hashed.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
-    elif path.suffix in (".json", ".jsonl", ".yaml"):
-        fields = read_fields(path)
-    else:
-        hashed.update(path.read_bytes())
-    kept = {name: value for name, value in fields.items() if not set(name.split(".")) & set(ASIDE)}
-    hashed.update(json.dumps(kept, sort_keys=True).encode())
-    return hashed.hexdigest()
-
-
-ASIDE = (
-    *TIMES,
-    "prepared",
-    "scene_sha256",
-    "capture",
-    "run",
-    "created",
-    "command",
-)  # of times and places
+    return digests_of(written) or {"failed": "nothing was written"}
 
 
 def table(digests: dict[str, dict[str, dict[str, str]]]) -> tuple[str, bool]:
-    """A row for each capture and verb, and whether all builds agree."""
+    """A row for each capture and verb, and whether all builds agree; one that failed does not."""
     first, *others = digests
     lines, agree = [f"| | files | {' | '.join(others)} |", "|---|---|" + "---|" * len(others)], True
     for key, before in digests[first].items():
@@ -191,7 +150,7 @@ def table(digests: dict[str, dict[str, dict[str, str]]]) -> tuple[str, bool]:
         for other in others:
             after = digests[other].get(key, {})
             names = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
-            agree = agree and not names
+            agree = agree and not names and "failed" not in after
             cells.append(f"{len(names)} differ: {', '.join(names[:3])}" if names else "same")
         count = f"failed: {before['failed']}" if "failed" in before else str(len(before))
         lines.append(f"| {key} | {count} | {' | '.join(cells)} |")
