@@ -21,7 +21,19 @@ import yaml
 from safetensors import safe_open
 
 # fields of times, versions and places, at any depth, which do not count; README.md and pages state places, too
-ASIDE = {"seconds", "fps", "version", "prepared", "scene", "scene_sha256", "capture", "run", "created", "command"}
+ASIDE = {
+    "seconds",
+    "fps",
+    "version",
+    "prepared",
+    "scene",
+    "scene_sha256",
+    "capture",
+    "annotates",
+    "run",
+    "created",
+    "command",
+}
 SKIPPED = {"README.md", ".html"}  # names and endings of files
 SHOWN = 12  # differences told of one file
 
