@@ -22,17 +22,8 @@ from safetensors import safe_open
 
 # fields of times, versions and places, at any depth, which do not count; README.md and pages state places, too
 ASIDE = {
-    "seconds",
-    "fps",
-    "version",
-    "prepared",
-    "scene",
-    "scene_sha256",
-    "capture",
-    "annotates",
-    "run",
-    "created",
-    "command",
+    *("seconds", "fps", "version", "prepared", "created", "scene", "scene_sha256"),
+    *("capture", "annotates", "run", "command"),
 }
 SKIPPED = {"README.md", ".html"}  # names and endings of files
 SHOWN = 12  # differences told of one file
