@@ -16,8 +16,8 @@ from source_trees import module_paths, module_trees
 ROOMS = {
     "cli": (2100, 1700),
     "viewer": (2850, 2100),
-    "report": (2100, 1500),
-    "studies": (4150, 2600),
+    "report": (1700, 1500),
+    "studies": (3300, 2600),
     "ingest": (18_000, 10_500),
     "tracking": (1350, 1200),
     "synthesis": (4400, 3200),

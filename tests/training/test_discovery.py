@@ -113,6 +113,20 @@ def test_a_tip_whose_shaft_is_bent_by_a_wrist_is_carved_along_itself(frames: int
     assert math.degrees(math.acos(min(1.0, abs(float(shape.instrument_from_shaft[2, 2]))))) < 8
 
 
+def test_carving_at_poses_that_take_gradients_takes_none_itself() -> None:
+    """As corrected poses do; a warning of PyTorch is an error here."""
+    evidence = make_evidence(MOUNTINGS["straight"])
+    learned = [
+        replace(frame, state=State({"tool": replace(own, pose=own.pose.clone().requires_grad_())}))
+        for frame in evidence.frames
+        for own in frame.state.instruments.values()
+    ]
+    shape = carve(replace(evidence, frames=tuple(learned)), "tool", torch.Generator().manual_seed(0), SEARCH)
+    assert shape is not None
+    assert not shape.seeds.requires_grad
+    assert not shape.instrument_from_shaft.requires_grad
+
+
 def test_a_grid_of_few_points_carves_or_finds_nothing() -> None:
     """`deformation.carving.grid` may be as small as 1; fewer points than the search looks for are no fault."""
     evidence = make_evidence(MOUNTINGS["straight"])

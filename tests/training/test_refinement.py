@@ -175,7 +175,7 @@ def test_a_joint_that_nobody_recorded_follows_the_instants_beside() -> None:
     refinement.joints[2] = 0.0
     before, after = (refinement.apply(k, frames[k].state, CAMERA, 1)[2] for k in (4, 8))
     assert float(before.detach()) > 0
-    assert float(after) == 0
+    assert float(after.detach()) == 0
 
 
 @pytest.mark.parametrize("stated", [True, False], ids=["stated links", "hinges to be found"])

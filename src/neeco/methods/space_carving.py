@@ -277,6 +277,7 @@ def shape_around_frame(shape: CarvedShape, distance: float, count: int, generato
     return replace(shape, instrument_from_shaft=frame, near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds)
 
 
+@torch.no_grad()
 def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: CarvingSettings) -> CarvedShape | None:
     """Return the shape of instrument `name`; None without evidence in its frame (wrong poses, or never in view)."""
     reach = 0.6 * evidence.distance
