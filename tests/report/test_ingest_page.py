@@ -64,7 +64,7 @@ def made(folder: Path, **changes) -> IngestResult:
         capture=folder, recording="rec <1>.yaml", video_frames=106, video_fps=25.0, size=(240, 192),
         selected=np.arange(count), selected_times=times, dropped=(*dropped, (99, DropReason("no camera"))),
         clocks={"em": clock, "jaw_angle": ClockOffset(-0.0097, 0.0, "given")}, registration=registration,
-        registered_frames=np.arange(count), reprojection_px=0.36, points=len(capture.points.positions),
+        reprojection_px=0.36, points=len(capture.points.positions),
         shapes={capture.instruments[0].name: shaft()} if capture.instruments else {},
         split_rule="unseen: jaw_angle above 59 deg", notes=("12 rows dropped: <NaN>",),
         search=("with the lens given: ends after 2 of 80 keyframes", "taken: all frames at once"),
@@ -331,7 +331,7 @@ def test_without_registration_and_joints_the_page_says_so(tmp_path):
                 state["joints"] = {}
 
     folder = edited(tmp_path / "bare", strip)
-    bare = made(folder, registration=None, clocks={}, shapes={}, registered_frames=np.array([]), dropped=(), notes=())
+    bare = made(folder, registration=None, clocks={}, shapes={}, dropped=(), notes=())
     write_ingest_page(bare, tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
     for piece in (
@@ -354,7 +354,7 @@ def test_without_an_instrument_or_points_there_is_still_a_page(tmp_path):
             frame["instruments"] = []
 
     folder = edited(tmp_path / "cameras", strip)
-    result = made(folder, registration=None, reprojection_px=None, clocks={}, points=0, registered_frames=np.array([]))
+    result = made(folder, registration=None, reprojection_px=None, clocks={}, points=0)
     write_ingest_page(result, tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
     for piece in ("Cameras only", "no instrument states", "random stand-ins"):

@@ -138,7 +138,6 @@ def _result(
 ) -> IngestResult:
     """Return the report on a capture of the `chosen` rows of the views, split by `rule`."""
     data, images, views, registration = world.data, world.images, world.views, world.registration
-    row_of = {row: index for index, row in enumerate(chosen.tolist())}
     item = data.video_instrument
     return IngestResult(
         capture=output,
@@ -151,7 +150,6 @@ def _result(
         dropped=tuple(sorted(dropped.items())),
         clocks=data.reported_clocks,
         registration=registration,
-        registered_frames=np.array([row_of.get(int(row), -1) for row in registration.used] if registration else []),
         reprojection_px=world.reprojection_px,
         points=len(world.tissue.positions),
         shapes=dict(world.shapes),

@@ -30,7 +30,6 @@ class IngestResult:
     dropped: tuple[tuple[int, DropReason], ...]  # video frame, why
     clocks: dict[str, ClockOffset]  # by the clock's name: "em", or a joint's
     registration: Registration | None  # None: instrument poses stay in their tracker's frame
-    registered_frames: np.ndarray  # [R] row of `selected` of each entry of `registration.used`; -1: not in the capture
     reprojection_px: float | None  # None: cameras were not found by SfM
     points: int
     shapes: dict[str, RoughShape] = field(default_factory=dict)  # rough shape of each instrument, its own frame
