@@ -378,6 +378,7 @@ def test_a_capture_made_of_arrays_is_written_and_reads_back(tmp_path):
         assert np.array_equal(frame.state.instruments["grasper"].pose, instruments[index])
         assert np.array_equal(frame.camera.world_from_camera, cameras[index].astype(np.float32))
     bytes_of = (images * 255).round().astype(np.uint8)
+    bytes_of.flags.writeable = False  # as a decoder's are; PyTorch's warning is an error here
     write_capture(capture, tmp_path / "bytes", images=bytes_of)
     assert np.array_equal((read_capture(tmp_path / "bytes").frames[2].load_image() * 255).round(), bytes_of[2])
     write_capture(Capture("mine", capture.frames), tmp_path / "bare", images=images)

@@ -233,7 +233,9 @@ def _write_image(frame: Frame, name: str, path: Path, image: Tensor | np.ndarray
         target = f"images/{name}{frame.image_path.suffix}"
         _copy(frame.image_path, path / target)
         return target
-    pixels = frame.load_image() if image is None else torch.as_tensor(image)
+    if image is not None and not isinstance(image, Tensor):
+        image = torch.from_numpy(np.array(image))  # those of a decoder cannot be written, of which PyTorch warns
+    pixels = frame.load_image() if image is None else image
     wanted = (frame.camera.height, frame.camera.width, 3)
     if tuple(pixels.shape) != wanted:
         raise NeecoError(f"{frame.image_path}: image has shape {tuple(pixels.shape)}, its camera says {wanted}")
