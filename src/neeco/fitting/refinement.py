@@ -211,6 +211,10 @@ class Refinement:
         if self.readings:
             self.joint_sd[instant] = joints
 
+    def weigh(self, index: int, weight: float) -> None:
+        """Set the weight in the loss of frame `index`, and of all frames of its instant."""
+        self.weights[self.frames_of_instant[self.instants[index]]] = weight
+
     @torch.no_grad()
     def prior_shares(self) -> Tensor:
         """Return how large errors of states that were not fitted are [3], as shares of the priors' standard deviations:

@@ -50,10 +50,9 @@ def contradicting_states(session: GaussianSession) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Misfits:
-    """Misfits of training frames in their present states, of several that show one instant of the first, infinite where
-    no instrument is in the image; `limit` above
-    which a state is an outlier, `rejection_limit` above which a frame that no other state explains is left out,
-    `suspect_limit` above which a state may be wrong."""
+    """Misfits of training frames in their present states, of several cameras the first one's; infinite where no
+    instrument is in the image. Above `limit` a state is an outlier, above `rejection_limit` a frame that no other state
+    explains is left out, above `suspect_limit` a state may be wrong."""
 
     of_frame: dict[int, float]
     limit: float
@@ -162,7 +161,7 @@ def leave_out_unexplained(search: StateSearch, misfits: Mapping[int, float]) -> 
     for index, misfit in misfits.items():
         if names[index] in noted and misfit > limit:
             noted[names[index]] = LEFT_OUT
-            search.session.refinement.weights[index] = 0
+            search.session.refinement.weigh(index, 0.0)
 
 
 def _judge(
@@ -197,8 +196,7 @@ def _judge(
         recorded = given if own is None else own.state
         session.refinement.set_state(index, given, recorded, search.deviations(index, scale))
         del session.scene.diagnostics[CONTRADICTING][name]
-    instant = session.refinement.frames_of_instant[session.refinement.instants[index]]
-    session.refinement.weights[instant] = float(contradicting_states(session).get(name) != LEFT_OUT)
+    session.refinement.weigh(index, float(contradicting_states(session).get(name) != LEFT_OUT))
 
 
 def _own_fit(search: StateSearch, index: int, scale: float) -> StateFit | None:

@@ -101,6 +101,41 @@ class Spin(Perturbation):
     shaft_roll: float = 0.0
 
 
+def _find_shadow(session: GaussianSession, kinematic: Kinematic) -> None:
+    if kinematic.settings.shadow:
+        with session.searching(as_learned=True):
+            find_shadow(session)
+
+
+def _observe_silhouettes(session: GaussianSession, kinematic: Kinematic) -> None:
+    with session.searching():
+        observe_silhouettes(session)
+
+
+def _place_wrists(session: GaussianSession, kinematic: Kinematic) -> None:
+    with session.searching():
+        place_wrists(session, kinematic)
+
+
+def _refine_wrists(session: GaussianSession, kinematic: Kinematic) -> None:
+    if kinematic.settings.refine_wrists:
+        with session.searching():
+            refine_wrists(session, kinematic)
+
+
+# what events of the schedule can have the method do
+ACTIONS: Mapping[str, Callable[[GaussianSession, Kinematic], None]] = {
+    "find_shadow": _find_shadow,
+    "observe_silhouettes": _observe_silhouettes,
+    "place_wrists": _place_wrists,
+    "refine_wrists": _refine_wrists,
+    "judge_states": judge_states,
+    "size_states": size_states,
+    "judge_states_again": judge_states_again,
+    "fit_states": fit_states,
+    "carve_from_states": carve_from_states,
+    "conclude_states": conclude_states,
+}
 EVENTS = (
     Event(0.1, "observe_silhouettes"),
     Event(0.12, "judge_states"),  # later, the scene has learned from wrong states
@@ -151,7 +186,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         "resolution.full_size_at": 0.55,
         "schedule.events": EVENTS,
     }
-    actions = tuple(dict.fromkeys(event.action for event in EVENTS))
+    actions = tuple(ACTIONS)
     extra_rates: ClassVar[Mapping[str, float]] = {LINK_LOGITS: 1e-2}
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: KinematicSettings | None = None) -> None:
@@ -331,23 +366,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return (opacities * mixed).sum() / opacities.sum().clamp_min(1e-6)
 
     def act(self, training: GaussianTraining, action: str) -> None:
-        session = gaussian_session(training)
-        if action == "find_shadow":
-            if self.settings.shadow:
-                with session.searching(as_learned=True):
-                    find_shadow(session)
-        elif action == "observe_silhouettes":
-            with session.searching():
-                observe_silhouettes(session)
-        elif action == "place_wrists":
-            with session.searching():
-                place_wrists(session, self)
-        elif action == "refine_wrists":
-            if self.settings.refine_wrists:
-                with session.searching():
-                    refine_wrists(session, self)
-        else:
-            STATE_ACTIONS[action](session, self)
+        ACTIONS[action](gaussian_session(training), self)
 
     def finish(self, training: GaussianTraining) -> None:
         session = gaussian_session(training)
@@ -371,16 +390,6 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             )
             found[name] = 0.0 if fixed else rates[parameter] * scale
         return found
-
-
-STATE_ACTIONS: Mapping[str, Callable[[GaussianSession, ArticulatedInstruments], None]] = {
-    "judge_states": judge_states,
-    "size_states": size_states,
-    "judge_states_again": judge_states_again,
-    "fit_states": fit_states,
-    "carve_from_states": carve_from_states,
-    "conclude_states": conclude_states,
-}
 
 
 def articulation_of(instrument: Instrument) -> Articulation:

@@ -37,9 +37,10 @@ def _corrects_states(session: GaussianSession) -> bool:
 
 
 def _fits_states(session: GaussianSession) -> bool:
-    """Return whether states are corrected, and one camera shows each instant: gradients of several cameras' images
-    determine an instant's state better than each image does."""
-    return _corrects_states(session) and all(len(frames) == 1 for frames in session.refinement.frames_of_instant)
+    """Return whether states are corrected, their errors are larger than a tracker's, and one camera shows each instant:
+    gradients of several cameras' images determine an instant's state better than each image does."""
+    single = all(len(frames) == 1 for frames in session.refinement.frames_of_instant)
+    return _corrects_states(session) and STATE_ERRORS in session.scene.diagnostics and single
 
 
 @torch.no_grad()
@@ -70,7 +71,7 @@ def judge_states_again(session: GaussianSession, articulated: ArticulatedInstrum
 @torch.no_grad()
 def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, *, last: bool = False) -> None:
     """Fit the states of all training frames to their images, where their errors are larger than a tracker's."""
-    if not (_fits_states(session) and STATE_ERRORS in session.scene.diagnostics):
+    if not _fits_states(session):
         return
     search, refinement = StateSearch.of(session, articulated), session.refinement
     contradicting = contradicting_states(session)
@@ -98,7 +99,7 @@ def conclude_states(session: GaussianSession, articulated: ArticulatedInstrument
 @torch.no_grad()
 def carve_from_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Carve the instruments' shapes anew from fitted states."""
-    if _fits_states(session) and STATE_ERRORS in session.scene.diagnostics:
+    if _fits_states(session):
         with session.searching():
             carve_again(session, articulated)
 

@@ -74,7 +74,7 @@ def _correct(session: GaussianSession, found: FoundStates) -> None:
     assert instrument.kinematics is not None
     for row, shown in enumerate(refinement.frames_of_instant):
         if found.inconsistent[row] and not found.refitted[row]:
-            refinement.weights[shown] = 0
+            refinement.weigh(shown[0], 0.0)
         elif found.inconsistent[row]:
             recorded = session.views.frames[shown[0]].state
             own = recorded.instruments[instrument.name]
