@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, Literal
 
 import pytest
@@ -68,6 +70,12 @@ def test_what_is_written_is_read_again(value: Outer) -> None:
 def test_what_does_not_fit_is_told_by_its_place(values: dict[str, Any], told: str) -> None:
     with pytest.raises(NeecoError, match=f"^{told}"):
         structure(Outer, values, "group")
+
+
+def test_any_mapping_and_any_sequence_are_read() -> None:
+    given = MappingProxyType({"inner": MappingProxyType({"count": 4}), "names": deque(["jaw"])})
+    read = structure(Outer, given, "group")
+    assert (read.inner.count, read.names) == (4, ("jaw",))
 
 
 def test_dots_reach_into_groups() -> None:

@@ -531,6 +531,31 @@ def test_timestamps_that_stand_still_are_replaced_with_a_note(tmp_path):
     assert "timestamps do not increase; taken as 25 a second" in found.notes[0]
 
 
+@pytest.mark.parametrize("column", ["length", "timestamp"])
+def test_lists_where_a_number_stands_in_each_row_are_refused(tmp_path: Path, column: str) -> None:
+    path = data_set(tmp_path, version="v3.0")
+    pattern = "meta/episodes/**/*.parquet" if column == "length" else "data/**/*.parquet"
+    for file in path.glob(pattern):
+        table = pyarrow.parquet.read_table(file)
+        lists = pyarrow.array([[]] * len(table), pyarrow.list_(pyarrow.float64()))
+        pyarrow.parquet.write_table(table.set_column(table.schema.get_field_index(column), column, lists), file)
+    assert f"{column}: expected one number in each row" in refusal(path)
+
+
+def test_row_groups_that_unpack_to_more_than_memory_should_hold_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only those of the columns and the episode that are read count."""
+    from neeco.ingest.readers import lerobot_files
+
+    states = [{STATE: arm(20, number)} for number in range(40)]
+    path = data_set(tmp_path, states=states, names={}, cameras=(), group=20)
+    monkeypatch.setattr(lerobot_files, "MAX_BYTES", 8_000)
+    assert len(read(path, f"episode 33/{STATE}").rows) == 20
+    monkeypatch.setattr(lerobot_files, "MAX_BYTES", 100)
+    assert "unpacks to over" in refusal(path)
+
+
 def test_without_the_package(tmp_path, monkeypatch):
     path = data_set(tmp_path, states=EPISODES[:1], cameras=())
     found = importlib.util.find_spec

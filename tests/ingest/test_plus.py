@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 
 import numpy as np
 import pytest
@@ -203,10 +204,16 @@ def test_truncated_and_damaged_images_are_refused(world, transforms):
                 list(format_of(path).open_images(path).read(range(COUNT)))
 
 
-def test_a_header_that_promises_far_more_than_is_packed_is_refused(world, transforms):
+def test_a_compressed_bomb_is_refused_before_it_is_unpacked(world, transforms):
     path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms), film(), compressed=True)
     changed(path, b"16 12 1 30", b"8000 8000 1 3000")
-    with pytest.raises(NeecoError, match="its images end early"):
+    with pytest.raises(NeecoError, match="of which no 3000 images"):
+        list(format_of(path).open_images(path).read(range(COUNT)))
+    # and one whose header fits the little that it says, while far more comes out
+    content = path.read_bytes().replace(b"8000 8000 1 3000", b"16 12 1 30")
+    start = content.index(b"LOCAL\n") + 6
+    path.write_bytes(content[:start] + zlib.compress(bytes(50_000_000)))
+    with pytest.raises(NeecoError, match="more images than its header says"):
         list(format_of(path).open_images(path).read(range(COUNT)))
 
 

@@ -245,6 +245,7 @@ def test_one_of_several_bodies_is_named(world):
         (HEADER.encode() + b"\n", "no rows"),
         (b"1,2,3\n4,5,6\n", "no header"),
         (HEADER.encode() + b"\n0,1,2,3,1,0,0,0\n", "1 row of 1 can be used"),
+        (HEADER.encode() + b"," * 2000 + b"\n" + b"1,2\n" * 4000, "most lines are much shorter than the longest one"),
         (HEADER.encode() + b"\n" + b"a,b,c,d,e,f,g,h\n" * 9, r"line 2: t_s is 'a', not a number"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import shutil
 import sys
 from collections.abc import Callable
@@ -230,6 +231,16 @@ def test_a_truncated_bag_is_refused_with_what_repairs_it(
         assert message.partition("(")[0] != refusal(lambda: read_arm(file)).partition("(")[0]
 
 
+def test_a_bag_that_was_not_closed_is_refused(tmp_path: Path, bags: dict[str, Path]) -> None:
+    path = _copy(bags["recording.bag"], tmp_path)
+    content = path.read_bytes()
+    at = content.index(b"index_pos=") + len(b"index_pos=")
+    path.write_bytes(content[:at] + bytes(8) + content[at + 8 :])
+    assert "(Bag is not indexed, reindex before reading); repair it with `rosbag reindex`" in refusal(
+        lambda: read_arm(path)
+    )
+
+
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap", "a.db3"])
 @pytest.mark.parametrize("content", [b"", b"#ROSBAG V1.2\n", b"nothing of the kind" * 100])
 def test_what_is_no_bag_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
@@ -301,6 +312,31 @@ def test_files_packed_as_a_whole_are_refused(tmp_path: Path, bags: dict[str, Pat
     metadata.write_text(metadata.read_text().replace("compression_mode: ''", "compression_mode: FILE"))
     assert "FILE" in metadata.read_text()
     assert "its files are packed as a whole; unpack one with `zstd -d`" in refusal(lambda: read_arm(path))
+
+
+def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit is lowered: a bomb of its real size would take seconds to make."""
+    from neeco.ingest.readers import _bagfile
+
+    monkeypatch.setattr(_bagfile, "MAX_CHUNK_BYTES", 60_000)
+    for kind, packed in (("a.bag", "bz2"), ("b.bag", "lz4"), ("c.bag", None), ("d-mcap", "zstd"), ("e-db3", "zstd")):
+        with BagWriter(tmp_path, kind, packed=packed) as bag:
+            for time in range(4):
+                bag.pose("/dvrk/PSM1/measured_cp", float(time), [0, 0, 0], [1, 0, 0, 0])
+                bag.image(LEFT, float(time), np.zeros((200, 200, 3), np.uint8), "rgb8")
+        known = format_of(bag.path)
+        assert known is not None
+        assert "a chunk of its messages" in refusal(lambda known=known, bag=bag: known.open_images(bag.path))
+
+
+def test_packed_bytes_are_unpacked_up_to_a_limit_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
+    from neeco.ingest.readers import _bagfile
+
+    monkeypatch.setattr(_bagfile, "MAX_CHUNK_BYTES", 1000)
+    assert _bagfile.unpack(bz2.compress(bytes(1000)), "bz2") == bytes(1000)
+    for data in (bz2.compress(bytes(1001)), bz2.compress(bytes(900))[:-5], b"BZh"):
+        with pytest.raises((OSError, _bagfile.ReaderError)):
+            _bagfile.unpack(data, "bz2")
 
 
 def test_definitions_in_a_bag_are_never_executed(tmp_path: Path, bags: dict[str, Path]) -> None:

@@ -101,6 +101,8 @@ def test_a_video_of_another_length_is_refused(world, trajectory):
         ("api_cp_data.yaml", "'0': 3", "expected states of arms by frame"),
         ("api_cp_data.yaml", "'0': {PSM1: {R: [[1, 0, 0]], t: [0, 0, 0]}}", "frame 0: 'PSM1': expected R"),
         ("api_cp_data.yaml", "first: {PSM1: 1}", "expected states of arms by frame"),
+        ("api_cp_data.yaml", ".inf: {PSM1: 1}", "expected states of arms by frame"),
+        ("api_cp_data.yaml", "1.5: {PSM1: 1}", "expected states of arms by frame"),
         ("api_jp_data.yaml", "'0': {PSM1: [1, 2]}", "expected six or seven joints"),
         ("api_jp_data.yaml", "'0': {PSM1: [1, 2, 3", "not valid YAML"),
     ],

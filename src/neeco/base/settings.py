@@ -65,12 +65,12 @@ class Place:
 
     def child(self, key: str) -> typing.Self:
         """The value under `key` (None when absent)."""
-        value = self.value.get(key) if isinstance(self.value, dict) else None
+        value = self.value.get(key) if isinstance(self.value, Mapping) else None
         return self.at(value, join_places(self.field, key_name(key)))
 
     def item(self, index: int) -> typing.Self:
         """The element `index` of a list (None when this is not one)."""
-        value = self.value[index] if isinstance(self.value, list | tuple) else None
+        value = self.value[index] if isinstance(self.value, Sequence) and not isinstance(self.value, str) else None
         return self.at(value, f"{self.field}[{index}]")
 
     def at(self, value: Any, field: str) -> typing.Self:
@@ -107,7 +107,7 @@ def read(hint: Any, place: Place, owner: str = "it") -> Any:
         (arm,) = (arm for arm in arms if arm is not type(None))
         return None if value is None else read(arm, place, owner)
     if origin is typing.Literal and value not in arms:
-        raise Fault(place.field, f"{value!r} is none of {', '.join(map(str, arms))}")
+        raise Fault(place.field, f"{printable(value)} is none of {', '.join(map(str, arms))}")
     if origin is tuple:
         if isinstance(value, str) or not isinstance(value, Sequence):
             raise Fault(place.field, f"{printable(value)} is not a list; write [{value}]")

@@ -277,13 +277,13 @@ def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
     """
     chosen, bad = table.rows[:, [column_index(table, name) for name in columns]], dict[int, str]()
     if chosen.dtype == object:
-        cells, chosen = chosen, np.full(chosen.shape, np.nan)
-        for (row, slot), cell in np.ndenumerate(cells):
-            value = parse_number(cell.replace(",", ".") if table.decimal_comma else cell)
-            if value is None:
-                bad.setdefault(row, f"{columns[slot]} is {printable(cell, 24)}, not a number")
-            else:
-                chosen[row, slot] = value
+        cells = chosen.ravel().tolist()
+        texts = [cell.replace(",", ".") for cell in cells] if table.decimal_comma else cells
+        values = [parse_number(text) for text in texts]
+        for place in (place for place, value in enumerate(values) if value is None):
+            row, slot = divmod(place, len(columns))
+            bad.setdefault(row, f"{columns[slot]} is {printable(cells[place], 24)}, not a number")
+        chosen = np.array(values, np.float64).reshape(chosen.shape)  # None becomes NaN
     missing = ~(np.abs(chosen) < HUGE)  # NaN compares false
     incomplete = missing.any(axis=1)
     incomplete[list(bad)] = False

@@ -6,6 +6,7 @@ types that are read have been the same for years, and a bag with other digests i
 
 from __future__ import annotations
 
+import bz2
 import io
 import re
 import sys
@@ -14,15 +15,17 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from lz4.frame import LZ4FrameDecompressor
 from PIL import Image
 from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag1.reader import decompressors
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import McapReader
@@ -44,6 +47,12 @@ else:
 
 MCAP_HEADER_AT, MCAP_SCHEMA = 17, 3  # byte where the header's content begins, and the opcode of schemas
 MAX_NAME_LENGTH = 200
+MIB = 2**20
+MAX_CHUNK_BYTES = 256 * MIB  # unpacked; recorders write some MiB
+MAX_METADATA_BYTES = 16 * MIB
+MAX_JOINTS = 400  # of one topic
+MAX_BODIES = 2000  # of all transforms
+_DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
 MAX_PIXELS = 90_000_000  # of an image, as for files of images
 MAX_SKIPPED = 30  # images that are read and dropped rather than sought over
 MIN_IMAGES = 2
@@ -137,8 +146,8 @@ class Bag:
     def messages(
         self, topics: Collection[str], start: int | None = None, stop: int | None = None
     ) -> Iterator[tuple[str, int, Any]]:
-        """Yield (topic, time of receipt in ns since 1970, message or None where it is damaged) of topics that have no
-        problem, received in [start, stop). The order of two messages does not depend on what else is asked for.
+        """Yield (topic, time of receipt in ns since 1970, message or None where it is damaged) of the given topics,
+        received in [start, stop). The order of two messages does not depend on what else is asked for.
         Raises NeecoError."""
         ros1 = isinstance(self.reader, Ros1Reader)
         deserialize = _store(ros1).deserialize_ros1 if ros1 else _store(ros1).deserialize_cdr
@@ -148,9 +157,10 @@ class Bag:
                 wanted = [connection for connection in source.connections if connection.topic in topics]
                 for connection, received, data in source.messages(wanted, start, stop) if wanted else ():
                     if not 0 <= received < 2**63:
-                        raise ReaderError("a message was received at no time")
+                        raise ReaderError("a message has an invalid time of receipt")
+                    data = unpack(data, "zstd" if packed else "none")
                     try:
-                        message = deserialize(zstd.decompress(data) if packed else data, connection.msgtype)
+                        message = deserialize(data, connection.msgtype)
                     except Exception:  # rosbags raises nearly anything of damaged ones; a message hides no other
                         message = None
                     yield connection.topic, received, message
@@ -174,7 +184,11 @@ def open_bag(path: Path) -> Iterator[Bag]:
     it cannot be read, as `Bag.messages` does."""
     for file in visible_entries(path) if path.is_dir() else [path]:
         require_content(file)
-    if path.is_dir() and re.search(rb"compression_mode: [\"']?file", read_head(path / "metadata.yaml", 1 << 20), re.I):
+    metadata = path / "metadata.yaml"
+    if metadata.is_file() and metadata.stat().st_size > MAX_METADATA_BYTES:
+        size = f"{metadata}: has over {MAX_METADATA_BYTES // MIB} MiB"
+        raise NeecoError(f"{size}; write it anew with `ros2 bag reindex`")
+    if path.is_dir() and re.search(rb"compression_mode: [\"']?file", read_head(metadata, 1 << 20), re.I):
         raise NeecoError(f"{path}: its files are packed as a whole; unpack one with `zstd -d` and give that")
     kinds = {"": DirectoryReader, ".bag": Ros1Reader, ".mcap": _McapReader, ".db3": Sqlite3Reader}
     with ExitStack() as stack:
@@ -183,11 +197,44 @@ def open_bag(path: Path) -> Iterator[Bag]:
             reader.open()
             stack.callback(reader.close)
             sources = reader.storages if path.is_dir() else [reader]
-            if any(
-                isinstance(file, McapReader) and not file.chunks and file.metadata.message_count for file in sources
-            ):
-                raise ReaderError("its messages are not in chunks")
+            for source in sources:
+                _limit_chunks(source)
         yield Bag(path, reader, sources)
+
+
+def unpack(data: bytes, compression: str) -> bytes:
+    """Return the unpacked bytes, at most MAX_CHUNK_BYTES of them. Raises ReaderError."""
+    if compression == "none":
+        return data
+    machine = _DECOMPRESSORS[compression]()
+    unpacked = machine.decompress(data, max_length=MAX_CHUNK_BYTES + 1)
+    _check_size(len(unpacked))
+    if not machine.eof:
+        raise ReaderError("a chunk of its messages ends early")
+    return unpacked
+
+
+def _limit_chunks(reader: Any) -> None:
+    """Have an open ROS 1 or MCAP reader refuse chunks that do not fit into memory. Raises ReaderError.
+
+    An index states the unpacked size of MCAP's chunks; ROS 1 bags state none, so these are unpacked up to the limit.
+    """
+    if isinstance(reader, McapReader):
+        if not reader.chunks and reader.metadata.message_count:
+            raise ReaderError("its messages are not in chunks")
+        for listed in reader.chunks:
+            _check_size(max(listed.uncompressed_size, listed.compressed_size))
+    elif isinstance(reader, Ros1Reader):
+        names = {known: name for name, known in decompressors.items()}
+        for place, chunk in reader.chunks.items():
+            _check_size(chunk.datasize)
+            limited = partial(unpack, compression=names[chunk.decompressor])
+            reader.chunks[place] = chunk._replace(decompressor=limited)
+
+
+def _check_size(size: int) -> None:
+    if size > MAX_CHUNK_BYTES:
+        raise ReaderError(f"a chunk of its messages has over {MAX_CHUNK_BYTES // MIB} MiB")
 
 
 @contextmanager
@@ -269,6 +316,8 @@ class Joints(Samples):
         if len(names) != len(positions):
             return "is damaged"
         for name, value in zip(names, positions, strict=True):
+            if name not in self.columns and len(self.columns) >= MAX_JOINTS:
+                continue
             column = self.columns.setdefault(name, array("d"))
             column.extend([np.nan] * (count - len(column)))
             column.extend([value] * (len(column) == count))  # of a joint named twice, the first
@@ -371,7 +420,8 @@ class Survey:
         elif kind in TRANSFORMS:
             for item in [] if message is None else message.transforms:
                 name = f"tf:{plain(item.child_frame_id).lstrip('/')}"
-                self.poses.setdefault(name, Poses(kind, static=topic.endswith("tf_static"))).add(received, item)
+                if name in self.poses or len(self.poses) < MAX_BODIES:
+                    self.poses.setdefault(name, Poses(kind, static=topic.endswith("tf_static"))).add(received, item)
         elif kind in POSE:
             self.poses.setdefault(topic, Poses(kind)).add(received, message)
         else:

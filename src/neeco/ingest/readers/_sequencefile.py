@@ -22,9 +22,11 @@ from neeco.ingest.readers import VideoSource
 
 META, NRRD = (".mha", ".mhd"), (".nrrd", ".nhdr")
 MAX_LINE_BYTES = 1 << 16
+MAX_HEADER_BYTES = 1 << 29  # 100 000 frames of 20 transforms
 MAX_FRAMES = 10_000_000
 MAX_SIDE = 8192  # px
-CHUNK_BYTES = 1 << 16  # of packed data, of which at most 64 MiB unpack at once
+MAX_RATIO = 1032  # of unpacked to packed bytes by zlib
+CHUNK_BYTES = 1 << 20  # that are read, and unpacked, at once
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w{1,200})")
 _UCHAR = ("uchar", "unsigned char", "uint8", "uint8_t", "met_uchar")
 _META_READ = {
@@ -108,14 +110,21 @@ def read_sequence(path: Path) -> FrameSequence:
         path=path, size=size, count=count, channels=channels, fields=header.frames,
         data=(path, header.end) if local else (beside, 0), packed=packed,
     )  # fmt: skip
-    if sequence.has_images and not packed:
-        file, start = sequence.data
-        require_content(file)
-        held = (file.stat().st_size - start) / sequence.frame_bytes
-        if held != count:
-            what = f"holds {held:.4g} images, its header states {count}"
-            raise NeecoError(f"{file}: {what}; copy or export the sequence again")
-    return sequence
+    if not sequence.has_images:
+        return sequence
+    file, start = sequence.data
+    require_content(file)
+    held, promised = file.stat().st_size - start, sequence.frame_bytes * count
+    stored = plain.get("compresseddatasize", "")
+    if not packed and held != promised:
+        what = f"holds {held / sequence.frame_bytes:.4g} images, its header states {count}"
+    elif packed and re.fullmatch(r"\d{1,18}", stored) and held < int(stored):
+        what = f"holds {held} bytes of compressed images, its header states {stored}"
+    elif packed and promised > MAX_RATIO * (held + 64):
+        what = f"holds {held} bytes, of which no {count} images of {size} can come"
+    else:
+        return sequence
+    raise NeecoError(f"{file}: {what}; copy or export the sequence again")
 
 
 def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> _Header:
@@ -125,6 +134,8 @@ def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> _Header:
     if is_nrrd and not stream.readline(MAX_LINE_BYTES).startswith(b"NRRD000"):
         raise header.fault("does not begin with NRRD000")
     for line in iter(partial(stream.readline, MAX_LINE_BYTES), b""):
+        if len(line) == MAX_LINE_BYTES or stream.tell() > MAX_HEADER_BYTES:
+            raise header.fault("its header does not end")
         text = line.decode("utf-8", "replace").strip()
         name, sign, value = (part.strip() for part in text.partition(":" if is_nrrd else "="))
         if text and not sign and not text.startswith("#"):
@@ -178,31 +189,36 @@ def _contents(sequence: FrameSequence, numbers: list[int]) -> Iterator[bytes]:
     try:
         with open_file(file, "images of a sequence") as stream:
             stream.seek(start)
-            unpacked, first, held = _unpacked(stream), 0, b""  # first: the frame with which held begins
+            unpacked, first, held = _unpacked(stream), 0, bytearray()  # first: the frame with which held begins
             for number in numbers:
                 if not sequence.packed:
                     stream.seek(start + number * length)
-                    held, first = stream.read(length), number
+                    held, first = bytearray(stream.read(length)), number
                 while sequence.packed and len(held) < (number - first + 1) * length:
-                    passed = min(number - first, len(held) // length)
-                    first, held = first + passed, held[passed * length :]
+                    if passed := min(number - first, len(held) // length):
+                        first += passed
+                        del held[: passed * length]
                     if not (part := next(unpacked, b"")):
                         break
                     held += part
-                content = held[(number - first) * length :][:length]
+                content = bytes(held[(number - first) * length :][:length])
                 if len(content) < length:
                     raise NeecoError(f"{file}: its images end early; copy or export the sequence again")
                 yield content
+            rest = len(held) - (sequence.count - first) * length
+            if sequence.packed and sequence.count - 1 in numbers and (rest > 0 or next(unpacked, b"")):
+                raise NeecoError(f"{file}: holds more images than its header says; export the sequence again")
     except (zlib.error, OSError) as error:
         raise NeecoError(f"{file}: its images are damaged ({error}); copy or export the sequence again") from None
 
 
 def _unpacked(stream: BinaryIO) -> Iterator[bytes]:
-    """Yield what streams of zlib or gzip, one after the other, unpack to."""
+    """Yield what streams of zlib or gzip, one after the other, unpack to, at most CHUNK_BYTES at a time."""
     machine, packed = zlib.decompressobj(zlib.MAX_WBITS | 32), b""  # of either kind
     while packed := packed or stream.read(CHUNK_BYTES):
-        if part := machine.decompress(packed):
+        if part := machine.decompress(packed, CHUNK_BYTES):
             yield part
-        packed = machine.unused_data
+        packed = machine.unconsumed_tail
         if machine.eof:
+            packed = machine.unused_data
             machine = zlib.decompressobj(zlib.MAX_WBITS | 32)

@@ -21,6 +21,7 @@ from neeco.ingest.readers.ndi import find_tools
 
 EXPECTED = "CSV with a header line"
 MAX_COLUMNS = 4096
+MAX_PADDING = 16  # of the cells of a text as a table over those that it holds
 SAMPLE_LINES = 400  # that tell which columns hold numbers
 _COMMENT = re.compile(r"^\s*(?:#+|//|%\s)\s*")
 
@@ -86,6 +87,8 @@ def read_cells(path: Path) -> Cells:
     if len(columns) > MAX_COLUMNS:
         line = texts[int(counts.argmax())][0]
         raise NeecoError(f"{path}: line {line}: has {len(columns)} cells; expected at most {MAX_COLUMNS}")
+    if len(columns) * len(lines) > MAX_PADDING * int(counts.sum()) + 10**6:
+        raise NeecoError(f"{path}: most lines are much shorter than the longest one; expected the rows of one table")
     is_open = any(line.count('"') % 2 for line in lines)  # a quote left open must not swallow the rest of the file
     try:
         frame = pandas.read_csv(
@@ -95,9 +98,12 @@ def read_cells(path: Path) -> Cells:
         )  # fmt: skip
     except (ValueError, OverflowError) as error:
         raise NeecoError(f"{path}: not readable as CSV ({' '.join(str(error).split())[:100]}); repair it") from None
-    cells = np.array([[cell.strip(' \t"') for cell in row] for row in frame.fillna("").to_numpy(object)], dtype=object)
+    frame = frame.fillna("")  # where a line has fewer cells
+    cells = np.empty(frame.size, object)
+    cells[:] = [cell.strip(' \t"') for cell in frame.to_numpy(object).ravel().tolist()]
     commas = sign in ";\t" and any("," in text for text in plain[:49])
-    return Cells(cells, np.array([number for number, _ in texts]), counts, comment, commas)
+    rows = cells.reshape(frame.shape)
+    return Cells(rows, np.array([number for number, _ in texts]), counts, comment, commas)
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:

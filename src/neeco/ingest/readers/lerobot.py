@@ -55,6 +55,7 @@ from neeco.ingest.readers.lerobot_files import (
     parquet_names,
     read_columns,
     read_data_set,
+    read_scalars,
 )
 from neeco.ingest.readers.video import ChosenFrames, open_video
 
@@ -295,8 +296,8 @@ def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np
 def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
     """Return times [R] s of an episode's rows from the first on, the rows of its file in their order, the number of
     each row's image in its film: the one nearest to its timestamp where no two share one, and notes."""
-    table = read_columns(episode.data, ["episode_index", "timestamp", "frame_index"], episode.number)
-    frames, stamps = table["frame_index"][:, 0], table["timestamp"][:, 0]
+    table = read_scalars(episode.data, ["episode_index", "timestamp", "frame_index"], episode.number)
+    frames, stamps = table["frame_index"], table["timestamp"]
     if len(frames) != episode.length:
         raise NeecoError(
             f"{episode.data}: has {len(frames)} rows of episode {episode.number}, meta says {episode.length}; download "

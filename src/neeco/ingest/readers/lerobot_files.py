@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_json, read_text, require_content, require_inside, visible_entries
 from neeco.capture.documents import as_float, printable
+from neeco.ingest.readers import file_state
 
 INFO = "meta/info.json"
 EPISODES_2, EPISODES_3 = "meta/episodes.jsonl", "meta/episodes"
@@ -23,6 +25,7 @@ VERSIONS = re.compile(r"v?(2)\.[01]|v?(3)\.0")
 FILM_COLUMNS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")  # of each camera, version 3
 FIXED = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns that every data set has
 MAX_NUMBERS = 4096  # of one feature in a row; more are an image or a point cloud
+MAX_BYTES = 2**30  # that the columns read of a row group may unpack to
 BUFFER_BYTES = 2**20  # of a column, read at a time
 _FIELD = re.compile(r"\{(\w+)(?::(0?\d{1,2}d))?\}")
 Record = dict[str, int | float]
@@ -145,7 +148,15 @@ class DataSet:
 
 
 def read_data_set(path: Path) -> DataSet:
-    """Read meta/info.json and the list of episodes. Raises NeecoError naming field and remedy."""
+    """Read meta/info.json and the list of episodes, once while they stay the same. Raises NeecoError naming field and
+    remedy."""
+    folder = path / EPISODES_3
+    files = [path / INFO, path / EPISODES_2, *(folder.glob("chunk-*/*.parquet") if folder.is_dir() else ())]
+    return _described(path, file_state(*sorted(file for file in files if file.exists())))
+
+
+@lru_cache(maxsize=4)
+def _described(path: Path, state: tuple[object, ...]) -> DataSet:
     file = path / INFO
     require_inside(file, _boundary(path))
     info = read_json(file)
@@ -203,9 +214,9 @@ def _records_3(path: Path, films: Sequence[str]) -> dict[int, Record]:
     found: dict[int, Record] = {}
     for file in visible_entries(path / EPISODES_3, "chunk-*/*.parquet"):
         held = parquet_names(require_inside(file, _boundary(path)))
-        table = read_columns(file, [*columns, *(name for name in of_films if name in held)], None)
+        table = read_scalars(file, [*columns, *(name for name in of_films if name in held)], None)
         for row in range(len(table["length"])):
-            record = {name: float(values[row, 0]) for name, values in table.items()}
+            record = {name: float(values[row]) for name, values in table.items()}
             counts = {name: _count(f"{file}: row {row}", value) for name, value in record.items() if "time" not in name}
             found[counts["episode_index"]] = {**record, **counts}
     if not found:
@@ -237,6 +248,15 @@ def read_columns(path: Path, columns: Sequence[str], episode: int | None) -> dic
     return found
 
 
+def read_scalars(path: Path, columns: Sequence[str], episode: int | None) -> dict[str, np.ndarray]:
+    """Return columns of one number a row [R], as `read_columns` does. Raises NeecoError."""
+    table = read_columns(path, columns, episode)
+    for name, values in table.items():
+        if values.shape[1] != 1:
+            raise NeecoError(f"{path}: {name}: expected one number in each row; download the data set again")
+    return {name: values[:, 0] for name, values in table.items()}
+
+
 def batches(path: Path, columns: Sequence[str], episode: int | None, rows: int) -> Iterator[Any]:
     """Yield columns as pyarrow's record batches of at most so many rows. Raises NeecoError."""
     import pyarrow.dataset
@@ -248,7 +268,14 @@ def batches(path: Path, columns: Sequence[str], episode: int | None, rows: int) 
             raise NeecoError(f"{path}: has no column {printable(name)}; its columns are {listed}")
     wanted = None if episode is None else pyarrow.dataset.field("episode_index") == episode
     with _damage_named(path):
-        yield from file.to_batches(
+        part = file if wanted is None else file.subset(filter=wanted)  # by the statistics of its row groups
+        for group in part.row_groups:
+            data, leaves = file.metadata.row_group(group.id), tuple(f"{name}." for name in columns)
+            chunks = [data.column(index) for index in range(data.num_columns)]
+            read = [chunk for chunk in chunks if f"{chunk.path_in_schema}.".startswith(leaves)]
+            if sum(chunk.total_uncompressed_size for chunk in read) > MAX_BYTES:
+                raise NeecoError(f"{path}: unpacks to over {MAX_BYTES >> 20} MiB at once; write smaller row groups")
+        yield from part.to_batches(
             columns=list(columns), filter=wanted, batch_size=rows, batch_readahead=0, use_threads=False
         )
 

@@ -6,6 +6,7 @@ each arm's own base frame, a few mm and degrees off the camera's.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -141,9 +142,10 @@ def _by_arm(file: Path, parse: Callable[[Any], np.ndarray], expected: str) -> di
     document = parse_yaml(file, read_text(file, "states by frame"), "copy it again", FastYamlLoader)
     found: dict[str, dict[int, np.ndarray | None]] = {}
     try:
-        states = {int(key): arms.items() for key, arms in document.items()}
-        if not 0 <= min(states) <= max(states) < 1e9:
-            raise ValueError("no numbers of frames")
+        numbers = [key for key in document if re.fullmatch(r"\d{1,9}", str(key), re.ASCII)]
+        states = {int(key): document[key].items() for key in numbers}
+        if not 0 < len(states) == len(document):
+            raise ValueError("not the numbers of frames")
     except (AttributeError, ValueError, TypeError):
         states = {}
     for frame, arms in states.items():
