@@ -98,7 +98,7 @@ def write_report(
         trained=len(capture.split("train")),
         train_scored="train" in evaluation["given"],
         tiles=_tiles(evaluation, kind),
-        **_numbers(evaluation),
+        tables=_tables(evaluation),
         notes=[*(f"Doubtful: {doubt}" for doubt in evaluation.get("doubts", ())), *evaluation.get("notes", ())],
         figures=frame_figures(evaluation, capture, scene, kind),
         pose_kind=KIND_NAMES[kind],
@@ -200,11 +200,11 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
     return tiles
 
 
-def _numbers(evaluation: dict[str, Any]) -> dict[str, Any]:
+def _tables(evaluation: dict[str, Any]) -> list[Any]:
     """The tables of numbers, of images and of labels: columns that anything is known for, and rows."""
     kinds = {kind: evaluation[kind] for kind in KINDS if kind in evaluation}
     tables = [_table(kinds, scores) for scores in (IMAGE_SCORES, LABEL_SCORES)]
-    return {"tables": [(columns, rows) for columns, rows in tables if columns]}
+    return [(columns, rows) for columns, rows in tables if columns]
 
 
 def _table(

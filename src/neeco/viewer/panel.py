@@ -251,7 +251,7 @@ class InstrumentPanel:
                     slider.value = shown
 
     def straighten(self) -> None:
-        """Reset slide and turns, as when the pose they led to has become the one they start from."""
+        """Reset slide and turns to zero: the instrument's present pose becomes their starting point."""
         for slider in (self.slide, self.roll, self.yaw, self.pitch):
             slider.value = 0.0
 

@@ -30,7 +30,6 @@ class Picture:
     digest: bytes | None = None  # of the pixels; None when not readable
     image: np.ndarray | None = None  # uint8 [h, w, 3], at most SETTINGS.compared_width px wide; None: not compared
     mask: np.ndarray | None = None  # float32 [h, w], share of each pixel that counts; None: all
-    grey: np.ndarray | None = None  # uint8 [h, w], every few pixels
     uniform: bool = False  # one colour
     hidden: Hidden | None = None  # by the mask; None: there is no usable one
     image_error: str = ""
@@ -66,8 +65,6 @@ def _read(parsed: Parsed, compared: set[int], points: np.ndarray, row: int) -> P
         pixels = frame.load_pixels()
         picture.digest = hashlib.blake2b(pixels.tobytes(), digest_size=16).digest()
         picture.uniform = bool((pixels[0] == pixels[0, 0]).all() and (pixels == pixels[0, 0]).all())
-        step = max(1, pixels.shape[1] // SETTINGS.compared_width)
-        picture.grey = np.rint(byte_pixels(pixels[::step, ::step]).mean(-1)).astype(np.uint8)
         if row in compared:
             picture.image = resized(byte_pixels(pixels), reduced_size(frame))
     except NeecoError as error:

@@ -71,7 +71,7 @@ def _check_cameras(parsed: Parsed, points: np.ndarray, verdicts: ImageVerdicts) 
     distance, radius = float(np.median(distances)), _radius(points)
     visible = cameras.sees(sampled(points)[None]).mean(axis=1)  # [F] share of the points in each image
     too_near = bool(parsed.instruments) and distance < SETTINGS.min_distance_mm
-    if too_near or distance > 10 * SETTINGS.max_distance * radius:
+    if too_near or distance > SETTINGS.far_distance * radius:
         message = f"cameras are {distance:.4g} mm from the points, which span {2 * radius:.4g} mm: metres?"
         matrices.error(message, ALL_IN_MM)
     elif visible.mean() < SETTINGS.min_visible and (verdict := verdicts.cameras).wrong_poses:

@@ -35,6 +35,7 @@ class CheckSettings:
     # placement
     few_points: int = 100  # sparse points below which they are called few
     max_distance: float = 10.0  # sizes of the scene
+    far_distance: float = 100.0  # the same, beyond which lengths of cameras and points have different units
     min_visible: float = 0.1  # share of the points, or of the frames, below which something is out of view
     min_body_visible: float = 0.5  # share of the frames that show a point fixed to the instrument: its sensor is behind
     min_distance_mm: float = 1.0  # an endoscope is never this close, nor travel this short: lengths are in metres
@@ -52,8 +53,8 @@ class CheckSettings:
     min_brightness_sd: float = 2.0  # of 255; points of one colour cannot be compared
     neighbours: int = 8  # of a point, with which its brightness is compared
     far_neighbours: int = 48  # the same for the coarse correlation, which inaccurate cameras keep
-    contradicted_colors: float = 0.1  # correlation below which images and cameras contradict each other,
-    contradicted_coarsely: float = 0.25  # if the coarse correlation is below this one
+    contradicted_colors: float = 0.1  # correlation below which images and cameras may contradict each other
+    contradicted_coarsely: float = 0.25  # coarse correlation below which they then do
     good_colors: float = 0.4  # correlation from which only images of neighbouring frames are tried
     max_offset: int = 10  # frames by which images are tried against the cameras
     max_swapped: float = 0.5  # share of the colours' difference that is left when red and blue are swapped back

@@ -54,6 +54,7 @@ class ImageVerdicts:
 
     def __init__(self, parsed: Parsed, pictures: Sequence[Picture]) -> None:
         self.parsed, self.pictures = parsed, pictures
+        self._instruments: dict[str, Verdict] = {}  # by name, of those that were asked for
 
     def report(self) -> None:
         """Report all contradictions as warnings."""
@@ -95,7 +96,12 @@ class ImageVerdicts:
 
     def instrument(self, instrument: Instrument) -> Verdict:
         """The instrument is where its states say, by what moves in the images. All frames must have its state."""
-        poses = {item.name: self._poses(item) for item in self.parsed.instruments}
+        if instrument.name not in self._instruments:
+            self._instruments[instrument.name] = self._find(instrument)
+        return self._instruments[instrument.name]
+
+    def _find(self, instrument: Instrument) -> Verdict:
+        poses = dict(self._poses)
         found = poses.pop(instrument.name)
         if found is None or self._motion is None:
             return Verdict("undecided")
@@ -123,9 +129,13 @@ class ImageVerdicts:
         remedy = "shifts, other axes, frames and units were tried; states, cameras and images must be of one recording"
         return Verdict("contradicted", POSES, message, remedy)
 
-    def _poses(self, instrument: Instrument) -> tuple[np.ndarray, np.ndarray] | None:
-        """Recorded poses [N, 4, 4], and what makes them those of the root [N, 4, 4], which shows most; None where a
-        frame has no state."""
+    @cached_property
+    def _poses(self) -> dict[str, tuple[np.ndarray, np.ndarray] | None]:
+        """Recorded poses [N, 4, 4] of each instrument, and what makes them those of the root [N, 4, 4], which shows
+        most; None where a frame has no state."""
+        return {instrument.name: self._poses_of(instrument) for instrument in self.parsed.instruments}
+
+    def _poses_of(self, instrument: Instrument) -> tuple[np.ndarray, np.ndarray] | None:
         name, tree = instrument.name, instrument.kinematics
         if not all(name in frame.state.instruments for frame in self.parsed.frames):
             return None
@@ -136,12 +146,11 @@ class ImageVerdicts:
     def _mistake(self, name: str, recorded: np.ndarray, back: np.ndarray, motion: MotionEvidence) -> Candidate | None:
         """The mistake in the poses [N, 4, 4] of an instrument that the images confirm."""
         rows, roots = motion.rows, recorded @ back
-        cameras = np.stack([self.parsed.frames[row].camera.world_from_camera.double().numpy() for row in rows])
         turns = Rotation.from_matrix(roots[rows, :3, :3])
         turning = np.degrees(np.sqrt(((turns.mean().inv() * turns).magnitude() ** 2).mean()))
         candidates = [
             replace(candidate, poses=candidate.poses @ back[rows])
-            for candidate in instrument_candidates(recorded[rows], cameras, name)
+            for candidate in instrument_candidates(recorded[rows], motion.cameras.poses, name)
             if candidate.kind != "rotation" or turning >= SETTINGS.min_turning_deg
         ]
         times = np.array([frame.state.time for frame in self.parsed.frames])
