@@ -33,7 +33,7 @@ from neeco.base.errors import NeecoError
 from neeco.base.files import read_json
 from neeco.capture import Capture, State, read_capture
 from neeco.capture.model import Instrument
-from neeco.fitting.refinement import Refinement
+from neeco.states.refinement import Refinement
 from neeco.training.run import open_run, read_checkpoint, stored_config
 
 POSE_SD = "refinement/pose_sd"  # of a checkpoint; runs of older versions have none
@@ -89,7 +89,7 @@ def of_run(path: Path) -> States:
         layout = refinement.layout
         for index in range(len(frames)):
             own = refinement.deviations(index).numpy()
-            if not refinement.weights[index] > 0:
+            if not refinement.counts(index):
                 own[:] = np.nan  # left out: none are stated
             sds.append(
                 {

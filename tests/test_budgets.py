@@ -25,7 +25,7 @@ ROOMS = {
     "labels": (950, 800),
     "methods": (6200, 3500),
     "training": (2050, 1700),
-    "fitting": (2600, 2600),
+    "states": (3300, 2600),
     "evidence": (300, 1200),
     "scene": (2000, 1800),
     "capture": (5100, 3900),

@@ -21,7 +21,7 @@ ROOMS = (  # from the top down; rooms of one line do not know each other
     ("labels",),
     ("methods",),
     ("training",),
-    ("fitting",),
+    ("states",),
     ("evidence",),
     ("scene",),
     ("capture",),

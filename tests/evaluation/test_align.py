@@ -1,13 +1,14 @@
 """A pose that was wrong by tracker errors is found again in the recorded image."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from neeco.fitting.alignment import STATE_ERRORS, AlignConfig, AlignedFrame, align_frame, pose_change
-from neeco.fitting.parameters import moved_pose
 from neeco.geometry.rotations import rigid_from_vector
+from neeco.states.alignment import AlignConfig, AlignedFrame, align_frame, pose_change
+from neeco.states.parameters import moved_pose
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +83,11 @@ def test_large_errors_of_a_recording_are_found_from_as_far(world, scene_and_fram
     scene, frame = scene_and_frame
     wrong = world.moved(frame, world.translation(0.5, yaw=math.radians(6)), world.translation())
     truth, left = frame.state.instruments["bar"].pose, []
-    for diagnostics in ({}, {STATE_ERRORS: 0.4}):
-        scene.diagnostics = diagnostics
+    recorded = scene.recorded
+    for error_scale in (0.0, 0.4):
+        scene.recorded = replace(recorded, error_scale=error_scale)
         left.append(pose_change(truth, align(scene, wrong).state.instruments["bar"].pose)["deg"])
-    scene.diagnostics = {}
+    scene.recorded = recorded
     assert left[1] < 0.8 * left[0]  # a tiny image tells little
 
 

@@ -13,7 +13,6 @@ from wristed_world import shifted
 
 from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
-from neeco.fitting.link_silhouette import ArticulatedModel, joint_values, with_motion
 from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.articulated import (
     ArticulatedMotion,
@@ -31,6 +30,7 @@ from neeco.ingest.registration.articulated_fit import (
 )
 from neeco.ingest.registration.silhouette_fit import BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
+from neeco.states.outline_model import ArticulatedModel, joint_values, with_motion
 
 FRAMES, RATE = 36, 8.0
 X, Y = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])

@@ -17,10 +17,10 @@ from neeco.capture.images import write_image
 from neeco.capture.model import Capture, PointCloud, State
 from neeco.capture.writer import write_capture
 from neeco.cli import main
-from neeco.fitting.crop_rendering import InstrumentRenderer, TissueRenderer
-from neeco.fitting.parameters import DEG
 from neeco.geometry.camera import Camera
 from neeco.scene import GaussianScene
+from neeco.states.crop_rendering import InstrumentRenderer, TissueRenderer
+from neeco.states.parameters import DEG
 from neeco.tracking.track import over_tissue, state_of, track_footage
 from neeco.training.run import GaussianRun, load_run
 

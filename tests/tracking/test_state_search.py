@@ -19,13 +19,12 @@ from wristed_world import make_driver
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State, Uncertainty
-from neeco.fitting.crop_rendering import FrameView
-from neeco.fitting.parameters import StateParameters
-from neeco.fitting.state_fitter import Fitter, StateFit
 from neeco.methods.kinematic import discovery
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.methods.kinematic.contradictions import (
-    CONTRADICTING,
+from neeco.methods.kinematic.state_passes import judge_states_again
+from neeco.scene import Recorded
+from neeco.scene.training_views import TrainingViews
+from neeco.states.contradictions import (
     Misfits,
     fitted_anew,
     half_turned_state,
@@ -34,10 +33,11 @@ from neeco.methods.kinematic.contradictions import (
     mirrored_state,
     refit_outliers,
 )
-from neeco.methods.kinematic.state_passes import LARGE
-from neeco.methods.kinematic.state_search import JOINT, LARGEST, FittedState, StateSearch
-from neeco.scene import Recorded
-from neeco.scene.training_views import TrainingViews
+from neeco.states.crop_rendering import FrameView
+from neeco.states.fitter import Fitter, StateFit
+from neeco.states.parameters import StateParameters
+from neeco.states.refinement import Refinement, Verdict
+from neeco.states.search import JOINT, LARGE, LARGEST, FittedState, StateSearch
 from neeco.training.config import method_defaults
 from neeco.training.session import GaussianSession, new_session
 
@@ -74,13 +74,20 @@ def session_of(root: Path, states: Sequence[State], cameras: int = 1) -> Gaussia
 
 
 def search_of(session: GaussianSession) -> StateSearch:
-    return StateSearch.of(session, session.scene.deformation)  # type: ignore[arg-type]
+    articulations = cast(ArticulatedInstruments, session.scene.deformation).articulations
+    shafts = [articulation.shaft()[1].detach().double() for articulation in articulations]
+    return StateSearch.of(session.scene, session.refinement, session.full_views.frames, shafts)
+
+
+def contradicting(refinement: Refinement) -> dict[int, Verdict]:
+    """Verdicts on the instants whose states contradict the others."""
+    return {k: Verdict(verdict) for k, verdict in enumerate(refinement.verdicts.tolist()) if verdict}
 
 
 def measured(search: StateSearch, scale: float) -> list[FittedState]:
     """Fits as images of 0.3 degrees and 0.3 mm make them of states with errors of this scale, without images."""
     fits, rng = [], np.random.default_rng(2)
-    layout = search.session.refinement.layout
+    layout = search.refinement.layout
     information = torch.diag(layout.vector_from_degrees(0.3, 0.3, 1.0, 0.1) ** -2)
     for index, wrong in enumerate(with_errors(TRUE, scale)):
         noise = torch.from_numpy(rng.standard_normal(layout.size)) * torch.diagonal(information).rsqrt()
@@ -103,11 +110,11 @@ def test_errors_of_a_robot_are_told_from_those_of_a_tracker(tmp_path: Path) -> N
 
 def test_without_stated_links_only_tilt_tells_how_large_errors_are(tmp_path: Path) -> None:
     search = search_of(session_of(tmp_path, TRUE))
-    assert search.session.scene.instruments[0].kinematics is None
+    assert search.scene.instruments[0].kinematics is None
     fits = measured(search, 0.1)
     rough = []
     for sign, fit in zip((1.0, -1.0) * 6, fits, strict=True):
-        view = search.session.recorded.cameras[fit.index].world_from_camera[:3, 2].double()
+        view = search.scene.recorded.cameras[fit.index].world_from_camera[:3, 2].double()
         away = TRUE[fit.index].instruments["grasper"].pose[:3, :3].double().T @ view
         wrong = torch.cat([math.radians(12) * search.shafts[0], 3.0 * away, torch.tensor([0.2])])  # roll, depth, jaw
         rough.append(replace(fit, correction=fit.correction + sign * wrong))
@@ -145,7 +152,7 @@ def test_a_wrong_state_contradicts_the_others_and_is_found_from_one_of_theirs(tm
     session = session_of(tmp_path, states)
     search = search_of(session)
     refit_outliers(search, LARGE, Misfits.of(search))
-    assert session.scene.diagnostics[CONTRADICTING] == {"000003": "fitted anew"}
+    assert contradicting(session.refinement) == {3: Verdict.REFITTED}
     found = session.refinement.state(3, states[3])
     assert session.refinement.layout.increments_between(TRUE[3], found)[3:6].norm() < 0.7
 
@@ -157,7 +164,7 @@ def test_a_wrong_state_is_found_by_the_first_of_two_cameras_and_corrected_for_bo
     assert session.refinement.frames_of_instant == [[k, count + k] for k in range(count)]
     search = search_of(session)
     refit_outliers(search, LARGE, Misfits.of(search))
-    assert session.scene.diagnostics[CONTRADICTING] == {"000003": "fitted anew"}
+    assert contradicting(session.refinement) == {3: Verdict.REFITTED}
     for index in (3, count + 3):
         found = session.refinement.state(index, states[3])
         assert session.refinement.layout.increments_between(TRUE[3], found)[3:6].norm() < 0.7
@@ -169,8 +176,8 @@ def test_an_instant_that_no_state_explains_is_left_out_with_all_its_images(tmp_p
     world.write_image(frame.image_path, torch.rand(64, 96, 3, generator=torch.Generator().manual_seed(0)))
     search = search_of(session)
     refit_outliers(search, LARGE, Misfits.of(search))
-    assert session.scene.diagnostics[CONTRADICTING] == {"000005": "left out"}
-    assert (session.refinement.weights == 0).nonzero().flatten().tolist() == [5, count + 5]
+    assert contradicting(session.refinement) == {5: Verdict.EXCLUDED}
+    assert [k for k in range(2 * count) if not session.refinement.counts(k)] == [5, count + 5]
 
 
 def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
@@ -179,14 +186,13 @@ def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
     world.write_image(frame.image_path, torch.rand(64, 96, 3, generator=torch.Generator().manual_seed(0)))
     search = search_of(session)
     refit_outliers(search, LARGE, Misfits.of(search))
-    assert session.scene.diagnostics[CONTRADICTING] == {"000005": "left out"}
-    assert session.refinement.weights.tolist() == [float(index != 5) for index in range(len(TRUE))]
+    assert contradicting(session.refinement) == {5: Verdict.EXCLUDED}
 
 
 def judged_by(
     search: StateSearch,
     explained: Callable[[State, State, StateFit], StateFit | None],
-) -> str | None:
+) -> Verdict:
     """What becomes of frame 5, judged again, if fits with a prior about a state, from a start, are as `explained`."""
 
     class Answering(Fitter[StateParameters]):
@@ -198,22 +204,22 @@ def judged_by(
             return found if measured else explained(expected, start or expected, found)
 
     fitter = Answering(search.fitter.instruments, search.fitter.parameters, search.fitter.tissue)
-    diagnostics = search.session.scene.diagnostics
-    diagnostics[CONTRADICTING] = diagnostics.get(CONTRADICTING) or {"000005": "fitted anew"}
+    if not search.refinement.verdicts.any():
+        search.refinement.judge(5, Verdict.REFITTED)
     judge_again(replace(search, fitter=fitter))
-    verdict: str | None = diagnostics.get(CONTRADICTING, {}).get("000005")
-    return verdict
+    return search.refinement.verdict(5)
 
 
 @pytest.mark.parametrize(
-    ("own", "gain", "verdict"), [(30.0, 20.0, None), (30.0, 40.0, "fitted anew"), (-30.0, -5.0, None)]
+    ("own", "gain", "verdict"),
+    [(30.0, 20.0, Verdict.ACCEPTED), (30.0, 40.0, Verdict.REFITTED), (-30.0, -5.0, Verdict.ACCEPTED)],
 )
 def test_a_state_refutes_another_only_if_more_of_the_image_is_explained(
-    own: float, gain: float, verdict: str | None, tmp_path: Path
+    own: float, gain: float, verdict: Verdict, tmp_path: Path
 ) -> None:
     """One that hardly shows in the image leaves little unexplained there; one with a negative gain explains nothing."""
     search = search_of(session_of(tmp_path, TRUE))
-    given = search.session.recorded.states[5]
+    given = search.scene.recorded.states[5]
 
     def explained(expected: State, start: State, found: StateFit) -> StateFit:
         if expected is given:
@@ -223,13 +229,13 @@ def test_a_state_refutes_another_only_if_more_of_the_image_is_explained(
     assert judged_by(search, explained) == verdict
 
 
-@pytest.mark.parametrize(("gain", "verdict"), [(50.0, None), (35.0, "fitted anew")])
+@pytest.mark.parametrize(("gain", "verdict"), [(50.0, Verdict.ACCEPTED), (35.0, Verdict.REFITTED)])
 def test_a_local_minimum_of_the_fit_from_a_recorded_state_does_not_refute_it(
-    gain: float, verdict: str | None, tmp_path: Path
+    gain: float, verdict: Verdict, tmp_path: Path
 ) -> None:
     """Fits from starts nearby speak for the recorded state, too."""
     search = search_of(session_of(tmp_path, TRUE))
-    given, layout = search.session.recorded.states[5], search.session.refinement.layout
+    given, layout = search.scene.recorded.states[5], search.refinement.layout
 
     def explained(expected: State, start: State, found: StateFit) -> StateFit:
         if expected is not given:
@@ -241,13 +247,14 @@ def test_a_local_minimum_of_the_fit_from_a_recorded_state_does_not_refute_it(
 
 
 @pytest.mark.parametrize(
-    ("gain", "outlier", "verdict"), [(31.0, False, None), (33.0, False, "fitted anew"), (20.0, True, "fitted anew")]
+    ("gain", "outlier", "verdict"),
+    [(31.0, False, Verdict.ACCEPTED), (33.0, False, Verdict.REFITTED), (20.0, True, Verdict.REFITTED)],
 )
 def test_a_state_that_seemed_wrong_is_right_if_it_explains_the_image_and_no_other_one_explains_more(
-    gain: float, outlier: bool, verdict: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    gain: float, outlier: bool, verdict: Verdict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     search = search_of(session_of(tmp_path, TRUE))
-    given, misfit = search.session.recorded.states[5], 2.0 if outlier else 0.9
+    given, misfit = search.scene.recorded.states[5], 2.0 if outlier else 0.9
     limits = replace(Misfits.of(search), limit=1.0, rejection_limit=4.0)
     monkeypatch.setattr(Misfits, "of", lambda search: limits)
 
@@ -256,17 +263,17 @@ def test_a_state_that_seemed_wrong_is_right_if_it_explains_the_image_and_no_othe
             return replace(found, misfit=misfit, gain=30.0)
         return replace(found, state=TRUE[11], misfit=0.8 * misfit, gain=gain)
 
-    search.session.scene.diagnostics[CONTRADICTING] = {"000005": "fitted anew"}
+    search.refinement.judge(5, Verdict.REFITTED)
     assert judged_by(search, explained) == verdict
 
 
 @pytest.mark.parametrize("noted", [True, False])
-@pytest.mark.parametrize(("gain", "verdict"), [(-5.0, None), (20.0, "fitted anew")])
+@pytest.mark.parametrize(("gain", "verdict"), [(-5.0, Verdict.ACCEPTED), (20.0, Verdict.REFITTED)])
 def test_an_instrument_outside_of_the_image_is_refuted_only_by_one_that_explains_something(
-    gain: float, verdict: str | None, noted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    gain: float, verdict: Verdict, noted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     search = search_of(session_of(tmp_path, TRUE))
-    given, diagnostics = search.session.recorded.states[5], search.session.scene.diagnostics
+    given = search.scene.recorded.states[5]
     misfits = Misfits.of(search)
     misfits.of_frame[5] = math.inf
     monkeypatch.setattr(Misfits, "of", lambda search: misfits)
@@ -274,22 +281,21 @@ def test_an_instrument_outside_of_the_image_is_refuted_only_by_one_that_explains
     def explained(expected: State, start: State, found: StateFit) -> StateFit | None:
         return None if expected is given else replace(found, state=TRUE[11], misfit=0.2, gain=gain)
 
-    diagnostics[CONTRADICTING] = {"000005": "left out"} if noted else {}
+    search.refinement.judge(5, Verdict.EXCLUDED if noted else Verdict.REFITTED)
     assert judged_by(search, explained) == verdict
-    assert search.session.refinement.weights[5] == 1
 
 
 def test_no_frame_is_left_out_later_because_others_are_explained_ever_better(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     search = search_of(session_of(tmp_path, TRUE))
-    given, limits = search.session.recorded.states[5], replace(Misfits.of(search), limit=1.0, rejection_limit=4.0)
+    given, limits = search.scene.recorded.states[5], replace(Misfits.of(search), limit=1.0, rejection_limit=4.0)
     monkeypatch.setattr(Misfits, "of", lambda search: limits)
 
     def explained(expected: State, start: State, found: StateFit) -> StateFit:
         return replace(found, misfit=5.0, gain=30.0) if expected is given else replace(found, misfit=4.5, gain=31.0)
 
-    assert judged_by(search, explained) != "left out"
+    assert judged_by(search, explained) is not Verdict.EXCLUDED
 
 
 @pytest.mark.parametrize(("misfit", "included"), [(0.22, True), (0.4, False)])
@@ -297,7 +303,7 @@ def test_deviations_of_a_state_fitted_anew_include_states_that_its_image_does_no
     misfit: float, included: bool, tmp_path: Path
 ) -> None:
     search, fits = search_of(session_of(tmp_path, TRUE)), 0
-    given, refinement = search.session.recorded.states[5], search.session.refinement
+    given, refinement = search.scene.recorded.states[5], search.refinement
 
     def explained(expected: State, start: State, found: StateFit) -> StateFit:
         nonlocal fits
@@ -308,7 +314,7 @@ def test_deviations_of_a_state_fitted_anew_include_states_that_its_image_does_no
             return replace(found, state=TRUE[11], misfit=0.2, gain=50.0)
         return replace(found, state=TRUE[0], misfit=misfit, gain=40.0)
 
-    assert judged_by(search, explained) == "fitted anew"
+    assert judged_by(search, explained) is Verdict.REFITTED
     apart = refinement.layout.increments_between(TRUE[11], TRUE[0])
     assert bool((refinement.deviations(5) > apart.abs() / 2).all()) == included
 
@@ -349,11 +355,9 @@ def test_a_state_fitted_anew_on_its_other_side_is_turned_back(tmp_path: Path) ->
 
 def test_states_with_usual_errors_are_not_taken_for_wrong_ones(tmp_path: Path) -> None:
     session = driver_session(tmp_path, scale=1.0)
-    session.refinement.weights[::3] = 0
-    session.scene.diagnostics[CONTRADICTING] = dict.fromkeys(session.recorded.names[::3], "left out")
+    session.refinement.verdicts[::3] = Verdict.EXCLUDED
     judge_again(search_of(session))
-    assert not session.scene.diagnostics[CONTRADICTING]
-    assert bool((session.refinement.weights == 1).all())
+    assert not contradicting(session.refinement)
 
 
 def test_a_state_is_judged_again_once_the_others_settled(tmp_path: Path) -> None:
@@ -362,13 +366,12 @@ def test_a_state_is_judged_again_once_the_others_settled(tmp_path: Path) -> None
     true = [right.recorded.states[index] for index in (2, 4)]
     mirrored = [mirrored_state(search_of(right), index, state) for index, state in zip((2, 4), true, strict=True)]
     session = driver_session(tmp_path, {4: mirrored[1]})
-    refinement, noted = session.refinement, session.scene.diagnostics
-    noted[CONTRADICTING] = {"000002": "fitted anew", "000007": "left out"}
+    refinement = session.refinement
+    refinement.judge(2, Verdict.REFITTED)
+    refinement.judge(7, Verdict.EXCLUDED)
     refinement.set_state(2, true[0], mirrored[0], refinement.deviations(2))
-    refinement.weights[7] = 0
     judge_again(search_of(session))
-    assert noted[CONTRADICTING] == {"000004": "fitted anew"}
-    assert bool((refinement.weights == 1).all())
+    assert contradicting(refinement) == {4: Verdict.REFITTED}
     for index, recorded, state in ((2, true[0], true[0]), (4, mirrored[1], true[1])):
         off = refinement.layout.increments_between(state, refinement.state(index, recorded))
         assert off[3:6].norm() < 1.0
@@ -377,11 +380,39 @@ def test_a_state_is_judged_again_once_the_others_settled(tmp_path: Path) -> None
 
 def test_a_frame_fitted_anew_that_stays_unexplained_is_left_out(tmp_path: Path) -> None:
     session = session_of(tmp_path, TRUE)
-    session.scene.diagnostics[CONTRADICTING] = {"000003": "fitted anew", "000005": "fitted anew"}
+    for index in (3, 5):
+        session.refinement.judge(index, Verdict.REFITTED)
     misfits = {index: 0.5 for index in range(len(TRUE))} | {3: 1.2, 5: 0.6, 7: 1.2}
     leave_out_unexplained(search_of(session), misfits)
-    assert session.scene.diagnostics[CONTRADICTING] == {"000003": "left out", "000005": "fitted anew"}
-    assert session.refinement.weights.tolist() == [float(index != 3) for index in range(len(TRUE))]
+    assert contradicting(session.refinement) == {3: Verdict.EXCLUDED, 5: Verdict.REFITTED}
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0])
+def test_states_are_judged_again_where_errors_are_large(size: float, tmp_path: Path) -> None:
+    """A mirrored state, which looks alike, remains where nothing says that states may be wrong."""
+    right = driver_session(tmp_path)
+    mirrored = mirrored_state(search_of(right), 4, right.recorded.states[4])
+    session = driver_session(tmp_path, {4: mirrored})
+    session.refinement.error_scale.fill_(size)
+    judge_states_again(session, cast(ArticulatedInstruments, session.scene.deformation))
+    assert contradicting(session.refinement) == ({4: Verdict.REFITTED} if size else {})
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("scale", [0.0, 1.0])
+def test_corrections_are_as_uncertain_as_errors_are_large(scale: float, cameras: int, tmp_path: Path) -> None:
+    session = session_of(tmp_path, with_errors(TRUE, scale), cameras=cameras)
+    search, before = search_of(session), session.refinement.deviations(0)
+    assert search.size_errors(()) == bool(scale) == (float(session.refinement.error_scale) > LARGE)
+    after = session.refinement.deviations(0)
+    torch.testing.assert_close(after, search.deviations(0, 1.0) if scale else before, rtol=1e-5, atol=0)
+
+
+def test_outliers_do_not_count_for_the_size_of_all_errors(tmp_path: Path) -> None:
+    states = list(TRUE)
+    for index in (3, 7):
+        states[index] = replace(TRUE[(index + 6) % 12], time=TRUE[index].time)
+    assert not search_of(session_of(tmp_path, states)).size_errors([3, 7])
 
 
 def test_stated_uncertainties_are_the_prior(tmp_path: Path) -> None:
@@ -419,7 +450,7 @@ def test_a_shape_that_carving_no_longer_finds_goes_on_as_learned(
     session = driver_session(tmp_path)
     scene = session.scene
     reports: list[str] = []
-    for name in ("fit_tissue", "tissue_evidence", "corrected_evidence"):
+    for name in ("fit_tissue", "tissue_evidence", "_corrected_evidence"):
         monkeypatch.setattr(discovery, name, lambda *given, **options: None)
     monkeypatch.setattr(discovery, "carved_shape", none)
     monkeypatch.setattr(session, "report", reports.append)

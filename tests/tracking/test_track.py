@@ -21,10 +21,10 @@ from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Capture, State
 from neeco.cli import main
 from neeco.evaluation.trust import TypicalErrors
-from neeco.fitting.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer, color_matched, view_of
-from neeco.fitting.parameters import DEG
-from neeco.fitting.state_fitter import loose_prior
 from neeco.report.track_page import write_track_page
+from neeco.states.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer, color_matched, view_of
+from neeco.states.fitter import loose_prior
+from neeco.states.parameters import DEG
 from neeco.tracking.follow import SEARCH_ROLLS_EVERY, Follower, Step
 from neeco.tracking.motion import MotionModel
 from neeco.tracking.parameters import TrackedParameters, fitter_of

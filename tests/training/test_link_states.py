@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from wristed_world import shifted
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
-from neeco.fitting.link_silhouette import ArticulatedModel, half_turned, joint_values, mirrored
-from neeco.fitting.link_states import LinkViews
-from neeco.fitting.silhouette_states import FoundStates, find_states, sds_of
+from neeco.states.outline_fit import LinkViews
+from neeco.states.outline_model import ArticulatedModel, half_turned, joint_values, mirrored
+from neeco.states.outline_states import FoundStates, find_states, sds_of
 
 WIDTH, HEIGHT, FOCAL, STATES = 240, 192, 260.0, 20
 DEG = np.pi / 180

@@ -10,9 +10,9 @@ import torch
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, State, Uncertainty
-from neeco.fitting.refinement import RefineConfig, Refinement
 from neeco.geometry.camera import Camera
 from neeco.scene.drawable import Recorded
+from neeco.states.refinement import RefineConfig, Refinement, Verdict
 
 CPU = torch.device("cpu")
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), 60.0, 60.0, 32.0, 24.0, 64, 48)
@@ -105,7 +105,7 @@ def test_readings_are_corrected_once_for_all_cameras_of_an_instant() -> None:
     assert readings[4] == readings[5] < 0.5
     assert readings[:4] + readings[6:] == [0.5] * 10
     recorded = Recorded.of(frames, (instrument,))
-    assert refinement.found(recorded, (instrument,)) is recorded  # what was recorded stays
+    assert refinement.found(recorded, (instrument,)).states is recorded.states  # what was recorded stays
 
 
 def on_scopes(apart: bool) -> tuple[tuple[Frame, ...], Instrument]:
@@ -202,7 +202,7 @@ def test_a_state_that_is_set_holds_from_the_first_step_on_and_draws_what_is_lear
     assert kept["fitted"]
     assert kept["instruments"]["rod"]["joints"]["jaw"] == pytest.approx(0.8)
     assert kept["instruments"]["rod"]["uncertainty"]["translation_mm"] == pytest.approx([0.1] * 3)
-    refinement.weights[6:8] = 0  # both cameras
+    refinement.judge(6, Verdict.EXCLUDED)  # both cameras
     left_out = refinement.to_json(recorded)[frames[6].name]
     assert left_out["left_out"]
     assert not kept["left_out"]

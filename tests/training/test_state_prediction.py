@@ -12,11 +12,11 @@ from torch import Tensor
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Frame, Instrument, InstrumentState, State
-from neeco.fitting.refinement import RefineConfig, Refinement
-from neeco.fitting.state_prediction import Prediction, predict_corrections
 from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid_from_vector
 from neeco.scene.state_corrections import StateCorrections
+from neeco.states.prediction import Prediction, predict_corrections
+from neeco.states.refinement import RefineConfig, Refinement
 
 CPU = torch.device("cpu")
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), 60.0, 60.0, 32.0, 24.0, 64, 48)

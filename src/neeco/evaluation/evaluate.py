@@ -34,7 +34,6 @@ from neeco.evaluation.mask_metrics import (
 )
 from neeco.evidence.foreground import Comparison, Foreground
 from neeco.evidence.label_quality import label_counts, learned_foreground, quality_of
-from neeco.fitting.alignment import align_frame, pose_changes
 from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import field_pinhole
 from neeco.labels.drawing import Drawing, draw
@@ -44,6 +43,7 @@ from neeco.raster.native import synchronise
 from neeco.raster.resampling import of_learned_size
 from neeco.raster.shadow import GAMMA, shadowed
 from neeco.scene.gaussian_scene import GaussianScene, is_gaussian, require_gaussians
+from neeco.states.alignment import align_frame, pose_changes
 
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene

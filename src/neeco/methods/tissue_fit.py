@@ -7,13 +7,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neeco.fitting.refinement import RefineConfig
 from neeco.methods.breathing import Breathing
 from neeco.methods.space_carving import Evidence, carved_shape, gather_evidence
 from neeco.methods.static import Static
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
+from neeco.states.refinement import RefineConfig
 from neeco.training.config import OptimizerConfig, TrainConfig, method_defaults
 from neeco.training.session import GaussianSession, new_session
 

@@ -45,6 +45,7 @@ class Recorded:
     lens: Lens | None = None  # whose distortion was removed from the images; None: not known
     scale: float = 1.0  # of the cameras' images, at which the scene was learned
     still: bool = False  # whether the camera did not move
+    error_scale: float = 0.0  # of its states' errors, in units of a robot's usual ones; 0: no larger than a tracker's
 
     @classmethod
     def of(

@@ -138,6 +138,8 @@ def pack_scene(scene: DrawableScene) -> tuple[dict[str, Tensor], dict[str, Any]]
         header["scale"] = recorded.scale
     if recorded.still:
         header["still"] = True
+    if recorded.error_scale:
+        header["error_scale"] = recorded.error_scale
     header["deformation"] = plain(scene.settings)
     own_tensors, own_fields = scene.pack()
     tensors, header = tensors | own_tensors, header | own_fields
@@ -202,7 +204,10 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
         raise ValueError(f"its scale is {scale}, not a share of the images' size")
     still = header.get("still") is True
     lit = share_lamps(cameras) if still else tuple(cameras)
-    return instruments, Recorded(names, splits, tuple(states), lit, lens=lens, scale=scale, still=still)
+    return instruments, Recorded(
+        names, splits, tuple(states), lit, lens=lens, scale=scale, still=still,
+        error_scale=_number(header.get("error_scale", 0.0)),
+    )  # fmt: skip
 
 
 def _described(instrument: Instrument) -> dict[str, Any]:

@@ -23,12 +23,12 @@ from neeco.capture.writer import fingerprint
 from neeco.evaluation.trust import Trust, TypicalErrors, estimate_trust, typical_errors_of
 from neeco.evidence.foreground import Comparison, Foreground
 from neeco.evidence.label_quality import QUALITY, label_counts, learned_foreground, quality_of
-from neeco.fitting.alignment import STATE_ERRORS, AlignConfig, AlignedFrame, align_frame, pose_changes
 from neeco.geometry.distortion import field_pinhole
 from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, instruments_of
 from neeco.raster.resampling import of_rendered_size, resampled
+from neeco.states.alignment import AlignConfig, AlignedFrame, align_frame, pose_changes
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings, parse_class_names
@@ -229,7 +229,7 @@ def fitted(
 ) -> tuple[AlignedFrame, LayeredDrawing]:
     """The poses of `frame` fitted to its image [H, W, 3], and what the scene renders there; `start`: a neighbour's
     increments, without which the search starts coarse."""
-    near = start is not None and STATE_ERRORS not in scene.diagnostics  # errors as large differ between neighbours
+    near = start is not None and not scene.recorded.error_scale  # errors as large differ between neighbours
     fit = align_frame(scene, frame, image, start, FROM_NEIGHBOUR if near else None)
     return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.min_component, tissue_image=True)
 

@@ -12,8 +12,8 @@ import torch
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import Frame, State
-from neeco.fitting.crop_rendering import FrameView
-from neeco.fitting.state_fitter import StateFit, loose_prior
+from neeco.states.crop_rendering import FrameView
+from neeco.states.fitter import StateFit, loose_prior
 from neeco.tracking.motion import MAX_GAP_S, MotionModel, MotionState
 from neeco.tracking.parameters import TrackingFitter
 from neeco.tracking.search import Search

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import State
-from neeco.fitting.state_fitter import StateFit
+from neeco.states.fitter import StateFit
 from neeco.tracking.parameters import TrackedParameters
 
 MIN_DIFFERENCES = 8  # second differences from which accelerations are estimated

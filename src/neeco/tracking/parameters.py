@@ -10,11 +10,11 @@ from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import Instrument, State
-from neeco.fitting.crop_rendering import InstrumentRenderer, TissueRenderer
-from neeco.fitting.parameters import InstrumentParameters, StateParameters
-from neeco.fitting.state_fitter import Fitter
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.scene import GaussianScene
+from neeco.states.crop_rendering import InstrumentRenderer, TissueRenderer
+from neeco.states.fitter import Fitter
+from neeco.states.parameters import InstrumentParameters, StateParameters
 
 RANGE_BELOW, RANGE_ABOVE = 0.1, 0.5  # of a joint's recorded range: how far below and above it a joint may be
 

@@ -21,8 +21,8 @@ from neeco.base.settings import with_fields
 from neeco.capture.model import Capture, Frame
 from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
-from neeco.fitting.state_fitter import loose_prior
 from neeco.scene import GaussianScene
+from neeco.states.fitter import loose_prior
 from neeco.tracking.parameters import fitter_of
 from neeco.tracking.track import INFO
 from neeco.training.run import scene_digest, stored_config

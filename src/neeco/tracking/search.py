@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import torch
 
 from neeco.capture.model import InstrumentState, State, evenly_spaced
-from neeco.fitting.crop_rendering import FrameView
-from neeco.fitting.parameters import DEG
-from neeco.fitting.state_fitter import MARGIN_PX, StateFit, loose_prior
 from neeco.geometry.camera import Camera
 from neeco.scene import Recorded
+from neeco.states.crop_rendering import FrameView
+from neeco.states.fitter import MARGIN_PX, StateFit, loose_prior
+from neeco.states.parameters import DEG
 from neeco.tracking.motion import MotionModel, MotionState
 from neeco.tracking.parameters import TrackedParameters, TrackingFitter
 

@@ -27,13 +27,13 @@ from torch import Tensor
 from neeco.base.errors import NeecoError
 from neeco.capture.model import Frame, State, evenly_spaced
 from neeco.evaluation.trust import NEIGHBOURHOOD, TypicalErrors, estimate_trust, typical_errors_of
-from neeco.fitting.crop_rendering import composite
-from neeco.fitting.parameters import DEG
-from neeco.fitting.state_fitter import StateFit, loose_prior
 from neeco.geometry.camera import Camera
 from neeco.labels.labellers import CompositedLabels, composited_labels
 from neeco.raster import rasterize
 from neeco.scene import Recorded
+from neeco.states.crop_rendering import composite
+from neeco.states.fitter import StateFit, loose_prior
+from neeco.states.parameters import DEG
 from neeco.tracking.parameters import TrackedInstrument, TrackingFitter
 from neeco.tracking.search import Search, differ
 

@@ -14,9 +14,9 @@ import yaml
 from neeco.base.errors import NeecoError, nearest
 from neeco.base.files import YamlLoader
 from neeco.base.settings import name_and_value, plain, structure, with_fields
-from neeco.fitting.refinement import RefineConfig
 from neeco.scene.method_registry import DEFAULT, current_name, method_class, method_settings
 from neeco.scene.training_session import RunLength
+from neeco.states.refinement import RefineConfig
 from neeco.training.resolution import ResolutionConfig, size_factor
 from neeco.training.schedule import Part, ScheduleConfig
 

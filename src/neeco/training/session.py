@@ -17,8 +17,6 @@ from torch.nn.functional import mse_loss
 from neeco.capture.model import Camera, Frame, State
 from neeco.evidence.foreground import Comparison, Foreground
 from neeco.evidence.label_quality import LABEL_QUALITY, QUALITY, label_counts, quality_of
-from neeco.fitting.refinement import Refinement
-from neeco.fitting.state_prediction import predict_corrections
 from neeco.raster import Rendering, rasterize
 from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
@@ -28,6 +26,8 @@ from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_session import GaussianTraining, Report, StepResult, check_finite, members, numbers
 from neeco.scene.training_views import TrainingViews
+from neeco.states.prediction import predict_corrections
+from neeco.states.refinement import Refinement
 from neeco.training.config import TrainConfig
 from neeco.training.density import GradientStatistics, control_density, reset_opacity
 from neeco.training.resolution import Resolution
@@ -175,7 +175,7 @@ class GaussianSession(GaussianTraining):
         if self.silhouettes is not None:
             assert rendering.channels is not None
             fitted = loss + self.silhouettes.loss(index, rendering.channels[..., 0])
-        weight = trust_of(self.given[index][0]) * float(self.refinement.weights[index])
+        weight = trust_of(self.given[index][0]) * float(self.refinement.counts(index))
         total = weight * fitted + self._regularisation(rendering, penalty)
         with tf32_products(self.views.device) if scene.deformation.large_operations else nullcontext():
             (total / views).backward()  # given the gradient instead, torch would import sympy: 2 s of every training

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
-from neeco.fitting.link_silhouette import ArticulatedModel, bends, joint_values, with_motion
 from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.articulated_fit import (
     WIDTHS_PX,
@@ -44,6 +43,7 @@ from neeco.ingest.registration.layers import EXCHANGED_SHARES
 from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S, BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock
 from neeco.ingest.registration.silhouette_search import distance_to, search_bases
+from neeco.states.outline_model import ArticulatedModel, bends, joint_values, with_motion
 
 START_FRAMES, FIT_FRAMES = 16, 48  # on which starts are compared, and that the result is fitted to
 ALONG_MM = (-10.0, -5.0, 5.0, 10.0)  # starts along the shaft

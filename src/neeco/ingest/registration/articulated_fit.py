@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.fitting.link_silhouette import ArticulatedModel, Outlines
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.ingest.foreground.silhouettes import EDGE_PX
 from neeco.ingest.registration.silhouette_fit import POSE_SDS, BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSilhouettes, moved_base, poses_at_clock
+from neeco.states.outline_model import ArticulatedModel, Outlines
 
 BASE = 7  # parameters of the base (turn rad [3], shift mm [3]) and the clock (s); the model's follow
 MAX_POINTS = 90  # of a mask's outline

@@ -26,7 +26,6 @@ from neeco.methods.kinematic.articulation import (
     ArticulatedInstruments,
     Articulation,
 )
-from neeco.methods.kinematic.contradictions import report_contradictions
 from neeco.methods.kinematic.discovery import find_instruments
 from neeco.methods.kinematic.finish import conclude
 from neeco.methods.kinematic.hinge_search import hinge_joints
@@ -60,6 +59,7 @@ from neeco.scene.drawable import ArticulatedMotion, Skeleton
 from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.training_session import GaussianTraining, Report
 from neeco.scene.visibility import extrapolate_tissue, outside_all_views
+from neeco.states.contradictions import describe_contradictions
 from neeco.training.schedule import Event
 from neeco.training.session import GaussianSession, gaussian_session
 
@@ -372,7 +372,8 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         session = gaussian_session(training)
         scene = session.scene
         conclude(session, self)
-        report_contradictions(session)
+        if contradictions := describe_contradictions(session.refinement, session.recorded.names):
+            session.report(contradictions)
         if self.breathing is not None:
             scene.diagnostics["breathing"] |= self.breathing.describe(scene.recorded.cameras)
         if self.settings.extrapolate_tissue:

@@ -16,12 +16,12 @@ from neeco.methods.kinematic.hinge_search import start_hinges
 from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
-from neeco.methods.kinematic.state_registration import corrected_evidence, register_states
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import Evidence, carve_along, carved_shape, frame_along, pad_and_stack
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
 from neeco.scene.gaussian_scene import GaussianScene
+from neeco.states.outline_states import register_states
 from neeco.training.session import GaussianSession
 
 
@@ -40,8 +40,10 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
     if isinstance(articulated, BreathingTissue) and articulated.may_breathe and session.timed:
         tissue = _learn_breathing(session, articulated, tissue)
     evidence = tissue_evidence(scene, session.views, session.config, tissue)
-    if register_states(session, articulated.articulations) is not None:
-        evidence = corrected_evidence(session, evidence)
+    stated = all(isinstance(articulation, StatedLinks) for articulation in articulated.articulations)
+    corrects = stated and session.config.refine.frame_poses
+    if corrects and register_states(session.views, session.refinement, scene.instruments):
+        evidence = _corrected_evidence(session, evidence)
     scene.canonical = _with_instruments(session, articulated, evidence)
 
 
@@ -61,7 +63,7 @@ def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -
         numbers = {frame.name: number for number, frame in enumerate(session.views.frames)}
         hits = [session.silhouettes.instrument(numbers[frame.name]) for frame in evidence.frames]
         evidence = replace(evidence, hits=pad_and_stack(hits, 0.0).to(evidence.hits))
-    evidence = corrected_evidence(session, evidence)
+    evidence = _corrected_evidence(session, evidence)
     with torch.no_grad():
         shafts = [articulation.shaft() for articulation in articulated.articulations]
         axes = [articulation.axes(shaft) for articulation, shaft in zip(articulated.articulations, shafts, strict=True)]
@@ -125,6 +127,17 @@ def _with_instruments(
         chosen = evenly_spaced(len(seeds), session.limits[1])
         bodies.append(seed_instrument(seeds[chosen], shape.radius).with_extras(**{LINK_LOGITS: logits[chosen]}))
     return join_bodies(bodies)
+
+
+def _corrected_evidence(session: GaussianSession, evidence: Evidence) -> Evidence:
+    """Return the evidence with the states as corrected so far, without frames that were left out."""
+    places = {frame.name: place for place, frame in enumerate(session.views.frames)}
+    scene, refinement = session.scene, session.refinement
+    numbers = [places[frame.name] for frame in evidence.frames]
+    states = [scene.registered(refinement.state(k, f.state)) for k, f in zip(numbers, evidence.frames, strict=True)]
+    frames = tuple(replace(frame, state=state) for frame, state in zip(evidence.frames, states, strict=True))
+    remaining = [row for row, number in enumerate(numbers) if refinement.counts(number)]
+    return replace(evidence, frames=frames).subset(torch.tensor(remaining))
 
 
 def _learn_breathing(session: GaussianSession, breathes: BreathingTissue, tissue: GaussianScene) -> GaussianScene:

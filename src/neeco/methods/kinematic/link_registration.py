@@ -17,13 +17,13 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from neeco.capture.model import BaseUncertainty, Instrument, evenly_spaced
-from neeco.fitting.link_states import BASE_SD_MM, BASE_SD_RAD
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, rotation_from_vector, skew
 from neeco.methods.kinematic.link_search import doubted_readings, note_doubt
 from neeco.methods.kinematic.stated_links import AXIS_SD, OFFSET_SD, PIVOT_SD, StatedLinks
 from neeco.methods.space_carving import CarvedShape, Evidence, camera_from_instrument
+from neeco.states.outline_fit import BASE_SD_MM, BASE_SD_RAD
 from neeco.training.session import GaussianSession
 
 MAX_FRAMES = 30

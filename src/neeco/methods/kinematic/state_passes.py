@@ -11,24 +11,12 @@ from collections.abc import Sequence
 
 import torch
 
-from neeco.capture.model import evenly_spaced
-from neeco.fitting.alignment import STATE_ERRORS
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.methods.kinematic.contradictions import (
-    Misfits,
-    contradicting_states,
-    fitted_anew,
-    judge_again,
-    leave_out_unexplained,
-    refit_outliers,
-)
 from neeco.methods.kinematic.discovery import carve_again
-from neeco.methods.kinematic.state_search import LARGEST, StateSearch
+from neeco.states.contradictions import Misfits, fitted_anew, judge_again, leave_out_unexplained, refit_outliers
+from neeco.states.refinement import Verdict
+from neeco.states.search import LARGE, SCALE, StateSearch
 from neeco.training.session import GaussianSession
-
-N_SAMPLED = 16  # frames by which errors are sized
-LARGE = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
-SCALE = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
 
 
 def _corrects_states(session: GaussianSession) -> bool:
@@ -40,32 +28,32 @@ def _fits_states(session: GaussianSession) -> bool:
     """Return whether states are corrected, their errors are larger than a tracker's, and one camera shows each instant:
     gradients of several cameras' images determine an instant's state better than each image does."""
     single = all(len(frames) == 1 for frames in session.refinement.frames_of_instant)
-    return _corrects_states(session) and STATE_ERRORS in session.scene.diagnostics and single
+    return _corrects_states(session) and bool(session.refinement.error_scale) and single
 
 
 @torch.no_grad()
 def judge_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Size the errors of the states of all training frames, and search for those that are wrong altogether."""
-    if _corrects_states(session) and STATE_ERRORS not in session.scene.diagnostics:
-        search = StateSearch.of(session, articulated)
+    if _corrects_states(session) and not session.refinement.error_scale:
+        search = _search(session, articulated)
         misfits = Misfits.of(search)
-        large = size_errors(search, misfits.outliers)
+        large = _size_errors(session, search, misfits.outliers)
         refit_outliers(search, SCALE if large else LARGE, misfits)
 
 
 @torch.no_grad()
 def size_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Size the errors of the states of all training frames, where they were not found large before."""
-    if _corrects_states(session) and STATE_ERRORS not in session.scene.diagnostics:
-        size_errors(StateSearch.of(session, articulated), ())
+    if _corrects_states(session) and not session.refinement.error_scale:
+        _size_errors(session, _search(session, articulated), ())
 
 
 @torch.no_grad()
 def judge_states_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Search again for wrong states, where errors are large or some states were found wrong before."""
-    suspected = STATE_ERRORS in session.scene.diagnostics or contradicting_states(session)
+    suspected = bool(session.refinement.error_scale) or bool(session.refinement.verdicts.any())
     if _corrects_states(session) and suspected:
-        judge_again(StateSearch.of(session, articulated))
+        judge_again(_search(session, articulated))
 
 
 @torch.no_grad()
@@ -73,13 +61,12 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, *,
     """Fit the states of all training frames to their images, where their errors are larger than a tracker's."""
     if not _fits_states(session):
         return
-    search, refinement = StateSearch.of(session, articulated), session.refinement
-    contradicting = contradicting_states(session)
+    search, refinement = _search(session, articulated), session.refinement
     explained: dict[int, float] = {}
     for (index,) in refinement.frames_of_instant:
-        if not refinement.weights[index] > 0:
+        if not refinement.counts(index):
             continue
-        wrong = session.recorded.names[index] in contradicting
+        wrong = refinement.verdict(index) is Verdict.REFITTED
         about = search.state(index) if wrong else None
         fit = fitted_anew(search, index) if wrong and last else search.fitted(index, SCALE, about)
         if fit is not None:
@@ -104,28 +91,14 @@ def carve_from_states(session: GaussianSession, articulated: ArticulatedInstrume
             carve_again(session, articulated)
 
 
-def size_errors(search: StateSearch, outliers: Sequence[int]) -> bool:
-    """Return whether states have larger errors than a tracker's, which the recording states, or images show of all
-    states but `outliers`, and note that: their corrections have a prior of such errors from then on."""
-    session, stated = search.session, search.stated_scale()
-    scale = stated if stated > LARGE else size_of_errors(search, outliers)
-    if scale <= LARGE:
-        return False
-    session.scene.diagnostics[STATE_ERRORS] = round(scale, 3)
-    session.report("the states' errors are larger than a tracker's: they are corrected by the images")
-    for index, *_ in session.refinement.frames_of_instant:
-        session.refinement.set_deviations(index, search.deviations(index, SCALE))
-    return True
+def _search(session: GaussianSession, articulated: ArticulatedInstruments) -> StateSearch:
+    shafts = [articulation.shaft()[1].detach().cpu().double() for articulation in articulated.articulations]
+    return StateSearch.of(session.scene, session.refinement, session.full_views.frames, shafts)
 
 
-def size_of_errors(search: StateSearch, outliers: Sequence[int]) -> float:
-    """Return how large the errors of a sample of states are, times the usual ones of a robot; without `outliers`,
-    which may be wrong altogether."""
-    refinement = search.session.refinement
-    fits = []
-    usual = [index for index in range(len(search.session.full_views.frames)) if index not in outliers]
-    for index in (usual[place] for place in evenly_spaced(len(usual), N_SAMPLED)):
-        # states that were fitted before training are judged by what is left of their errors
-        fit = search.fitted(index, LARGEST, search.state(index) if refinement.fitted[index] else None)
-        fits += [] if fit is None else [fit]
-    return search.scale_of(fits) if len(fits) > 2 else 0.0
+def _size_errors(session: GaussianSession, search: StateSearch, outliers: Sequence[int]) -> bool:
+    """Size the errors of all states but `outliers`, and report whether they are larger than a tracker's."""
+    large = search.size_errors(outliers)
+    if large:
+        session.report("the states' errors are larger than a tracker's: they are corrected by the images")
+    return large

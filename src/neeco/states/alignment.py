@@ -17,13 +17,13 @@ from torch import Tensor
 
 from neeco.capture.images import area_averaged
 from neeco.capture.model import Frame, Instrument, State
-from neeco.fitting.crop_rendering import MAX_PIXELS
-from neeco.fitting.minimise import ImageResidual, minimise
-from neeco.fitting.parameters import InstrumentParameters, StateParameters, moved_camera, precision_of
 from neeco.geometry.camera import Camera
 from neeco.raster import depth_maps, rasterize
 from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
+from neeco.states.crop_rendering import MAX_PIXELS
+from neeco.states.minimise import ImageResidual, minimise
+from neeco.states.parameters import InstrumentParameters, StateParameters, moved_camera, precision_of
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
@@ -48,9 +48,7 @@ class AlignConfig:
     step_deg: float = 0.1
 
 
-# of a scene's diagnostics: how large the errors of its recording's states are, where they are larger than a tracker's
-STATE_ERRORS = "scale_of_state_errors"
-# for such states: priors as wide, and steps enough to come from as far
+# for states whose errors are larger than a tracker's: priors as wide, and steps enough to come from as far
 WIDE = AlignConfig(
     sigma_instrument_mm=1.5, sigma_instrument_deg=3.0, sigma_joint_deg=4.0, sigma_joint_mm=1.5, steps=(10, 6, 4)
 )
@@ -110,7 +108,7 @@ def align_frame(
     a tracker's errors, or WIDE where the scene's recording has larger ones. Takes about 7 * (6 * instruments + joints +
     8) small renderings (WIDE: three times as many).
     """
-    config = config or (WIDE if STATE_ERRORS in scene.diagnostics else AlignConfig())
+    config = config or (WIDE if scene.recorded.error_scale else AlignConfig())
     instruments = [item for item in scene.instruments if item.name in frame.state.instruments]
     parameters = StateParameters(tuple(map(InstrumentParameters.of, instruments)), joints_last=True, camera=True)
     mask, precision = frame.load_mask(), precision_of(_deviations(parameters, instruments, config))

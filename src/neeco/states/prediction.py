@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Frame, evenly_spaced
-from neeco.fitting.refinement import Refinement
 from neeco.scene.state_corrections import MAX_ANCHORS, StateCorrections, kernel
+from neeco.states.refinement import Refinement
 
 N_BLOCKS = 6  # stretches of the recording, left out one after the other
 MIN_INSTANTS = 12

@@ -7,14 +7,16 @@ Biometrika 1971) replace those that were expected where they are clearly larger.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.model import evenly_spaced
-from neeco.fitting.link_silhouette import mirrored
-from neeco.fitting.link_states import (
+from neeco.capture.model import Instrument, InstrumentState, evenly_spaced
+from neeco.scene.training_views import TrainingViews
+from neeco.states.outline_fit import (
     FIRST_SOFTNESS,
     POSE,
     STAGES,
@@ -25,7 +27,9 @@ from neeco.fitting.link_states import (
     adjust,
     posterior,
 )
-from neeco.fitting.parameters import DEG
+from neeco.states.outline_model import mirrored
+from neeco.states.parameters import DEG
+from neeco.states.refinement import Refinement, Verdict
 
 # standard deviations of errors that are tried: tilts, roll (rad), across, depth (mm), revolute (rad), prismatic (mm)
 TRIED = (2 * DEG, 6 * DEG, 0.4, 1.5, 4 * DEG, 1.5)
@@ -46,6 +50,8 @@ MAX_USUAL_MISFIT = 0.25  # median, above which colours do not show the instrumen
 MAX_MISFIT = 0.4  # from which a state is wrong even where nothing explains it better
 BETTER = 0.75  # share of the misfit, below which another start is right
 N_OTHERS = 4  # states of other moments that are tried
+WIDTH_PX = 320  # of the images compared
+MIN_STATES = 8  # with fewer, nothing is said about them
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -86,6 +92,57 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
         sds = np.maximum(np.maximum(found, MIN_SHARE * sds_of(TRIED, slides)), expected)
     states = _with_inconsistent(_fit(views, sds, first), sds, slides, large=large)
     return states if large or states.inconsistent.any() else None
+
+
+def register_states(views: TrainingViews, refinement: Refinement, instruments: Sequence[Instrument]) -> bool:
+    """Refit the states of training frames that contradict the others, or exclude them; return whether there are any.
+
+    Only those of a single instrument, with stated links and all readings recorded, before pinholes of one size.
+    """
+    frames = views.frames
+    tree = instruments[0].kinematics
+    sizes = {(frame.camera.width, frame.camera.height) for frame in frames}
+    count = len(refinement.frames_of_instant)
+    if len(instruments) != 1 or not all(frame.camera.is_pinhole for frame in frames):
+        return False
+    if tree is None or instruments[0].unrecorded or len(sizes) > 1 or count < MIN_STATES:
+        return False
+    (instrument,) = instruments
+    scale = min(1.0, WIDTH_PX / frames[0].camera.width)
+    small = views if scale == 1.0 else views.scaled(scale)
+    cameras = [frame.camera for frame in small.frames]
+    firsts = [frames[shown[0]].state.instruments[instrument.name] for shown in refinement.frames_of_instant]
+    images = np.stack([image.cpu().numpy() for image in small.images])
+    usable = [np.ones(images.shape[1:3], bool) if mask is None else mask.cpu().numpy() for mask in small.masks]
+    recorded = LinkViews(
+        tree=tree,
+        images=images,
+        usable=np.stack(usable),
+        camera_from_world=np.stack([np.linalg.inv(camera.world_from_camera.double().numpy()) for camera in cameras]),
+        intrinsics=np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras], np.float64),
+        state_of_view=np.array(refinement.instants),
+        poses=np.stack([state.pose.double().numpy() for state in firsts]),
+        readings=np.array([[state.joints[reading] for reading in tree.readings] for state in firsts], np.float64),
+    )
+    slides = np.array([instrument.slides(reading) for reading in tree.readings])
+    usual = refinement.deviations(0).numpy()
+    tilt, roll, across, depth = usual[:3].min(), usual[:3].max(), usual[3:6].min(), usual[3:6].max()
+    expected = np.append([tilt, tilt, roll, across, across, depth], usual[6:])
+    found = find_states(recorded, expected, slides)
+    if found is None or not found.inconsistent.any():  # errors of all states are refined while training
+        return False
+    for row, (first, *_) in enumerate(refinement.frames_of_instant):
+        if found.inconsistent[row] and not found.refitted[row]:
+            refinement.judge(first, Verdict.EXCLUDED)
+        elif found.inconsistent[row]:
+            given = frames[first].state
+            own = given.instruments[instrument.name]
+            readings = dict(zip(tree.readings, found.readings[row].tolist(), strict=True))
+            state = InstrumentState(torch.from_numpy(found.poses[row]).to(own.pose), {**own.joints, **readings})
+            deviations = torch.from_numpy(np.sqrt(np.diagonal(found.covariances[row])).copy())
+            refinement.set_state(first, given, replace(given, instruments={instrument.name: state}), deviations)
+            refinement.judge(first, Verdict.REFITTED)
+    return True
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from neeco.capture.model import Instrument, State
-from neeco.fitting.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer
-from neeco.fitting.parameters import DEG, InstrumentParameters, StateParameters
-from neeco.fitting.refinement import MIN_DEVIATION, MM_PER_RAD
-from neeco.fitting.state_fitter import Fitter, StateFit
-from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.training.session import GaussianSession
+from neeco.capture.model import Frame, Instrument, State, evenly_spaced
+from neeco.scene import GaussianScene
+from neeco.states.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer
+from neeco.states.fitter import Fitter, StateFit
+from neeco.states.parameters import DEG, InstrumentParameters, StateParameters
+from neeco.states.refinement import MIN_DEVIATION, MM_PER_RAD, Refinement
 
 # standard deviations of states by a robot's log and a rough base: of the shaft's tilt and roll (degrees), of the origin
 # across the view and in depth (mm), of joints (degrees)
@@ -31,6 +30,9 @@ KEPT_SHARE = 0.85  # of squared corrections that count, without the largest
 CORRELATION_PX = 100.0  # pixels that count as one observation, as the scene is still learned
 BEYOND_LIMITS = 0.5  # of the range of a joint's limits, by which readings may be off
 LEVELS, STEPS = (0.25, 0.5, 1.0), (4, 4, 4)
+N_SAMPLED = 16  # frames by which errors are sized
+LARGE = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
+SCALE = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,32 +54,37 @@ class FittedState:
 class StateSearch:
     """Fits of training frames against the scene as learned so far."""
 
-    session: GaussianSession
+    scene: GaussianScene
+    refinement: Refinement
+    frames: Sequence[Frame]  # training frames at full size
     fitter: Fitter[StateParameters]
-    shafts: list[Tensor]  # directions [3], instrument frame
+    shafts: Sequence[Tensor]  # directions [3], instrument frame
 
     @classmethod
-    def of(cls, session: GaussianSession, articulated: ArticulatedInstruments) -> StateSearch:
-        """Return the search against the session's scene as it is now."""
-        scene, layout = session.scene, session.refinement.layout
-        shafts = [articulation.shaft()[1].detach().cpu().double() for articulation in articulated.articulations]
+    def of(
+        cls, scene: GaussianScene, refinement: Refinement, frames: Sequence[Frame], shafts: Sequence[Tensor]
+    ) -> StateSearch:
+        """Return the search against `scene` as it is now."""
         bounded = StateParameters(
-            tuple(_bounded(own, item) for own, item in zip(layout.instruments, scene.instruments, strict=True))
+            tuple(
+                _bounded(own, item) for own, item in zip(refinement.layout.instruments, scene.instruments, strict=True)
+            )
         )
-        return cls(session, Fitter(InstrumentRenderer(scene), bounded, TissueRenderer(scene), CORRELATION_PX), shafts)
+        fitter = Fitter(InstrumentRenderer(scene), bounded, TissueRenderer(scene), CORRELATION_PX)
+        return cls(scene, refinement, frames, fitter, shafts)
 
     @property
     def linked(self) -> bool:
         """Whether the links of all instruments are stated."""
-        return all(item.kinematics is not None for item in self.session.scene.instruments)
+        return all(item.kinematics is not None for item in self.scene.instruments)
 
     def state(self, index: int) -> State:
         """Return the state of training frame `index` as corrected so far."""
-        return self.session.refinement.state(index, self.session.recorded.states[index])
+        return self.refinement.state(index, self.scene.recorded.states[index])
 
     def view(self, index: int, state: State | None) -> FrameView:
         """Return frame `index` over tissue with the shadow of instruments in `state` (None: none)."""
-        return self.fitter.view(self.session.full_views.frames[index], state)
+        return self.fitter.view(self.frames[index], state)
 
     def fitted(
         self, index: int, scale: float, about: State | None = None, start: State | None = None
@@ -85,12 +92,12 @@ class StateSearch:
         """Return the state of frame `index` fitted from its present one (or another `start`), with a prior about that
         recorded (or `about` another) of errors `scale` times as large as usual ones of a robot, or as stated; None
         where the fit leads out of the image."""
-        given, precision = self.session.recorded.states[index], self.precision(index, scale)
+        given, precision = self.scene.recorded.states[index], self.precision(index, scale)
         start = start or self.state(index)
         fit = self.fitter.fit(self.view(index, start), about or given, precision, start, levels=LEVELS, steps=STEPS)
         if fit is None:
             return None
-        correction = self.session.refinement.layout.increments_between(about or given, fit.state)
+        correction = self.refinement.layout.increments_between(about or given, fit.state)
         return FittedState(index=index, fit=fit, precision=precision, correction=correction)
 
     def misfit(self, index: int, state: State) -> float:
@@ -112,9 +119,9 @@ class StateSearch:
         """Return standard deviations [P] (rad, mm) of errors along `_axes`: stated ones, else `scale` times usual ones;
         of an unrecorded joint a quarter of its limits."""
         found: list[float] = []
-        layout = self.session.refinement.layout
-        for item, own, shaft in zip(self.session.scene.instruments, layout.instruments, self.shafts, strict=True):
-            stated = self.session.full_views.frames[index].state.instruments[item.name].uncertainty
+        layout = self.refinement.layout
+        for item, own, shaft in zip(self.scene.instruments, layout.instruments, self.shafts, strict=True):
+            stated = self.frames[index].state.instruments[item.name].uncertainty
             turns = scale * DEG * torch.tensor([TILT, TILT, ROLL], dtype=torch.float64)
             shifts: Sequence[float] = (scale * ACROSS, scale * ACROSS, scale * DEPTH)
             if stated is not None:
@@ -134,8 +141,8 @@ class StateSearch:
     def _axes(self, index: int) -> Tensor:
         """Return the rows [P, P] that take corrections to the axes of errors: tilt, tilt, roll, across, across, depth,
         joints of every instrument."""
-        layout = self.session.refinement.layout
-        state, camera = self.session.recorded.states[index], self.session.recorded.cameras[index]
+        layout = self.refinement.layout
+        state, camera = self.scene.recorded.states[index], self.scene.recorded.cameras[index]
         rows = torch.eye(layout.size, dtype=torch.float64)
         for item, (pose, _), shaft in zip(layout.instruments, layout.rows, self.shafts, strict=True):
             rows[pose.start : pose.start + 3, pose.start : pose.start + 3] = _about(shaft)
@@ -144,6 +151,30 @@ class StateSearch:
                 camera.world_from_camera[:3, :3].cpu().double().T @ own
             )
         return rows
+
+    def size_errors(self, outliers: Sequence[int]) -> bool:
+        """Return whether states have larger errors than a tracker's, which the recording states, or images show of all
+        states but `outliers`, and set that: their corrections have a prior of such errors from then on."""
+        stated, refinement = self.stated_scale(), self.refinement
+        scale = stated if stated > LARGE else self._size_of_errors(outliers)
+        if scale <= LARGE:
+            return False
+        refinement.error_scale.fill_(scale)
+        for index, *_ in refinement.frames_of_instant:
+            refinement.set_deviations(index, self.deviations(index, SCALE))
+        return True
+
+    def _size_of_errors(self, outliers: Sequence[int]) -> float:
+        """Return how large the errors of a sample of states are, times the usual ones of a robot; without `outliers`,
+        which may be wrong altogether."""
+        fits = []
+        usual = [index for index in range(len(self.frames)) if index not in outliers]
+        for index in (usual[place] for place in evenly_spaced(len(usual), N_SAMPLED)):
+            # states that were fitted before training are judged by what is left of their errors
+            about = self.state(index) if self.refinement.fitted[index] else None
+            fit = self.fitted(index, LARGEST, about)
+            fits += [] if fit is None else [fit]
+        return self.scale_of(fits) if len(fits) > 2 else 0.0
 
     def scale_of(self, fits: Sequence[FittedState]) -> float:
         """Return how large errors are, times the usual ones of a robot: the median over the classes of errors of
@@ -172,8 +203,8 @@ class StateSearch:
     def stated_scale(self) -> float:
         """Return how large errors are by the recording's own statement, times the usual ones of a robot: the median
         over tilt, roll, depth and joints; 0 where less than half of the states say so."""
-        names = [item.name for item in self.session.scene.instruments]
-        states = [frame.state.instruments for frame in self.session.full_views.frames]
+        names = [item.name for item in self.scene.instruments]
+        states = [frame.state.instruments for frame in self.frames]
         stated = [k for k, of in enumerate(states) if all(of[name].uncertainty is not None for name in names)]
         if not stated or 2 * len(stated) < len(states):
             return 0.0
@@ -184,14 +215,14 @@ class StateSearch:
     def _kinds(self) -> list[int]:
         """Return the class of each correction: tilt 0, roll 1, across 2, depth 3, joints 4, unrecorded ones 5."""
         kinds: list[int] = []
-        for item, own in zip(self.session.scene.instruments, self.session.refinement.layout.instruments, strict=True):
+        for item, own in zip(self.scene.instruments, self.refinement.layout.instruments, strict=True):
             kinds += [0, 0, 1, 2, 2, 3, *(5 if reading in item.unrecorded else 4 for reading in own.joints)]
         return kinds
 
     def _usual(self) -> Tensor:
         """Return usual errors [P] of a robot's states (rad, mm)."""
         found: list[float] = []
-        for own in self.session.refinement.layout.instruments:
+        for own in self.refinement.layout.instruments:
             found += [TILT * DEG, TILT * DEG, ROLL * DEG, ACROSS, ACROSS, DEPTH]
             found += [JOINT * DEG * (MM_PER_RAD if slides else 1.0) for slides in own.slides]
         return torch.tensor(found, dtype=torch.float64)

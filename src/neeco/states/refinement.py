@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from functools import reduce
 from operator import add
 from typing import Any
@@ -16,16 +17,23 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Camera, Frame, Instrument, State
-from neeco.fitting.parameters import InstrumentParameters, StateParameters, moved_camera
 from neeco.geometry.rotations import vector_from_rotation
 from neeco.raster.optimizer import adam_update
 from neeco.scene.deformation import log_linear
 from neeco.scene.drawable import Recorded
+from neeco.states.parameters import InstrumentParameters, StateParameters, moved_camera
 
 LEARNED = ("poses", "joints", "cameras", "latency")
 PRIORS = ("pose_mean", "joint_mean", "pose_sd", "joint_sd")
-STATE = (*LEARNED, *PRIORS, "frame_steps", "fitted", "weights")  # tensors of a checkpoint, without the moments
-ON_CPU = ("frame_steps", "fitted", "weights")  # read in every step
+STATE = (
+    *LEARNED,
+    *PRIORS,
+    "frame_steps",
+    "fitted",
+    "verdicts",
+    "error_scale",
+)  # tensors of a checkpoint, without the moments
+ON_CPU = ("frame_steps", "fitted", "verdicts", "error_scale")  # read in every step
 MM_PER_RAD = 20.0  # motion of a prismatic joint that counts as much as 1 rad of a revolute one
 MAX_SPEEDUP = 10.0  # of the learning rates where a pose is less certain than usual
 MIN_DEVIATION = 1e-4  # rad, mm: a standard deviation of 0 would hold a pose for ever
@@ -34,6 +42,14 @@ MIN_SHARE = 0.05  # of a prior's standard deviations, that remain of a state's
 UNCORRECTED = 1.2  # times what was corrected: errors, as some remain that corrections do not explain
 MAX_NEIGHBOUR_S = 1.0  # s between instants whose unrecorded joints are similar
 MAX_VELOCITY_S = 0.5  # s between frames that velocities are taken from
+
+
+class Verdict(IntEnum):
+    """Outcome for the recorded state of an instant."""
+
+    ACCEPTED = 0  # as recorded, but for corrections that training learns
+    REFITTED = 1  # it contradicts the others; fitted to its image from other starts
+    EXCLUDED = 2  # it contradicts the others and no state explains its image, which does not count in the loss
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,8 +86,9 @@ class Refinement:
     between their limits and are smooth in time. A state is corrected once for all frames of one instant, as several
     cameras observe it: errors of single cameras are not what differs between instants. Tensors: `poses` [P, I, 6] of P
     instants, `joints` [P, R], `cameras` [F, 6], `latency` [1]; of the priors on the first two `pose_mean`, `pose_sd`,
-    `joint_mean`, `joint_sd`; `fitted` [F] bool: frames whose state was set (`set_state`); `weights` [F] of frames in
-    the loss.
+    `joint_mean`, `joint_sd`; `fitted` [F] bool: frames whose state was set (`set_state`); `verdicts` [P] on recorded
+    states; `error_scale` [1]: of their errors, in units of a robot's usual ones, where they are larger than a tracker's
+    (else 0).
     """
 
     def __init__(
@@ -106,7 +123,8 @@ class Refinement:
             for name in LEARNED
         }
         self.pose_mean, self.joint_mean = torch.zeros_like(self.poses), torch.zeros_like(self.joints)
-        self.frame_steps, self.weights = torch.zeros(len(frames)), torch.ones(len(frames))
+        self.frame_steps, self.error_scale = torch.zeros(len(frames)), torch.zeros(1, dtype=torch.float64)
+        self.verdicts = torch.full((len(first),), Verdict.ACCEPTED, dtype=torch.uint8)
         self.fitted = torch.zeros(len(frames), dtype=torch.bool)
         self._leaves: dict[str, Tensor] = {}
 
@@ -211,9 +229,17 @@ class Refinement:
         if self.readings:
             self.joint_sd[instant] = joints
 
-    def weigh(self, index: int, weight: float) -> None:
-        """Set the weight in the loss of frame `index`, and of all frames of its instant."""
-        self.weights[self.frames_of_instant[self.instants[index]]] = weight
+    def verdict(self, index: int) -> Verdict:
+        """Return the verdict on the recorded state of frame `index`."""
+        return Verdict(int(self.verdicts[self.instants[index]]))
+
+    def judge(self, index: int, verdict: Verdict) -> None:
+        """Set the verdict on the recorded state of frame `index`, and of all frames of its instant."""
+        self.verdicts[self.instants[index]] = verdict
+
+    def counts(self, index: int) -> bool:
+        """Return whether frame `index` counts in the loss."""
+        return self.verdict(index) is not Verdict.EXCLUDED
 
     @torch.no_grad()
     def prior_shares(self) -> Tensor:
@@ -326,7 +352,9 @@ class Refinement:
         return corrections.median(0).values if bool(self.fitted.any()) else corrections.mean(0)
 
     def found(self, recorded: Recorded, instruments: tuple[Instrument, ...]) -> Recorded:
-        """Return the recording with unrecorded joints as estimated, within their limits, and fitted states as such."""
+        """Return the recording with unrecorded joints as estimated, within their limits, fitted states as such, and how
+        large the errors of its states were."""
+        recorded = replace(recorded, error_scale=float(self.error_scale))
         if not bool(self.unrecorded.any() | self.fitted.any()):
             return recorded
         states = [
@@ -365,7 +393,7 @@ class Refinement:
                     "pose": own.pose.cpu().double().tolist(),
                     "joints": {joint: float(value) for joint, value in own.joints.items()},
                 }
-                if self.weights[index] > 0:
+                if self.counts(index):
                     instruments[item.name]["uncertainty"] = {
                         "translation_mm": shifts.tolist(),
                         "rotation_deg": deviations[pose][:3].rad2deg().tolist(),
@@ -374,7 +402,7 @@ class Refinement:
             found[name] = {
                 "instruments": instruments,
                 "fitted": bool(self.fitted[index]),
-                "left_out": not bool(self.weights[index] > 0),
+                "left_out": not self.counts(index),
             }
         return found
 

@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from neeco.capture.kinematics import KinematicTree
-from neeco.fitting.link_silhouette import MAX_BEND_MM, ArticulatedModel, Outlines, joint_values
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.lines import frame_about
 from neeco.geometry.trocar import line_through_trocar
+from neeco.states.outline_model import MAX_BEND_MM, ArticulatedModel, Outlines, joint_values
 
 POSE = 6  # parameters of a state's pose: two tilts, roll (rad), two shifts across the view, depth (mm); joints follow
 BINS, SMOOTH_BINS = 24, 0.8  # of colours, per channel

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Frame, State
-from neeco.fitting.crop_rendering import (
+from neeco.raster.types import Gaussians
+from neeco.states.crop_rendering import (
     N_POSED,
     FrameView,
     InstrumentRenderer,
@@ -25,9 +26,8 @@ from neeco.fitting.crop_rendering import (
     view_of,
     working_size,
 )
-from neeco.fitting.minimise import ImageResidual, minimise
-from neeco.fitting.parameters import StateParameters, precision_of
-from neeco.raster.types import Gaussians
+from neeco.states.minimise import ImageResidual, minimise
+from neeco.states.parameters import StateParameters, precision_of
 
 HUBER = 0.05  # colour residual beyond which the cost of a pixel is linear
 CORRELATION_PX = 25.0  # pixels of the full size that count as one observation, since residuals of neighbours correlate

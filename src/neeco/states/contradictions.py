@@ -17,12 +17,11 @@ from torch import Tensor
 
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import InstrumentState, State, evenly_spaced
-from neeco.fitting.link_silhouette import half_turned, mirrored
-from neeco.fitting.state_fitter import StateFit
-from neeco.methods.kinematic.state_search import LEVELS, STEPS, StateSearch
-from neeco.training.session import GaussianSession
+from neeco.states.fitter import StateFit
+from neeco.states.outline_model import half_turned, mirrored
+from neeco.states.refinement import Refinement, Verdict
+from neeco.states.search import LEVELS, STEPS, StateSearch
 
-CONTRADICTING = "contradicting_states"  # of a scene's diagnostics: what became of each, by the frame's name
 OUTLYING = 3.0  # robust standard deviations of a log misfit above which a state is an outlier
 REJECTED = 6.0  # above which a frame that no state explains is left out
 BETTER = 0.7  # of a state's misfit: that of another one which refutes it
@@ -39,13 +38,6 @@ ALIKE = 1.15  # times a state's misfit, below which the mirrored state may be ri
 N_OWN, N_NEAR = 12, 64  # starts sampled from the prior about a recorded state, and about another
 MAX_SHARE, MAX_SUSPECTS = 1 / 3, 24  # of all frames
 MAX_NAMED = 8  # frames in a line
-FITTED_ANEW, LEFT_OUT = "fitted anew", "left out"
-
-
-def contradicting_states(session: GaussianSession) -> dict[str, str]:
-    """Return what became of states that contradict the others, by the frame's name."""
-    noted: dict[str, str] = session.scene.diagnostics.get(CONTRADICTING, {})
-    return noted
 
 
 @dataclass(frozen=True)
@@ -62,7 +54,7 @@ class Misfits:
     @classmethod
     def of(cls, search: StateSearch) -> Misfits:
         """Measure them. With few frames, or where half of them would be, there are no outliers."""
-        firsts = [frames[0] for frames in search.session.refinement.frames_of_instant]
+        firsts = [frames[0] for frames in search.refinement.frames_of_instant]
         misfits = {index: search.misfit(index, search.state(index)) for index in firsts}
         shown = torch.tensor([misfit for misfit in misfits.values() if math.isfinite(misfit)])
         if len(shown) < MIN_FRAMES:
@@ -101,21 +93,20 @@ class Refitted:
         if search.linked:
             fits = [*fits, *_fits_near(search, index, half_turned_state(search, best.state))]
             best = _best(fits)
-        apart = search.session.refinement.layout.increments_between
+        apart = search.refinement.layout.increments_between
         possible = torch.stack([apart(best.state, fit.state) for fit in fits if BETTER * fit.misfit <= best.misfit])
         return cls(best, (best.deviations(precision).square() + possible.square().mean(0)).sqrt())
 
 
 @torch.no_grad()
 def refit_outliers(search: StateSearch, scale: float, misfits: Misfits) -> None:
-    """Fit states that are outliers from other starts, or leave them out, and note them in the scene's diagnostics.
+    """Fit states that are outliers from other starts, or exclude them.
 
     scale: of the errors of all states (see `StateSearch.fitted`).
     """
-    names, noted = search.session.recorded.names, contradicting_states(search.session)
     others = _states_of(search, [index for index, misfit in misfits.of_frame.items() if misfit <= misfits.limit])
     for index in misfits.outliers:
-        if names[index] not in noted:
+        if search.refinement.verdict(index) is Verdict.ACCEPTED:
             own = _own_fit(search, index, scale)
             if own is None or own.misfit > misfits.limit:
                 found = _fits_from(search, index, _other_starts(search, index, others))
@@ -127,18 +118,17 @@ def judge_again(search: StateSearch) -> None:
     """Compare states once more, when the states of the others are fitted: those that contradict the others, which are
     used again as recorded where they no longer do, and those that may be wrong. None is left out by its misfit alone:
     the limit sinks as all others are explained better."""
-    session, weights = search.session, search.session.refinement.weights
-    names, noted = session.recorded.names, contradicting_states(session)
+    refinement, recorded = search.refinement, search.scene.recorded
     misfits = replace(Misfits.of(search), rejection_limit=math.inf)
-    judged = {*noted, *(names[index] for index in _suspects(search, misfits))}
-    others = _states_of(search, [index for index in range(len(names)) if weights[index] > 0])
+    suspects = _suspects(search, misfits)
+    others = _states_of(search, [index for index in range(len(recorded.names)) if refinement.counts(index)])
     for index in misfits.of_frame:
-        name = names[index]
-        if name in judged:
+        contradicts = refinement.verdict(index) is not Verdict.ACCEPTED
+        if contradicts or index in suspects:
             starts, own = _other_starts(search, index, others), _own_fit(search, index, 1.0)
             if search.linked:
-                starts.append(mirrored_state(search, index, session.recorded.states[index]))
-            if name in noted:
+                starts.append(mirrored_state(search, index, recorded.states[index]))
+            if contradicts:
                 starts.append(search.state(index))
             _judge(search, index, 1.0, own, _fits_from(search, index, starts), misfits)
 
@@ -151,17 +141,16 @@ def fitted_anew(search: StateSearch, index: int) -> Refitted | None:
 
 
 def leave_out_unexplained(search: StateSearch, misfits: Mapping[int, float]) -> None:
-    """Leave out frames that were fitted anew and are outliers after the last fits: their states remain unknown.
+    """Exclude frames that were fitted anew and are outliers after the last fits: their states remain unknown.
 
-    misfits: by frame index, of all frames with a weight.
+    misfits: by frame index, of all frames that count.
     """
-    names, noted = search.session.recorded.names, contradicting_states(search.session)
-    right = [misfit for index, misfit in misfits.items() if names[index] not in noted]
+    refinement = search.refinement
+    right = [misfit for index, misfit in misfits.items() if refinement.verdict(index) is Verdict.ACCEPTED]
     limit = _limit(torch.tensor(right), OUTLYING) if len(right) >= MIN_FRAMES else math.inf
     for index, misfit in misfits.items():
-        if names[index] in noted and misfit > limit:
-            noted[names[index]] = LEFT_OUT
-            search.session.refinement.weigh(index, 0.0)
+        if refinement.verdict(index) is Verdict.REFITTED and misfit > limit:
+            refinement.judge(index, Verdict.EXCLUDED)
 
 
 def _judge(
@@ -172,37 +161,37 @@ def _judge(
     others: Sequence[StateFit],
     misfits: Misfits,
 ) -> None:
-    """Replace the state of frame `index` where another explains its image much better, leave the frame out where none
-    does, and note either. A frame noted before is used again as recorded if no other state explains more of its image.
+    """Refit the state of frame `index` where another explains its image much better, or exclude the frame where none
+    does. A frame judged so before is accepted again if no other state explains more of its image.
 
     own: the best fit about the recorded state; None where it leaves the image, and its gain is 0. others: fits of other
     states.
     """
-    session, name, given = search.session, search.session.recorded.names[index], search.session.recorded.states[index]
+    refinement, given = search.refinement, search.scene.recorded.states[index]
     misfit, gain = (misfits.of_frame[index], 0.0) if own is None else (own.misfit, max(own.gain, 0.0))
-    other, verdict = _best(others) if others else None, ""
+    best = _best(others) if others else None
+    verdict = Verdict.ACCEPTED
     # an instrument that is hardly in the image has a low misfit, too
-    if other is not None and other.misfit < BETTER * misfit and other.gain > gain:
-        if _distance(search, index, given, other.state, scale) > MIN_DISTANCE:
-            verdict = FITTED_ANEW if other.misfit < misfits.limit else LEFT_OUT
-            found = Refitted.of(search, index, others)
-            session.refinement.set_state(index, given, found.fit.state, found.deviations)
+    if best is not None and best.misfit < BETTER * misfit and best.gain > gain:
+        if _distance(search, index, given, best.state, scale) > MIN_DISTANCE:
+            verdict = Verdict.REFITTED if best.misfit < misfits.limit else Verdict.EXCLUDED
+            refitted = Refitted.of(search, index, others)
+            refinement.set_state(index, given, refitted.fit.state, refitted.deviations)
     elif misfits.rejection_limit < misfit < math.inf:
-        verdict = LEFT_OUT
-    explained = not misfits.limit < misfit < math.inf and (other is None or other.gain <= UNCLEAR * gain)
-    if verdict:
-        session.scene.diagnostics.setdefault(CONTRADICTING, {})[name] = verdict
-    elif explained and name in contradicting_states(session):
+        verdict = Verdict.EXCLUDED
+    explained = not misfits.limit < misfit < math.inf and (best is None or best.gain <= UNCLEAR * gain)
+    if verdict is not Verdict.ACCEPTED:
+        refinement.judge(index, verdict)
+    elif explained and refinement.verdict(index) is not Verdict.ACCEPTED:
         recorded = given if own is None else own.state
-        session.refinement.set_state(index, given, recorded, search.deviations(index, scale))
-        del session.scene.diagnostics[CONTRADICTING][name]
-    session.refinement.weigh(index, float(contradicting_states(session).get(name) != LEFT_OUT))
+        refinement.set_state(index, given, recorded, search.deviations(index, scale))
+        refinement.judge(index, Verdict.ACCEPTED)
 
 
 def _own_fit(search: StateSearch, index: int, scale: float) -> StateFit | None:
     """Return the best fit of a frame with the prior about its recorded state, from several starts: a single fit may end
     in a local minimum. None where all leave the image."""
-    given, precision = search.session.recorded.states[index], search.precision(index, scale)
+    given, precision = search.scene.recorded.states[index], search.precision(index, scale)
     starts = [given, search.state(index), *_sampled(search, index, given, precision, N_OWN)]
     return max(_fits(search, index, starts, precision, given), key=lambda fit: fit.gain, default=None)
 
@@ -218,13 +207,11 @@ def _sampled(search: StateSearch, index: int, state: State, precision: Tensor, c
 def _suspects(search: StateSearch, misfits: Misfits) -> list[int]:
     """Return frames of instruments with stated links whose states may be wrong though they are no outliers: explained
     worse than most, or not much better than the mirrored state, which is another one."""
-    session, weights = search.session, search.session.refinement.weights
     if not (math.isfinite(misfits.limit) and search.linked):
         return []
-    noted = contradicting_states(session)
     scores: dict[int, float] = {}
     for index, misfit in misfits.of_frame.items():
-        if not (math.isfinite(misfit) and weights[index] > 0) or session.recorded.names[index] in noted:
+        if not math.isfinite(misfit) or search.refinement.verdict(index) is not Verdict.ACCEPTED:
             continue
         state, alike = search.state(index), 0.0
         other = mirrored_state(search, index, state)
@@ -242,13 +229,13 @@ def _states_of(search: StateSearch, frames: Sequence[int]) -> list[State]:
 
 def _distance(search: StateSearch, index: int, given: State, state: State, scale: float) -> float:
     """Return the root mean square of a correction of frame `index` in standard deviations of the prior."""
-    apart = search.session.refinement.layout.increments_between(given, state)
+    apart = search.refinement.layout.increments_between(given, state)
     return math.sqrt(float((apart @ search.precision(index, scale) @ apart) / len(apart)))
 
 
 def mirrored_state(search: StateSearch, index: int, state: State) -> State:
     """Return the state that looks alike from afar in frame `index`, of instruments with stated links."""
-    camera_from_world = search.session.recorded.cameras[index].world_from_camera.inverse().cpu().double().numpy()
+    camera_from_world = search.scene.recorded.cameras[index].world_from_camera.inverse().cpu().double().numpy()
     return _changed(search, state, lambda tree, shaft, *own: mirrored(tree, shaft, camera_from_world, *own))
 
 
@@ -264,7 +251,7 @@ def _changed(
 ) -> State:
     """Return the state with pose and readings of each instrument by `change` of (tree, shaft, pose, readings)."""
     found: dict[str, InstrumentState] = {}
-    for item, shaft in zip(search.session.scene.instruments, search.shafts, strict=True):
+    for item, shaft in zip(search.scene.instruments, search.shafts, strict=True):
         own = state.instruments[item.name]
         assert item.kinematics is not None
         joints = {name: float(value) for name, value in own.joints.items()}
@@ -273,23 +260,24 @@ def _changed(
     return replace(state, instruments={**state.instruments, **found})
 
 
-def report_contradictions(session: GaussianSession) -> None:
-    """Report in one line which training states contradict the others, and what became of them."""
-    noted = contradicting_states(session)
-    if not noted:
-        return
-    names = sorted(noted)
-    shown = ", ".join(names[:MAX_NAMED]) + (f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else "")
-    out = sum(verdict == LEFT_OUT for verdict in noted.values())
-    session.report(
-        f"{len(names)} of {len(session.recorded.names)} states contradict the others: {shown}; {len(names) - out} were "
-        f"fitted to their images from other states, {out} left out"
+def describe_contradictions(refinement: Refinement, names: Sequence[str]) -> str:
+    """Return a line on training states that contradict the others and what became of them; empty without any. names:
+    of all frames."""
+    firsts = [frames[0] for frames in refinement.frames_of_instant]
+    contradicting = sorted(names[index] for index in firsts if refinement.verdict(index) is not Verdict.ACCEPTED)
+    if not contradicting:
+        return ""
+    excluded = sum(not refinement.counts(index) for index in firsts)
+    more = f" and {len(contradicting) - MAX_NAMED} more" if len(contradicting) > MAX_NAMED else ""
+    return (
+        f"{len(contradicting)} of {len(firsts)} states contradict the others: {', '.join(contradicting[:MAX_NAMED])}"
+        f"{more}; {len(contradicting) - excluded} were fitted to their images from other states, {excluded} left out"
     )
 
 
 def _other_starts(search: StateSearch, index: int, others: Sequence[State]) -> list[State]:
     """Return states from which a frame is fitted: those of others, and its own with joints bent the other way."""
-    given, layout = search.session.recorded.states[index], search.fitter.parameters
+    given, layout = search.scene.recorded.states[index], search.fitter.parameters
     bent = [[-2 * given.instruments[own.name].joints[joint] for joint in own.joints] for own in layout.instruments]
     still = [torch.zeros(6, dtype=torch.float64)] * len(bent)
     return [
