@@ -35,7 +35,6 @@ class Settings:
     resolution: int = 2400  # texels along the tissue's side
     every: int = 1  # keep one frame in so many (previews)
     frames: int | None = None  # slow the motion until it has so many training frames
-    video: bool = False  # recording/: what `neeco ingest` takes
     still: bool = False  # the scope stands still
     stereo: bool = False  # right/: the images of a second camera beside it
     processor: Processor = field(default_factory=Processor)

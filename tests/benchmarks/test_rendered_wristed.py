@@ -120,23 +120,6 @@ def test_the_wrist_goes_beyond_its_training_range_in_unseen_frames_only(benchmar
     assert reached["unseen"] > 1.1
 
 
-def test_a_recording_logs_what_the_encoders_say_on_the_robots_clock(benchmarks: ModuleType, tmp_path: Path) -> None:
-    from rendered.frames import take_shots
-    from rendered.motion import plan
-    from rendered.recording import EM_CLOCK_S, _write_wrist
-    from rendered.scenes import SCENES
-    from rendered.truth import World
-
-    spec = SCENES["bowel-wristed"]
-    trajectory = plan(spec.path, spec.design.hinge, 40, 8, spec.seed)
-    _write_wrist(tmp_path / "wrist.csv", World(spec, take_shots(trajectory, spec)), trajectory, spec.encoders)
-    rows = np.loadtxt(tmp_path / "wrist.csv", delimiter=",", skiprows=1)
-    angles = np.array([trajectory.at(time - EM_CLOCK_S).wrist for time in rows[:, 0]])
-    errors = rows[:, 1:] - angles - spec.encoders.offsets
-    assert np.abs(errors).max() < 4 * spec.encoders.play + 5 * spec.encoders.noise
-    assert np.abs(np.median(errors, 0)).max() < spec.encoders.play
-
-
 def test_all_that_casts_a_shadow_lies_within_reach(benchmarks: ModuleType) -> None:
     from rendered.motion import Bend
     from rendered.scenes import SCENES
