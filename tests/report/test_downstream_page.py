@@ -10,11 +10,9 @@ from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.report.charts import Level, Series, line_chart
 from neeco.report.downstream_page import picture, score_chart, write_downstream_report
-from neeco.studies.downstream.experiment import DownstreamPlan
-from neeco.studies.downstream.job import DownstreamSettings, predictions_file, write_predictions
-from neeco.studies.downstream.results import findings, rows_of, summarise
+from neeco.studies.downstream.experiment import DownstreamPlan, DownstreamSettings, write_predictions
+from neeco.studies.downstream.results import Detections, box_iou, findings, rows_of, summarise
 from neeco.studies.downstream.samples import Example
-from neeco.studies.downstream.scores import Detections, box_iou
 
 VOID = {"meta", "img", "br", "path", "link", "wbr"}
 GAIN = {"real": 0.0, "real+strong": 0.01, "kinematic": 0.05, "kinematic+real": 0.1}
@@ -50,7 +48,7 @@ def job_of(plan, model, condition, real, fold):
                 rows.append({"frame": sample.name, "iou": value + 0.01 * k * len(condition)})
         if fold == 0:
             folder = plan.settings.job_folder(model, condition, real, fold)
-            write_predictions(predictions_file(folder, split), [sample.name for sample in samples], found)
+            write_predictions(folder, split, [sample.name for sample in samples], found)
         key = "ap" if PREDICTS[model] == "boxes" else "iou"
         job["splits"][split] = {"frames": len(samples), key: value, "per_frame": rows}
     return job

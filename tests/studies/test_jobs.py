@@ -28,8 +28,7 @@ from neeco.capture import read_capture
 from neeco.scene.training_session import UNLIMITED
 from neeco.studies import study
 from neeco.studies import training_job as module
-from neeco.studies.machine import threads_per_worker
-from neeco.studies.study import check_workers, run_jobs
+from neeco.studies.study import check_workers, run_jobs, threads_per_worker
 from neeco.studies.training_job import Curve, phase_1_psnr, psnr_at
 from neeco.training import train as train_module
 from neeco.training.run import checkpoint_path, write_config
@@ -355,20 +354,9 @@ def test_small_tasks_share_the_gpus(visible: str, seen: set[str], monkeypatch) -
     assert set(found) == seen
 
 
-def test_gpus_are_asked_for_where_jobs_compute_on_them(make_job, monkeypatch) -> None:
-    here, there = ([replace(make_job(), device=word)] for word in ("cpu", "auto"))
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cpu"))
-    assert [study.wants_gpus(jobs) for jobs in (here, there)] == [False, False]
-    monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cuda"))
-    assert [study.wants_gpus(jobs) for jobs in (here, there)] == [False, True]
-    monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cpu"))
-    monkeypatch.setenv("RAY_ADDRESS", "head:6379")  # whose machines may have what this one has not
-    assert [study.wants_gpus(jobs) for jobs in (here, there)] == [False, True]
-
-
-def test_workers_share_the_cores() -> None:
-    assert [threads_per_worker(workers, 8) for workers in (1, 2, 3, 16)] == [8, 4, 2, 1]
+def test_workers_share_the_cores(monkeypatch) -> None:
+    monkeypatch.setattr(study, "usable_cores", lambda: 8)
+    assert [threads_per_worker(workers) for workers in (1, 2, 3, 16)] == [8, 4, 2, 1]
 
 
 def test_workers_give_the_same_numbers(make_job, tmp_path) -> None:

@@ -14,12 +14,12 @@ from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline,
 from neeco.report.charts import Level, Series, legend, line_chart
 from neeco.report.page import REPORT_FILE, jpeg, split_counts, write_page
 from neeco.report.sections import Figure, Images, Section
-from neeco.studies.downstream.conditions import REAL
-from neeco.studies.downstream.experiment import DownstreamPlan
-from neeco.studies.downstream.job import predictions_file, read_predictions
+from neeco.studies.downstream.experiment import DownstreamPlan, read_predictions
 from neeco.studies.downstream.results import (
     MAIN,
     TITLES,
+    Detections,
+    Prediction,
     budget_text,
     failed_jobs,
     is_synthetic,
@@ -30,8 +30,8 @@ from neeco.studies.downstream.results import (
     title_of,
 )
 from neeco.studies.downstream.samples import Example
-from neeco.studies.downstream.scores import Detections, Prediction
-from neeco.studies.machine import machine_words
+from neeco.studies.downstream.training_data import REAL
+from neeco.studies.study import machine_words
 
 TRUTH_COLOR = (255, 255, 0)
 JOB_KEYS = ("model", "condition", "real", "fold")
@@ -113,7 +113,7 @@ def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: st
     predictions, scores = [], []
     for condition, real in shown:
         folder = plan.settings.job_folder(model["name"], condition, real, 0)
-        predictions.append(read_predictions(predictions_file(folder, test)))
+        predictions.append(read_predictions(folder, test))
         wanted = (model["name"], condition, real, 0)
         jobs = [job for job in experiment["jobs"] if tuple(job[name] for name in JOB_KEYS) == wanted]
         frames = jobs[0]["splits"].get(test, {}).get("per_frame", ()) if jobs else ()

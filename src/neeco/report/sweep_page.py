@@ -14,9 +14,8 @@ from neeco.report.charts import Series, legend, line_chart
 from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
 from neeco.report.sections import Figure, Images, Section
 from neeco.studies.configurations import Table
-from neeco.studies.machine import machine_words
-from neeco.studies.sweep import COLUMNS, RESULTS_FILE, Rows, SweepPlan, failures
-from neeco.studies.sweep_tables import length_words, tables_of
+from neeco.studies.study import machine_words
+from neeco.studies.sweep import COLUMNS, RESULTS_FILE, Rows, SweepPlan, failures, length_words, tables_of
 from neeco.studies.tables import csv_text
 from neeco.studies.training_job import CURVE_FILE, CURVE_ROW, read_rows
 from neeco.training.run import open_run

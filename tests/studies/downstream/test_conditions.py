@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neeco.base.errors import NeecoError
-from neeco.studies.downstream.conditions import (
+from neeco.studies.downstream.training_data import (
     RESERVED,
     Condition,
     default_conditions,

@@ -20,11 +20,15 @@ from torch import Tensor
 from neeco.base.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
 from neeco.studies.downstream import model as models_module
-from neeco.studies.downstream.experiment import plan_downstream, run_downstream
-from neeco.studies.downstream.job import JOB_SCHEMA, DownstreamSettings, predictions_file, read_predictions
-from neeco.studies.downstream.results import failed_jobs, tables_of, write_tables
+from neeco.studies.downstream.experiment import (
+    JOB_SCHEMA,
+    DownstreamSettings,
+    plan_downstream,
+    read_predictions,
+    run_downstream,
+)
+from neeco.studies.downstream.results import Detections, failed_jobs, tables_of
 from neeco.studies.downstream.samples import ImageSet
-from neeco.studies.downstream.scores import Detections
 
 TIMES = ("seconds", "machine")
 
@@ -112,7 +116,7 @@ def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamSettings) -> Non
 
 def test_a_jobs_scores_are_of_what_it_answered(spec: DownstreamSettings, recorded: Path) -> None:
     job = trained(replace(spec, conditions=("real",), num_real=("all",), folds=1))["jobs"][0]
-    answers = read_predictions(predictions_file(spec.job_folder("pixels", "real", 10, 0), "test"))
+    answers = read_predictions(spec.job_folder("pixels", "real", 10, 0), "test")
     values = []
     for row in job["splits"]["test"]["per_frame"]:
         answer = answers[row["frame"]]
@@ -311,10 +315,6 @@ def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSettings, m
     assert job["error"] == "pixels: its loss is not finite at step 3; begin anew"
     assert job["splits"] == {}
     assert len(failed_jobs(result)) == len(failed)
-    write_tables(spec.output, result)
-    assert "not finite" in (spec.output / "downstream.md").read_text()
-    if failing == "all":
-        assert "failed: pixels" in (spec.output / "downstream.md").read_text()
     again = trained(replace(spec, num_real=("0", "6")))
     assert not failed_jobs(again)
     assert again["complete"]
@@ -515,7 +515,7 @@ def test_boxes_are_scored_and_kept(spec: DownstreamSettings) -> None:
     job = trained(replace(spec, models=("corners",), conditions=("kin",), folds=1))["jobs"][0]
     scores = job["splits"]["test"]
     assert {"ap", "ap50", "ap75", "frames", "per_frame"} == set(scores)
-    kept = read_predictions(predictions_file(spec.job_folder("corners", "kin", 0, 0), "test"))
+    kept = read_predictions(spec.job_folder("corners", "kin", 0, 0), "test")
     assert list(kept) == ["006", "007"]
     assert isinstance(kept["006"], Detections)
     assert kept["006"].boxes.tolist() == [[0, 0, 24, 20]]
@@ -546,19 +546,15 @@ def test_a_wrong_file_in_a_set_fails_its_jobs_alone(spec: DownstreamSettings, dr
 
 def test_tables_hold_the_numbers(spec: DownstreamSettings) -> None:
     result = trained(spec)
-    write_tables(spec.output, result)
     with (spec.output / "downstream.csv").open(newline="") as stream:
         lines = list(csv.DictReader(stream))
     assert [float(line["iou"]) for line in lines] == [row["iou"] for row in result["summary"]]
-    markdown = (spec.output / "downstream.md").read_text()
-    assert all(f"{row['iou']:.3f}" in markdown for row in result["summary"])
-    assert "pixels: 6 steps of 2 images of 48x40; 2 folds" in markdown
 
 
 def test_jobs_are_handed_the_capture(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
-    from neeco.studies.downstream import job
+    from neeco.studies.downstream import experiment
 
-    monkeypatch.setattr(job, "read_capture", lambda *_: pytest.fail("read again"))
+    monkeypatch.setattr(experiment, "read_capture", lambda *_: pytest.fail("read again"))
     assert trained(replace(spec, conditions=("kin",), folds=1))["complete"]
 
 

@@ -55,10 +55,10 @@ def test_it_prints_tables_answers_and_where_all_of_it_lies(words, tmp_path: Path
         "kin+real",
         "kin+real+permuted",
     ]
-    assert {"downstream.csv", "downstream.md", "report.html", "jobs"} <= {p.name for p in output.iterdir()}
+    assert {"downstream.csv", "report.html", "jobs"} <= {p.name for p in output.iterdir()}
     assert all(sentence in shown for sentence in result["findings"])
     assert "unet, test" in shown
-    assert f"{output}/: downstream.md, .csv, .json" in shown
+    assert f"{output}/: downstream.csv, .json" in shown
     before = {file: file.stat().st_mtime_ns for file in output.glob("jobs/*/job.json")}
     assert main(words) == 0
     assert {file: file.stat().st_mtime_ns for file in output.glob("jobs/*/job.json")} == before
@@ -93,7 +93,7 @@ def test_a_failing_training_is_told_and_is_exit_1(words, tmp_path: Path, monkeyp
     last = told.err.strip().splitlines()[-1]
     assert last.startswith("neeco: error: 1 of 2 trainings failed: unet, kin+real, 6 labelled, fold 0: unet: its loss")
     assert "report: " in told.out  # the others' results are there all the same
-    assert (tmp_path / "out" / "downstream.md").is_file()
+    assert (tmp_path / "out" / "downstream.csv").is_file()
 
 
 def test_ctrl_c_says_how_to_go_on(words, monkeypatch, capsys) -> None:

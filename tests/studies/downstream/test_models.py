@@ -17,13 +17,13 @@ from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
-from neeco.studies.downstream.batches import BatchSampler
 from neeco.studies.downstream.model import WEIGHTS_FILE, find_models, input_size, model_class
 from neeco.studies.downstream.models import dfine
 from neeco.studies.downstream.models.dfine import DFine
 from neeco.studies.downstream.models.unet import ResidualUNet, UNet
+from neeco.studies.downstream.results import Detections
 from neeco.studies.downstream.samples import Example
-from neeco.studies.downstream.scores import Detections
+from neeco.studies.downstream.training_data import BatchSampler
 
 
 def needs(model: str) -> None:

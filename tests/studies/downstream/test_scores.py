@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from neeco.studies.downstream.samples import Example
-from neeco.studies.downstream.scores import (
+from neeco.studies.downstream.results import (
     BOX_SCORES,
     MASK_SCORES,
     Detections,
@@ -17,6 +16,7 @@ from neeco.studies.downstream.scores import (
     mask_scores,
     mean_scores,
 )
+from neeco.studies.downstream.samples import Example
 
 ONE = ("instrument",)
 PARTS = ("shaft", "wrist", "jaws")

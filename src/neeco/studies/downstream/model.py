@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import write_atomically
 from neeco.base.registry import plugins
-from neeco.studies.downstream.batches import Batch, BatchSampler, collate, training_image
-from neeco.studies.downstream.scores import Prediction
+from neeco.studies.downstream.results import Prediction
+from neeco.studies.downstream.training_data import Batch, BatchSampler, collate, training_image
 
 WEIGHTS_FILE = "weights.safetensors"
 REPORT_EVERY = 10  # steps

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neeco.studies.downstream.batches import Batch
 from neeco.studies.downstream.model import TorchModel, missing_packages
-from neeco.studies.downstream.scores import Detections, Prediction
+from neeco.studies.downstream.results import Detections, Prediction
+from neeco.studies.downstream.training_data import Batch
 
 STRIDES = (16, 32)  # px, of the backbone's last two stages, which it detects on
 
