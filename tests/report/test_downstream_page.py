@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
-from neeco.report.charts import Level, Series, line_chart
+from neeco.report.charts import Series, line_chart
 from neeco.report.downstream_page import picture, score_chart, write_downstream_report
 from neeco.studies.downstream.experiment import DownstreamPlan, DownstreamSettings, write_predictions
 from neeco.studies.downstream.results import Detections, box_iou, findings, rows_of, summarise
@@ -162,12 +162,12 @@ def test_boxes_are_drawn_where_they_are():
 
 def test_a_logarithmic_axis_has_the_points_as_ticks():
     points = tuple((float(x), y) for x, y in ((1, 0.1), (10, 0.2), (97, 0.3), (100, 0.4)))
-    chart = line_chart("t", "x", [Series("a", 0, points)], over_logarithmic=True)
+    chart = line_chart("t", "x", [Series(0, points)], over_logarithmic=True)
     ticks = [part.partition("<")[0] for part in chart.split(">") if part.partition("<")[0] in ("1", "10", "97", "100")]
     assert ticks == ["100", "10", "1"] or ticks == ["1", "10", "100"]  # 97 would cover 100
-    single = [Series("a", 0, ((5.0, 0.2),))]
+    single = [Series(0, ((5.0, 0.2),))]
     assert line_chart("t", "x", single, over_logarithmic=True) == ""
-    assert "level of it" in line_chart("t", "x", single, levels=[Level("level of it", 1, 0.3)], over_logarithmic=True)
+    assert 'class="level"' in line_chart("t", "x", single, levels=[(1, 0.3)], over_logarithmic=True)
 
 
 def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(world, tmp_path, noon):

@@ -11,9 +11,8 @@ from PIL import Image, ImageDraw
 
 from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline, overlay_parts
-from neeco.report.charts import Level, Series, legend, line_chart
-from neeco.report.page import REPORT_FILE, jpeg, split_counts, write_page
-from neeco.report.sections import Figure, Images, Section
+from neeco.report.charts import Series, legend, line_chart
+from neeco.report.page import REPORT_FILE, Figure, Images, Section, jpeg, split_counts, write_page
 from neeco.studies.downstream.experiment import DownstreamPlan, read_predictions
 from neeco.studies.downstream.results import (
     MAIN,
@@ -79,8 +78,8 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
         subtitle="what synthetic images are worth",
         version=experiment["version"],
         stamps=[computer],
-        intro=["Every training has as many steps; no training saw the tested frames, which were recorded."],
-        findings=[("", sentence) for sentence in experiment["findings"]],
+        intro="Every training has as many steps; no training saw the tested frames, which were recorded.",
+        findings=experiment["findings"],
         sections=sections,
     )
 
@@ -92,11 +91,11 @@ def score_chart(model: Row, test: str, rows: list[Row]) -> str:
     for order, condition in enumerate(dict.fromkeys(row["condition"] for row in rows)):
         points = [row for row in rows if row["condition"] == condition and row[metric] is not None]
         if points and REAL not in condition.split("+"):
-            levels.append(Level("", order, points[0][metric]))
+            levels.append((order, points[0][metric]))
             continue
         line = tuple((float(row["real"]), row[metric]) for row in points)
         band = tuple((float(row["real"]), row["low"], row["high"]) for row in points if row["low"] is not None)
-        series.append(Series("", order, line, dots=line, band=band))
+        series.append(Series(order, line, dots=line, band=band))
     title = f"{TITLES[metric]}: {model['name']}, {test}"
     return line_chart(title, "labelled frames", series, levels=levels, over_logarithmic=True) if series else ""
 

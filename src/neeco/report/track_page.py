@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.evaluation.image_metrics import overlay_parts
 from neeco.labels.drawing import draw
-from neeco.report.charts import SMALL, Level, Series, line_chart
+from neeco.report.charts import SMALL, Series, line_chart
 from neeco.report.page import jpeg, to_bytes, write_page
 from neeco.tracking.track import Tracked, state_of
 
@@ -58,10 +58,10 @@ def _charts(tracked: Tracked) -> list[str]:
     """Trust and misfit, then the joints of every instrument with bands of BAND standard deviations, over time."""
     records, first = tracked.records, tracked.records[0]["time"]
     times = [record["time"] - first for record in records]
-    trust = Series("", 0, tuple(zip(times, (record["trust"]["value"] for record in records), strict=True)))
-    misfit = Series("", 1, tuple((t, r["misfit"]) for t, r in zip(times, records, strict=True) if r["how"] != "lost"))
+    trust = Series(0, tuple(zip(times, (record["trust"]["value"] for record in records), strict=True)))
+    misfit = Series(1, tuple((t, r["misfit"]) for t, r in zip(times, records, strict=True) if r["how"] != "lost"))
     charts = [
-        line_chart("trust", "s", [trust], levels=[Level("asked for", 1, tracked.min_trust)], size=SMALL),
+        line_chart("trust", "s", [trust], levels=[(1, tracked.min_trust)], note="dashed: asked for", size=SMALL),
         line_chart("misfit of pixels", "s", [misfit], size=SMALL),
     ]
     rows = [k for k, record in enumerate(records) if record["how"] != "lost"]
@@ -72,16 +72,14 @@ def _charts(tracked: Tracked) -> list[str]:
             unit: Callable[[float], float] = float if item.slides(name) else math.degrees
             values = [unit(one["joints"][name]) for one in found]
             deviations = [unit(one["deviation"][f"joint.{name}"]) for one in found]
-            charts.append(
-                _banded(f"{item.name}: {name}, {'mm' if item.slides(name) else 'deg'}", at, values, deviations)
+            bands = tuple(
+                tuple((t, v + way * BAND * d) for t, v, d in zip(at, values, deviations, strict=True))
+                for way in (-1, 1)
             )
+            title = f"{item.name}: {name}, {'mm' if item.slides(name) else 'deg'}"
+            line = tuple(zip(at, values, strict=True))
+            charts.append(line_chart(title, "s", [Series(0, line, bands)], size=SMALL))
     return charts
-
-
-def _banded(title: str, times: Sequence[float], values: Sequence[float], deviations: Sequence[float]) -> str:
-    main = tuple(zip(times, values, strict=True))
-    bands = tuple(tuple((t, v + way * BAND * d) for (t, v), d in zip(main, deviations, strict=True)) for way in (-1, 1))
-    return line_chart(title, "s", [Series("", 0, main, bands)], size=SMALL)
 
 
 def _figure(tracked: Tracked, frame: Frame, record: dict[str, Any]) -> dict[str, Any]:
