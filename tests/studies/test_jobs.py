@@ -24,7 +24,6 @@ from worker_tasks import seen_gpu
 from neeco.base import workers
 from neeco.base.errors import NeecoError
 from neeco.base.settings import with_fields
-from neeco.capture import read_capture
 from neeco.scene.training_session import UNLIMITED
 from neeco.studies import study
 from neeco.studies import training_job as module
@@ -279,13 +278,6 @@ def test_a_run_of_another_capture_is_refused(finished_job, tmp_path) -> None:
         run_jobs([replace(finished_job, capture=tmp_path / "other")])
 
 
-def test_a_cluster_without_ray_is_refused_with_the_remedy(make_job, monkeypatch) -> None:
-    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
-    monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(NeecoError, match=r"\.\[cluster\]"):
-        run_jobs([make_job()], workers=2)
-
-
 def test_a_cluster_that_does_not_answer_is_reported_at_once(make_job, monkeypatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         closed = server.getsockname()[1]
@@ -437,14 +429,6 @@ def kill_when(file: Path, processes: Callable[[], list[int]], killed: list[int])
             os.kill(number, signal.SIGKILL)
             killed.append(number)
         time.sleep(0.05)
-
-
-def test_a_field_which_draws_slowly_is_drawn_less_often_for_its_curve(capture: Path) -> None:
-    made = read_capture(capture)
-    gaussians, field = (Curve(capture / "curve.jsonl", made, ("train",), field=kind) for kind in (False, True))
-    assert len(field.frames["train"]) < len(gaussians.frames["train"])
-    assert len(field.shares) < len(gaussians.shares)
-    assert field.shares[-1] == gaussians.shares[-1] == 1  # both end with the finished scene
 
 
 def test_the_late_part_of_phase_1_counts(tmp_path: Path) -> None:
