@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
+from neeco.base.errors import counted
 from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline, overlay_parts
 from neeco.report.charts import Series, legend, line_chart
@@ -19,7 +20,6 @@ from neeco.studies.downstream.results import (
     TITLES,
     Detections,
     Prediction,
-    budget_text,
     failed_jobs,
     is_synthetic,
     models_and_tests,
@@ -52,7 +52,12 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
     """
     capture, computer = plan.capture, machine_words(experiment["machine"], "torch_threads")
     files = {"downstream.csv": summary_text(experiment)}
-    sections = [Section(title="Results", text=f"{budget_text(experiment)}. {EXPLANATION}", files=files)]
+    budget = [
+        f"{item['name']}: {item['steps']} steps of {item['batch']} images of {item['input'][0]}x{item['input'][1]}"
+        for item in experiment["models"]
+    ]
+    text = f"{'; '.join(budget)}; {counted(experiment['folds'], 'fold')}. {EXPLANATION}"
+    sections = [Section(title="Results", text=text, files=files)]
     for model, test in models_and_tests(experiment):
         table, rows = table_of(experiment, model, test), rows_of(experiment, model, test)
         names = list(dict.fromkeys(row["condition"] for row in rows))

@@ -22,6 +22,7 @@ from neeco.base.errors import NeecoError
 from neeco.base.files import own_folder, read_json, require_like, require_same, write_atomically, write_json, write_text
 from neeco.capture import Capture, read_capture
 from neeco.capture.checks import read_checked
+from neeco.evaluation.mask_folders import truth_file
 from neeco.raster.devices import device_of
 from neeco.studies.downstream.model import Predict, TorchModel, TrainingTask, input_size, model_class
 from neeco.studies.downstream.results import (
@@ -43,7 +44,6 @@ from neeco.studies.downstream.samples import (
     Sample,
     class_names,
     frame_size,
-    has_labels,
     permuted,
     recorded_samples,
     synthetic_samples,
@@ -390,7 +390,8 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
 
 def _splits(capture: Capture, requested: Sequence[str]) -> tuple[str, ...]:
     """The splits to test on. Raises NeecoError."""
-    usable = [split for split in capture.splits if split != "train" and has_labels(capture, split)]
+    labelled = {frame.split for frame in capture.frames if truth_file(capture.root, frame.name)}
+    usable = [split for split in capture.splits if split != "train" and split in labelled]
     for split in requested or ("",):
         if split not in usable and (split or not usable):
             known = f"has true masks of {', '.join(usable)}" if usable else "has no true mask outside of split train"

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neeco.base.errors import counted
 from neeco.evaluation.mask_metrics import boundary_f, dice, iou, mean_of, precision
 from neeco.studies.downstream.samples import Example
 from neeco.studies.downstream.training_data import BASELINES, PERMUTED, REAL
@@ -388,15 +387,6 @@ def _title(metric: str) -> str:
 def tables_of(experiment: Document) -> list[ResultTable]:
     """The table of every model and test."""
     return [table_of(experiment, model, test) for model, test in models_and_tests(experiment)]
-
-
-def budget_text(experiment: Document) -> str:
-    """Return the budget of every training and the number of seeds, in words."""
-    models = [
-        f"{model['name']}: {model['steps']} steps of {model['batch']} images of {model['input'][0]}x{model['input'][1]}"
-        for model in experiment["models"]
-    ]
-    return f"{'; '.join(models)}; {counted(experiment['folds'], 'fold')}"
 
 
 def summary_text(experiment: Document) -> str:

@@ -248,11 +248,6 @@ def recorded_samples(
     return tuple(RecordedSample(frame, masks, table) for frame in frames)
 
 
-def has_labels(capture: Capture, split: str) -> bool:
-    """Return whether any frame of the split has a true mask."""
-    return any(truth_file(capture.root, frame.name) for frame in capture.split(split))
-
-
 def frame_size(samples: Sequence[RecordedSample]) -> tuple[int, int]:
     """(width, height) of recorded frames. Raises NeecoError where they differ."""
     sizes = {(sample.frame.camera.width, sample.frame.camera.height) for sample in samples}
