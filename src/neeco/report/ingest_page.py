@@ -159,7 +159,7 @@ def _frames(result: IngestResult, capture: Capture) -> dict[str, Any]:
     in_video = {item.name: item.from_video for item in capture.instruments}
     shafts = {name: video.shaft_diameter_mm for name, video in in_video.items() if video is not None}
     ordered = sorted(capture.frames, key=lambda frame: frame.state.time)
-    for frame in (ordered[index] for index in evenly_spaced(len(ordered), figures.N_SAMPLES)):
+    for frame in (ordered[index] for index in evenly_spaced(len(ordered), figures.SETTINGS.samples)):
         row = rows.get(round(frame.state.time, 6))
         poses = {name: state.pose for name, state in frame.state.instruments.items() if capture.registered}
         before = {}  # world_from_instrument by the trackers alone

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -15,8 +16,17 @@ from neeco.report.charts import SMALL, Series, line_chart
 from neeco.report.page import jpeg, to_bytes, write_page
 from neeco.tracking.track import Tracked, state_of
 
-N_STRIP, N_LEAST_TRUSTED = 24, 12  # frames shown: spread over the footage, and the least trusted
-BAND = 2.0  # standard deviations
+
+@dataclass(frozen=True)
+class TrackPageSettings:
+    """Frames and bands on the page."""
+
+    spread: int = 24  # frames, spread over the footage
+    least_trusted: int = 12  # frames
+    band: float = 2.0  # standard deviations to either side
+
+
+SETTINGS = TrackPageSettings()
 HOWS = {
     "begun": "begun from the given state",
     "followed": "followed from the neighbouring frame",
@@ -32,7 +42,7 @@ def write_track_page(tracked: Tracked) -> Path:
     records = tracked.records
     frames = sorted(tracked.footage.frames, key=lambda frame: frame.state.time)
     values = [record["trust"]["value"] for record in records]
-    least = sorted(range(len(records)), key=lambda k: values[k])[:N_LEAST_TRUSTED]
+    least = sorted(range(len(records)), key=lambda k: values[k])[: SETTINGS.least_trusted]
     missing = sum(record["how"] == "lost" for record in records)
     return write_page(
         tracked.page,
@@ -49,13 +59,13 @@ def write_track_page(tracked: Tracked) -> Path:
             (str(sum(record["how"] in ("beside", "found") for record in records)), "times searched for again"),
         ],
         charts=[chart for chart in _charts(tracked) if chart],
-        strip=[_figure(tracked, frames[k], records[k]) for k in evenly_spaced(len(records), N_STRIP)],
+        strip=[_figure(tracked, frames[k], records[k]) for k in evenly_spaced(len(records), SETTINGS.spread)],
         least_trusted=[_figure(tracked, frames[k], records[k]) for k in least],
     )
 
 
 def _charts(tracked: Tracked) -> list[str]:
-    """Trust and misfit, then the joints of every instrument with bands of BAND standard deviations, over time."""
+    """Trust and misfit, then the joints of every instrument with bands of `band` standard deviations, over time."""
     records, first = tracked.records, tracked.records[0]["time"]
     times = [record["time"] - first for record in records]
     trust = Series(0, tuple(zip(times, (record["trust"]["value"] for record in records), strict=True)))
@@ -73,7 +83,7 @@ def _charts(tracked: Tracked) -> list[str]:
             values = [unit(one["joints"][name]) for one in found]
             deviations = [unit(one["deviation"][f"joint.{name}"]) for one in found]
             bands = tuple(
-                tuple((t, v + way * BAND * d) for t, v, d in zip(at, values, deviations, strict=True))
+                tuple((t, v + way * SETTINGS.band * d) for t, v, d in zip(at, values, deviations, strict=True))
                 for way in (-1, 1)
             )
             title = f"{item.name}: {name}, {'mm' if item.slides(name) else 'deg'}"

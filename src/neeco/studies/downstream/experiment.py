@@ -67,11 +67,8 @@ from neeco.studies.study import REMEDY, JobEvent, JobProgress, check_output, che
 
 SCHEMA = "neeco-downstream/3"
 FILE, TABLE = "downstream.json", "downstream.csv"
-DEFAULT_COUNTS = (5, 10, 20, 50)  # of labelled frames, besides all
-WRITE_EVERY_S = 30.0  # the results so far are written no more often: they are thousands of frames' scores
 JOB_SCHEMA = "neeco-downstream-job/3"
 JOB_FILE = "job.json"
-KEPT_FOLD = 0  # whose weights and predictions are kept
 PREFIX = "frame_"  # of the names of frames in files of predictions
 
 
@@ -97,6 +94,9 @@ class DownstreamSettings:
     workers: int = 1
     transforms: str = "transforms.json"
     device: str = "auto"
+    default_counts: tuple[int, ...] = (5, 10, 20, 50)  # of labelled frames, besides all
+    kept_fold: int = 0  # whose weights and predictions are kept
+    write_every_s: float = 30.0  # results so far are written no more often: they are thousands of frames' scores
     parts_steps: float = 2.5  # times as many steps to learn parts as one class: more of them do not help
 
     @property
@@ -254,7 +254,7 @@ class DownstreamJob:
             seed=self.fold,
             device=device_of(settings.device, drawing=False),
             folder=self.folder,
-            keep_weights=self.fold == KEPT_FOLD,
+            keep_weights=self.fold == settings.kept_fold,
         )
 
     def _test(self, predict: Predict, test: str, capture: Capture) -> dict[str, Any]:
@@ -263,7 +263,7 @@ class DownstreamJob:
         samples = self.settings.samples(capture, test)
         truth = [CACHE.load(sample) for sample in samples]
         predictions = predict([example.image for example in truth])
-        if self.fold == KEPT_FOLD:
+        if self.fold == self.settings.kept_fold:
             write_predictions(self.folder, test, [sample.name for sample in samples], predictions)
         frames: list[dict[str, float]] = []
         for found, example in zip(predictions, truth, strict=True):
@@ -363,7 +363,11 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
         labelled_count(word, 10**9)
     if any(REAL in condition for condition in conditions) and set(settings.num_real or "all") != {"0"}:
         labelled = len(recorded_samples(capture, "train", settings.classes, settings.labels))
-        wanted = settings.num_real or ("0", *(str(count) for count in DEFAULT_COUNTS if count < labelled), "all")
+        wanted = settings.num_real or (
+            "0",
+            *(str(count) for count in settings.default_counts if count < labelled),
+            "all",
+        )
         counts = sorted({labelled_count(word, labelled) for word in wanted})
     jobs = tuple(
         DownstreamJob(settings, model, condition, real, fold)
@@ -444,7 +448,7 @@ def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | 
         def record(results: Sequence[Mapping[str, Any]]) -> None:
             nonlocal written
             known[:] = results
-            if time.monotonic() > written + WRITE_EVERY_S:
+            if time.monotonic() > written + plan.settings.write_every_s:
                 write_json(file, document(plan, known))
                 written = time.monotonic()
 
