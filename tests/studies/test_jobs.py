@@ -160,21 +160,18 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
         ("job.json", {"seconds": []}, "seconds: is not as neeco writes it"),
     ],
 )
-def test_a_damaged_job_is_reported_by_file_and_field(name: str, change: dict, reported: str, finished_job) -> None:
-    job = finished_job
-    file = job.folder / name
+def test_damaged_files_of_a_job_are_reported_by_file_and_field(
+    name: str, change: dict, reported: str, finished_job
+) -> None:
+    file = finished_job.folder / name
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     with pytest.raises(NeecoError, match=f"{name}: {reported}.*remove that run's folder"):
-        job.run()
-
-
-def test_a_damaged_curve_is_reported_by_its_line(finished_job) -> None:
-    job = finished_job
-    (job.folder / "job.json").unlink()
-    with (job.folder / "curve.jsonl").open("a") as stream:
+        finished_job.run()
+    file.unlink()
+    with (finished_job.folder / "curve.jsonl").open("a") as stream:
         stream.write("[[[")
     with pytest.raises(NeecoError, match=r"curve.jsonl: line \d+: not valid JSON"):
-        job.run()
+        finished_job.run()
 
 
 def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,14 +263,12 @@ def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytes
         ({"values": {"max_tissue_gaussians": 99}}, "max_tissue_gaussians: begun with None, now 99"),
     ],
 )
-@pytest.mark.usefixtures("finished_job")
-def test_a_folder_of_another_job_is_refused_before_any_work(make_job, changes, reported, monkeypatch) -> None:
+def test_a_folder_of_another_job_is_refused_before_any_work(
+    make_job, finished_job, tmp_path, changes, reported, monkeypatch
+) -> None:
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained"))
     with pytest.raises(NeecoError, match=f"{reported}; give another --output"):
         run_jobs([make_job(seed=1), make_job(**changes)])
-
-
-def test_a_run_of_another_capture_is_refused(finished_job, tmp_path) -> None:
     with pytest.raises(NeecoError, match="capture: begun with"):
         run_jobs([replace(finished_job, capture=tmp_path / "other")])
 
@@ -300,10 +295,7 @@ def test_workers_have_a_gpu_each(workers: int, device: str, reported: str, monke
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     check_workers(workers, torch.device("cpu"))
     check_workers(1, torch.device(device))
-    if reported:
-        with pytest.raises(NeecoError, match=reported):
-            check_workers(workers, torch.device(device))
-    else:
+    with pytest.raises(NeecoError, match=reported) if reported else contextlib.nullcontext():
         check_workers(workers, torch.device(device))
 
 
@@ -323,26 +315,17 @@ def test_a_task_on_a_node_sees_the_gpu_it_was_given(monkeypatch) -> None:
     assert workers.work_on_node(seen_gpu, None, None, 1, os.getcwd()) == "1"
 
 
-@pytest.mark.parametrize("visible", ["", "4,5"])
-def test_tasks_here_see_a_gpu_each(visible: str, monkeypatch) -> None:
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    how = workers.Workers(count=2, threads=1, fresh=True, gpu=True)
-    events = workers.run_tasks(seen_gpu, None, range(4), how)
-    found = [event.value for event in events if event.stage == "done"]
-    assert len(found) == 4
-    assert set(found) == set((visible or "0,1").split(","))
-
-
 @pytest.mark.parametrize(("visible", "seen"), [("", {"0", "1"}), ("4,5", {"4", "5"})])
-def test_small_tasks_share_the_gpus(visible: str, seen: set[str], monkeypatch) -> None:
+@pytest.mark.parametrize("shared", [None, 2])
+def test_tasks_here_see_a_gpu_each_or_share_them_where_they_are_small(shared, visible, seen, monkeypatch) -> None:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    check_workers(3, torch.device("cuda"), share_gpus=True)
-    how = workers.Workers(count=3, threads=1, fresh=True, gpu=True, shared_gpus=2)
-    found = [event.value for event in workers.run_tasks(seen_gpu, None, range(3), how) if event.stage == "done"]
-    assert len(found) == 3
+    count = 3 if shared else 2
+    check_workers(count, torch.device("cuda"), share_gpus=bool(shared))
+    how = workers.Workers(count=count, threads=1, fresh=True, gpu=True, shared_gpus=shared)
+    found = [event.value for event in workers.run_tasks(seen_gpu, None, range(4), how) if event.stage == "done"]
+    assert len(found) == 4
     assert set(found) == seen
 
 

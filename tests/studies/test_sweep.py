@@ -23,7 +23,6 @@ from neeco.raster.devices import fast_bfloat16
 from neeco.scene.method_registry import method_settings
 from neeco.studies import training_job as jobs_module
 from neeco.studies.configurations import Configuration, Study, SweepRequest, Table, TableRow, ablations, read_study
-from neeco.studies.study import spread
 from neeco.studies.sweep import direction, plan_sweep, run_sweep, tables_of
 from neeco.studies.tables import ResultTable
 from neeco.training.session import GaussianSession
@@ -252,12 +251,6 @@ def test_directions_agree_when_the_signs_do(ours: float | None, published: float
     assert direction(ours, published, 0.1) == verdict
 
 
-def test_spread_is_the_mean_and_the_sample_standard_deviation() -> None:
-    assert spread([20.0, 22.0]) == {"mean": 21.0, "std": pytest.approx(2**0.5), "n": 2}
-    assert spread([20.0, None, float("nan")]) == {"mean": 20.0, "std": None, "n": 1}
-    assert spread([]) == {"mean": None, "std": None, "n": 0}
-
-
 @pytest.mark.parametrize(
     ("text", "reported"),
     [
@@ -334,12 +327,6 @@ def test_what_cannot_be_compared_is_refused_in_one_line_before_any_work(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_table_of_ablate_that_is_unknown_is_named(capture: Path, tmp_path: Path, capsys) -> None:
-    words = ["ablate", str(capture), "--tables", "densty", "--output", str(tmp_path / "out")]
-    assert main(words) == 1
-    assert "--tables: 'densty' is unknown; choose of density, " in capsys.readouterr().err
-
-
 def test_an_output_that_holds_something_else_is_refused(capture: Path, study: Path, tmp_path: Path, capsys) -> None:
     output = tmp_path / "out"
     one = ("--seeds", "1")
@@ -361,7 +348,10 @@ def test_an_output_that_holds_something_else_is_refused(capture: Path, study: Pa
         assert reported in capsys.readouterr().err
 
 
-def test_a_method_that_needs_states_is_refused_on_a_capture_without(capture: Path, tmp_path: Path, capsys) -> None:
+def test_a_method_that_needs_states_and_a_table_that_is_unknown_are_refused(capture: Path, tmp_path, capsys) -> None:
+    words = ["ablate", str(capture), "--tables", "densty", "--output", str(tmp_path / "out")]
+    assert main(words) == 1
+    assert "--tables: 'densty' is unknown; choose of density, " in capsys.readouterr().err
     path = capture / "transforms.json"
     document = json.loads(path.read_text())
     document.pop("instruments")

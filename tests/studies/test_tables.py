@@ -43,6 +43,12 @@ def test_equal_means_are_both_best_and_lower_lpips_is_better(table: ResultTable)
     assert cells["a_b"][2].text == "1.00"  # 60 s in minutes
 
 
+def test_spread_is_the_mean_and_the_sample_standard_deviation() -> None:
+    assert spread([20.0, 22.0]) == {"mean": 21.0, "std": pytest.approx(2**0.5), "n": 2}
+    assert spread([20.0, None, float("nan")]) == {"mean": 20.0, "std": None, "n": 1}
+    assert spread([]) == {"mean": None, "std": None, "n": 0}
+
+
 def test_csv_keeps_every_digit_and_leaves_unknown_empty() -> None:
     rows = list(csv.DictReader(io.StringIO(csv_text(["name", "psnr"], [{"name": "a", "psnr": 2**0.5}, {"name": "b"}]))))
     assert [float(rows[0]["psnr"]), rows[1]["psnr"]] == [2**0.5, ""]

@@ -137,23 +137,6 @@ def test_the_same_words_give_the_same_bits(spec: DownstreamSettings, tmp_path: P
     assert len({(folder / "weights.safetensors").read_bytes() for folder in folders}) == 1
 
 
-def test_every_condition_and_model_of_a_fold_has_the_same_labelled_frames(spec: DownstreamSettings) -> None:
-    plan = plan_downstream(
-        replace(spec, models=("pixels", "corners"), conditions=("real", "kin+real"), num_real=("6",), folds=3)
-    )
-    chosen: dict[int, set] = {}
-    for job in plan.jobs:
-        task = job.task(plan.capture)
-        learned = tuple(sample.name for sample in task.batches.sources[0])
-        assert len(learned) == 6
-        assert {"006", "007", "012"}.isdisjoint(learned)
-        assert list(learned) == [sample.name for sample in job.labelled(plan.capture)]
-        assert len(task.batches.sources) == 1 + len(job.condition.sets)
-        chosen.setdefault(job.fold, set()).add(learned)
-    assert [len(chosen[fold]) for fold in range(3)] == [1, 1, 1]
-    assert len(set.union(*chosen.values())) == 3
-
-
 def test_permuted_labels_are_all_of_other_images(spec: DownstreamSettings) -> None:
     plan = plan_downstream(replace(spec, conditions=("kin+real", "kin+real+permuted"), num_real=("6",), folds=1))
     right, wrong = (job.task(plan.capture).batches.sources[1] for job in plan.jobs)
@@ -169,6 +152,20 @@ def test_pasted_images_are_of_the_labelled_frames_alone(spec: DownstreamSettings
     labelled, pasted = job.task(plan.capture).batches.sources
     assert len(pasted) == 400
     assert {source.name for source in pasted[0].backgrounds.samples} == {sample.name for sample in labelled}
+
+
+def test_every_condition_and_model_of_a_fold_has_the_same_labelled_frames(spec: DownstreamSettings) -> None:
+    plan = plan_downstream(
+        replace(spec, models=("pixels", "corners"), conditions=("real", "kin+real"), num_real=("6",), folds=3)
+    )
+    chosen: dict[int, set] = {}
+    for job in plan.jobs:
+        learned = tuple(sample.name for sample in job.task(plan.capture).batches.sources[0])
+        assert len(learned) == 6
+        assert {"006", "007", "012"}.isdisjoint(learned)
+        chosen.setdefault(job.fold, set()).add(learned)
+    assert [len(chosen[fold]) for fold in range(3)] == [1, 1, 1]
+    assert len(set.union(*chosen.values())) == 3
 
 
 def test_by_default_counts_are_nested_and_as_many_as_there_are(spec: DownstreamSettings) -> None:
@@ -213,15 +210,6 @@ def test_recordings_without_truth_or_with_other_parts_are_refused(spec: Downstre
     shutil.rmtree(capture / "truth")
     with refused("all frames: no frame has a label"):
         plan_downstream(far)
-
-
-def test_jobs_of_an_older_protocol_are_refused_in_one_line(spec: DownstreamSettings) -> None:
-    small = replace(spec, conditions=("kin",), folds=1)
-    trained(small)
-    for file in spec.output.glob("jobs/*/job.json"):
-        file.write_text(file.read_text().replace(JOB_SCHEMA, "neeco-downstream-job/1"))
-    with refused("job.json: schema: begun with 'neeco-downstream-job/1'", "give another --output"):
-        plan_downstream(small)
 
 
 # going on and growing
@@ -310,29 +298,26 @@ def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSettings, m
     assert again["complete"]
 
 
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
+def test_a_folder_of_other_jobs_is_refused_before_the_work(
+    spec: DownstreamSettings, tmp_path: Path, monkeypatch
+) -> None:
+    small = replace(spec, conditions=("kin",), folds=1)
+    trained(small)
+    monkeypatch.setattr(Pixels, "fit", lambda *_: pytest.fail("taught"))
+    for change, told in (
         ({"steps": 7}, "steps: begun with 6, now 7"),
         ({"batch": 3}, "batch: begun with 2, now 3"),
         ({"size": 24}, "size: begun with 48, now 24"),
         ({"classes": "parts"}, "classes: begun with 'instrument', now 'parts'"),
-    ],
-)
-def test_a_folder_of_other_jobs_is_refused_before_the_work(spec, change, told: str, monkeypatch) -> None:
-    small = replace(spec, conditions=("kin",), folds=1)
-    trained(small)
-    monkeypatch.setattr(Pixels, "fit", lambda *_: pytest.fail("taught"))
-    with refused("job.json: ", told, "give another --output"):
-        trained(replace(replace(small, folds=2), **change))
-
-
-def test_another_set_under_the_same_name_is_refused(spec: DownstreamSettings, tmp_path: Path) -> None:
-    small = replace(spec, conditions=("kin",), folds=1)
-    trained(small)
-    for data in (ImageSet("kin", write_set(tmp_path / "else")), replace(spec.sets[0], count=3)):
-        with refused("job.json: sets: begun with", "give another --output"):
-            plan_downstream(replace(small, sets=(data,)))
+        ({"sets": (ImageSet("kin", write_set(tmp_path / "else")),)}, "sets: begun with"),
+        ({"sets": (replace(spec.sets[0], count=3),)}, "sets: begun with"),
+    ):
+        with refused("job.json: ", told, "give another --output"):
+            trained(replace(replace(small, folds=2), **change))
+    for file in spec.output.glob("jobs/*/job.json"):
+        file.write_text(file.read_text().replace(JOB_SCHEMA, "neeco-downstream-job/1"))
+    with refused("job.json: schema: begun with 'neeco-downstream-job/1'", "give another --output"):
+        plan_downstream(small)
 
 
 def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSettings, capture: Path) -> None:
