@@ -7,7 +7,7 @@ that a tracker, structure from motion and a jaw sensor make, and `truth/` (part 
 instrument's shadow darkens by more than 15 %, depth, exact `transforms.json`, `hinge.json` or `kinematics.json`). The
 same command gives the same pixels on the same machine.
 
-How it works (`rendered/`): the organ is a height field with procedural colour (`tissue.py`, `noise.py`), the instrument
+How it works (`rendered/`): the organ is a height field with procedural colour (`tissue.py`), the instrument
 a distance function (`instrument.py`, `wristed.py`); rays meet both, 2 x 2 a pixel, lit by lamps beside the lens
 (`render.py`). `motion.py` plans camera and instrument, `errors.py` is what the sensors make of it, `scenes.py` holds
 the named scenes; `frames.py`, `truth.py`, `points.py` and `writing.py` write. Random scenes of the

@@ -14,9 +14,9 @@ from torch import Tensor
 from neeco.base.files import write_atomically
 from neeco.capture.images import write_labels
 from rendered import instrument
-from rendered.hinge import truth_ids
+from rendered.exposure import Processor
+from rendered.kinematics import truth_ids
 from rendered.motion import Array, Moment, Trajectory, is_unseen, rigid
-from rendered.processor import Processor
 from rendered.render import Drawing, Lens, Place, draw, shadowed, view_of
 from rendered.scenes import SceneSpec
 from rendered.tissue import ORGANS

@@ -15,8 +15,7 @@ from neeco.capture import Capture, Frame, Instrument, InstrumentState, PointClou
 from neeco.geometry.camera import Camera
 from rendered import errors
 from rendered.frames import Renderer, Settings, Shot, image_name, take_shots
-from rendered.hinge import describe_hinge
-from rendered.kinematics import describe_kinematics, stated_kinematics
+from rendered.kinematics import describe_hinge, describe_kinematics, stated_kinematics
 from rendered.motion import THINNINGS, Array, Moment, Trajectory, plan, slowed
 from rendered.points import PointSampler
 from rendered.render import Lens, Place

@@ -40,8 +40,7 @@ def test_the_capture_records_every_reading(capture: Path) -> None:
 
 def test_what_is_seen_lies_on_the_link_that_it_is_labelled_as(capture: Path) -> None:
     """Surface points from the stored depth, carried to their link's frame by forward kinematics, lie on its solid."""
-    from rendered.hinge import truth_ids
-    from rendered.kinematics import JAW_NAMES
+    from rendered.kinematics import JAW_NAMES, truth_ids
     from rendered.scenes import SCENES
 
     stated = json.loads((capture / "truth" / "kinematics.json").read_text())

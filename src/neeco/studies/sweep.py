@@ -61,7 +61,12 @@ def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) 
         study = study.prepared(request)
     except NeecoError as error:
         raise NeecoError(f"{place}{error}") from None
-    methods = {name: _method_of(study, name, place) for name in study.configurations}
+    methods = {}
+    for name, configuration in study.configurations.items():
+        try:
+            methods[name] = training_config(configuration.method, {}).method
+        except NeecoError as error:
+            raise NeecoError(f"{place}configurations.{name}: {error}") from None
     configs = {name: config_of(request, study, name, place, methods) for name in study.configurations}
     capture = read_checked(request.capture, request.transforms)
     for name, config in configs.items():
@@ -178,14 +183,6 @@ def config_of(request: SweepRequest, study: Study, name: str, place: str, method
         option, colon, problem = str(error).partition(":")
         field = option.removeprefix("--set ").removeprefix("--").replace("-", "_")
         raise NeecoError(f"{given_in.get(field, f'{where}: ')}{field}{colon}{problem}") from None
-
-
-def _method_of(study: Study, name: str, place: str) -> str:
-    """Return the method that a configuration trains. Raises NeecoError naming it where it has none."""
-    try:
-        return training_config(study.configurations[name].method, {}).method
-    except NeecoError as error:
-        raise NeecoError(f"{place}configurations.{name}: {error}") from None
 
 
 def _has(method: str, field: str) -> bool:

@@ -183,7 +183,11 @@ class PastedSample:
         size = source.classes.shape[::-1]
         background = self.backgrounds.image(int(rng.integers(len(self.backgrounds))), size)
         background = background[:, :: int(rng.choice([-1, 1]))]
-        matrix = _placement(size, rng, settings)
+        middle = np.array([(side - 1) / 2 for side in size])
+        turn, zoom = rng.uniform(-settings.max_turn, settings.max_turn), settings.max_zoom ** rng.uniform(-1, 1)
+        linear = cv2.getRotationMatrix2D((0, 0), turn, zoom)[:, :2] @ np.diag([rng.choice([-1.0, 1.0]), 1.0])
+        shift = rng.uniform(-settings.max_shift, settings.max_shift, 2) * size
+        matrix = np.concatenate([linear, (middle + shift - linear @ middle)[:, None]], 1)
         # a shaft goes on where the image that it is cut from ends
         edge = cv2.BORDER_REPLICATE
         pixels = cv2.warpAffine(source.image, matrix, size, flags=cv2.INTER_LINEAR, borderMode=edge)
@@ -192,15 +196,6 @@ class PastedSample:
         gain = rng.uniform(1 - settings.max_gain, 1 + settings.max_gain)
         image = alpha * pixels * gain + (1 - alpha) * background
         return Example(image.clip(0, 255).round().astype(np.uint8), classes)
-
-
-def _placement(size: tuple[int, int], rng: np.random.Generator, settings: PasteSettings) -> np.ndarray:
-    """[2, 3]: a random flip, turn, zoom and shift of an image of this size (width, height), px."""
-    middle = np.array([(side - 1) / 2 for side in size])
-    turn, zoom = rng.uniform(-settings.max_turn, settings.max_turn), settings.max_zoom ** rng.uniform(-1, 1)
-    linear = cv2.getRotationMatrix2D((0, 0), turn, zoom)[:, :2] @ np.diag([rng.choice([-1.0, 1.0]), 1.0])
-    shift = rng.uniform(-settings.max_shift, settings.max_shift, 2) * size
-    return np.concatenate([linear, (middle + shift - linear @ middle)[:, None]], 1)
 
 
 def pasted_samples(samples: Sequence[RecordedSample], folder: Path | None, seed: int) -> tuple[PastedSample, ...]:
