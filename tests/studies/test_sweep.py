@@ -128,12 +128,6 @@ def test_more_configurations_and_seeds_are_added(capture: Path, study: Path, tmp
     assert len(rows_of(output)) == 12
 
 
-def test_workers_give_the_same_rows(capture: Path, study: Path, tmp_path: Path) -> None:
-    here, there = tmp_path / "here", tmp_path / "there"
-    assert sweep(capture, study, here) == sweep(capture, study, there, "--workers", "2") == 0
-    assert rows_of(here) == rows_of(there)
-
-
 def test_a_failed_run_has_its_reason_in_its_place_and_the_status_is_1(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -78,9 +78,9 @@ def write_report(
 ) -> Path:
     """Write `report.html` into the run folder and return its path. One file: style, pictures and curves are inside it.
 
-    evaluation: what `evaluate_run` returned. playable: a page
-    of its own that renders the scene, shown in a frame of this one. How many threads torch takes is the caller's to set
-    (`open_run`). Raises NeecoError when a picture cannot be read or the page cannot be written.
+    evaluation: what `evaluate_run` returned. playable: a page of its own that renders the scene, shown in a frame of
+    this one. The caller sets the number of torch threads (`open_run`). Raises NeecoError when a picture cannot be read
+    or the page cannot be written.
     """
     rows = read_metrics(run_path / "metrics.jsonl")
     kind = "aligned" if "aligned" in evaluation else "given"

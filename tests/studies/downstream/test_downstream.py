@@ -27,7 +27,7 @@ from neeco.studies.downstream.experiment import (
     read_predictions,
     run_downstream,
 )
-from neeco.studies.downstream.results import Detections, failed_jobs, tables_of
+from neeco.studies.downstream.results import Detections, tables_of
 from neeco.studies.downstream.samples import ImageSet
 
 TIMES = ("seconds", "machine")
@@ -272,30 +272,6 @@ def test_interrupted_it_goes_on_to_the_same_numbers(
     result = trained(spec)
     for key in ("jobs", "summary", "findings", "notes", "sets", "models"):
         assert without_times(result[key]) == without_times(expected[key])
-
-
-@pytest.mark.parametrize("failing", [0, 2, "all"])
-def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
-    fit, fits = Pixels.fit, [-1]
-
-    def sometimes(self, task):
-        fits[0] += 1
-        if failing in (fits[0], "all"):
-            raise NeecoError("pixels: its loss is not finite at step 3;\n  begin anew")
-        return fit(self, task)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Pixels, "fit", sometimes)
-        result = trained(replace(spec, num_real=("0", "6")))
-    failed = [index for index, job in enumerate(result["jobs"]) if "error" in job]
-    assert failed == (list(range(6)) if failing == "all" else [failing])
-    job = result["jobs"][failed[0]]
-    assert job["error"] == "pixels: its loss is not finite at step 3; begin anew"
-    assert job["splits"] == {}
-    assert len(failed_jobs(result)) == len(failed)
-    again = trained(replace(spec, num_real=("0", "6")))
-    assert not failed_jobs(again)
-    assert again["complete"]
 
 
 def test_a_folder_of_other_jobs_is_refused_before_the_work(

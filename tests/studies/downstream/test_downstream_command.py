@@ -83,13 +83,17 @@ def test_a_failing_training_is_told_and_is_exit_1(words, tmp_path: Path, monkeyp
             raise NeecoError("unet: its loss is not finite at step 1")
         return fit(self, task)
 
-    monkeypatch.setattr(UNet, "fit", sometimes)
-    assert main([*words, "--conditions", "real", "kin+real"]) == 1
+    with monkeypatch.context() as patched:
+        patched.setattr(UNet, "fit", sometimes)
+        assert main([*words, "--conditions", "real", "kin+real"]) == 1
     told = capsys.readouterr()
     last = told.err.strip().splitlines()[-1]
     assert last.startswith("neeco: error: 1 of 2 trainings failed: unet, kin+real, 6 labelled, fold 0: unet: its loss")
     assert "report: " in told.out  # the others' results are there all the same
+    result = json.loads((tmp_path / "out" / "downstream.json").read_text())
+    assert [job["splits"] for job in result["jobs"] if "error" in job] == [{}]
     assert (tmp_path / "out" / "downstream.csv").is_file()
+    assert main([*words, "--conditions", "real", "kin+real"]) == 0  # what failed is done again
 
 
 def test_ctrl_c_says_how_to_go_on(words, monkeypatch, capsys) -> None:
