@@ -61,25 +61,26 @@ def test_another_seed_or_other_threads_of_random_numbers_give_other_or_the_same_
     assert a == b != c
 
 
-@pytest.fixture
-def small_dfine(monkeypatch: pytest.MonkeyPatch) -> None:
+class SmallDFine(DFine):
+    """The same with fewer channels and queries."""
+
+    stages = (16, 32, 64, 64)
+    width = 32
+    queries = 6
+    learning_rate = 2e-3
+
+
+def test_a_dfine_learns_where_rectangles_are(tmp_path: Path) -> None:
     needs("dfine")
-    monkeypatch.setattr(DFine, "stages", (16, 32, 64, 64))
-    monkeypatch.setattr(DFine, "width", 32)
-    monkeypatch.setattr(DFine, "queries", 6)
-    monkeypatch.setattr(DFine, "learning_rate", 2e-3)
+    losses = []
 
+    class Watched(SmallDFine):
+        def loss(self, *given) -> Tensor:
+            value = super().loss(*given)
+            losses.append(value.item())
+            return value
 
-def test_a_dfine_learns_where_rectangles_are(small_dfine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    losses, loss = [], DFine.loss
-
-    def watched(self, *given) -> Tensor:
-        value = loss(self, *given)
-        losses.append(value.item())
-        return value
-
-    monkeypatch.setattr(DFine, "loss", watched)
-    predict = DFine().fit(task_of(tmp_path, batches=BatchSampler(squares(2), seed=0), steps=40))
+    predict = Watched().fit(task_of(tmp_path, batches=BatchSampler(squares(2), seed=0), steps=40))
     assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:5])
     (answer,) = predict([square(0).image])
     assert isinstance(answer, Detections)
@@ -99,34 +100,36 @@ def test_dfines_answers_are_boxes_of_each_image_best_first() -> None:
     )  # in pixels of the image as it was given, and inside it
 
 
-def test_a_dfine_repeats_bit_for_bit_and_bears_images_without_an_instrument(small_dfine, tmp_path: Path) -> None:
+def test_a_dfine_repeats_bit_for_bit_and_bears_images_without_an_instrument(tmp_path: Path) -> None:
+    needs("dfine")
     empty = replace(square(0), classes=np.zeros((64, 64), np.uint8))
     for name in ("one", "two"):
         feed = BatchSampler([Held(empty), Held(empty), *squares(1)], seed=0, augmented=True)
-        DFine().fit(task_of(tmp_path / name, batches=feed, steps=3))
+        SmallDFine().fit(task_of(tmp_path / name, batches=feed, steps=3))
     first, second = ((tmp_path / name / WEIGHTS_FILE).read_bytes() for name in ("one", "two"))
     assert first == second
 
 
-def test_a_dfine_needs_as_many_places_as_boxes(small_dfine, tmp_path: Path) -> None:
-    assert not DFine.is_too_small((64, 32))
-    DFine().fit(task_of(tmp_path, size=(64, 32), steps=1))
-    assert DFine.is_too_small((32, 32))
+def test_a_dfine_needs_as_many_places_as_boxes(tmp_path: Path) -> None:
+    needs("dfine")
+    assert not SmallDFine.is_too_small((64, 32))
+    SmallDFine().fit(task_of(tmp_path, size=(64, 32), steps=1))
+    assert SmallDFine.is_too_small((32, 32))
     assert not UNet.is_too_small((16, 16))
 
 
 # what every model's training does
 
 
-def test_the_last_weights_are_the_model_and_are_kept_where_asked_for(tmp_path: Path, monkeypatch) -> None:
-    states, loss = [], Pixels.loss
+def test_the_last_weights_are_the_model_and_are_kept_where_asked_for(tmp_path: Path) -> None:
+    states = []
 
-    def watched(self, module, *given) -> Tensor:
-        states.append({name: value.clone() for name, value in module.state_dict().items()})  # before the step
-        return loss(self, module, *given)
+    class Watched(Pixels):
+        def loss(self, module, *given) -> Tensor:
+            states.append({name: value.clone() for name, value in module.state_dict().items()})  # before the step
+            return super().loss(module, *given)
 
-    monkeypatch.setattr(Pixels, "loss", watched)
-    Pixels().fit(task_of(tmp_path / "kept", steps=10))
+    Watched().fit(task_of(tmp_path / "kept", steps=10))
     stored = load_file(tmp_path / "kept" / WEIGHTS_FILE)
     near, far = ((stored["weight"] - states[step]["weight"]).abs().max() for step in (9, 3))
     assert 0 < near < 0.1 * far  # one small step, as the learning rate ends at 0
@@ -141,11 +144,13 @@ def test_strong_augmentation_repeats_with_the_seed_and_changes_the_weights(tmp_p
     assert one == two != plain
 
 
-def test_a_loss_that_is_not_finite_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    loss = Pixels.loss
-    monkeypatch.setattr(Pixels, "loss", lambda *given: loss(*given) * float("nan"))
+def test_a_loss_that_is_not_finite_is_told(tmp_path: Path) -> None:
+    class Diverging(Pixels):
+        def loss(self, *given) -> Tensor:
+            return super().loss(*given) * float("nan")
+
     with pytest.raises(NeecoError, match="pixels: its loss is not finite at step 4"):
-        Pixels().fit(task_of(tmp_path))
+        Diverging().fit(task_of(tmp_path))
     assert not (tmp_path / WEIGHTS_FILE).exists()
 
 
