@@ -9,9 +9,8 @@ import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.evaluation.evaluate import evaluate_run
-from neeco.report import write_report
 from neeco.report.charts import Series, line_chart
-from neeco.report.run_page import chosen_rows, curve, read_metrics
+from neeco.report.run_page import chosen_rows, curve, read_metrics, write_report
 
 VOID = {"meta", "img", "br", "link"}
 

@@ -38,36 +38,39 @@ def score_masks(
     IoU of the classes its truth shows, mean over the images that show any. None is "not known", never zero. Raises
     NeecoError for what cannot be read or compared.
     """
-    given = open_masks(predicted, classes)
+    predictions = open_masks(predicted, classes)
     source = read_truth(truth) if isinstance(truth, Path) else truth
-    wanted = open_truth(source, truth_classes, None if isinstance(source, Capture) else splits)
-    everything = set(wanted.files)
+    truths = open_truth(source, truth_classes, None if isinstance(source, Capture) else splits)
+    all_names = set(truths.files)
     if isinstance(source, Capture):
-        frames = [frame for name, frame in wanted.frames.items() if name in given.files] or [*wanted.frames.values()]
-        wanted = open_truth(source, truth_classes, splits or list(dict.fromkeys(frame.split for frame in frames)))
-    if not set(given.files) & set(wanted.files):
-        names = f"{next(iter(given.files))!r} and {next(iter(wanted.files))!r}"
-        raise NeecoError(f"{predicted}: no mask is named like one of {wanted.path} (such as {names}); rename the files")
-    (ours, theirs), notes = _shared_classes(given, wanted)
-    numbers = {part: number for number, part in reversed(theirs.items())}  # of several ids of a part the first
+        predicted_frames = [frame for name, frame in truths.frames.items() if name in predictions.files]
+        usual = dict.fromkeys(frame.split for frame in predicted_frames or truths.frames.values())
+        truths = open_truth(source, truth_classes, splits or list(usual))
+    if not set(predictions.files) & set(truths.files):
+        names = f"{next(iter(predictions.files))!r} and {next(iter(truths.files))!r}"
+        raise NeecoError(f"{predicted}: no mask is named like one of {truths.path} (such as {names}); rename the files")
+    (ours, theirs), notes = _shared_classes(predictions, truths)
+    numbers: dict[str, int] = {}  # of several ids of a part the first
+    for number, part in theirs.items():
+        numbers.setdefault(part, number)
     tables = [_table(names, numbers) for names in (ours, theirs)]
     whole = PartTally({1: "instrument"}, tuple(SCORES.values()))
-    parts = PartTally({number: part for part, number in reversed(numbers.items())}, tuple(SCORES.values()))
+    parts = PartTally({number: part for part, number in numbers.items()}, tuple(SCORES.values()))
     visible: list[list[str]] = []  # parts in the truth of each image
-    for index, name in enumerate(sorted(wanted.files)):
-        ids, counted = wanted.load(name), wanted.counted(name)
-        guess = given.load(name) if name in given.files else np.zeros_like(ids)
+    for index, name in enumerate(sorted(truths.files)):
+        ids, counted = truths.load(name), truths.counted(name)
+        guess = predictions.load(name) if name in predictions.files else np.zeros_like(ids)
         if guess.shape != ids.shape:
-            size, wanted_size = (f"{image.shape[1]}x{image.shape[0]}" for image in (guess, ids))
-            problem = f"size: mask is {size}, its truth is {wanted_size}; resize it (nearest)"
-            raise NeecoError(f"{given.files[name]}: {problem}")
+            size, true_size = (f"{image.shape[1]}x{image.shape[0]}" for image in (guess, ids))
+            problem = f"size: mask is {size}, its truth is {true_size}; resize it (nearest)"
+            raise NeecoError(f"{predictions.files[name]}: {problem}")
         whole.add((guess > 0).astype(np.uint8), (ids > 0).astype(np.uint8), counted)
         parts.add(tables[0][guess], tables[1][ids], counted)
         counting = ids.ravel() if counted is None else ids[counted]
         present = {*tables[1][counting].tolist()}
         visible.append([*(["instrument"] if counting.any() else []), *(p for p, n in numbers.items() if n in present)])
         if progress is not None:
-            progress(index + 1, len(wanted.files))
+            progress(index + 1, len(truths.files))
     swap, assignment = parts.swapped()
     rows = {part: _means(parts, swap.get(part, part), part) for part in part_scores(parts.names)}
     for part in dict.fromkeys(theirs.values()):
@@ -77,10 +80,10 @@ def score_masks(
     instrument = _means(whole, "instrument", "instrument")
     if unnamed := [part for part, row in {"instrument": instrument, **rows}.items() if row["images"] == 0]:
         notes.append(f"{', '.join(unnamed)}: null, no image shows it")
-    missing, extra = sorted(set(wanted.files) - set(given.files)), sorted(set(given.files) - everything)
-    notes += [*given.notes, *wanted.notes]
+    missing, extra = sorted(set(truths.files) - set(predictions.files)), sorted(set(predictions.files) - all_names)
+    notes += [*predictions.notes, *truths.notes]
     if missing:
-        notes.append(f"{len(missing)} of {len(wanted.files)} images have no prediction and count as empty")
+        notes.append(f"{len(missing)} of {len(truths.files)} images have no prediction and count as empty")
     if extra:
         notes.append(f"{len(extra)} predictions have no truth and were left out")
     return finite(
@@ -88,16 +91,16 @@ def score_masks(
             "schema": SCHEMA,
             "version": __version__,
             "predicted": str(predicted),
-            "truth": str(wanted.path),
-            "splits": list(dict.fromkeys(frame.split for frame in wanted.frames.values())) or None,
-            "images": len(wanted.files),
+            "truth": str(truths.path),
+            "splits": list(dict.fromkeys(frame.split for frame in truths.frames.values())) or None,
+            "images": len(truths.files),
             "instrument": instrument | {"challenge_iou": _challenge(whole, visible, {})},
             "parts": rows if theirs else None,
             "classes": {"challenge_iou": _challenge(parts, visible, swap)} if theirs else None,
             "pair_assignment": assignment,
             "per_image": [
                 {"name": name} | dict(zip(SCORES, row["instrument", "instrument"], strict=True))
-                for name, row in zip(sorted(wanted.files), whole.rows, strict=True)
+                for name, row in zip(sorted(truths.files), whole.rows, strict=True)
             ],
             "missing": missing,
             "extra": extra,

@@ -105,15 +105,12 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
     verdict: of `assess_ingest`; capture: what lies at `result.capture`, read here unless given. Raises NeecoError when
     it or one of the images shown cannot be read, or the page cannot be written.
     """
-    capture, found = capture or read_capture(result.capture), result.registration
-    registration = (
-        found
-        and {  # root mean squares of cameras against the laparoscope's tracker; the sensor's place
-            "position_rms": rms(found.position_residual),
-            "rotation_rms": float(np.degrees(rms(found.rotation_residual))),
-            "sensor_mm": found.camera_from_sensor[:3, 3],
-        }
-    )
+    capture, fit = capture or read_capture(result.capture), result.registration
+    registration = None
+    if fit is not None:  # root mean squares of cameras against the laparoscope's tracker; the sensor's place
+        rotation_deg = float(np.degrees(rms(fit.rotation_residual)))
+        residuals = {"position_rms": rms(fit.position_residual), "rotation_rms": rotation_deg}
+        registration = {**residuals, "sensor_mm": fit.camera_from_sensor[:3, 3]}
     write_page(
         path,
         "ingest.html",

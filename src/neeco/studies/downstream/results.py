@@ -286,10 +286,10 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
             row |= {metric: mean and mean.mean for metric, mean in means.items()}
             row |= {"low": score.low, "high": score.high}
             reference = _reference(arm, test, scores, main)
-            if reference is not None and (found := scores.estimate(arm, test, main, reference)) is not None:
-                row |= {"against": reference.condition, "against_real": reference.real, "difference": found.mean}
-                row |= {"difference_low": found.low, "difference_high": found.high}
-                row["verdict"] = verdict(found.folds, found.low, found.high)
+            if reference is not None and (gain := scores.estimate(arm, test, main, reference)) is not None:
+                row |= {"against": reference.condition, "against_real": reference.real, "difference": gain.mean}
+                row |= {"difference_low": gain.low, "difference_high": gain.high}
+                row["verdict"] = verdict(gain.folds, gain.low, gain.high)
             rows.append(row)
     return rows
 
@@ -339,15 +339,15 @@ def is_synthetic(row: Document, experiment: Document) -> bool:
 
 def findings(experiment: Document) -> list[str]:
     """Return the findings: a sentence for every model, test and condition with synthetic images that is compared."""
-    found = []
+    sentences = []
     for model, test in models_and_tests(experiment):
         for row in rows_of(experiment, model, test):
             if "against" in row and (is_synthetic(row, experiment) or PERMUTED in row["condition"].split("+")):
                 score = f"{_title(MAIN[model['predicts']])} {row[MAIN[model['predicts']]]:.3f}"
                 against = f"{title_of(row['against'], row['against_real'])} ({_difference(row)})"
                 arm = f"{model['name']}, {test}: {title_of(row['condition'], row['real'])}"
-                found.append(f"{arm}: {score}; {row['verdict']} against {against}")
-    return found
+                sentences.append(f"{arm}: {score}; {row['verdict']} against {against}")
+    return sentences
 
 
 def _difference(row: Document) -> str:
