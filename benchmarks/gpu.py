@@ -47,7 +47,7 @@ from neeco.raster.optimizer import adam_step
 from neeco.raster.triton import ready
 from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.method_registry import make_deformation, method_settings
-from neeco.studies.machine import machine
+from neeco.studies.study import machine
 
 WORKLOADS = ("25000,320x256", "300000,960x540", "1000000,1920x1080")
 KINDS = ("draw", "frame", "draw+backward", "step")

@@ -19,11 +19,9 @@ def prepare() -> None:
     import torch
 
     import_modules()
-    from neeco.studies import machine
 
     torch.set_num_threads(1)
     hasten_ingest()
-    machine.N_ROUNDS, machine.TIMED_IMAGES = 1, 1
 
 
 def make_world(desk: Path, wanted: set[str]) -> None:

@@ -1,16 +1,16 @@
 """Renders named captures with exact truth: other organs and instruments than the samples.
 
-    python benchmarks/rendered_captures.py NAME OUT [--size WxH] [--every N] [--still] [--video] [--exact] [--frames N]
+    python benchmarks/rendered_captures.py NAME OUT [--size WxH] [--every N] [--still] [--exact] [--frames N]
 
 Writes a complete `neeco-capture/1` folder of 275 frames: images, `transforms.json` and `sparse.ply` with the errors
 that a tracker, structure from motion and a jaw sensor make, and `truth/` (part masks, masks of tissue that the
 instrument's shadow darkens by more than 15 %, depth, exact `transforms.json`, `hinge.json` or `kinematics.json`). The
 same command gives the same pixels on the same machine.
 
-How it works (`rendered/`): the organ is a height field with procedural colour (`tissue.py`, `noise.py`), the instrument
+How it works (`rendered/`): the organ is a height field with procedural colour (`tissue.py`), the instrument
 a distance function (`instrument.py`, `wristed.py`); rays meet both, 2 x 2 a pixel, lit by lamps beside the lens
 (`render.py`). `motion.py` plans camera and instrument, `errors.py` is what the sensors make of it, `scenes.py` holds
-the named scenes; `frames.py`, `truth.py`, `points.py`, `recording.py` and `writing.py` write. Random scenes of the
+the named scenes; `frames.py`, `truth.py`, `points.py` and `writing.py` write. Random scenes of the
 same renderer: `worlds.py draw`. About 0.6 s of CPU time a frame of 320x256.
 """
 
@@ -53,7 +53,6 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
     parser.add_argument("--size", type=_lens, default=Lens(), metavar="WxH", help="of the images (320x256)")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="keep one frame in so many")
     parser.add_argument("--still", action="store_true", help="the scope stands still in the middle of its path")
-    parser.add_argument("--video", action="store_true", help="also recording/: video and logs for `neeco ingest`")
     parser.add_argument("--exact", action="store_true", help="cameras, poses and readings without errors")
     parser.add_argument(
         "--frames",
@@ -66,21 +65,13 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
     spec = SCENES[arguments.scene]
     if arguments.frames is not None and (arguments.frames % THINNINGS[-1] or arguments.frames < 2 * THINNINGS[-1]):
         parser.error(f"--frames: {arguments.frames} is no multiple of {THINNINGS[-1]} above it; give such as 2025")
-    if arguments.frames and (arguments.video or arguments.every > 1):
-        parser.error("--frames: every frame is written, and no recording; leave out --every and --video")
+    if arguments.frames and arguments.every > 1:
+        parser.error("--frames: every frame is written; leave out --every")
     if arguments.exact and spec.encoders is not None:
         parser.error(f"--exact: the links that {arguments.scene} states would be off all the same; take another scene")
-    settings = Settings(
-        arguments.size,
-        every=arguments.every,
-        frames=arguments.frames,
-        video=arguments.video,
-        still=arguments.still,
-    )
+    settings = Settings(arguments.size, every=arguments.every, frames=arguments.frames, still=arguments.still)
     if arguments.still:
         spec = spec.with_still_camera()
-    elif arguments.video:
-        spec = spec.with_rolling_camera()
     return spec.without_errors() if arguments.exact else spec, arguments.output, settings
 
 

@@ -56,7 +56,7 @@ ALLOWED = {
     "neeco.base.placeholders": "holds the helpers",
     "neeco.ingest.cameras._sfm_worker": "a program of its own, which reads the job that its parent wrote",
     "neeco.ingest.cameras.sfm": "reads what its own worker wrote into a temporary folder",
-    "neeco.studies.machine": "reads /proc, and nothing else",
+    "neeco.studies.study": "reads /proc, and nothing else",
     "neeco.viewer.export": "reads the package's own files",
     "neeco.viewer.posing_server": "reads the package's own files",
     "neeco.cli": "opens the null device in place of a closed stream",

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from rendered.errors import EXACT, ErrorModel
+from rendered.exposure import Processor
 from rendered.instrument import Blade, Design, Material
 from rendered.motion import Path
-from rendered.processor import Processor
 from rendered.render import Lamps, Lens, Place
 from rendered.scenes import DEGREE, Joint, Mount, SceneSpec
 from rendered.tissue import ORGANS, Tissue

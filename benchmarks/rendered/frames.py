@@ -14,9 +14,9 @@ from torch import Tensor
 from neeco.base.files import write_atomically
 from neeco.capture.images import write_labels
 from rendered import instrument
-from rendered.hinge import truth_ids
+from rendered.exposure import Processor
+from rendered.kinematics import truth_ids
 from rendered.motion import Array, Moment, Trajectory, is_unseen, rigid
-from rendered.processor import Processor
 from rendered.render import Drawing, Lens, Place, draw, shadowed, view_of
 from rendered.scenes import SceneSpec
 from rendered.tissue import ORGANS
@@ -35,7 +35,6 @@ class Settings:
     resolution: int = 2400  # texels along the tissue's side
     every: int = 1  # keep one frame in so many (previews)
     frames: int | None = None  # slow the motion until it has so many training frames
-    video: bool = False  # recording/: what `neeco ingest` takes
     still: bool = False  # the scope stands still
     stereo: bool = False  # right/: the images of a second camera beside it
     processor: Processor = field(default_factory=Processor)

@@ -34,7 +34,6 @@ class Path:
     roll_middle: float
     roll_train: float  # about the middle, either way
     roll_most: float
-    camera_rolling: float = 0.0  # rad, how far the camera rolls either way
     wrist_train: tuple[float, ...] = ()  # how far the joints of a wrist turn either way
     wrist_most: tuple[float, ...] = ()
 
@@ -87,7 +86,7 @@ class Trajectory:
         hinge = np.asarray(self._hinge(time))
         opening, roll = float(self._opening(time)), float(self._roll(time))
         return Moment(
-            look(center, target, self.path.camera_roll + self.path.camera_rolling * math.sin(time)),
+            look(center, target, self.path.camera_roll),
             _aim(np.array(self.path.trocar), hinge, self.path.roll_middle + roll, self.hinge_mm),
             opening,
             roll,

@@ -14,8 +14,7 @@ from torch import Tensor
 from rendered import instrument as tools
 from rendered.instrument import Design, Material
 from rendered.motion import Bend, Moment
-from rendered.noise import blur
-from rendered.tissue import Tissue
+from rendered.tissue import Tissue, blur
 
 WET = 1.5  # strength of highlights on tissue
 WET_SHARPNESS = 170.0

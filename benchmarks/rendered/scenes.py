@@ -60,10 +60,6 @@ class SceneSpec:
     errors: ErrorModel = field(default_factory=ErrorModel)
     encoders: Encoders | None = None  # of the wrist, where there is one
 
-    def with_rolling_camera(self) -> SceneSpec:
-        """The same scene, filmed as a recording should be: turns about two axes calibrate the tracker on the scope."""
-        return replace(self, path=replace(self.path, camera_rolling=0.3))
-
     def with_still_camera(self) -> SceneSpec:
         """The same scene before a scope that stands still in the middle of its path: the world is its frame, and
         nothing about it is off."""

@@ -15,11 +15,9 @@ from neeco.capture import Capture, Frame, Instrument, InstrumentState, PointClou
 from neeco.geometry.camera import Camera
 from rendered import errors
 from rendered.frames import Renderer, Settings, Shot, image_name, take_shots
-from rendered.hinge import describe_hinge
-from rendered.kinematics import describe_kinematics, stated_kinematics
+from rendered.kinematics import describe_hinge, describe_kinematics, stated_kinematics
 from rendered.motion import THINNINGS, Array, Moment, Trajectory, plan, slowed
 from rendered.points import PointSampler
-from rendered.recording import write_raw_recording
 from rendered.render import Lens, Place
 from rendered.scenes import SceneSpec
 from rendered.truth import JOINT, World, truth_document
@@ -51,8 +49,6 @@ def write_recording(spec: SceneSpec, path: Path, settings: Settings) -> None:
         write_json(path / "truth" / "hinge.json", describe_hinge(spec))
     else:
         write_json(path / "truth" / "kinematics.json", describe_kinematics(spec))
-    if settings.video:
-        write_raw_recording(world, trajectory, settings, path, np.random.default_rng(spec.seed + 2))
     write_capture(recorded(world, trajectory, sampler, path, settings.lens, generator), path)
     if settings.frames is not None:
         write_thinned(path)

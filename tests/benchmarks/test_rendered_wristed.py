@@ -40,8 +40,7 @@ def test_the_capture_records_every_reading(capture: Path) -> None:
 
 def test_what_is_seen_lies_on_the_link_that_it_is_labelled_as(capture: Path) -> None:
     """Surface points from the stored depth, carried to their link's frame by forward kinematics, lie on its solid."""
-    from rendered.hinge import truth_ids
-    from rendered.kinematics import JAW_NAMES
+    from rendered.kinematics import JAW_NAMES, truth_ids
     from rendered.scenes import SCENES
 
     stated = json.loads((capture / "truth" / "kinematics.json").read_text())
@@ -118,23 +117,6 @@ def test_the_wrist_goes_beyond_its_training_range_in_unseen_frames_only(benchmar
         reached[kind] = max(reached[kind], most)
     assert 0.5 < reached["seen"] <= 1.02  # a spline passes its knots by a little
     assert reached["unseen"] > 1.1
-
-
-def test_a_recording_logs_what_the_encoders_say_on_the_robots_clock(benchmarks: ModuleType, tmp_path: Path) -> None:
-    from rendered.frames import take_shots
-    from rendered.motion import plan
-    from rendered.recording import EM_CLOCK_S, _write_wrist
-    from rendered.scenes import SCENES
-    from rendered.truth import World
-
-    spec = SCENES["bowel-wristed"]
-    trajectory = plan(spec.path, spec.design.hinge, 40, 8, spec.seed)
-    _write_wrist(tmp_path / "wrist.csv", World(spec, take_shots(trajectory, spec)), trajectory, spec.encoders)
-    rows = np.loadtxt(tmp_path / "wrist.csv", delimiter=",", skiprows=1)
-    angles = np.array([trajectory.at(time - EM_CLOCK_S).wrist for time in rows[:, 0]])
-    errors = rows[:, 1:] - angles - spec.encoders.offsets
-    assert np.abs(errors).max() < 4 * spec.encoders.play + 5 * spec.encoders.noise
-    assert np.abs(np.median(errors, 0)).max() < spec.encoders.play
 
 
 def test_all_that_casts_a_shadow_lies_within_reach(benchmarks: ModuleType) -> None:

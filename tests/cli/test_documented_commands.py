@@ -24,7 +24,7 @@ from neeco.cli import VERBS, main
 # What stands for "…" and for the parts of a synopsis, by the words before it.
 IN_FULL = {
     "evaluate RUN [--splits": "evaluate RUN --splits test unseen --align --json FILE.json",
-    "score-masks PREDICTED TRUTH [": ("score-masks PREDICTED TRUTH --splits test unseen --components --json FILE.json"),
+    "score-masks PREDICTED TRUTH [": "score-masks PREDICTED TRUTH --splits test unseen --json FILE.json",
     "compare CAPTURE …": "compare CAPTURE --methods 3dgs kinematic --iterations 40 --output cmp",
     "compare CAPTURE --methods …": "compare CAPTURE --methods 3dgs kinematic --output cmp",
     "compare CAPTURE --output C225 --transforms": (

@@ -9,7 +9,6 @@ import torch
 from neeco.base.errors import NeecoError
 from neeco.capture.images import write_labels
 from neeco.cli import main
-from neeco.evaluation import evaluate
 from neeco.evaluation.evaluate import evaluate_run
 
 
@@ -48,10 +47,6 @@ def test_a_scene_scored_on_its_own_drawings_is_nearly_perfect(world, tmp_path):
     assert any("lpips" in note and "no weights" in note for note in evaluation["notes"])
     assert evaluation["per_frame"]["given"]["test"][0]["frame"] == "002"
     assert ("test", 1, 1) in seen
-
-
-def test_the_numbers_are_written_into_the_run_folder(world, tmp_path):
-    evaluation = evaluated(make_run(world, tmp_path), ["test"])
     assert json.loads((tmp_path / "evaluation.json").read_text()) == evaluation
     assert "aligned" not in evaluation
 
@@ -87,16 +82,11 @@ def test_aligned_scores_forgive_the_tracker_and_given_scores_do_not(world, tmp_p
 
 
 def test_without_truth_the_mask_numbers_are_null_and_a_note_says_so(world, tmp_path):
-    evaluation = evaluated(make_run(world, tmp_path, truth=False), ["test"])
+    evaluation = evaluated(make_run(world, tmp_path, truth=False), ["train", "test"])
     numbers = evaluation["given"]["test"]
     assert numbers["mask_iou"] is None
     assert numbers["psnr_instrument"] is None
     assert numbers["mask_frames"] == 0
-    assert any("no frame has a true or reference mask" in note for note in evaluation["notes"])
-
-
-def test_what_holds_of_several_splits_is_noted_once(world, tmp_path):
-    evaluation = evaluated(make_run(world, tmp_path, truth=False), ["train", "test"])
     (note,) = [note for note in evaluation["notes"] if "no frame has a true or reference mask" in note]
     assert note.startswith("train, test: psnr_instrument, mask_iou, part_iou: null")
 
@@ -152,41 +142,6 @@ def test_an_unknown_split_is_refused_naming_those_there_are(world, tmp_path):
         evaluated(only_training)
 
 
-def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_path, monkeypatch):
-    from neeco.evaluation import evaluate, image_metrics
-
-    seen = {}
-
-    def noting(where, function):
-        def call(*arguments, **options):
-            seen[where] = torch.get_num_threads()
-            return function(*arguments, **options)
-
-        return call
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    try:
-        network = image_metrics.Lpips((image_metrics.Convolution(1, 1, 0, None, True),), one_by_one_filter())
-        monkeypatch.setattr(image_metrics, "find_lpips", lambda folder: {"alexnet": network})
-        monkeypatch.setattr(evaluate, "draw", noting("draw", evaluate.draw))
-        monkeypatch.setattr(image_metrics, "relu", noting("lpips", image_metrics.relu))
-        run = make_run(world, tmp_path)
-        monkeypatch.setattr("neeco.training.run.load_run", lambda path, device, **_: run)
-        assert main(["evaluate", str(run.path), "--splits", "test"]) == 0
-        assert (seen, torch.get_num_threads()) == ({"draw": 1, "lpips": 3}, 3)
-    finally:
-        torch.set_num_threads(before)
-
-
-def one_by_one_filter():
-    return {
-        "features.0.weight": torch.ones(1, 3, 1, 1),
-        "features.0.bias": torch.zeros(1),
-        "linear.0.weight": torch.ones(1),
-    }
-
-
 @pytest.mark.parametrize("place", ["taken/scores.json", "folder"])
 def test_numbers_that_could_not_be_written_are_told_before_scoring(world, tmp_path, monkeypatch, capsys, place):
     run = make_run(world, tmp_path / "run")
@@ -206,10 +161,3 @@ def test_numbers_are_also_written_where_asked(world, tmp_path, monkeypatch):
     assert main(["evaluate", str(run.path), "--json", str(tmp_path / "new" / "scores.json")]) == 0
     assert (tmp_path / "new" / "scores.json").read_text() == (run.path / "evaluation.json").read_text()
     assert "images it never saw. " in (run.path / "report.html").read_text()
-
-
-def test_the_device_is_waited_for_before_a_clock_is_read(world, tmp_path, monkeypatch):
-    waited = []
-    monkeypatch.setattr(evaluate, "synchronise", waited.append)
-    evaluated(make_run(world, tmp_path), ["test"])
-    assert waited == [torch.device("cpu")] * (evaluate.N_TIMED + 2)

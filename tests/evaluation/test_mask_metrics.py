@@ -25,20 +25,6 @@ def test_iou_and_dice_of_two_overlapping_strips():
     assert iou(first, second, mask("##..", "....")) == pytest.approx(1 / 2)
 
 
-def test_jaws_are_matched_once_for_the_whole_split_not_per_frame():
-    tally = PartTally(USUAL_NAMES)
-    truth = torch.tensor([[1, 2, 3, 3, 3, 4, 4]], dtype=torch.uint8)
-    named = truth.clone()
-    swapped = torch.tensor([[1, 2, 4, 4, 4, 3, 3]], dtype=torch.uint8)
-    for parts in (swapped, swapped, named):
-        tally.add(parts, truth)
-    scores, assignment = tally.result()
-    assert assignment == {"jaws": "swapped"}
-    assert scores["jaw_left"] == pytest.approx(2 / 3)
-    assert scores["jaws"] == 1.0
-    assert scores["shaft"] == 1.0
-
-
 def test_parts_of_any_name_are_scored_and_pairs_are_those_that_differ_by_left_and_right():
     assert pairs_of(["cone", "left_blade", "hook", "right_blade", "lid_left"]) == {
         "blades": ("left_blade", "right_blade")

@@ -108,7 +108,7 @@ def test_compare_names_what_computed(verb: Call, word: str, capture: str) -> Non
     assert result["complete"]
     name = torch.cuda.get_device_name() if word == "cuda" else None
     assert result["machine"]["gpu"] == name
-    assert (name or result["machine"]["cpu"]) in Path("out/table.md").read_text()
+    assert (name or result["machine"]["cpu"]) in Path("out/report.html").read_text()
 
 
 @slowly

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
-from neeco.report.charts import Level, Series, line_chart
+from neeco.report.charts import Series, line_chart
 from neeco.report.downstream_page import picture, score_chart, write_downstream_report
-from neeco.studies.downstream.experiment import DownstreamPlan
-from neeco.studies.downstream.job import DownstreamSettings, predictions_file, write_predictions
-from neeco.studies.downstream.results import findings, rows_of, summarise
+from neeco.studies.downstream.experiment import DownstreamPlan, DownstreamSettings, write_predictions
+from neeco.studies.downstream.results import Detections, box_iou, findings, rows_of, summarise
 from neeco.studies.downstream.samples import Example
-from neeco.studies.downstream.scores import Detections, box_iou
 
 VOID = {"meta", "img", "br", "path", "link", "wbr"}
 GAIN = {"real": 0.0, "real+strong": 0.01, "kinematic": 0.05, "kinematic+real": 0.1}
@@ -50,7 +48,7 @@ def job_of(plan, model, condition, real, fold):
                 rows.append({"frame": sample.name, "iou": value + 0.01 * k * len(condition)})
         if fold == 0:
             folder = plan.settings.job_folder(model, condition, real, fold)
-            write_predictions(predictions_file(folder, split), [sample.name for sample in samples], found)
+            write_predictions(folder, split, [sample.name for sample in samples], found)
         key = "ap" if PREDICTS[model] == "boxes" else "iou"
         job["splits"][split] = {"frames": len(samples), key: value, "per_frame": rows}
     return job
@@ -164,12 +162,12 @@ def test_boxes_are_drawn_where_they_are():
 
 def test_a_logarithmic_axis_has_the_points_as_ticks():
     points = tuple((float(x), y) for x, y in ((1, 0.1), (10, 0.2), (97, 0.3), (100, 0.4)))
-    chart = line_chart("t", "x", [Series("a", 0, points)], over_logarithmic=True)
+    chart = line_chart("t", "x", [Series(0, points)], over_logarithmic=True)
     ticks = [part.partition("<")[0] for part in chart.split(">") if part.partition("<")[0] in ("1", "10", "97", "100")]
     assert ticks == ["100", "10", "1"] or ticks == ["1", "10", "100"]  # 97 would cover 100
-    single = [Series("a", 0, ((5.0, 0.2),))]
+    single = [Series(0, ((5.0, 0.2),))]
     assert line_chart("t", "x", single, over_logarithmic=True) == ""
-    assert "level of it" in line_chart("t", "x", single, levels=[Level("level of it", 1, 0.3)], over_logarithmic=True)
+    assert 'class="level"' in line_chart("t", "x", single, levels=[(1, 0.3)], over_logarithmic=True)
 
 
 def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(world, tmp_path, noon):

@@ -1,4 +1,4 @@
-"""What tables say of known numbers, in Markdown, CSV and on a terminal."""
+"""What tables say of known numbers, in CSV and on a terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich.console import Console
 
 from neeco.cli._output import fitted
 from neeco.studies.study import spread
-from neeco.studies.tables import Column, ResultTable, SummaryRow, csv_text, markdown_document, summary_table
+from neeco.studies.tables import Column, ResultTable, csv_text, summary_table
 
 COLUMNS = (
     Column("psnr", "PSNR", 2, "high"),
@@ -30,8 +30,8 @@ def numbers(name: str) -> dict:
 
 @pytest.fixture
 def table() -> ResultTable:
-    rows = [SummaryRow((name,), numbers(name), REASONS.get(name)) for name in PSNR]
-    return summary_table("my_capture", ("method",), COLUMNS, rows)
+    rows = [(name, numbers(name), REASONS.get(name)) for name in PSNR]
+    return summary_table("my_capture", "method", COLUMNS, rows)
 
 
 def test_equal_means_are_both_best_and_lower_lpips_is_better(table: ResultTable) -> None:
@@ -43,12 +43,10 @@ def test_equal_means_are_both_best_and_lower_lpips_is_better(table: ResultTable)
     assert cells["a_b"][2].text == "1.00"  # 60 s in minutes
 
 
-def test_markdown_escapes_names_and_reports_failures(table: ResultTable) -> None:
-    page = markdown_document("My_capture", "Two seeds.", [table], "seeds", ["lpips: a note"])
-    assert "| a\\_b | **21.00** ± 1.41 | **0.100** ± 0.000 | 1.00 ± 0.00 |" in page
-    assert "| c\\|d | **21.00** ± 0.71 | 0.200 ± 0.000 |" in page
-    assert "| lost | failed: loss is 100% nan\\_ |" in page
-    assert "- lpips: a note" in page
+def test_spread_is_the_mean_and_the_sample_standard_deviation() -> None:
+    assert spread([20.0, 22.0]) == {"mean": 21.0, "std": pytest.approx(2**0.5), "n": 2}
+    assert spread([20.0, None, float("nan")]) == {"mean": 20.0, "std": None, "n": 1}
+    assert spread([]) == {"mean": None, "std": None, "n": 0}
 
 
 def test_csv_keeps_every_digit_and_leaves_unknown_empty() -> None:

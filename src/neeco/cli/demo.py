@@ -113,7 +113,7 @@ def _synthesize(trained: TrainedRun, output: Path) -> None:
 
 def _evaluate(trained: TrainedRun, networks: dict[str, Lpips]) -> Path:
     from neeco.evaluation.evaluate import evaluate_run
-    from neeco.report import write_report
+    from neeco.report.run_page import write_report
     from neeco.viewer.export import embedded_page
 
     print("4/4 evaluate on frames kept from training")

@@ -13,7 +13,7 @@ from neeco.base.settings import Device, name_and_value
 from neeco.cli._output import print_outcome
 
 if TYPE_CHECKING:
-    from neeco.studies.downstream.job import DownstreamSettings
+    from neeco.studies.downstream.experiment import DownstreamSettings
     from neeco.studies.downstream.samples import ImageSet
 
 
@@ -70,17 +70,16 @@ def run(args: Downstream) -> int:
     from neeco.cli._progress import Bars
     from neeco.report.downstream_page import write_downstream_report
     from neeco.studies.downstream.experiment import plan_downstream, run_downstream
-    from neeco.studies.downstream.results import failed_jobs, tables_of, write_tables
+    from neeco.studies.downstream.results import failed_jobs, tables_of
 
     with Bars() as bars:
         plan = plan_downstream(_settings(args))
         experiment = run_downstream(plan, bars.job)
-        write_tables(args.output, experiment)
         bars.stage("report", 0, 1)
         page = write_downstream_report(plan, experiment)
         bars.stage("report", 1, 1)
     return print_outcome(
-        {"tables": f"{args.output}/: downstream.md, .csv, .json", "report": page},
+        {"results": f"{args.output}/: downstream.csv, .json", "report": page},
         tables_of(experiment),
         sentences=experiment["findings"],
         notes=experiment["notes"],
@@ -91,7 +90,7 @@ def run(args: Downstream) -> int:
 
 def _settings(args: Downstream) -> DownstreamSettings:
     """The study that these words describe. Raises NeecoError for sets and tests that cannot be understood."""
-    from neeco.studies.downstream.job import DownstreamSettings
+    from neeco.studies.downstream.experiment import DownstreamSettings
 
     tests: dict[str, Path] = {}
     for word in args.test:  # NAME=CAPTURE, or a capture that goes by its folder's name

@@ -56,7 +56,7 @@ def run(args: Evaluate) -> int:
     from neeco.evaluation.evaluate import evaluate_run
     from neeco.evaluation.image_metrics import find_lpips
     from neeco.raster.devices import device_of
-    from neeco.report import write_report
+    from neeco.report.run_page import write_report
     from neeco.training.run import open_run
     from neeco.viewer.export import embedded_page
 

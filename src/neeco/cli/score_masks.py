@@ -11,18 +11,12 @@ from rich.table import Column, Table
 
 from neeco.cli._output import JsonTarget, ready_for_json, whole_lines, write_numbers
 
-COLUMNS = (
-    ("IoU", "iou"),
-    ("Dice", "dice"),
-    ("boundary F", "boundary_f"),
-    ("box AP", "box_ap"),
-    ("box AP50", "box_ap50"),
-)
+COLUMNS = (("IoU", "iou"), ("Dice", "dice"), ("boundary F", "boundary_f"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Score a folder of masks against the truth: IoU, Challenge IoU, Dice, boundary F and box AP, per part."""
+    """Score a folder of masks against the truth: IoU, Challenge IoU, Dice and boundary F, per part."""
 
     predicted: Annotated[Path, tyro.conf.Positional]
     """Folder of masks: PNG with part ids or 0/255, or what `neeco render` wrote."""
@@ -34,8 +28,6 @@ class Arguments:
     """What PREDICTED's ids mean, such as shaft=10 wrist=20. Default: 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right."""
     truth_classes: tuple[str, ...] = ()
     """What TRUTH's ids mean. Default: as above."""
-    components: bool = False
-    """Boxes about each connected group of pixels, not one per part."""
     json: JsonTarget = None
 
 
@@ -52,7 +44,6 @@ def run(arguments: Arguments) -> int:
             splits=arguments.splits,
             classes=parse_classes(arguments.classes, "--classes"),
             truth_classes=parse_classes(arguments.truth_classes, "--truth-classes"),
-            components=arguments.components,
             progress=advance,
         )
         if write_numbers(arguments.json, scores):
@@ -85,9 +76,7 @@ def _lines(scores: dict[str, Any]) -> list[str]:
     challenge = shown(scores["instrument"]["challenge_iou"])
     lines = [f"{scores['images']} images{splits}; Challenge IoU of the instrument {challenge}"]
     if scores["classes"] is not None:
-        classes = scores["classes"]
-        lines[0] += f", of its parts {shown(classes['challenge_iou'])}"
-        lines.append(f"parts: IoU {shown(classes['isinet_iou'])}, mean class IoU {shown(classes['mean_class_iou'])}")
+        lines[0] += f", of its parts {shown(scores['classes']['challenge_iou'])}"
     for pair, way in scores["pair_assignment"].items():
         if way == "swapped":
             lines.append(f"{pair}: left and right are taken the other way round, which fits this folder better")

@@ -32,17 +32,16 @@ def run_study(request: SweepRequest, study: Study, source: Path | None = None) -
     """Run a study with progress bars; print its tables and where the files lie; 1 when a run failed."""
     from neeco.cli._progress import Bars
     from neeco.report.sweep_page import write_sweep_report
-    from neeco.studies.sweep import RESULTS_FILE, failures, plan_sweep, run_sweep
-    from neeco.studies.sweep_tables import tables_of, write_tables
+    from neeco.studies.sweep import RESULTS_FILE, failures, plan_sweep, run_sweep, tables_of
 
     with Bars() as bars:
         plan = plan_sweep(request, study, source)
         rows = run_sweep(plan, bars.job)
         bars.stage("report", 0, 1)
-        table, page = write_tables(plan, rows), write_sweep_report(plan, rows)
+        page = write_sweep_report(plan, rows)
         bars.stage("report", 1, 1)
     return print_outcome(
-        {"results": request.output / RESULTS_FILE, "tables": table, "report": page},
+        {"results": request.output / RESULTS_FILE, "report": page},
         [numbers for _, _, numbers in tables_of(plan, rows)],
         notes=plan.notes,
         failed=failures(rows),

@@ -20,12 +20,22 @@ from neeco.raster.types import Rendering
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene
 
-MAX_VIEWS = 96  # training views compared with, evenly spaced over the recording: neighbours show the same tissue
-SCALE = 0.25  # of the image's resolution
-MIN_SIDE_PX = 48  # below which images are not reduced
-TOLERANCE, TOLERANCE_MM = 0.02, 1.0  # of the depth
-NEAREST_MM = 1e-3  # points behind a camera are not observed
-CHUNK_VIEWS = 16  # tested at once; most points are observed in the first chunk
+
+@dataclass(frozen=True, kw_only=True)
+class CoverageSettings:
+    """The depth maps that a point is compared with."""
+
+    max_views: int = 96  # of training, evenly spaced over the recording: neighbours show the same tissue
+    scale: float = 0.25  # of the image's resolution
+    min_side_px: int = 48  # below which images are not reduced
+    tolerance: float = 0.02  # share of the depth
+    tolerance_mm: float = 1.0  # in addition
+    nearest_mm: float = 1e-3  # points behind a camera are not observed
+    chunk_views: int = 16  # tested at once; most points are observed in the first chunk
+    min_alpha: float = 0.5  # of a pixel that has a depth
+
+
+SETTINGS = CoverageSettings()
 
 
 @dataclass(frozen=True)
@@ -43,34 +53,33 @@ class Coverage:
         A view observed a point that projects into it no deeper than the surface rendered there, within 2% + 1 mm.
         """
         observed = torch.zeros(len(points), dtype=torch.bool)
-        for start in range(0, len(self.depths), CHUNK_VIEWS):
+        chunks = -(-len(self.depths) // SETTINGS.chunk_views)
+        for start in range(chunks):  # views far apart in time first: each chunk takes every chunks-th view
             left = torch.nonzero(~observed)[:, 0]
             if len(left) == 0:
                 break
-            # views far apart in time first: each chunk takes every stride-th view
-            views = torch.arange(len(self.depths))[start // CHUNK_VIEWS :: -(-len(self.depths) // CHUNK_VIEWS)]
-            observed[left] = self._observed_by(points[left], views).any(dim=0)
+            observed[left] = self._observed_by(points[left], torch.arange(len(self.depths))[start::chunks]).any(dim=0)
         return observed
 
     def _observed_by(self, points: Tensor, views: Tensor) -> Tensor:
-        """Return bool [V', M] for the views with the given indices."""
+        """Return bool [V', M] for the views with these indices."""
         pose = self.camera_from_world[views]
         local = torch.einsum("vij,mj->vmi", pose[:, :3, :3], points) + pose[:, None, :3, 3]  # [V', M, 3]
         depth = local[..., 2]
         fx, fy, cx, cy = self.intrinsics[views].T[..., None]  # each [V', 1]
-        column, row = (place.floor().long() for place in project(local, fx, fy, cx, cy, nearest=NEAREST_MM))
+        column, row = (place.floor().long() for place in project(local, fx, fy, cx, cy, nearest=SETTINGS.nearest_mm))
         width, height = self.sizes[views].T[..., None]
         inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
         stride = self.depths.shape[2]
         index = (row * stride + column).clamp(0, self.depths[0].numel() - 1)
         surface = self.depths[views].flatten(1).gather(1, index)  # [V', M]
-        return inside & (depth <= surface * (1 + TOLERANCE) + TOLERANCE_MM)
+        return inside & (depth <= surface * (1 + SETTINGS.tolerance) + SETTINGS.tolerance_mm)
 
 
 @torch.no_grad()
 def observed_depths(scene: DrawableScene, frames: Sequence[Frame]) -> Coverage:
-    """Render small depth maps of at most MAX_VIEWS training `frames`, instruments included."""
-    chosen = [frames[index] for index in evenly_spaced(len(frames), MAX_VIEWS)]
+    """Render small depth maps of at most `max_views` training `frames`, instruments included."""
+    chosen = [frames[index] for index in evenly_spaced(len(frames), SETTINGS.max_views)]
     cameras = [_small(frame.camera) for frame in chosen]
     maps = [_filled(scene.render(frame.state, camera)) for frame, camera in zip(chosen, cameras, strict=True)]
     height, width = max((len(depth) for depth in maps), default=1), max((depth.shape[1] for depth in maps), default=1)
@@ -108,13 +117,12 @@ def unobserved_tissue(coverage: Coverage, scene: DrawableScene, frame: Frame) ->
 
 def _small(camera: Camera) -> Camera:
     """Return the camera at the resolution of the depth maps."""
-    return camera.scaled(min(1.0, max(SCALE, MIN_SIDE_PX / min(camera.width, camera.height))))
+    return camera.scaled(min(1.0, max(SETTINGS.scale, SETTINGS.min_side_px / min(camera.width, camera.height))))
 
 
 def _filled(rendering: Rendering) -> Tensor:
-    """Return the depth [h, w] mm on the CPU, thin or empty pixels (alpha < 0.5) with the nearest solid pixel's, if any
-    is."""
-    depth, hollow = rendering.depth.cpu().float(), (rendering.alpha.cpu() < 0.5).numpy()
+    """Return the depth [h, w] mm on the CPU; pixels of an alpha below `min_alpha` have the nearest solid pixel's."""
+    depth, hollow = rendering.depth.cpu().float(), (rendering.alpha.cpu() < SETTINGS.min_alpha).numpy()
     if not hollow.any() or hollow.all():
         return depth
     rows, columns = distance_transform_edt(hollow, return_distances=False, return_indices=True)

@@ -21,7 +21,7 @@ from neeco.capture.images import read_mask
 from neeco.capture.model import Capture, Frame, State
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
-from neeco.evaluation.mask_folders import ReferenceMask, load_reference, truth_names
+from neeco.evaluation.mask_folders import load_reference, truth_names
 from neeco.evaluation.mask_metrics import (
     PartTally,
     dice,
@@ -36,7 +36,7 @@ from neeco.evidence.foreground import Comparison, Foreground
 from neeco.evidence.label_quality import label_counts, learned_foreground, quality_of
 from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import field_pinhole
-from neeco.labels.drawing import Drawing, draw
+from neeco.labels.drawing import draw
 from neeco.labels.labellers import threshold_of
 from neeco.raster import depth_maps, rasterize
 from neeco.raster.native import synchronise
@@ -49,13 +49,27 @@ if TYPE_CHECKING:
     from neeco.scene import DrawableScene
     from neeco.training.run import TrainedRun
 
-MISSING_LIGHT = 0.15  # share of the tissue's light, from which a pixel is in shadow
-MIN_AREA = 1e-3  # of the image: a smaller shadow has no score
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """Thresholds of shadows, and the timing of renderings."""
+
+    missing_light: float = 0.15  # share of the tissue's light, from which a pixel is in shadow
+    min_shadow: float = 1e-3  # share of the image: a smaller shadow has no score
+    timed: int = 7  # renderings, after two to warm up
+    max_timed_s: float = 10.0  # after which a slow scene is not rendered again
+
+
+SETTINGS = EvaluationSettings()
+EVALUATION_FILE = "evaluation.json"
+LPIPS_KEYS = {"alexnet": "lpips", "vgg16": "lpips_vgg"}  # AlexNet is the one its authors score with
+LABEL_KEYS = ("mask_iou", "mask_dice", "mask_precision", "mask_recall", "shaft_recall", "shadow_labelled")
+Progress = Callable[[str, int, int], None]  # what, how many done, of how many
 
 
 def load_shadow(capture: Capture, frame: Frame) -> Tensor | None:
     """Return the true shadow of a frame, bool [H, W], of `truth/shadow/<stem>.png` (0/255: tissue that loses more than
-    MISSING_LIGHT); None without one. Raises NeecoError where it is damaged or of another size than the frame."""
+    `missing_light`); None without one. Raises NeecoError where it is damaged or of another size than the frame."""
     file = capture.root / SHADOW_FOLDER / f"{frame.name}.png"
     if not file.is_file():
         return None
@@ -65,7 +79,7 @@ def load_shadow(capture: Capture, frame: Frame) -> Tensor | None:
 @torch.no_grad()
 def rendered_shadow(scene: GaussianScene, state: State, camera: Camera) -> Tensor | None:
     """Return the scene's own shadow of the instruments in `state`, bool [H, W]: tissue, rendered alone, that loses
-    more than MISSING_LIGHT. None where the scene models none."""
+    more than `missing_light`. None where the scene models none."""
     if not scene.casts_shadow:
         return None
     camera = scene.recorded.as_learned(camera)
@@ -75,13 +89,13 @@ def rendered_shadow(scene: GaussianScene, state: State, camera: Camera) -> Tenso
     pinhole = field_pinhole(of_learned_size(camera))
     shares = []
     for lit in (light, replace(light, shadow=None)):
-        found = shadowed(replace(posed, headlight=lit), pinhole, depth_maps).headlight
-        left = None if found is None else found.left
-        shares.append(torch.ones_like(posed.opacities) if left is None else left)
+        headlight = shadowed(replace(posed, headlight=lit), pinhole, depth_maps).headlight
+        remaining = None if headlight is None else headlight.left
+        shares.append(torch.ones_like(posed.opacities) if remaining is None else remaining)
     tissue = ~scene.canonical.of_instruments
     rendering = rasterize(posed.select(tissue), camera, channels=(shares[0] / shares[1])[tissue][:, None])
     assert rendering.channels is not None
-    return (rendering.channels[..., 0] < (1 - MISSING_LIGHT) ** (1 / GAMMA) * rendering.alpha).cpu()
+    return (rendering.channels[..., 0] < (1 - SETTINGS.missing_light) ** (1 / GAMMA) * rendering.alpha).cpu()
 
 
 def labelled_shadow(mask: Tensor, truth: Tensor, shadow: Tensor, counted: Tensor) -> float:
@@ -90,16 +104,9 @@ def labelled_shadow(mask: Tensor, truth: Tensor, shadow: Tensor, counted: Tensor
     All bool [H, W]: label, true mask, shadow (counted outside the true mask), pixels that count.
     """
     area = shadow & ~truth & counted
-    if int(area.sum()) < MIN_AREA * area.numel():
+    if int(area.sum()) < SETTINGS.min_shadow * area.numel():
         return math.nan
     return int((area & mask).sum()) / int(area.sum())
-
-
-EVALUATION_FILE = "evaluation.json"
-N_TIMED = 7  # renderings
-MAX_TIMED_S = 10.0  # after which a slow scene is not rendered again
-LPIPS_KEYS = {"alexnet": "lpips", "vgg16": "lpips_vgg"}  # AlexNet is the one its authors score with
-Progress = Callable[[str, int, int], None]  # what, how many done, of how many
 
 
 @dataclass
@@ -122,19 +129,6 @@ class _Context:
     networks: Mapping[str, Lpips]
     coverage: Coverage
     foreground: Foreground | None  # tells instruments from tissue in images without masks
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Recorded:
-    """A recorded frame with all that scoring needs, for the given and the aligned rendering."""
-
-    image: Tensor  # [H, W, 3] in [0, 1]
-    mask: Tensor | None  # [H, W] bool, False where pixels do not count
-    reference: ReferenceMask | None
-    shaft: Tensor | None  # [H, W] bool, where the reference tells parts
-    unobserved: Tensor  # [H, W] bool, tissue that no training frame observed
-    tissue: Tensor  # [H, W] bool
-    features: dict[str, list[Tensor]]  # LPIPS features by network name
 
 
 def evaluate_run(
@@ -222,86 +216,65 @@ def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tu
 
 
 def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) -> None:
-    """Render one frame at its given poses and, where asked, at fitted ones; add the scores to the tallies."""
+    """Render one frame at its given poses and, where asked, at fitted ones; add the scores to the tallies. A score is
+    None where there is nothing to compare with."""
     scene = context.scene
     unobserved, tissue = unobserved_tissue(context.coverage, scene, frame)
     reference = load_reference(context.capture, frame)
-    image, mask = frame.load_image(), frame.load_mask()
-    networks = context.networks if min(image.shape[:2]) >= MIN_SIZE else {}
-    features = {name: network.features(image) for name, network in networks.items()}
-    recorded = _Recorded(
-        image=image,
-        mask=mask,
-        reference=reference,
-        shaft=_shaft(reference, truth_names(context.capture.root)),
-        unobserved=unobserved,
-        tissue=tissue,
-        features=features,
-    )
+    target, mask = frame.load_image(), frame.load_mask()
+    counted = torch.ones(target.shape[:2], dtype=torch.bool, device=target.device) if mask is None else mask
+    tissue_pixels = int((tissue & counted).sum())
+    networks = context.networks if min(target.shape[:2]) >= MIN_SIZE else {}
+    features = {name: network.features(target) for name, network in networks.items()}
+    shafts = [number for number, part in truth_names(context.capture.root).items() if part == "shaft"]
+    true_shaft = None
+    if reference is not None and reference.parts is not None and shafts:
+        true_shaft = torch.isin(reference.parts, torch.tensor(shafts, dtype=reference.parts.dtype))
     true_shadow = load_shadow(context.capture, frame)
     for kind, tally in tallies.items():
         row: dict[str, Any] = {"frame": frame.name}
         state, camera = frame.state, frame.camera
         if kind == "aligned":
             assert context.posed is not None
-            fit = align_frame(context.posed, frame, image)
+            fit = align_frame(context.posed, frame, target)
             state, camera = fit.state, fit.camera
             row["moved"] = pose_changes(frame, state, camera)
             row["world_from_camera"] = camera.world_from_camera.tolist()
             row["joints"] = {name: dict(item.joints) for name, item in state.instruments.items()}
             row["world_from_instrument"] = {name: item.pose.tolist() for name, item in state.instruments.items()}
         if context.foreground is not None and is_gaussian(scene):
-            view = Comparison.of(scene, state, scene.recorded.as_learned(camera), image, mask)
+            view = Comparison.of(scene, state, scene.recorded.as_learned(camera), target, mask)
             tally.counts += label_counts(view, context.foreground)
         drawing = draw(scene, state, camera)
+        image = drawing.image
         shadow = true_shadow
         if shadow is None and reference is not None and is_gaussian(scene):
             shadow = rendered_shadow(scene, state, camera)
-        tally.scores.append(_scores(drawing, recorded, shadow, networks))
-        tally.rows.append(row | tally.scores[-1])
-        if drawing.parts is not None and reference is not None and reference.parts is not None:
-            ours = to_truth_ids(drawing.parts, scene.label_names, tally.parts.names)
-            tally.parts.add(ours, reference.parts, mask)
-
-
-def _shaft(reference: ReferenceMask | None, names: Mapping[int, str]) -> Tensor | None:
-    """Return the true pixels of all shafts, bool [H, W]; None where the reference does not tell them."""
-    numbers = [number for number, part in names.items() if part == "shaft"]
-    if reference is None or reference.parts is None or not numbers:
-        return None
-    return torch.isin(reference.parts, torch.tensor(numbers, dtype=reference.parts.dtype))
-
-
-def _scores(
-    drawing: Drawing, recorded: _Recorded, shadow: Tensor | None, networks: Mapping[str, Lpips]
-) -> dict[str, float | None]:
-    """Return the scores of one frame; None where there is nothing to compare with."""
-    image, target, mask, reference = drawing.image, recorded.image, recorded.mask, recorded.reference
-    counted = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
-    tissue = int((recorded.tissue & counted).sum())
-    labelled = None if drawing.parts is None or reference is None else (drawing.parts > 0, reference.mask)
-    shown = image if mask is None else torch.where(mask[..., None], image, target)
-    lpips = {
-        name: network.between(network.features(shown), recorded.features[name], mask)
-        for name, network in networks.items()
-    }
-    return {
-        "psnr": psnr(image, target, counted),
-        "ssim": ssim(image, target, mask),
-        **{key: lpips.get(name) for name, key in LPIPS_KEYS.items()},
-        "psnr_instrument": None if reference is None else psnr(image, target, counted & reference.mask),
-        "mask_iou": None if labelled is None else iou(*labelled, counted),
-        "mask_dice": None if labelled is None else dice(*labelled, counted),
-        "mask_precision": None if labelled is None else precision(*labelled, counted),
-        "mask_recall": None if labelled is None else precision(*labelled[::-1], counted),
-        "shaft_recall": precision(recorded.shaft, labelled[0], counted)
-        if labelled and recorded.shaft is not None
-        else None,
-        "shadow_labelled": labelled_shadow(*labelled, shadow, counted) if labelled and shadow is not None else None,
-        "psnr_covered": psnr(image, target, counted & ~recorded.unobserved),
-        "psnr_uncovered": psnr(image, target, counted & recorded.unobserved),
-        "covered_fraction": 1.0 - int((recorded.unobserved & counted).sum()) / tissue if tissue else None,
-    }
+        compared = image if mask is None else torch.where(mask[..., None], image, target)
+        scores: dict[str, float | None] = {"psnr": psnr(image, target, counted), "ssim": ssim(image, target, mask)}
+        scores |= dict.fromkeys((*LPIPS_KEYS.values(), "psnr_instrument", *LABEL_KEYS))
+        for name, network in networks.items():
+            scores[LPIPS_KEYS[name]] = network.between(network.features(compared), features[name], mask)
+        if reference is not None:
+            scores["psnr_instrument"] = psnr(image, target, counted & reference.mask)
+        if drawing.parts is not None and reference is not None:
+            label = drawing.parts > 0
+            scores["mask_iou"] = iou(label, reference.mask, counted)
+            scores["mask_dice"] = dice(label, reference.mask, counted)
+            scores["mask_precision"] = precision(label, reference.mask, counted)
+            scores["mask_recall"] = precision(reference.mask, label, counted)
+            scores["shaft_recall"] = None if true_shaft is None else precision(true_shaft, label, counted)
+            if shadow is not None:
+                scores["shadow_labelled"] = labelled_shadow(label, reference.mask, shadow, counted)
+            if reference.parts is not None:
+                ours = to_truth_ids(drawing.parts, scene.label_names, tally.parts.names)
+                tally.parts.add(ours, reference.parts, mask)
+        scores["psnr_covered"] = psnr(image, target, counted & ~unobserved)
+        scores["psnr_uncovered"] = psnr(image, target, counted & unobserved)
+        uncovered = int((unobserved & counted).sum())
+        scores["covered_fraction"] = 1.0 - uncovered / tissue_pixels if tissue_pixels else None
+        tally.scores.append(scores)
+        tally.rows.append(row | scores)
 
 
 def _summary(scene: DrawableScene, tally: _Tally) -> tuple[dict[str, Any], dict[str, str]]:
@@ -323,15 +296,15 @@ def _summary(scene: DrawableScene, tally: _Tally) -> tuple[dict[str, Any], dict[
 
 @torch.no_grad()
 def _speed(scene: DrawableScene, frames: Sequence[Frame]) -> tuple[float, int | None]:
-    """Return renderings per second (median of N_TIMED after two to warm up; of fewer where those take long) and the
-    number of Gaussians."""
+    """Return renderings per second (median, after two to warm up; of fewer where those take long) and the number of
+    Gaussians."""
     seconds: list[float] = []
-    for index in range(N_TIMED + 2):
+    for index in range(SETTINGS.timed + 2):
         frame = frames[index % len(frames)]
         start = time.perf_counter()
         synchronise(scene.render(frame.state, frame.camera).color.device)
         seconds.append(time.perf_counter() - start)
-        if len(seconds) > 1 and sum(seconds) > MAX_TIMED_S:
+        if len(seconds) > 1 and sum(seconds) > SETTINGS.max_timed_s:
             break
     return 1.0 / statistics.median(seconds[2:] or seconds[1:]), scene.num_gaussians
 

@@ -1,4 +1,4 @@
-"""Metrics between masks: intersection over union and Dice, also per part; boundary F (DAVIS); box AP."""
+"""Metrics between masks: intersection over union and Dice, also per part; boundary F (DAVIS)."""
 
 from __future__ import annotations
 
@@ -10,18 +10,13 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from scipy import ndimage, sparse
-from scipy.sparse.csgraph import maximum_bipartite_matching
+from scipy import ndimage
 from torch import Tensor
 
 from neeco.labels.drawing import distances_to
 
 _LEFT = re.compile(r"(?:^|_)left(?=_|$)")
 BOUNDARY_TOLERANCE = 0.008  # of the image's diagonal, as DAVIS
-COCO_THRESHOLDS = tuple(np.linspace(0.5, 0.95, 10).round(2))
-RECALLS = np.linspace(0, 1, 101)
-
-
 Pixels = TypeVar("Pixels", Tensor, np.ndarray)
 
 
@@ -75,59 +70,57 @@ def pairs_of(parts: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 def part_scores(names: Mapping[int, str]) -> tuple[str, ...]:
     """Return the scored parts, where `names` are those of the truth by id, and each pair as one."""
-    return *names.values(), *pairs_of(names.values())
+    parts = tuple(dict.fromkeys(names.values()))
+    return *parts, *pairs_of(parts)
 
 
 @dataclass
 class PartTally:
-    """IoU per part over the frames of a split. names: part by id in the truth.
+    """Scores per part over many images. names: part by id in the truth; scores: of masks, the IoU first.
 
-    A scene learned from images cannot know which of a pair is left: the assignment that is better over the whole split
-    is reported (never the better one per frame).
+    A scene learned from images cannot know which of a pair is left: the assignment that is better over all images is
+    reported (never the better one per image).
     """
 
     names: Mapping[int, str]
-    rows: list[dict[tuple[str, str], float]] = field(default_factory=list)  # of frames, by (part, part of the truth)
+    scores: tuple[Callable[..., float], ...] = (iou,)
+    rows: list[dict[tuple[str, str], tuple[float, ...]]] = field(default_factory=list)  # by (part, part of the truth)
 
-    def add(self, parts: Tensor, truth: Tensor, counted: Tensor | None = None) -> None:
-        """Add one frame: `parts` and `truth` [H, W] uint8, both in the truth's numbers."""
+    def add(self, parts: Pixels, truth: Pixels, counted: Pixels | None = None) -> None:
+        """Add one image: `parts` and `truth` [H, W] uint8, both in the truth's numbers."""
         ours, theirs = ({part: ids == number for number, part in self.names.items()} for ids in (parts, truth))
         compared = [(part, part) for part in part_scores(self.names)]
         for pair, (left, right) in pairs_of(self.names.values()).items():
             for masks in (ours, theirs):
                 masks[pair] = masks[left] | masks[right]
             compared += [(left, right), (right, left)]
-        self.rows.append({(a, b): iou(ours[a], theirs[b], counted) for a, b in compared})
+        self.rows.append(
+            {(a, b): tuple(score(ours[a], theirs[b], counted) for score in self.scores) for a, b in compared}
+        )
+
+    def swapped(self) -> tuple[dict[str, str], dict[str, str]]:
+        """Return the parts to exchange, and how each pair is assigned: "swapped" where that fits better, else "as
+        named"."""
+        swap: dict[str, str] = {}
+        assignment = {}
+        for pair, (left, right) in pairs_of(self.names.values()).items():
+            as_named, exchanged = (
+                np.nansum([self.mean(ours, theirs) for ours, theirs in zip(order, (left, right), strict=True)])
+                for order in ((left, right), (right, left))
+            )
+            assignment[pair] = "swapped" if exchanged > as_named else "as named"
+            swap |= {left: right, right: left} if exchanged > as_named else {}
+        return swap, assignment
+
+    def mean(self, ours: str, theirs: str, score: int = 0) -> float:
+        """Return the mean of a score over the images that show the part; NaN where none does."""
+        return mean_of([row[ours, theirs][score] for row in self.rows])
 
     def result(self) -> tuple[dict[str, float], dict[str, str]]:
-        """Return the mean IoU per part over the frames that show it (NaN when none does), and the assignment of each
+        """Return the mean IoU per part over the images that show it (NaN when none does), and the assignment of each
         pair, "as named" or "swapped"."""
-
-        def mean(ours: str, theirs: str) -> float:
-            return mean_of([row[ours, theirs] for row in self.rows])
-
-        swap, assignment = assigned_pairs(pairs_of(self.names.values()), mean)
-        return {part: mean(swap.get(part, part), part) for part in part_scores(self.names)}, assignment
-
-
-def assigned_pairs(
-    pairs: Mapping[str, tuple[str, str]], mean_iou: Callable[[str, str], float]
-) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the parts to exchange, and how each pair is assigned: "swapped" where that fits better, else "as named".
-
-    mean_iou: of a part and a part of the truth, over all images.
-    """
-    swap: dict[str, str] = {}
-    assignment = {}
-    for pair, (left, right) in pairs.items():
-        swapped, named = (
-            (mean_iou(right, left), mean_iou(left, right)),
-            (mean_iou(left, left), mean_iou(right, right)),
-        )
-        is_better = np.nansum(swapped) > np.nansum(named)
-        assignment[pair] = "swapped" if is_better else "as named"
-        swap |= {left: right, right: left} if is_better else {}
-    return swap, assignment
+        swap, assignment = self.swapped()
+        return {part: self.mean(swap.get(part, part), part) for part in part_scores(self.names)}, assignment
 
 
 def mean_of(values: Sequence[float | None]) -> float:
@@ -169,44 +162,3 @@ def boundary_f(
     precision = int((first & inside & near_second).sum()) / judged[0]
     recall = int((second & inside & near_first).sum()) / judged[1]
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
-
-
-def boxes_of(mask: np.ndarray, components: bool = False) -> np.ndarray:
-    """Return boxes [n, 4] (x0, y0, x1, y1; px, x1 and y1 exclusive) about a bool mask [H, W].
-
-    One about all its pixels, or with `components` one about each group that touches by side or corner.
-    """
-    labels = ndimage.label(mask, np.ones((3, 3)))[0] if components else mask.astype(np.uint8)
-    found = [(x.start, y.start, x.stop, y.stop) for y, x in ndimage.find_objects(labels)]
-    return np.array(found, np.float64).reshape(-1, 4)
-
-
-def box_ious(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the intersection over union [n, m] of boxes [n, 4] and [m, 4]."""
-    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
-    both = np.clip(high - low, 0, None).prod(axis=2)
-    areas = [np.prod(some[:, 2:] - some[:, :2], axis=1) for some in (boxes, others)]
-    return both / (areas[0][:, None] + areas[1][None, :] - both)
-
-
-def average_precision(
-    predicted: Sequence[np.ndarray], truth: Sequence[np.ndarray], thresholds: Sequence[float] = COCO_THRESHOLDS
-) -> float:
-    """Return the average precision over recalls 0, 0.01 … 1, mean over IoU `thresholds` (Lin et al., COCO, 2014).
-
-    predicted, truth: boxes [n, 4] of each image. Masks have no confidence, so that all boxes rank equally: there is one
-    operating point, its precision holds up to its recall, and as many boxes are matched as the threshold allows. NaN
-    when no image has a true box.
-    """
-    boxes, wanted = sum(map(len, predicted)), sum(map(len, truth))
-    if not wanted:
-        return math.nan
-    ious = [box_ious(some, others) for some, others in zip(predicted, truth, strict=True)]
-    found = [sum(_matches(table >= threshold) for table in ious) for threshold in thresholds]
-    return float(np.mean([hits / boxes * np.mean(hits / wanted >= RECALLS) if hits else 0.0 for hits in found]))
-
-
-def _matches(fits: np.ndarray) -> int:
-    """Return the number of pairs in a maximum matching of rows and columns."""
-    return int((maximum_bipartite_matching(sparse.csr_matrix(fits)) >= 0).sum()) if fits.any() else 0

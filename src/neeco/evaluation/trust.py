@@ -18,31 +18,35 @@ from torch import Tensor
 
 from neeco.labels.drawing import distances_to
 
-NEIGHBOURHOOD = 0.03  # of the image's diagonal: how far from the label pixels may be missed
-TYPICAL_QUANTILE = 0.99  # of the errors in training frames
-MAX_SHARE = 0.5  # of the tissue's error: an instrument with a smaller one is there, if blurred
-WINDOW_PX = 3  # side of the square over which a pixel's error is averaged
+
+@dataclass(frozen=True)
+class TrustSettings:
+    """Thresholds of the votes of pixels on a label."""
+
+    neighbourhood: float = 0.03  # share of the image's diagonal: how far from the label pixels may be missed
+    typical_quantile: float = 0.99  # of the errors in training frames
+    max_share: float = 0.5  # of the tissue's error: an instrument with a smaller one is there, if blurred
+    window_px: int = 3  # side of the square over which a pixel's error is averaged
+
+
+SETTINGS = TrustSettings()
 
 
 class LabelledRendering(Protocol):
-    """A rendering with its label, such as a `LayeredDrawing`."""
+    """A rendering with its label, such as a `LayeredDrawing`: images [H, W, 3] in [0, 1]; parts [H, W], above 0 in the
+    label; the tissue rendered alone is required."""
 
     @property
-    def image(self) -> Tensor:
-        """[H, W, 3] in [0, 1]."""
-
+    def image(self) -> Tensor: ...
     @property
-    def parts(self) -> Tensor:
-        """[H, W], above 0 in the label."""
-
+    def parts(self) -> Tensor: ...
     @property
-    def tissue_image(self) -> Tensor | None:
-        """[H, W, 3] in [0, 1] of the tissue rendered alone, which is required."""
+    def tissue_image(self) -> Tensor | None: ...
 
 
 @dataclass(frozen=True)
 class TypicalErrors:
-    """The TYPICAL_QUANTILE of pixels' errors (mean over colours) in training frames."""
+    """A high quantile (`typical_quantile`) of pixels' errors (mean over colours) in training frames."""
 
     inside: float  # the label
     nearby: float  # in its neighbourhood
@@ -77,7 +81,8 @@ def typical_errors_of(drawings: Sequence[tuple[LabelledRendering, Tensor, Tensor
     inside = np.concatenate([frame.whole[frame.label] for frame in errors])
     nearby = np.concatenate([frame.whole[frame.nearby] for frame in errors])
     inside_error, nearby_error = (
-        round(float(np.quantile(values, TYPICAL_QUANTILE)), 5) if len(values) else 1.0 for values in (inside, nearby)
+        round(float(np.quantile(values, SETTINGS.typical_quantile)), 5) if len(values) else 1.0
+        for values in (inside, nearby)
     )
     return TypicalErrors(inside_error, nearby_error)
 
@@ -87,7 +92,7 @@ def estimate_trust(
     image: Tensor,
     mask: Tensor | None,
     typical: TypicalErrors,
-    neighbourhood: float = NEIGHBOURHOOD,
+    neighbourhood: float = SETTINGS.neighbourhood,
 ) -> Trust:
     """Return the trust in the label of `drawing` as that of `image` [H, W, 3]; 0 where there is no label.
 
@@ -95,7 +100,7 @@ def estimate_trust(
     diagonal away do.
     """
     errors = _errors(drawing, image, mask, neighbourhood)
-    unexplained = (errors.whole > typical.inside) & (errors.whole > MAX_SHARE * errors.tissue)
+    unexplained = (errors.whole > typical.inside) & (errors.whole > SETTINGS.max_share * errors.tissue)
     against = errors.label & ((errors.whole > errors.tissue) | unexplained)
     missed = errors.nearby & (errors.whole > typical.nearby)
     size = max(1, int(errors.label.sum()))
@@ -111,14 +116,14 @@ def _count_without_single_pixels(votes: np.ndarray) -> int:
 
 
 def _errors(
-    drawing: LabelledRendering, image: Tensor, mask: Tensor | None, neighbourhood: float = NEIGHBOURHOOD
+    drawing: LabelledRendering, image: Tensor, mask: Tensor | None, neighbourhood: float = SETTINGS.neighbourhood
 ) -> _Errors:
     votes = np.ones(drawing.parts.shape, dtype=bool) if mask is None else mask.numpy()
     label = drawing.parts.numpy() > 0
     near = ~label & (distances_to(label) <= neighbourhood * float(np.hypot(*label.shape)))
     assert drawing.tissue_image is not None
     whole, tissue = (
-        uniform_filter((rendered - image).abs().mean(2).numpy(), WINDOW_PX)
+        uniform_filter((rendered - image).abs().mean(2).numpy(), SETTINGS.window_px)
         for rendered in (drawing.image, drawing.tissue_image)
     )
     return _Errors(label & votes, near & votes, whole, tissue)

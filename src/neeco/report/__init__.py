@@ -1,5 +1,1 @@
-"""The one-page report of a run."""
-
-from neeco.report.run_page import write_report
-
-__all__ = ["write_report"]
+"""HTML pages, each one file without anything to fetch, and their figures."""

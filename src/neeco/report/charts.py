@@ -1,4 +1,4 @@
-"""Charts as inline SVG in the colours of the page's style sheet: lines of series, dots over time, and their keys.
+"""Charts as inline SVG in the colours of the page's style sheet: lines of series, and their keys.
 
 Matplotlib draws them in placeholder colours (PALETTE), which become the style sheet's variables, so
 that it is readable in a light, a dark and a printed page; its background is transparent and its text stays text. An
@@ -22,25 +22,12 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
-from matplotlib.transforms import IdentityTransform
 
 SIZE, SMALL = (460, 270), (420, 190)  # view box units; the page scales them
-LABEL_STEP = 13  # units between two names at the ends of lines
-LABEL_CHARACTERS = 20  # of a name at the end of its line
-CHARACTER = 6.9  # units that one takes at most, on average
 COLORS = 7
-DASHES = (
-    (),
-    (7, 3),
-    (2, 3),
-    (10, 3, 2, 3),
-    (14, 4),
-    (5, 2, 1, 2, 1, 2),
-    (1, 2, 6, 2),
-)  # tell lines apart in grey print
+# of lines, which tell them apart in grey print
+DASHES = ((), (7, 3), (2, 3), (10, 3, 2, 3), (14, 4), (5, 2, 1, 2, 1, 2), (1, 2, 6, 2))
 MARKS = ("o", "s", "^", "x", "D", "+", "v")
-CROWDED = 0.06  # of a logarithmic axis: the least distance of two ticks
-FEW_DECADES = (10.0, 300.0)  # highest over lowest where the ticks of a logarithmic axis are 1, 2 and 5
 
 VARIABLES = ("ink", "soft", "edge", "accent", "phase", "good", "bad", *(f"m{order}" for order in range(COLORS)))
 PALETTE = {name: f"#0101{index:02x}" for index, name in enumerate(VARIABLES)}  # of the style sheet's variables
@@ -74,21 +61,11 @@ Point = tuple[float, float]
 class Series:
     """One method (or level) in a chart. `order`: its place among all, which gives it colour, dashes and mark."""
 
-    name: str
     order: int
     main: tuple[Point, ...] = ()  # the line to read
     faint: tuple[tuple[Point, ...], ...] = ()  # thin lines, one per seed
     dots: tuple[Point, ...] = ()  # faint marks
     band: tuple[tuple[float, float, float], ...] = ()  # x, low, high: an interval about the line
-
-
-@dataclass(frozen=True)
-class Level:
-    """One value for the whole chart. `order`: the place whose colour it takes."""
-
-    name: str
-    order: int
-    value: float
 
 
 @contextmanager
@@ -139,7 +116,7 @@ def line_chart(
     series: Sequence[Series],
     *,
     starts: Sequence[tuple[float, str]] = (),
-    levels: Sequence[Level] = (),
+    levels: Sequence[tuple[int, float]] = (),
     note: str = "",
     logarithmic: bool = False,
     over_logarithmic: bool = False,
@@ -147,50 +124,58 @@ def line_chart(
 ) -> str:
     """Lines and marks over a shared x axis as inline SVG; "" when nothing has two points.
 
-    starts: (x, what begins there), shown as dashed vertical lines. levels: thin dashed lines from side to side; with
-    them a single point is a chart. note: stands at the right, above the chart. over_logarithmic: the axis of x, whose
-    ticks are then the points' own.
+    starts: (x, what begins there), shown as dashed vertical lines. levels: (order, value) of thin dashed lines from
+    side to side; with them a single point is a chart. note: stands at the right, above the chart. over_logarithmic: the
+    axis of x, whose ticks are then the points' own.
     """
     xs = sorted({x for item in series for line in (item.main, *item.faint, item.dots) for x, _ in line})
     if len(xs) < (1 if levels else 2):
         return ""
-    longest = max(len(name) for name in [*(item.name for item in series), *(level.name for level in levels)])
-    axes = new_axes(size, 46, 14 + round(CHARACTER * min(LABEL_CHARACTERS, longest)), 28, 42)
+    axes = new_axes(size, 46, 14, 28, 42)
     axes.set_title(title)
     axes.set_title(note, loc="right", fontsize=11)
     axes.set_xlabel(over)
     axes.set_yscale("log" if logarithmic else "linear")
     axes.margins(y=0.05)
     for item in series:
-        axes.plot(*_columns(item.dots), alpha=0.45, **_mark(item.order))
+        axes.plot(*np.array(item.dots).reshape(-1, 2).T, alpha=0.45, **_mark(item.order))
         if item.band:
             across, low, high = np.array(item.band).T
             axes.fill_between(across, low, high, color=_color(item.order), alpha=0.12, linewidth=0)
         for line in item.faint:
             _draw_line(axes, item.order, line, linewidth=0.7, alpha=0.55)
     for item in series:  # above all that is faint
-        dashes = DASHES[item.order % len(DASHES)]
-        _draw_line(axes, item.order, item.main, linewidth=2, **({"dashes": dashes} if dashes else {}))
-    for level in levels:
-        axes.axhline(level.value, color=_color(level.order), linewidth=1.1, dashes=(4, 4), gid="level")
+        _draw_line(axes, item.order, item.main, linewidth=2, dashes=DASHES[item.order % len(DASHES)])
+    for order, value in levels:
+        axes.axhline(value, color=_color(order), linewidth=1.1, dashes=(4, 4), gid="level")
     if over_logarithmic:
         _set_logarithmic_x(axes, xs)
     else:
         axes.set_xlim(min(0.0, xs[0]), xs[-1] if xs[-1] > min(0.0, xs[0]) else None)
         round_ticks(axes.xaxis, 5, short)
-    cut = not logarithmic and _begin_at_zero(axes)
+    low, high = axes.get_ylim()
+    cut = not logarithmic and low >= high / 2  # an axis from zero would flatten the lines
+    if cut:
+        place: dict[str, Any] = {"textcoords": "offset points", "va": "top", "fontsize": 9}
+        axes.annotate("axis cut", (0, 0), (-36, -19), "axes fraction", color=PALETTE["soft"], gid="cut", **place)
+    elif not logarithmic:
+        axes.set_ylim(min(low, 0.0), high)
     round_ticks(axes.yaxis, 4, short)
     if logarithmic:
-        low, high = axes.get_ylim()
         axes.yaxis.set_minor_locator(NullLocator())
-        if high / low > FEW_DECADES[0]:
-            subdivided = high / low < FEW_DECADES[1]
-            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if subdivided else (1.0,)))
+        if high / low > 10:  # 1, 2 and 5 of each decade where there are few
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high / low < 300 else (1.0,)))
     falling = any(item.main and item.main[-1][1] < item.main[0][1] for item in series)
-    for x, words in starts:
-        _draw_start(axes, x, words, falling)
-    ends = [(item.main[-1][1], item.order, item.name) for item in series if item.main and item.name]
-    _draw_names(axes, [*ends, *((level.value, level.order, level.name) for level in levels)])
+    first, last = axes.get_xlim()
+    for x, words in starts:  # the name stands where lines leave room for it
+        x = min(max(x, first), last)
+        right = x - first > 0.75 * (last - first)
+        axes.axvline(x, color=PALETTE["phase"], linewidth=1, dashes=(4, 3), gid="phase")
+        offset, align = (-4 if right else 4, -12 if falling else 5), "right" if right else "left"
+        axes.annotate(
+            words, (x, 1 if falling else 0), offset, axes.get_xaxis_transform(), "offset points",
+            ha=align, color=PALETTE["phase"],
+        )  # fmt: skip
     return inline_svg(axes, f"{title} over {over}{', vertical axis cut' if cut else ''}")
 
 
@@ -202,8 +187,7 @@ def legend(names: Sequence[str], shown: Sequence[str]) -> list[tuple[str, Markup
         if name in shown:
             axes = new_axes((46, 14), 0, 0, 0, 0)
             axes.set_axis_off()
-            dashes = DASHES[order % len(DASHES)]
-            _draw_line(axes, order, ((1, 7), (45, 7)), linewidth=2, **({"dashes": dashes} if dashes else {}))
+            _draw_line(axes, order, ((1, 7), (45, 7)), linewidth=2, dashes=DASHES[order % len(DASHES)])
             axes.plot(23, 7, **_mark(order))
             axes.set(xlim=(0, 46), ylim=(0, 14))
             entries.append((name, inline_svg(axes, f"line of {name}")))
@@ -223,10 +207,6 @@ def short(value: float) -> str:
     return f"{value:.4g}" if abs(value) >= 100 else f"{value:.3g}"
 
 
-def _columns(points: Sequence[Point]) -> tuple[list[float], list[float]]:
-    return [x for x, _ in points], [y for _, y in points]
-
-
 def _color(order: int) -> str:
     """A method's colour, as the style sheet has it."""
     return PALETTE[f"m{order % COLORS}"]
@@ -238,27 +218,10 @@ def _mark(order: int, size: float = 6.4) -> dict[str, Any]:
     return {**shape, "linestyle": "", "color": _color(order)}
 
 
-def _draw_line(axes: Axes, order: int, points: Sequence[Point], **style: Any) -> None:
+def _draw_line(axes: Axes, order: int, points: Sequence[Point], dashes: tuple[int, ...] = (), **style: Any) -> None:
     """A line through points, or a mark where there is but one."""
-    style = {"color": _color(order), **style} if len(points) > 1 else _mark(order, 8.0)
-    axes.plot(*_columns(points), **style)
-
-
-def _draw_start(axes: Axes, x: float, words: str, falling: bool) -> None:
-    """A dashed line where something begins; its name stands where lines leave room for it."""
-    low, high = axes.get_xlim()
-    x = min(max(x, low), high)
-    right = x - low > 0.75 * (high - low)
-    axes.axvline(x, color=PALETTE["phase"], linewidth=1, dashes=(4, 3), gid="phase")
-    axes.annotate(
-        words,
-        (x, 1 if falling else 0),
-        (-4 if right else 4, -12 if falling else 5),
-        xycoords=axes.get_xaxis_transform(),
-        textcoords="offset points",
-        ha="right" if right else "left",
-        color=PALETTE["phase"],
-    )
+    style = {"color": _color(order), **({"dashes": dashes} if dashes else {}), **style}
+    axes.plot(*np.array(points).reshape(-1, 2).T, **(style if len(points) > 1 else _mark(order, 8.0)))
 
 
 def _set_logarithmic_x(axes: Axes, xs: Sequence[float]) -> None:
@@ -269,36 +232,8 @@ def _set_logarithmic_x(axes: Axes, xs: Sequence[float]) -> None:
     axes.set_xlim(xs[0] / margin, xs[-1] * margin)
     ticks: list[float] = []
     for x in reversed(xs):
-        if not ticks or ticks[-1] / x > span**CROWDED:
+        if not ticks or ticks[-1] / x > span**0.06:  # share of the axis
             ticks.append(x)
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_locator(FixedLocator(ticks))
     axes.xaxis.set_major_formatter(lambda value, _: short(round(value, 9)))
-
-
-def _begin_at_zero(axes: Axes) -> bool:
-    """Let a vertical axis of positive values begin at zero, or mark its cut where that would flatten the lines."""
-    low, high = axes.get_ylim()
-    if low < high / 2:
-        axes.set_ylim(min(low, 0.0), high)
-        return False
-    stroke: dict[str, Any] = {"transform": axes.transAxes, "color": PALETTE["soft"], "linewidth": 1.2, "gid": "cut"}
-    for height in (0.02, 0.055):
-        axes.plot([-0.012, 0.012], [height - 0.02, height + 0.02], **stroke)
-    place: dict[str, Any] = {"textcoords": "offset points", "va": "top", "fontsize": 9}
-    axes.annotate("axis cut", (0, 0), (-36, -19), "axes fraction", color=PALETTE["soft"], gid="cut", **place)
-    return True
-
-
-def _draw_names(axes: Axes, ends: Sequence[tuple[float, int, str]]) -> None:
-    """The names of lines, each (y, order, name), where they end; moved apart where they would cover one another."""
-    axes.get_ylim()  # the scale is settled only when it is asked for
-    wanted = sorted((-axes.transData.transform((axes.get_xlim()[0], y))[1], order, name) for y, order, name in ends)
-    places: list[float] = []  # downwards
-    for y, _, _ in wanted:
-        places.append(max(y, places[-1] + LABEL_STEP) if places else y)
-    too_low = max(0.0, places[-1] + axes.bbox.y0) if places else 0.0
-    for (_, order, name), y in zip(wanted, places, strict=True):
-        shown = name if len(name) <= LABEL_CHARACTERS else name[: LABEL_CHARACTERS - 1] + "…"
-        place: dict[str, Any] = {"transform": IdentityTransform(), "va": "center_baseline"}
-        axes.text(axes.bbox.x1 + 8, too_low - y, shown, color=_color(order), gid="name", **place)

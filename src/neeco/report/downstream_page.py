@@ -9,18 +9,17 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
+from neeco.base.errors import counted
 from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline, overlay_parts
-from neeco.report.charts import Level, Series, legend, line_chart
-from neeco.report.page import REPORT_FILE, jpeg, split_counts, write_page
-from neeco.report.sections import Figure, Images, Section
-from neeco.studies.downstream.conditions import REAL
-from neeco.studies.downstream.experiment import DownstreamPlan
-from neeco.studies.downstream.job import predictions_file, read_predictions
+from neeco.report.charts import Series, legend, line_chart
+from neeco.report.page import REPORT_FILE, Figure, Images, Section, jpeg, split_counts, write_page
+from neeco.studies.downstream.experiment import DownstreamPlan, read_predictions
 from neeco.studies.downstream.results import (
     MAIN,
     TITLES,
-    budget_text,
+    Detections,
+    Prediction,
     failed_jobs,
     is_synthetic,
     models_and_tests,
@@ -30,8 +29,8 @@ from neeco.studies.downstream.results import (
     title_of,
 )
 from neeco.studies.downstream.samples import Example
-from neeco.studies.downstream.scores import Detections, Prediction
-from neeco.studies.machine import machine_words
+from neeco.studies.downstream.training_data import REAL
+from neeco.studies.study import machine_words
 
 TRUTH_COLOR = (255, 255, 0)
 JOB_KEYS = ("model", "condition", "real", "fold")
@@ -53,7 +52,12 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
     """
     capture, computer = plan.capture, machine_words(experiment["machine"], "torch_threads")
     files = {"downstream.csv": summary_text(experiment)}
-    sections = [Section(title="Results", text=f"{budget_text(experiment)}. {EXPLANATION}", files=files)]
+    budget = [
+        f"{item['name']}: {item['steps']} steps of {item['batch']} images of {item['input'][0]}x{item['input'][1]}"
+        for item in experiment["models"]
+    ]
+    text = f"{'; '.join(budget)}; {counted(experiment['folds'], 'fold')}. {EXPLANATION}"
+    sections = [Section(title="Results", text=text, files=files)]
     for model, test in models_and_tests(experiment):
         table, rows = table_of(experiment, model, test), rows_of(experiment, model, test)
         names = list(dict.fromkeys(row["condition"] for row in rows))
@@ -79,8 +83,8 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
         subtitle="what synthetic images are worth",
         version=experiment["version"],
         stamps=[computer],
-        intro=["Every training has as many steps; no training saw the tested frames, which were recorded."],
-        findings=[("", sentence) for sentence in experiment["findings"]],
+        intro="Every training has as many steps; no training saw the tested frames, which were recorded.",
+        findings=experiment["findings"],
         sections=sections,
     )
 
@@ -92,11 +96,11 @@ def score_chart(model: Row, test: str, rows: list[Row]) -> str:
     for order, condition in enumerate(dict.fromkeys(row["condition"] for row in rows)):
         points = [row for row in rows if row["condition"] == condition and row[metric] is not None]
         if points and REAL not in condition.split("+"):
-            levels.append(Level("", order, points[0][metric]))
+            levels.append((order, points[0][metric]))
             continue
         line = tuple((float(row["real"]), row[metric]) for row in points)
         band = tuple((float(row["real"]), row["low"], row["high"]) for row in points if row["low"] is not None)
-        series.append(Series("", order, line, dots=line, band=band))
+        series.append(Series(order, line, dots=line, band=band))
     title = f"{TITLES[metric]}: {model['name']}, {test}"
     return line_chart(title, "labelled frames", series, levels=levels, over_logarithmic=True) if series else ""
 
@@ -113,7 +117,7 @@ def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: st
     predictions, scores = [], []
     for condition, real in shown:
         folder = plan.settings.job_folder(model["name"], condition, real, 0)
-        predictions.append(read_predictions(predictions_file(folder, test)))
+        predictions.append(read_predictions(folder, test))
         wanted = (model["name"], condition, real, 0)
         jobs = [job for job in experiment["jobs"] if tuple(job[name] for name in JOB_KEYS) == wanted]
         frames = jobs[0]["splits"].get(test, {}).get("per_frame", ()) if jobs else ()

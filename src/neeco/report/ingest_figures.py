@@ -1,43 +1,55 @@
-"""Pictures of an ingested capture: sample frames with the tracked poses over them."""
+"""Figures of an ingested capture: sample frames with the tracked poses over them, and how its states are covered.
+
+Coverage is of every degree of freedom of every instrument, by split, with the range of the training frames.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFilter
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from neeco.capture.model import Capture, Frame, evenly_spaced
+from neeco.capture.model import Capture, Frame
 from neeco.evaluation.image_metrics import outline
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_world
 from neeco.ingest.foreground.rough_shape import RoughShape
+from neeco.report.charts import PALETTE, inline_svg, new_axes, page_style, round_ticks
 from neeco.report.page import MAX_WIDTH, jpeg, to_bytes
 
-N_SAMPLES = 12  # frames shown
 AXIS_COLORS = ("#ff5252", "#4cd964", "#4aa8ff")  # x, y, z
 OUTLINE_COLOR = "#ffe14a"
-MIN_DEPTH_MM = 1.0  # of points that are shown
-AXIS_SHARE = 0.16  # of the image's width: length of the frame axes
 ORIGIN = np.zeros((1, 3))
-SHAFT_DIAMETERS = 30.0  # length shown of a shaft found in video
+SPLIT_COLORS = {"train": "accent", "test": "good", "unseen": "phase"}
 
 
-def sample_frames(capture: Capture) -> list[Frame]:
-    """Return up to N_SAMPLES frames, evenly spread over time."""
-    frames = sorted(capture.frames, key=lambda frame: frame.state.time)
-    return [frames[index] for index in evenly_spaced(len(frames), N_SAMPLES)]
+@dataclass(frozen=True)
+class FigureSettings:
+    """Sizes of overlays and charts."""
+
+    samples: int = 12  # frames shown
+    min_depth_mm: float = 1.0  # of points that are shown
+    axis_share: float = 0.16  # of the image's width: length of the frame axes
+    shaft_diameters: float = 30.0  # length shown of a shaft found in video
+    bins: int = 24  # of a histogram
+    constant: float = 1e-6  # mm or deg: a smaller range is one value
+
+
+SETTINGS = FigureSettings()
 
 
 def axis_length(capture: Capture) -> float:
-    """Return a round number of mm that spans about AXIS_SHARE of the image at the instruments' median depth."""
+    """Return a round number of mm that spans about `axis_share` of the image at the instruments' median depth."""
     sizes = []
     for frame in capture.frames:
         for state in frame.state.instruments.values():
             _, (depth,) = _project(ORIGIN, state.pose, frame.camera)
-            if depth > MIN_DEPTH_MM:
-                sizes.append(AXIS_SHARE * frame.camera.width / frame.camera.fx * depth)
+            if depth > SETTINGS.min_depth_mm:
+                sizes.append(SETTINGS.axis_share * frame.camera.width / frame.camera.fx * depth)
     return round_length(float(np.median(sizes)) if sizes else 10.0)
 
 
@@ -50,7 +62,7 @@ def in_view(capture: Capture, name: str) -> float:
 def shows(frame: Frame, pose: Tensor) -> bool:
     """Return whether the origin of an instrument at `pose`, world_from_instrument [4, 4], lies inside the image."""
     ((x, y),), (depth,) = _project(ORIGIN, pose, frame.camera)
-    return bool(depth > MIN_DEPTH_MM and 0 <= x < frame.camera.width and 0 <= y < frame.camera.height)
+    return bool(depth > SETTINGS.min_depth_mm and 0 <= x < frame.camera.width and 0 <= y < frame.camera.height)
 
 
 def posed_picture(
@@ -86,7 +98,7 @@ def _draw_outline(image: Image.Image, shape: RoughShape, pose: Tensor, camera: C
     mask = Image.new("L", image.size)
     painter = ImageDraw.Draw(mask)
     for (x, y), z in zip(*_project(shape.points, pose, camera), strict=True):
-        radius = 0.75 * shape.spacing * camera.fx / z if z > MIN_DEPTH_MM else 0.0
+        radius = 0.75 * shape.spacing * camera.fx / z if z > SETTINGS.min_depth_mm else 0.0
         if radius and -radius < x < image.width + radius and -radius < y < image.height + radius:
             painter.ellipse((x - radius, y - radius, x + radius, y + radius), fill=255)
     edge = Image.fromarray(outline(np.asarray(mask) > 0).astype(np.uint8) * 255).filter(ImageFilter.MaxFilter(3))
@@ -95,13 +107,13 @@ def _draw_outline(image: Image.Image, shape: RoughShape, pose: Tensor, camera: C
 
 def _draw_shaft(painter: ImageDraw.ImageDraw, diameter: float, pose: Tensor, camera: Camera) -> None:
     """Draw the two contours of a shaft and its end."""
-    along = np.linspace(-SHAFT_DIAMETERS, 0, 61)[:, None] * diameter * np.array([0.0, 0.0, 1.0])  # [61, 3]
+    along = np.linspace(-SETTINGS.shaft_diameters, 0, 61)[:, None] * diameter * np.array([0.0, 0.0, 1.0])  # [61, 3]
     centre = np.linalg.inv(pose.numpy()) @ camera.world_from_camera.double().numpy()[:, 3]  # of the camera, [4] mm
     aside = np.cross(centre[:3] - along, [0.0, 0.0, 1.0])
     aside *= diameter / 2 / np.linalg.norm(aside, axis=1, keepdims=True)
     pixels, depth = zip(*(_project(along + side * aside, pose, camera) for side in (-1, 1)), strict=True)
     lines = [
-        [tuple(place) for place, z in zip(places, depths, strict=True) if z > MIN_DEPTH_MM]
+        [tuple(place) for place, z in zip(places, depths, strict=True) if z > SETTINGS.min_depth_mm]
         for places, depths in zip(pixels, depth, strict=True)
     ]
     for line in (*lines, [line[-1] for line in lines if line]):
@@ -111,12 +123,12 @@ def _draw_shaft(painter: ImageDraw.ImageDraw, diameter: float, pose: Tensor, cam
 
 def _draw_frame(painter: ImageDraw.ImageDraw, pose: Tensor, camera: Camera, length: float) -> None:
     pixels, depth = _project(np.concatenate([ORIGIN, length * np.eye(3)]), pose, camera)
-    if depth[0] <= MIN_DEPTH_MM:
+    if depth[0] <= SETTINGS.min_depth_mm:
         return
     x, y = start = tuple(pixels[0])
     for width, colors in ((10, ("#000000",) * 3), (6, AXIS_COLORS)):
         for end, z, color in zip(pixels[1:], depth[1:], colors, strict=True):
-            if z > MIN_DEPTH_MM:
+            if z > SETTINGS.min_depth_mm:
                 painter.line([start, tuple(end)], fill=color, width=width)
     painter.ellipse((x - 7, y - 7, x + 7, y + 7), fill="#ffffff", outline="#000000", width=2)
 
@@ -125,10 +137,114 @@ def _project(points: np.ndarray, pose: Tensor, camera: Camera) -> tuple[np.ndarr
     """Return px [N, 2] (undefined behind the camera) and depth [N] of points [N, 3] of an instrument at `pose`."""
     world_from_instrument = pose.numpy()
     world = points @ world_from_instrument[:3, :3].T + world_from_instrument[:3, 3]
-    return project_world(world, camera, nearest=MIN_DEPTH_MM)
+    return project_world(world, camera, nearest=SETTINGS.min_depth_mm)
 
 
 def round_length(wanted: float) -> float:
     """Return the greatest of 1, 2, 5, 10, 20, ... that is not above `wanted`."""
     power = 10.0 ** np.floor(np.log10(max(wanted, 1e-9)))
     return float(max(step * power for step in (1, 2, 5) if step * power <= wanted * 1.000001))
+
+
+@dataclass(frozen=True)
+class Degree:
+    """One degree of freedom over the frames that have it. values [N] in `unit`; splits: N names."""
+
+    instrument: str
+    name: str
+    unit: str  # mm or deg
+    values: np.ndarray
+    splits: tuple[str, ...]
+
+    def of(self, split: str) -> np.ndarray:
+        return self.values[np.array(self.splits) == split]
+
+    @property
+    def trained(self) -> tuple[float, float] | None:
+        """Lowest and highest value of the training frames; None when there are none."""
+        values = self.of("train")
+        return (float(values.min()), float(values.max())) if len(values) else None
+
+
+def degrees_of_freedom(capture: Capture) -> list[Degree]:
+    """Position x, y, z mm; pitch, yaw, roll deg about the mean direction of the training frames; each joint.
+
+    Pitch, yaw and roll are intrinsic rotations in that order about the tracked frame's x, y and z axis, away from the
+    mean.
+    """
+    degrees = []
+    for instrument in capture.instruments:
+        frames = [frame for frame in capture.frames if instrument.name in frame.state.instruments]
+        if not frames:
+            continue
+        states = [frame.state.instruments[instrument.name] for frame in frames]
+        splits = tuple(frame.split for frame in frames)
+        poses = np.stack([state.pose.numpy() for state in states])
+        columns = [(f"position {axis}", "mm", poses[:, row, 3]) for row, axis in enumerate("xyz")]
+        rotations, trained = Rotation.from_matrix(poses[:, :3, :3]), np.array([split == "train" for split in splits])
+        mean = (rotations[trained] if trained.any() else rotations).mean()
+        turns = (mean.inv() * rotations).as_euler("XYZ", degrees=True)
+        columns += [(name, "deg", turns[:, index]) for index, name in enumerate(("pitch", "yaw", "roll"))]
+        for joint in instrument.joints:
+            values = np.array([state.joints.get(joint, np.nan) for state in states])
+            sliding = instrument.slides(joint)
+            columns.append((joint, "mm" if sliding else "deg", values if sliding else np.degrees(values)))
+        for name, unit, values in columns:
+            known = np.isfinite(values)
+            shown = tuple(split for split, keep in zip(splits, known, strict=True) if keep)
+            if known.any():
+                degrees.append(Degree(instrument.name, name, unit, values[known], shown))
+    return degrees
+
+
+def unvisited(degrees: Sequence[Degree]) -> list[str]:
+    """Stretches inside the trained range, a tenth of it or longer, that no training frame visits."""
+    sentences = []
+    several = len({degree.instrument for degree in degrees}) > 1
+    for degree in degrees:
+        name = f"{degree.instrument} {degree.name}" if several else degree.name
+        values = np.sort(degree.of("train"))
+        if len(values) < 2 or np.ptp(values) < SETTINGS.constant:
+            continue
+        steps = np.diff(values)
+        sentences += [
+            f"{name}: nothing between {_number(values[place])} and {_number(values[place + 1])} {degree.unit}."
+            for place in np.flatnonzero(steps > 0.1 * np.ptp(values))
+        ]
+    return sentences
+
+
+@page_style()
+def histogram(degree: Degree) -> str:
+    """Stacked bars of a degree of freedom, coloured by split, as inline SVG; what training lacks is shaded."""
+    low, high = float(degree.values.min()), float(degree.values.max())
+    trained = degree.trained
+    caption = "never trained" if trained is None else f"trained {_number(trained[0])} … {_number(trained[1])}"
+    label = f"frames over {degree.name}, {degree.unit}; {caption}"
+    axes = new_axes((340, 150), 12, 12, 28, 22)
+    axes.set_title(f"{degree.name}, {degree.unit}")
+    axes.set_yticks([])
+    if high - low < SETTINGS.constant:
+        axes.text(0, 0.5, f"always {_number(low)}", transform=axes.transAxes)
+        axes.set_xticks([])
+        return inline_svg(axes, label)
+    axes.set_title(caption, loc="right", fontsize=11, color=PALETTE["soft"])
+    left, right = low - 0.02 * (high - low), high + 0.02 * (high - low)
+    axes.set_xlim(left, right)
+    for start, end in [(left, right)] if trained is None else [(left, trained[0]), (trained[1], right)]:
+        if end - start > 0.0125 * (right - left):  # a thinner one would be a stroke
+            axes.axvspan(start, end, color=PALETTE["phase"], alpha=0.13, linewidth=0, gid="beyond")
+    edges, floor = np.linspace(low, high, SETTINGS.bins + 1), np.zeros(SETTINGS.bins)
+    for name in sorted(set(degree.splits), key=lambda name: [*SPLIT_COLORS, name].index(name)):
+        top = floor + np.histogram(degree.of(name), edges)[0]
+        axes.stairs(top, edges, baseline=floor, fill=True, color=PALETTE[SPLIT_COLORS.get(name, "soft")])
+        floor = top
+    axes.set_ylim(0, max(1.0, floor.max()))
+    axes.axhline(0, color=PALETTE["edge"], linewidth=1)
+    round_ticks(axes.xaxis, 4, _number)
+    return inline_svg(axes, label)
+
+
+def _number(value: float) -> str:
+    text = f"{value:.0f}" if abs(value) >= 20 else f"{value:.1f}" if abs(value) >= 2 else f"{value:.2g}"
+    return "0" if float(text) == 0 else text.replace("-", "−")

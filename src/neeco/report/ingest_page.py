@@ -11,21 +11,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from neeco.base.errors import counted
 from neeco.base.files import finite
 from neeco.capture import read_capture
 from neeco.capture.checks import inspect_capture
 from neeco.capture.documents import Problem, errors_only
-from neeco.capture.model import Capture, Frame
+from neeco.capture.model import Capture, evenly_spaced
 from neeco.ingest.assessment import VERDICTS, Assessment, assess_ingest, clock_cost_mm, rms
 from neeco.ingest.frames.views import StageProgress
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.result import IngestResult
 from neeco.report import ingest_figures as figures
-from neeco.report.coverage import SPLIT_COLORS, degrees_of_freedom, histogram, unvisited
 from neeco.report.page import split_counts, write_page
 
 PAGE = "ingest.html"
@@ -107,7 +105,12 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
     verdict: of `assess_ingest`; capture: what lies at `result.capture`, read here unless given. Raises NeecoError when
     it or one of the images shown cannot be read, or the page cannot be written.
     """
-    capture = capture or read_capture(result.capture)
+    capture, fit = capture or read_capture(result.capture), result.registration
+    registration = None
+    if fit is not None:  # root mean squares of cameras against the laparoscope's tracker; the sensor's place
+        rotation_deg = float(np.degrees(rms(fit.rotation_residual)))
+        residuals = {"position_rms": rms(fit.position_residual), "rotation_rms": rotation_deg}
+        registration = {**residuals, "sensor_mm": fit.camera_from_sensor[:3, 3]}
     write_page(
         path,
         "ingest.html",
@@ -123,22 +126,12 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
         in_view=[
             (item.name, figures.in_view(capture, item.name)) for item in capture.instruments if capture.registered
         ],
-        registration=_registration(result),
+        registration=registration,
         clocks=_clocks(result, capture),
         **_frames(result, capture),
         **_coverage(capture),
         dropped=_dropped(result),
     )
-
-
-def _registration(result: IngestResult) -> dict[str, Any] | None:
-    """Return distances between cameras and the laparoscope's tracker, root mean squares, and the sensor's place."""
-    found = result.registration
-    if found is None:
-        return None
-    rotation = float(np.degrees(rms(found.rotation_residual)))
-    sensor = found.camera_from_sensor[:3, 3]
-    return {"position_rms": rms(found.position_residual), "rotation_rms": rotation, "sensor_mm": sensor}
 
 
 def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
@@ -162,10 +155,14 @@ def _frames(result: IngestResult, capture: Capture) -> dict[str, Any]:
     samples, shown_before = [], 0
     in_video = {item.name: item.from_video for item in capture.instruments}
     shafts = {name: video.shaft_diameter_mm for name, video in in_video.items() if video is not None}
-    for frame in figures.sample_frames(capture):
+    ordered = sorted(capture.frames, key=lambda frame: frame.state.time)
+    for frame in (ordered[index] for index in evenly_spaced(len(ordered), figures.SETTINGS.samples)):
         row = rows.get(round(frame.state.time, 6))
         poses = {name: state.pose for name, state in frame.state.instruments.items() if capture.registered}
-        before = {} if row is None else _unregistered(result, frame, row)
+        before = {}  # world_from_instrument by the trackers alone
+        for name, tracked in result.unregistered.items() if row is not None else ():
+            if np.isfinite(tracked[row]).all():
+                before[name] = frame.camera.world_from_camera.double() @ torch.from_numpy(tracked[row])
         shown_before += any(figures.shows(frame, pose) for pose in before.values())
         samples.append(
             (
@@ -188,29 +185,21 @@ def _frames(result: IngestResult, capture: Capture) -> dict[str, Any]:
     }
 
 
-def _unregistered(result: IngestResult, frame: Frame, row: int) -> dict[str, Tensor]:
-    """Return world_from_instrument [4, 4] of every instrument before registration, in the frame `selected[row]`."""
-    poses = {name: torch.from_numpy(poses[row]) for name, poses in result.unregistered.items()}
-    return {
-        name: frame.camera.world_from_camera.double() @ pose for name, pose in poses.items() if pose.isfinite().all()
-    }
-
-
 def _coverage(capture: Capture) -> dict[str, Any]:
     """Return the range of states: stretches without a training frame, and charts by instrument."""
-    degrees = degrees_of_freedom(capture)
-    named = [name for name in capture.splits if name in SPLIT_COLORS]
+    degrees = figures.degrees_of_freedom(capture)
+    named = [name for name in capture.splits if name in figures.SPLIT_COLORS]
     others = ", ".join(name for name in capture.splits if name not in named)
     return {
         "degrees": degrees,
         "trained": any(degree.trained is not None for degree in degrees),
-        "unvisited": unvisited(degrees),
-        "split_colors": [*((SPLIT_COLORS[name], name) for name in named), *([("soft", others)] if others else [])],
+        "unvisited": figures.unvisited(degrees),
+        "split_colors": [(figures.SPLIT_COLORS[name], name) for name in named] + ([("soft", others)] if others else []),
         "instruments": [
             {
                 "name": item.name,
                 "jointed": bool(item.joints),
-                "charts": [histogram(degree) for degree in degrees if degree.instrument == item.name],
+                "charts": [figures.histogram(degree) for degree in degrees if degree.instrument == item.name],
             }
             for item in capture.instruments
         ],
@@ -225,12 +214,8 @@ def _dropped(result: IngestResult) -> list[list[str]]:
     rows = []
     for pattern, members in sorted(groups.items(), key=lambda group: -len(group[1])):
         reasons = {why for _, why in members}
-        frames = _ranges(np.array(sorted(frame for frame, _ in members)))
-        rows.append([reasons.pop() if len(reasons) == 1 else pattern, str(len(members)), frames])
+        frames = np.array(sorted(frame for frame, _ in members))
+        runs = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
+        ranges = ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
+        rows.append([reasons.pop() if len(reasons) == 1 else pattern, str(len(members)), ranges])
     return rows
-
-
-def _ranges(frames: np.ndarray) -> str:
-    """Return increasing numbers as `3, 7–12, 40`."""
-    runs = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
-    return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)

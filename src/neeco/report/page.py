@@ -1,9 +1,12 @@
-"""Pages from templates, which escape all text that is put into them, and the pictures inside pages."""
+"""Pages from templates, which escape all text that is put into them; the pictures inside pages; sections of a study's
+page."""
 
 from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -11,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 from PIL import Image
 from torch import Tensor
 
@@ -18,6 +22,7 @@ import neeco
 from neeco.base.files import write_text
 from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import difference_map, to_uint8
+from neeco.studies.tables import ResultTable
 
 REPORT_FILE = "report.html"
 MAX_WIDTH = 480  # px of a picture; the page has to stay a file one can mail
@@ -27,6 +32,40 @@ SPLITS = {  # what the usual names of splits mean
     "novel_view": "a camera that training never used",
     "train": "frames it learned from",
 }
+
+
+@dataclass(frozen=True)
+class Images:
+    """Images of one method, one below the other, as data URIs."""
+
+    name: str
+    pictures: tuple[str, ...]
+    alt: str
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A chart (inline SVG) with its legend."""
+
+    chart: str
+    legend: Sequence[tuple[str, Markup]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A part of a study's page, shown in the order of these fields; what is empty is left out."""
+
+    title: str
+    split: str = ""  # of usual names the meaning is shown with the title
+    level: int = 2  # of the heading
+    text: str = ""
+    results: ResultTable | None = None
+    images: Sequence[Images] = ()
+    figures: Sequence[Figure] = ()
+    files: Mapping[str, str] = field(default_factory=dict)  # CSV by file name
+    notes: Sequence[str] = ()
+    facts: Sequence[tuple[str, str]] = ()
 
 
 def write_page(path: Path, template: str, **data: Any) -> Path:

@@ -36,6 +36,10 @@ class Score(NamedTuple):
     form: str
     meaning: str
 
+    def written(self, numbers: Mapping[str, Any]) -> str:
+        """Its value among the numbers, as the table shows it."""
+        return "–" if numbers.get(self.key) is None else self.form.format(numbers[self.key])
+
 
 IMAGE_SCORES = (
     Score("psnr", "PSNR dB", "{:.2f}", "Similarity of the rendered pixels to the recorded; 30 is close, 20 is rough."),
@@ -74,9 +78,9 @@ def write_report(
 ) -> Path:
     """Write `report.html` into the run folder and return its path. One file: style, pictures and curves are inside it.
 
-    evaluation: what `evaluate_run` returned. playable: a page
-    of its own that renders the scene, shown in a frame of this one. How many threads torch takes is the caller's to set
-    (`open_run`). Raises NeecoError when a picture cannot be read or the page cannot be written.
+    evaluation: what `evaluate_run` returned. playable: a page of its own that renders the scene, shown in a frame of
+    this one. The caller sets the number of torch threads (`open_run`). Raises NeecoError when a picture cannot be read
+    or the page cannot be written.
     """
     rows = read_metrics(run_path / "metrics.jsonl")
     kind = "aligned" if "aligned" in evaluation else "given"
@@ -122,9 +126,26 @@ def frame_figures(
     figures = []
     for split, rows in evaluation.get("per_frame", {}).get(kind, {}).items():
         frames = {frame.name: frame for frame in capture.split(split)}
-        for why, row in chosen_rows(rows):
-            if row["frame"] in frames:
-                figures.append(_figure(capture, scene, split, frames[row["frame"]], why, row))
+        for why, row in ((why, row) for why, row in chosen_rows(rows) if row["frame"] in frames):
+            frame = frames[row["frame"]]
+            drawing = draw(scene, *_poses(frame, row))
+            recorded, image = frame.load_image().numpy(), drawing.image.numpy()
+            pictures = [
+                ("recorded image", jpeg(to_bytes(recorded))),
+                ("rendered image", jpeg(to_bytes(image))),
+                ("difference of the two", difference(image, recorded, frame.load_mask())),
+            ]
+            if drawing.parts is not None:
+                overlay, reference = overlay_parts(recorded, drawing.parts.numpy()), load_reference(capture, frame)
+                if reference is not None:
+                    overlay = overlay_outline(overlay, reference.mask.numpy())
+                pictures.append(("recorded image, label over it", jpeg(overlay)))
+            scores = [f"{row['psnr']:.2f} dB"]
+            if row.get("mask_iou") is not None:
+                scores.append(f"IoU {row['mask_iou']:.3f}")
+            for body, moved in row.get("moved", {}).items():
+                scores.append(f"{body} moved {moved['mm']:.2f} mm, {moved['deg']:.2f}°")
+            figures.append({"split": split, "name": frame.name, "why": why, "scores": scores, "pictures": pictures})
     return figures
 
 
@@ -137,30 +158,6 @@ def chosen_rows(rows: Sequence[dict[str, Any]]) -> list[tuple[str, dict[str, Any
         if 0 <= place < len(ranked):
             chosen.setdefault(place, why)
     return [(why, ranked[place]) for place, why in sorted(chosen.items())]
-
-
-def _figure(
-    capture: Capture, scene: DrawableScene, split: str, frame: Frame, why: str, row: dict[str, Any]
-) -> dict[str, Any]:
-    drawing = draw(scene, *_poses(frame, row))
-    recorded, image = frame.load_image().numpy(), drawing.image.numpy()
-    pictures = [
-        ("recorded image", jpeg(to_bytes(recorded))),
-        ("rendered image", jpeg(to_bytes(image))),
-        ("difference of the two", difference(image, recorded, frame.load_mask())),
-    ]
-    if drawing.parts is not None:
-        overlay = overlay_parts(recorded, drawing.parts.numpy())
-        reference = load_reference(capture, frame)
-        if reference is not None:
-            overlay = overlay_outline(overlay, reference.mask.numpy())
-        pictures.append(("recorded image, label over it", jpeg(overlay)))
-    scores = [f"{row['psnr']:.2f} dB"]
-    if row.get("mask_iou") is not None:
-        scores.append(f"IoU {row['mask_iou']:.3f}")
-    for body, moved in row.get("moved", {}).items():
-        scores.append(f"{body} moved {moved['mm']:.2f} mm, {moved['deg']:.2f}°")
-    return {"split": split, "name": frame.name, "why": why, "scores": scores, "pictures": pictures}
 
 
 def _poses(frame: Frame, row: dict[str, Any]) -> tuple[State, Camera]:
@@ -201,26 +198,19 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
 
 
 def _tables(evaluation: dict[str, Any]) -> list[Any]:
-    """The tables of numbers, of images and of labels: columns that anything is known for, and rows."""
+    """The tables of numbers, of images and of labels: columns that anything is known for, and rows (title of the kind,
+    its splits with their cells)."""
     kinds = {kind: evaluation[kind] for kind in KINDS if kind in evaluation}
-    tables = [_table(kinds, scores) for scores in (IMAGE_SCORES, LABEL_SCORES)]
-    return [(columns, rows) for columns, rows in tables if columns]
-
-
-def _table(
-    kinds: dict[str, Any], scores: tuple[Score, ...]
-) -> tuple[list[Score], list[tuple[str, list[tuple[str, list[str]]]]]]:
-    """Columns and rows (title of the kind, its splits) of one table."""
     known = [numbers for splits in kinds.values() for numbers in splits.values()]
-    columns = [score for score in scores if any(numbers.get(score.key) is not None for numbers in known)]
-    groups = []
-    for kind, splits in kinds.items():
-        rows = [
-            (split, [_written(numbers.get(score.key), score.form) for score in columns])
-            for split, numbers in splits.items()
+    tables = []
+    for scores in (IMAGE_SCORES, LABEL_SCORES):
+        columns = [score for score in scores if any(numbers.get(score.key) is not None for numbers in known)]
+        groups = [
+            (KINDS[kind], [(split, [score.written(numbers) for score in columns]) for split, numbers in splits.items()])
+            for kind, splits in kinds.items()
         ]
-        groups.append((KINDS[kind], rows))
-    return columns, groups
+        tables += [(columns, groups)] if columns else []
+    return tables
 
 
 def _tints(scene: DrawableScene) -> list[tuple[str, str]]:
@@ -249,10 +239,6 @@ def _facts(capture: Capture, scene: DrawableScene, rows: list[dict[str, Any]]) -
     return facts
 
 
-def _written(value: Any, form: str) -> str:
-    return "–" if value is None else form.format(value)
-
-
 def read_metrics(path: Path) -> list[dict[str, Any]]:
     """Rows of a metrics.jsonl; empty when there is none. A last line cut off by a kill is left out."""
     if not path.is_file():
@@ -268,15 +254,6 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def phase_starts(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
-    """(iteration, phase) wherever the phase changes, the first phase left out."""
-    changes = []
-    for before, after in pairwise(rows):
-        if after.get("phase") != before.get("phase") and after.get("phase") is not None:
-            changes.append((float(after["iteration"]), f"phase {after['phase']}"))
-    return changes
-
-
 def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: bool = False) -> str:
     """A chart of `key` over iterations, dashed lines where a phase begins; "" when fewer than two rows have numbers."""
     known = [row for row in rows if type(row.get(key)) in (int, float) and math.isfinite(row[key])]
@@ -286,8 +263,10 @@ def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: 
     if (run := -(-len(points) // MAX_POINTS)) > 1:  # means of equally many, so that a noisy curve reads as its trend
         groups = [points[start : start + run] for start in range(0, len(points), run)]
         points = [(group[-1][0], sum(y for _, y in group) / len(group)) for group in groups]
-    series = [Series("", 0, tuple(points))]
-    note, starts = f"{short(points[-1][1])} at the end", phase_starts(rows)
+    series = [Series(0, tuple(points))]
+    note = f"{short(points[-1][1])} at the end"
+    changes = [after for before, after in pairwise(rows) if after.get("phase") not in (before.get("phase"), None)]
+    starts = [(float(row["iteration"]), f"phase {row['phase']}") for row in changes]
     return line_chart(title, "iterations", series, starts=starts, note=note, logarithmic=logarithmic, size=SMALL)
 
 
@@ -326,8 +305,14 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
 
 
 def _annotated_figure(record: dict[str, Any], frame: Frame) -> dict[str, Any]:
-    """One frame: its image with the outlines of its labels, and what is known of it."""
+    """One frame: its image with the contours of its labels, and what is known of it."""
     trust, moved = record["trust"], record["moved"]
+    image = Image.fromarray(to_bytes(frame.load_image().numpy()))
+    pen = ImageDraw.Draw(image)
+    for k, label in enumerate(record["labels"]):
+        for polygon in label.get("polygons", ()):
+            points = [tuple(point) for point in polygon]
+            pen.line([*points, points[0]], fill=OUTLINES[k % len(OUTLINES)], width=1)
     return {
         "name": frame.name,
         "split": record["recorded_split"],
@@ -335,16 +320,5 @@ def _annotated_figure(record: dict[str, Any], frame: Frame) -> dict[str, Any]:
         "trust": f"{trust['value']:.3f}",
         "votes": f"{trust['against']:.1%} of the label speak against it, it misses {trust['missed']:.1%}",
         "moved": ", ".join(f"{body} {by['mm']:.2f} mm, {by['deg']:.2f}°" for body, by in moved.items()),
-        "picture": jpeg(_outlined(frame, record["labels"])),
+        "picture": jpeg(np.asarray(image)),
     }
-
-
-def _outlined(frame: Frame, labels: Sequence[dict[str, Any]]) -> np.ndarray:
-    """The recorded image uint8 [H, W, 3] with the contours of its labels."""
-    picture = Image.fromarray(to_bytes(frame.load_image().numpy()))
-    pen = ImageDraw.Draw(picture)
-    for k, label in enumerate(labels):
-        for polygon in label.get("polygons", ()):
-            points = [tuple(point) for point in polygon]
-            pen.line([*points, points[0]], fill=OUTLINES[k % len(OUTLINES)], width=1)
-    return np.asarray(picture)

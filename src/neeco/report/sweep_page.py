@@ -11,12 +11,20 @@ from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.labels.drawing import draw
 from neeco.report.charts import Series, legend, line_chart
-from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
-from neeco.report.sections import Figure, Images, Section
+from neeco.report.page import (
+    REPORT_FILE,
+    Figure,
+    Images,
+    Section,
+    difference,
+    jpeg,
+    split_counts,
+    to_bytes,
+    write_page,
+)
 from neeco.studies.configurations import Table
-from neeco.studies.machine import machine_words
-from neeco.studies.sweep import COLUMNS, RESULTS_FILE, Rows, SweepPlan, failures
-from neeco.studies.sweep_tables import length_words, tables_of
+from neeco.studies.study import machine_words
+from neeco.studies.sweep import COLUMNS, RESULTS_FILE, Rows, SweepPlan, failures, length_words, tables_of
 from neeco.studies.tables import csv_text
 from neeco.studies.training_job import CURVE_FILE, CURVE_ROW, read_rows
 from neeco.training.run import open_run
@@ -64,7 +72,7 @@ def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
         name=capture.root.absolute().name,
         subtitle=study.title,
         stamps=[computer],
-        intro=[intro],
+        intro=intro,
         findings=[],
         sections=sections,
     )
@@ -85,9 +93,9 @@ def _curves(plan: SweepPlan, table: Table, split: str) -> list[Figure]:
         ]
         mean = tuple(tuple(np.mean(points, axis=0).tolist()) for points in zip(*lines, strict=False))
         if mean:
-            series.append(Series(names[order], order, mean, tuple(lines) if len(lines) > 1 else ()))
+            series.append(Series(order, mean, tuple(lines) if len(lines) > 1 else ()))
     chart = line_chart(f"PSNR, {split}, dB", over, series)
-    return [Figure(chart, legend(names, [item.name for item in series]))] if chart else []
+    return [Figure(chart, legend(names, [names[item.order] for item in series]))] if chart else []
 
 
 def _pictures(plan: SweepPlan, rows: Rows) -> list[Section]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -11,12 +12,21 @@ from typing import Any
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.evaluation.image_metrics import overlay_parts
 from neeco.labels.drawing import draw
-from neeco.report.charts import SMALL, Level, Series, line_chart
+from neeco.report.charts import SMALL, Series, line_chart
 from neeco.report.page import jpeg, to_bytes, write_page
 from neeco.tracking.track import Tracked, state_of
 
-N_STRIP, N_LEAST_TRUSTED = 24, 12  # frames shown: spread over the footage, and the least trusted
-BAND = 2.0  # standard deviations
+
+@dataclass(frozen=True)
+class TrackPageSettings:
+    """Frames and bands on the page."""
+
+    spread: int = 24  # frames, spread over the footage
+    least_trusted: int = 12  # frames
+    band: float = 2.0  # standard deviations to either side
+
+
+SETTINGS = TrackPageSettings()
 HOWS = {
     "begun": "begun from the given state",
     "followed": "followed from the neighbouring frame",
@@ -32,7 +42,7 @@ def write_track_page(tracked: Tracked) -> Path:
     records = tracked.records
     frames = sorted(tracked.footage.frames, key=lambda frame: frame.state.time)
     values = [record["trust"]["value"] for record in records]
-    least = sorted(range(len(records)), key=lambda k: values[k])[:N_LEAST_TRUSTED]
+    least = sorted(range(len(records)), key=lambda k: values[k])[: SETTINGS.least_trusted]
     missing = sum(record["how"] == "lost" for record in records)
     return write_page(
         tracked.page,
@@ -49,19 +59,19 @@ def write_track_page(tracked: Tracked) -> Path:
             (str(sum(record["how"] in ("beside", "found") for record in records)), "times searched for again"),
         ],
         charts=[chart for chart in _charts(tracked) if chart],
-        strip=[_figure(tracked, frames[k], records[k]) for k in evenly_spaced(len(records), N_STRIP)],
+        strip=[_figure(tracked, frames[k], records[k]) for k in evenly_spaced(len(records), SETTINGS.spread)],
         least_trusted=[_figure(tracked, frames[k], records[k]) for k in least],
     )
 
 
 def _charts(tracked: Tracked) -> list[str]:
-    """Trust and misfit, then the joints of every instrument with bands of BAND standard deviations, over time."""
+    """Trust and misfit, then the joints of every instrument with bands of `band` standard deviations, over time."""
     records, first = tracked.records, tracked.records[0]["time"]
     times = [record["time"] - first for record in records]
-    trust = Series("", 0, tuple(zip(times, (record["trust"]["value"] for record in records), strict=True)))
-    misfit = Series("", 1, tuple((t, r["misfit"]) for t, r in zip(times, records, strict=True) if r["how"] != "lost"))
+    trust = Series(0, tuple(zip(times, (record["trust"]["value"] for record in records), strict=True)))
+    misfit = Series(1, tuple((t, r["misfit"]) for t, r in zip(times, records, strict=True) if r["how"] != "lost"))
     charts = [
-        line_chart("trust", "s", [trust], levels=[Level("asked for", 1, tracked.min_trust)], size=SMALL),
+        line_chart("trust", "s", [trust], levels=[(1, tracked.min_trust)], note="dashed: asked for", size=SMALL),
         line_chart("misfit of pixels", "s", [misfit], size=SMALL),
     ]
     rows = [k for k, record in enumerate(records) if record["how"] != "lost"]
@@ -72,16 +82,14 @@ def _charts(tracked: Tracked) -> list[str]:
             unit: Callable[[float], float] = float if item.slides(name) else math.degrees
             values = [unit(one["joints"][name]) for one in found]
             deviations = [unit(one["deviation"][f"joint.{name}"]) for one in found]
-            charts.append(
-                _banded(f"{item.name}: {name}, {'mm' if item.slides(name) else 'deg'}", at, values, deviations)
+            bands = tuple(
+                tuple((t, v + way * SETTINGS.band * d) for t, v, d in zip(at, values, deviations, strict=True))
+                for way in (-1, 1)
             )
+            title = f"{item.name}: {name}, {'mm' if item.slides(name) else 'deg'}"
+            line = tuple(zip(at, values, strict=True))
+            charts.append(line_chart(title, "s", [Series(0, line, bands)], size=SMALL))
     return charts
-
-
-def _banded(title: str, times: Sequence[float], values: Sequence[float], deviations: Sequence[float]) -> str:
-    main = tuple(zip(times, values, strict=True))
-    bands = tuple(tuple((t, v + way * BAND * d) for (t, v), d in zip(main, deviations, strict=True)) for way in (-1, 1))
-    return line_chart(title, "s", [Series("", 0, main, bands)], size=SMALL)
 
 
 def _figure(tracked: Tracked, frame: Frame, record: dict[str, Any]) -> dict[str, Any]:

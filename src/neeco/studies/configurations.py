@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -37,7 +37,6 @@ COSTS = (  # of a whole run
 MEASURES = {column.key: column for column in (*SCORES, *MOMENTS, *COSTS)}
 LENGTHS = ("iterations", "minutes", "cpu_minutes")
 MAX_NAME_BYTES = 200  # of a configuration: its folder's name has more, and file systems take 255
-EXAMPLE = "write it as docs/studies.md shows"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,10 +71,13 @@ class SweepRequest:
         """Raises NeecoError naming the option that cannot be used."""
         if self.seeds is not None and self.seeds < 1:
             raise NeecoError(f"--seeds: {self.seeds} is none at all; give at least 1")
-        given = {key: getattr(self, key) for key in LENGTHS}
-        if any(value is not None for value in given.values()):
-            key = single_length(given)
-            require_length(f"--{key.replace('_', '-')}", given[key])
+        if any(value is not None for value in self.lengths.values()):
+            single_length(self.lengths, "--")
+
+    @property
+    def lengths(self) -> dict[str, Any]:
+        """The lengths of a run by LENGTHS."""
+        return {key: getattr(self, key) for key in LENGTHS}
 
     def run_folder(self, name: str, seed: int) -> Path:
         """Return the run folder of a configuration and seed."""
@@ -131,10 +133,9 @@ class Study:
         NeecoError naming the field that cannot be used."""
         study = self if request.seeds is None else replace(self, seeds=request.seeds)
         alone = {name: study.unfolded(name) for name in study.configurations}
-        lengths = {key: getattr(request, key) for key in LENGTHS}
-        if any(value is not None for value in lengths.values()):
+        if any(request.lengths.values()):
             alone = {name: replace(item, iterations=None) for name, item in alone.items()}
-            study = replace(study, **lengths)
+            study = replace(study, **request.lengths)
         everybody = {name: TableRow() for name in alone}
         tables = {
             name: replace(table, title=table.title or name, rows=table.rows or everybody)
@@ -149,10 +150,10 @@ class Study:
         if not self.configurations:
             raise NeecoError("configurations: none is given; name at least one, with its method")
         for name in self.configurations:
-            if not name or name.startswith(".") or {*name} & {"/", "\\", "\0"}:
-                raise NeecoError(f"configurations: {name!r} names no folder; leave out / and \\ and a dot at its start")
-            if not name.isprintable() or name != name.strip() or len(name.encode()) > MAX_NAME_BYTES:
-                raise NeecoError(f"configurations: {name[:40]!r} names no folder; give a short name in one line")
+            plain = name.isprintable() and name == name.strip() and not name.startswith(".")
+            if not plain or not 0 < len(name.encode()) <= MAX_NAME_BYTES or {*name} & {"/", "\\"}:
+                problem = f"{name[:40]!r} names no folder; give a short name in one line without / and \\"
+                raise NeecoError(f"configurations: {problem}")
             self.length_of(name)
         if self.seeds < 1:
             raise NeecoError(f"seeds: {self.seeds} is none at all; give at least 1")
@@ -189,9 +190,8 @@ class Study:
         none, or several."""
         own = self.configurations[name].iterations
         if own is not None:
-            return "iterations", require_length(f"configurations.{name}.iterations", own)
-        key = single_length({key: getattr(self, key) for key in LENGTHS})
-        return key, require_length(key, getattr(self, key))
+            return single_length({"iterations": own}, f"configurations.{name}.")
+        return single_length({key: getattr(self, key) for key in LENGTHS}, "")
 
     def only(self, tables: Iterable[str]) -> Study:
         """Return the study with these tables and the configurations that stand in them. Raises NeecoError for a name
@@ -205,9 +205,10 @@ class Study:
 
 def read_study(file: Path) -> Study:
     """Read STUDY.yaml. Raises NeecoError naming the file and the field that is unknown or does not fit."""
-    values = parse_yaml(file, read_text(file, "a study in YAML"), EXAMPLE)
+    example = "write it as docs/studies.md shows"
+    values = parse_yaml(file, read_text(file, "a study in YAML"), example)
     if not isinstance(values, dict):
-        raise NeecoError(f"{file}: is no group of fields such as configurations; {EXAMPLE}")
+        raise NeecoError(f"{file}: is no group of fields such as configurations; {example}")
     try:
         return structure(Study, values)
     except NeecoError as error:
@@ -219,20 +220,18 @@ def ablations() -> Study:
     return read_study(Path(str(files("neeco.studies") / "ablations.yaml")))
 
 
-def single_length(given: Mapping[str, float | None]) -> str:
-    """Return the one key of `given` that has a value. Raises NeecoError where none has, or several."""
-    found = [key for key, value in given.items() if value is not None]
-    if len(found) == 1:
-        return found[0]
-    what = f"{' and '.join(found)} are given" if found else "no length of the runs is given"
-    raise NeecoError(f"{what}; all train equally long: give one of {', '.join(LENGTHS)} (try --minutes 5)")
-
-
-def require_length(place: str, value: float) -> float:
-    """Return a length of runs. Raises NeecoError naming `place` where nothing can be trained so long."""
+def single_length(lengths: Mapping[str, float | None], place: str) -> tuple[str, float]:
+    """Return the one of LENGTHS that has a value, and the value. Raises NeecoError where none has, or several, and
+    naming it behind `place` where nothing can be trained so long."""
+    values = {key: value for key, value in lengths.items() if value is not None}
+    if len(values) != 1:
+        what = f"{' and '.join(values)} are given" if values else "no length of the runs is given"
+        raise NeecoError(f"{what}; all train equally long: give one of {', '.join(LENGTHS)} (try --minutes 5)")
+    ((key, value),) = values.items()
     if not 0 < value < math.inf:
-        raise NeecoError(f"{place}: {value} is no time to train; give more than 0")
-    return value
+        field = key.replace("_", "-") if place == "--" else key
+        raise NeecoError(f"{place}{field}: {value} is no time to train; give more than 0")
+    return key, value
 
 
 def require_known(place: str, name: str, known: Iterable[str]) -> None:

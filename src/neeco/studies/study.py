@@ -1,4 +1,4 @@
-"""The engine of every study (`sweep`, `downstream`): jobs that stand on their own and can be resumed.
+"""The engine of every study (`sweep`, `downstream`): jobs that stand on their own and can be resumed; the machine.
 
 A study is a list of jobs (`Job`), each with a folder of its own, and one JSON file that is valid at every moment.
 `check_output` checks that the output folder is free, or holds the same study begun earlier; `run_jobs` runs all jobs,
@@ -10,50 +10,50 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import platform
+import re
 import statistics
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol
 
 import torch
 
-from neeco.base.errors import NeecoError
+from neeco.base.errors import NeecoError, counted
 from neeco.base.files import TEMPORARY, read_begun, require_same, write_text
 from neeco.base.workers import Workers, address, check_gpus, run_tasks
 from neeco.base.workers import check_workers as check_reachable
 from neeco.capture import Capture
 from neeco.raster.devices import device_of, readable_failures
-from neeco.raster.native import keep_freed_memory, set_threads
-from neeco.studies.machine import threads_per_worker
+from neeco.raster.native import keep_freed_memory, set_threads, simd, threads
 
 CHECKPOINT_S = 60.0  # that interrupted jobs get to write their checkpoints
 REMEDY = "give another --output"  # where a folder holds other work
+GO_ON = "run the same command again to go on, nothing finished is lost"
 
 JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], what is going on
 Result = dict[str, Any]  # what a job returns and writes; of a failed one its identity, "error" and empty "splits"
 
 
 class Job(Protocol):
-    """One job of a study. It stores what it finished in its folder, and finds it there when it is run again."""
+    """One job of a study. It stores what it finished in its folder, and finds it there when it is run again.
+
+    capture: the capture's folder; folder: the one that it writes; device: a word for `device_of`; title: its name in
+    messages.
+    """
 
     @property
-    def capture(self) -> Path:
-        """The capture's folder."""
-
+    def capture(self) -> Path: ...
     @property
-    def folder(self) -> Path:
-        """The folder that it writes."""
-
+    def folder(self) -> Path: ...
     @property
-    def device(self) -> str:
-        """A word for `device_of`."""
-
+    def device(self) -> str: ...
     @property
-    def title(self) -> str:
-        """Its name in messages."""
+    def title(self) -> str: ...
 
     def identity(self) -> dict[str, Any]:
         """Return what distinguishes it from the other jobs; part of its result, whether it finishes or fails."""
@@ -115,22 +115,37 @@ def run_jobs(
     tries again. Raises NeecoError before any work when a job's folder is another job's or the cluster does not answer,
     and KeyboardInterrupt saying which job was stopped.
     """
-    check_workers(workers, _device_of(jobs), light)
+    device = device_of(jobs[0].device if jobs else "cpu", drawing=False)
+    check_workers(workers, device, light)
     known = dict(finished)
 
-    def report(event: JobEvent) -> None:
-        if event.result is not None:
-            known[event.index] = event.result
+    def report(index: int, stage: str, share: float = 0.0, text: str = "", result: Result | None = None) -> None:
+        if result is not None:
+            known[index] = result
+            text = result.get("error", "")
+            stage, share = "failed" if text else "done", 1.0
             if record:
                 record([known[index] for index in sorted(known)])
         if progress:
+            event = JobEvent(
+                index=index, total=len(jobs), job=jobs[index], stage=stage, share=share, text=text, result=result
+            )
             progress(event)
 
     for job in jobs:
         job.check()
     if workers > 1 or address():
-        return _run_in_workers(jobs, workers, report, light)
-    return [_run_here(place, jobs, captures.get(job.capture), report) for place, job in enumerate(jobs)]
+        return _run_in_workers(jobs, workers, device, report, light)
+    results = []
+    for index, job in enumerate(jobs):
+        try:
+            results.append(attempt_job(job, partial(report, index), captures.get(job.capture)))
+        except KeyboardInterrupt as interrupt:
+            moment = " ".join(map(str, interrupt.args)).split(";")[0]
+            place = f"job {index + 1} of {len(jobs)} ({job.title}){', ' + moment if moment else ''}"
+            raise KeyboardInterrupt(f"{place}; {GO_ON}") from None
+        report(index, "done", result=results[-1])
+    return results
 
 
 def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:
@@ -175,61 +190,21 @@ def _failed(job: Job, error: str) -> Result:
     return job.identity() | {"error": error, "splits": {}}
 
 
-def _end(index: int, total: int, job: Job, result: Result) -> JobEvent:
-    """The event that a job is done or has failed."""
-    failure = result.get("error", "")
-    return JobEvent(
-        index=index, total=total, job=job, stage="failed" if failure else "done", share=1.0, text=failure, result=result
-    )
-
-
-def _run_here(index: int, jobs: Sequence[Job], capture: Capture | None, report: Callable[[JobEvent], None]) -> Result:
-    """Run one of the jobs in this process."""
-    job, total = jobs[index], len(jobs)
-
-    def progress(stage: str, share: float, text: str) -> None:
-        report(JobEvent(index=index, total=total, job=job, stage=stage, share=share, text=text))
-
-    try:
-        result = attempt_job(job, progress, capture)
-    except KeyboardInterrupt as interrupt:
-        moment = " ".join(map(str, interrupt.args)).split(";")[0]
-        where = f"job {index + 1} of {total} ({job.title}){', ' + moment if moment else ''}"
-        raise _interrupted(where) from None
-    report(_end(index, total, job, result))
-    return result
-
-
-def _interrupted(where: str) -> KeyboardInterrupt:
-    return KeyboardInterrupt(f"{where}; run the same command again to go on, nothing finished is lost")
-
-
-def _device_of(jobs: Sequence[Job]) -> torch.device:
-    """The device of the jobs, who share it, as this machine understands its word."""
-    return device_of(jobs[0].device if jobs else "cpu", drawing=False)
-
-
-def wants_gpus(jobs: Sequence[Job]) -> bool:
-    """Return whether the jobs compute on GPUs, where the workers' machines have some."""
-    if not jobs or jobs[0].device == "cpu":
-        return False
-    return bool(address()) or _device_of(jobs).type != "cpu"
-
-
 def _run_in_workers(
-    jobs: Sequence[Job], workers: int, report: Callable[[JobEvent], None], light: bool = False
+    jobs: Sequence[Job], workers: int, device: torch.device, report: Callable[..., None], light: bool
 ) -> list[Result]:
     """`run_jobs` with `workers` jobs at once, each in a process of its own; light ones one after another in it.
 
     With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
-    device is opened in its worker, who sees one GPU, that no other has.
+    device is opened in its worker, who sees one GPU, that no other has: on a cluster of machines other than this one,
+    it is one unless the jobs ask for the CPU.
     """
     folders = [job.folder.absolute().parent for job in jobs]
     how = Workers(
         count=workers,
         threads=None if address() else threads_per_worker(workers),
         fresh=not light,
-        gpu=wants_gpus(jobs),
+        gpu=bool(jobs) and jobs[0].device != "cpu" and (bool(address()) or device.type != "cpu"),
         shared_gpus=torch.cuda.device_count() if light else None,
         stop_s=CHECKPOINT_S,
         writes=Path(os.path.commonpath(folders)) / f"{TEMPORARY}probe" if folders else None,
@@ -240,17 +215,19 @@ def _run_in_workers(
     try:
         with contextlib.closing(run_tasks(_run_in_worker, None, jobs, how)) as events:
             for event in events:
-                index, job, reason = event.index, jobs[event.index], event.value
+                index, reason = event.index, event.value
                 running.add(index)
                 if event.stage in ("started", "died"):
                     text = f"its worker died ({reason}); it goes on from its checkpoint" if reason else ""
-                    report(JobEvent(index=index, total=len(jobs), job=job, stage="training", text=text))
+                    report(index, "training", text=text)
                     continue
                 running.remove(index)
-                results[index] = reason if event.stage == "done" else _failed(job, f"its worker died: {reason}")
-                report(_end(index, len(jobs), job, results[index]))
+                failure = f"its worker died: {reason}"
+                results[index] = reason if event.stage == "done" else _failed(jobs[index], failure)
+                report(index, "done", result=results[index])
     except KeyboardInterrupt:
-        raise _interrupted(f"while running {'; '.join(jobs[index].title for index in sorted(running))}") from None
+        names = "; ".join(jobs[index].title for index in sorted(running))
+        raise KeyboardInterrupt(f"while running {names}; {GO_ON}") from None
     return [results[index] for index in range(len(jobs))]
 
 
@@ -260,3 +237,45 @@ def _run_in_worker(_: None, job: Job, threads: int) -> Result:
     torch.set_num_threads(threads)
     keep_freed_memory()
     return attempt_job(job)
+
+
+def machine(device: torch.device, workers: int | None = None) -> dict[str, Any]:
+    """Processor, cores this process may use, threads, versions, and the GPU where `device` is one; of a study also its
+    `workers`, and the threads that each of several has."""
+    on_gpu = device.type == "cuda"
+    share = threads_per_worker(workers) if workers is not None and workers > 1 else None
+    try:
+        processors = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        processors = ""
+    named = re.search(r"^(?:model name|Model)[^:\n]*:(.*)$", processors, re.MULTILINE)
+    return {
+        "cpu": named[1].strip() if named else platform.processor() or platform.machine(),
+        "cores": usable_cores(),
+        "threads": threads(),
+        "torch_threads": torch.get_num_threads(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "backend": f"triton (CUDA {torch.version.cuda})" if on_gpu else f"cpu ({simd()})",
+        "gpu": torch.cuda.get_device_name(device) if on_gpu else None,
+    } | ({} if workers is None else {"workers": workers, "threads_per_worker": share})
+
+
+def machine_words(machine: Mapping[str, Any], threads: str = "threads") -> str:
+    """The machine that a study's numbers were taken on. threads: the field that counts them where it had one worker."""
+    gpu = f"{machine['gpu']}, " if machine.get("gpu") else ""
+    count = machine["threads_per_worker"] or machine[threads]
+    workers = f", {machine['workers']} at once" if machine["workers"] > 1 else ""
+    cores = f"{machine['cpu']}, {machine['cores']} cores"
+    return f"{gpu}{cores}, {counted(count, 'thread')}{workers}, torch {machine['torch']}"
+
+
+def threads_per_worker(workers: int) -> int:
+    """Each of `workers` gets its share of the cores, at least one thread."""
+    return max(1, usable_cores() // workers)
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""`sweep`: configurations x seeds on one capture, each a job; their scores in one tidy table."""
+"""`sweep`: configurations x seeds on one capture, each a job; one tidy table of scores, and what is read off it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from neeco import __version__
-from neeco.base.errors import NeecoError
+from neeco.base.errors import NeecoError, counted
 from neeco.base.files import own_folder, require_same, write_json, write_text
 from neeco.base.settings import name_and_value, plain
 from neeco.capture import Capture
@@ -20,10 +20,9 @@ from neeco.evaluation.image_metrics import WEIGHTS_VARIABLE, find_lpips
 from neeco.raster.devices import device_of
 from neeco.scene.method_registry import method_class, unmet_need
 from neeco.scene.training_session import UNLIMITED
-from neeco.studies.configurations import MEASURES, Study, SweepRequest
-from neeco.studies.machine import machine
-from neeco.studies.study import REMEDY, JobEvent, Result, check_output, check_workers, run_jobs
-from neeco.studies.tables import csv_text
+from neeco.studies.configurations import COSTS, MEASURES, Study, SweepRequest, Table
+from neeco.studies.study import REMEDY, JobEvent, Result, check_output, check_workers, machine, run_jobs, spread
+from neeco.studies.tables import UNKNOWN, Cell, Column, ResultTable, Row, csv_text, summary_table
 from neeco.studies.training_job import JOB_FILE, TrainingJob, read_result
 from neeco.training.config import TrainConfig, training_config
 from neeco.training.run import require_same_capture
@@ -33,6 +32,8 @@ SWEEP_FILE = "sweep.json"
 RESULTS_FILE = "results.csv"
 COLUMNS = ("configuration", "method", "seed", "split", "frames", *MEASURES, "error")
 SHARED = {"seed": "seeds", "iterations": "iterations", "minutes": "minutes", "transforms": "--transforms"}
+Numbers = Mapping[str, Mapping[str, Any]]  # `study.spread` by configuration and measure, of one split
+PRIMARY = "test"  # the split that published numbers are compared with, where there is one
 Rows = Sequence[Mapping[str, Any]]  # of the tidy table: one for each configuration, seed and split, by COLUMNS
 
 
@@ -60,7 +61,12 @@ def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) 
         study = study.prepared(request)
     except NeecoError as error:
         raise NeecoError(f"{place}{error}") from None
-    methods = {name: _method_of(study, name, place) for name in study.configurations}
+    methods = {}
+    for name, configuration in study.configurations.items():
+        try:
+            methods[name] = training_config(configuration.method, {}).method
+        except NeecoError as error:
+            raise NeecoError(f"{place}configurations.{name}: {error}") from None
     configs = {name: config_of(request, study, name, place, methods) for name in study.configurations}
     capture = read_checked(request.capture, request.transforms)
     for name, config in configs.items():
@@ -119,7 +125,19 @@ def run_sweep(plan: SweepPlan, progress: Callable[[JobEvent], None] | None = Non
                 for split in plan.splits
             ]
             write_text(output / RESULTS_FILE, csv_text(COLUMNS, rows))
-            write_json(output / SWEEP_FILE, _document(plan) | {"complete": len(results) == len(plan.jobs)})
+            made = {  # how the results were made
+                "schema": SCHEMA,
+                "version": __version__,
+                "capture": str(plan.request.capture.absolute()),
+                "transforms": plan.request.transforms,
+                "clock": plan.jobs[0].clock,
+                "splits": list(plan.splits),
+                "settings": list(plan.request.set),
+                "machine": plan.machine,
+                "study": plain(plan.study),
+                "complete": len(results) == len(plan.jobs),
+            }
+            write_json(output / SWEEP_FILE, made)
             return rows
 
         record([finished[index] for index in sorted(finished)])
@@ -131,21 +149,6 @@ def failures(rows: Rows) -> list[str]:
     """Return `name, seed k: why` of every job that failed."""
     failed = [f"{row['configuration']}, seed {row['seed']}: {row['error']}" for row in rows if row.get("error")]
     return list(dict.fromkeys(failed))
-
-
-def _document(plan: SweepPlan) -> dict[str, Any]:
-    """The contents of sweep.json: how the results were made."""
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "capture": str(plan.request.capture.absolute()),
-        "transforms": plan.request.transforms,
-        "clock": plan.jobs[0].clock,
-        "splits": list(plan.splits),
-        "settings": list(plan.request.set),
-        "machine": plan.machine,
-        "study": plain(plan.study),
-    }
 
 
 def config_of(request: SweepRequest, study: Study, name: str, place: str, methods: Mapping[str, str]) -> TrainConfig:
@@ -182,15 +185,84 @@ def config_of(request: SweepRequest, study: Study, name: str, place: str, method
         raise NeecoError(f"{given_in.get(field, f'{where}: ')}{field}{colon}{problem}") from None
 
 
-def _method_of(study: Study, name: str, place: str) -> str:
-    """Return the method that a configuration trains. Raises NeecoError naming it where it has none."""
-    try:
-        return training_config(study.configurations[name].method, {}).method
-    except NeecoError as error:
-        raise NeecoError(f"{place}configurations.{name}: {error}") from None
-
-
 def _has(method: str, field: str) -> bool:
     """Return whether a method has a field of its training config; `deformation.FIELD` is a method's own."""
     group, _, own = field.partition(".")
     return group != "deformation" or own in {item.name for item in dataclasses.fields(method_class(method).Settings)}
+
+
+def tables_of(plan: SweepPlan, rows: Rows) -> list[tuple[str, str, ResultTable]]:
+    """Return (name, split, numbers) of the study's tables: one with published numbers for the primary split alone, the
+    others for each split; at last ("", "", the cost of the runs)."""
+    study, splits = plan.study, plan.splits
+    finished = {row["configuration"] for row in rows if not row.get("error")}
+    reasons = {row["configuration"]: row["error"] for row in rows if row["configuration"] not in finished}
+    numbers: dict[str, Numbers] = {  # mean, standard deviation and number of the seeds that finished
+        split: {
+            name: {
+                key: spread(row.get(key) for row in rows if (row["configuration"], row["split"]) == (name, split))
+                for key in MEASURES
+            }
+            for name in dict.fromkeys(row["configuration"] for row in rows)
+        }
+        for split in splits
+    }
+    found = []
+    for name, table in study.tables.items():
+        primary = PRIMARY if PRIMARY in splits else splits[0]
+        for split in [primary] if any(row.published for row in table.rows.values()) else splits:
+            title = f"{table.title}, {split}"
+            if table.reference is None:
+                columns = [MEASURES[key] for key in table.measures]
+                rows_of = [(row.label or key, numbers[split][key], reasons.get(key)) for key, row in table.rows.items()]
+                made = summary_table(title, "configuration", columns, rows_of)
+            else:
+                made = _differences(title, table, numbers[split], reasons, study.even_db)
+            found.append((name, split, made))
+    costs = [(name, numbers[splits[0]][name], reasons.get(name)) for name in study.configurations]
+    return [*found, ("", "", summary_table("Training and rendering", "configuration", COSTS, costs))]
+
+
+def direction(ours: float | None, published: float, even: float) -> str:
+    """Compare the signs of two differences: "yes", "no", "even" where ours is below `even`, UNKNOWN."""
+    if ours is None:
+        return UNKNOWN
+    return "even" if abs(ours) < even else "yes" if (ours > 0) == (published > 0) else "no"
+
+
+def _differences(title: str, table: Table, numbers: Numbers, reasons: Mapping[str, str], even: float) -> ResultTable:
+    """Means with their differences to the reference; of a measure with published numbers also these, and whether both
+    differ in the same direction."""
+    reference = str(table.reference)
+    columns: list[Column] = []
+    cells: dict[str, list[Cell]] = {name: [] for name in table.rows}
+    for at, column in enumerate(MEASURES[key] for key in table.measures):
+        published = {name: row.published[at] for name, row in table.rows.items() if len(row.published) > at}
+        titles = [f"{column.title}: published", "ours", "agrees"] if published else [column.title]
+        columns += [Column(column.key, text) for text in titles]
+        base = numbers[reference][column.key]["mean"]
+        limit = even if "psnr" in column.key else 0.0  # which is in dB
+        for name in table.rows:
+            mean, std = (numbers[name][column.key][part] for part in ("mean", "std"))
+            change = None if name == reference or mean is None or base is None else mean - base
+            text = UNKNOWN if mean is None else column.written(mean)
+            text += "" if std is None else f" ± {column.written(std)}"
+            text += "" if change is None else f" ({change * column.scale:+.{column.digits}f})"
+            words = [text]
+            if published:
+                both = name != reference and {name, reference} <= published.keys()
+                agrees = direction(change, published[name] - published[reference], limit) if both else ""
+                words = [column.written(published[name]) if name in published else UNKNOWN, text, agrees]
+            cells[name] += map(Cell, words)
+    rows = tuple(
+        Row((row.label or name,), tuple(cells[name]), reasons.get(name), reference=name == reference)
+        for name, row in table.rows.items()
+    )
+    return ResultTable(title, ("configuration",), tuple(columns), rows)
+
+
+def length_words(study: Study) -> str:
+    """Return the length of the runs and the number of seeds, in words."""
+    lengths = dict.fromkeys(study.length_of(name) for name in study.configurations)
+    each = " or ".join(f"{value:,g} {key.replace('cpu_', 'CPU ')}" for key, value in lengths)
+    return f"{each} each, {counted(study.seeds, 'seed')}"

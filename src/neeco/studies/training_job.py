@@ -36,15 +36,11 @@ if TYPE_CHECKING:
 JOB_SCHEMA = "neeco-job/2"
 JOB_FILE = "job.json"  # the result of a finished job
 CURVE_FILE = "curve.jsonl"  # held-out PSNR over the training
-CURVE_SHARES = tuple(step / 10 for step in range(1, 11))  # of the run, at which held-out frames are rendered
-CURVE_FRAMES = 4  # of each split, evenly spaced: the whole split is scored at the end
-FIELD_SHARES, FIELD_FRAMES = (0.2, 0.6, 1.0), 2  # the same of a radiance field, which takes seconds for an image
 CHECKPOINTS = {
     "psnr_at_20": 0.2,
     "psnr_at_40": 0.4,
     "psnr_at_60": 0.6,
 }  # shares of the run: the paper's 4k, 8k, 12k steps
-LATE = 0.75  # share of phase 1 after which its training PSNR counts
 CLOCKS: dict[str, Callable[[], float]] = {"wall": time.monotonic, "processor": time.process_time}
 ANEW = f"{REMEDY}, or remove that run's folder"
 SPLIT_SCORES = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou", "mask_dice", "frames")
@@ -53,6 +49,15 @@ RESULT = {"name": str, "method": str, "seed": int, "iterations": int, "seconds":
 RESULT |= {"num_gaussians": (int, None), "phase_1_psnr": (float, None), "lpips_networks": [str]}
 RESULT |= {"splits": {str: dict.fromkeys((*SPLIT_SCORES, *CHECKPOINTS), (float, None))}}
 CURVE_ROW = {"iteration": int, "seconds": float, "progress": float, "split": str, "psnr": (float, None)}
+
+
+@dataclass(frozen=True)
+class CurveSettings:
+    """Held-out PSNR over a training."""
+
+    shares: tuple[float, ...] = tuple(step / 10 for step in range(1, 11))  # of the run, at which frames are rendered
+    frames: int = 4  # of each split, evenly spaced: the whole split is scored at the end
+    late: float = 0.75  # share of phase 1 after which its training PSNR counts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +189,7 @@ def phase_1_psnr(folder: Path) -> float | None:
     """
     rows = read_rows(folder / "metrics.jsonl", {"iteration": int, "phase": int, "psnr": float})
     rows = [row for row in rows if row["phase"] == 1]
-    late = [row["psnr"] for row in rows if row["iteration"] > LATE * rows[-1]["iteration"]]
+    late = [row["psnr"] for row in rows if row["iteration"] > CurveSettings.late * rows[-1]["iteration"]]
     return round(sum(late) / len(late), 4) if late else None
 
 
@@ -203,11 +208,12 @@ class Curve:
 
     def __init__(self, file: Path, capture: Capture, splits: Sequence[str], *, field: bool = False) -> None:
         self.file = file
-        self.shares, count = (FIELD_SHARES, FIELD_FRAMES) if field else (CURVE_SHARES, CURVE_FRAMES)
+        settings = CurveSettings((0.2, 0.6, 1.0), 2) if field else CurveSettings()  # a field takes seconds for an image
+        self.shares = settings.shares
         self.rows: list[dict[str, Any]] | None = None  # None before the first step of this start
         self.frames: dict[str, list[tuple[Frame, Tensor, Tensor | None]]] = {}
         for split in splits:
-            chosen = [capture.split(split)[at] for at in evenly_spaced(len(capture.split(split)), count)]
+            chosen = [capture.split(split)[at] for at in evenly_spaced(len(capture.split(split)), settings.frames)]
             self.frames[split] = [(frame, frame.load_image(), frame.load_mask()) for frame in chosen]
 
     def after_step(self, session: Session) -> None:

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import Frame, State, evenly_spaced
-from neeco.evaluation.trust import NEIGHBOURHOOD, TypicalErrors, estimate_trust, typical_errors_of
+from neeco.evaluation.trust import SETTINGS, TypicalErrors, estimate_trust, typical_errors_of
 from neeco.geometry.camera import Camera
 from neeco.labels.labellers import CompositedLabels, composited_labels
 from neeco.raster import rasterize
@@ -215,7 +215,7 @@ class Judge:
         """Return the trust in a fitted state, and the best other state where one was searched for: with
         `search_rolls`, or where the trust is low."""
         drawing, view = self.renderer.render(fit), fit.view
-        neighbourhood = NEIGHBOURHOOD * view.diagonal / math.hypot(view.camera.width, view.camera.height)
+        neighbourhood = SETTINGS.neighbourhood * view.diagonal / math.hypot(view.camera.width, view.camera.height)
         overlap = estimate_trust(drawing, view.image, view.weight > 0, self.reference.errors, neighbourhood).value
         beyond = self.directions.beyond(fit.state, view.camera)
         half = HALF_TRUST_MISFIT * self.allowance * self.reference.misfit / (1 + beyond / HALVING_DEG)

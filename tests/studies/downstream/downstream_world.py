@@ -11,10 +11,10 @@ import torch
 from PIL import Image
 from torch import nn
 
-from neeco.studies.downstream.batches import Batch, BatchSampler, TrainingImage, collate, shrink
 from neeco.studies.downstream.model import TorchModel, TrainingTask
 from neeco.studies.downstream.models.unet import UNet
 from neeco.studies.downstream.samples import Example
+from neeco.studies.downstream.training_data import Batch, BatchSampler, TrainingImage, collate, shrink
 
 PARTS = (("bar", "shaft"), ("bar", "wrist"), ("bar", "jaw_left"), ("bar", "jaw_right"))
 

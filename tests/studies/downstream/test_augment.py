@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from neeco.studies.downstream.batches import collate, shrink
 from neeco.studies.downstream.samples import Example
+from neeco.studies.downstream.training_data import collate, shrink
 from neeco.synthesis.augmentation import augment, augment_batch, moved
 
 SIZE = (60, 80)

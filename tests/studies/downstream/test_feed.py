@@ -11,9 +11,9 @@ from downstream_world import Held, batch_of, squares
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neeco.studies.downstream import batches, samples
-from neeco.studies.downstream.batches import BatchSampler, training_image
-from neeco.studies.downstream.samples import Example, LeastRecentlyUsed
+from neeco.studies.downstream import training_data
+from neeco.studies.downstream.samples import Cache, Example
+from neeco.studies.downstream.training_data import BatchSampler, training_image
 
 REAL, SETS = squares(3, 0, 16), (squares(11, 10, 16), squares(1, 50, 16))
 SOURCES = (REAL, *SETS)
@@ -74,8 +74,7 @@ def test_the_seed_decides_the_order_whatever_the_batches() -> None:
 
 def test_images_are_read_once_unless_they_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     def reads(limit: int) -> list[int]:
-        monkeypatch.setattr(batches, "IMAGES", LeastRecentlyUsed())
-        monkeypatch.setattr(samples, "CACHE_BYTES", limit)
+        monkeypatch.setattr(training_data, "CACHE", Cache(limit))
         source = [Held(sample.example, sample.name, []) for sample in squares(4, 0, 16)]
         for _ in range(3):
             for sample in source:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neeco.studies.downstream.intervals import Arm, Scores, block_weights, seed_weights
+from neeco.studies.downstream.results import Arm, Estimate, Scores, block_weights, seed_weights
 
 ARMS = {name: Arm("unet", name, 10) for name in ("a", "b")}
 
@@ -44,7 +44,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
     for _ in range(200):
         seeds, blocks = rng.normal(0, 0.02, (5, 1)), np.repeat(rng.normal(0, 0.05, (1, 20)), 5, 1)
         values = 0.7 + seeds + blocks + rng.normal(0, 0.02, (5, 100))
-        low, high = Scores(jobs({"a": values})).interval(ARMS["a"], "test", "iou")
+        _, _, low, high = Scores(jobs({"a": values})).estimate(ARMS["a"], "test", "iou")
         held += low <= 0.7 <= high
     assert 0.85 < held / 200 < 0.99  # 95 % of many seeds and blocks, fewer of five seeds
 
@@ -52,8 +52,8 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
 def test_a_difference_on_the_same_frames_is_surer_than_its_sides() -> None:
     hard = np.random.default_rng(1).normal(0.6, 0.2, (4, 50))
     scores = Scores(jobs({"a": hard + 0.01, "b": hard}))
-    low, high = scores.interval(ARMS["a"], "test", "iou")
-    folds, mean, (first, last) = scores.difference(ARMS["a"], ARMS["b"], "test", "iou")
+    _, _, low, high = scores.estimate(ARMS["a"], "test", "iou")
+    folds, mean, first, last = scores.estimate(ARMS["a"], "test", "iou", ARMS["b"])
     assert high - low > 0.05
     assert (folds, mean) == (4, pytest.approx(0.01))
     assert (first, last) == (pytest.approx(0.01), pytest.approx(0.01))
@@ -64,16 +64,16 @@ def test_only_folds_that_both_have_are_compared() -> None:
     found[0] = found[0] | {"error": "lost", "splits": {}}
     found[1]["splits"]["test"]["iou"] = 0.8
     scores = Scores(found)
-    folds, mean, _ = scores.difference(ARMS["a"], ARMS["b"], "test", "iou")
+    folds, mean, *_ = scores.estimate(ARMS["a"], "test", "iou", ARMS["b"])
     assert (folds, mean) == (2, pytest.approx(0.35))
-    assert scores.difference(ARMS["a"], Arm("unet", "c", 10), "test", "iou") is None
-    assert scores.interval(Arm("unet", "c", 10), "test", "iou") == (None, None)
+    assert scores.estimate(ARMS["a"], "test", "iou", Arm("unet", "c", 10)) is None
+    assert scores.estimate(Arm("unet", "c", 10), "test", "iou") is None
 
 
 def test_frames_without_the_class_are_left_out() -> None:
     found = jobs({"a": np.array([[0.5, 0.5, 0.9, 0.5]])})
     found[0]["splits"]["test"]["per_frame"][2]["iou"] = None
-    assert Scores(found).interval(ARMS["a"], "test", "iou") == (0.5, 0.5)
+    assert Scores(found).estimate(ARMS["a"], "test", "iou")[2:] == (0.5, 0.5)
 
 
 def test_scores_of_no_frames_are_resampled_over_seeds_alone() -> None:
@@ -83,6 +83,6 @@ def test_scores_of_no_frames_are_resampled_over_seeds_alone() -> None:
             for fold, value in enumerate(values)
         ]
 
-    low, high = Scores(boxes(0.4, 0.5, 0.6)).interval(ARMS["a"], "test", "ap")
+    _, _, low, high = Scores(boxes(0.4, 0.5, 0.6)).estimate(ARMS["a"], "test", "ap")
     assert 0.4 <= low < 0.5 < high <= 0.6
-    assert Scores(boxes(0.4)).interval(ARMS["a"], "test", "ap") == (None, None)
+    assert Scores(boxes(0.4)).estimate(ARMS["a"], "test", "ap") == Estimate(1, 0.4, None, None)

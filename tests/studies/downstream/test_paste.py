@@ -12,8 +12,8 @@ from downstream_world import save_rgb
 
 from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
-from neeco.studies.downstream.paste import Backgrounds, pasted_samples
 from neeco.studies.downstream.samples import Example, RecordedSample, recorded_samples
+from neeco.studies.downstream.training_data import Backgrounds, pasted_samples
 
 
 def covered(example: Example) -> np.ndarray:

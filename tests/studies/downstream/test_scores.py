@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from neeco.studies.downstream.samples import Example
-from neeco.studies.downstream.scores import (
+from neeco.studies.downstream.results import (
     BOX_SCORES,
     MASK_SCORES,
     Detections,
@@ -17,6 +16,7 @@ from neeco.studies.downstream.scores import (
     mask_scores,
     mean_scores,
 )
+from neeco.studies.downstream.samples import Example
 
 ONE = ("instrument",)
 PARTS = ("shaft", "wrist", "jaws")
@@ -42,10 +42,6 @@ def test_scores_of_a_mask_by_hand() -> None:
     assert scores["dice"] == pytest.approx(8 / 11)
     assert scores["precision"] == pytest.approx(4 / 5)
     assert scores["recall"] == pytest.approx(4 / 6)
-
-
-def test_a_perfect_mask_scores_one_throughout() -> None:
-    truth = rows("0110", "0110", "0000")
     assert mask_scores(truth, truth_of(truth), ONE) == dict.fromkeys(MASK_SCORES, 1.0)
 
 
@@ -116,42 +112,26 @@ HERE = (10, 10, 30, 30)
 THERE = (35, 35, 60, 60)
 
 
-def test_what_is_found_exactly_scores_one() -> None:
-    scores = box_scores([boxes_of((*HERE, 0.9)), boxes_of((*THERE, 0.6))], [boxed(HERE), boxed(THERE)], ONE)
-    assert scores == pytest.approx(dict.fromkeys(BOX_SCORES, 1.0))
-
-
-def test_what_is_not_found_scores_nothing() -> None:
-    truth = [boxed(HERE), boxed(THERE)]
-    for answers in ([boxes_of(), boxes_of()], [boxes_of((0, 0, 5, 5, 0.9)), boxes_of((*HERE, 0.9))]):
-        assert box_scores(answers, truth, ONE) == dict.fromkeys(BOX_SCORES, 0.0)
+@pytest.mark.parametrize(
+    ("answers", "truth", "ap"),
+    [
+        ([((*HERE, 0.9),), ((*THERE, 0.6),)], [HERE, THERE], 1),
+        ([(), ()], [HERE, THERE], 0),
+        ([((0, 0, 5, 5, 0.9),), ((*HERE, 0.9),)], [HERE, THERE], 0),
+        ([((*HERE, 0.9),), ()], [HERE, THERE], 51 / 101),  # precision 1 up to recall .5: recalls 0, .01 … .5
+        ([((*HERE, 0.9), (40, 40, 50, 50, 0.3))], [HERE], 1),  # worse answers below the right ones take nothing
+        ([((*HERE, 0.2), (40, 40, 50, 50, 0.8))], [HERE], 0.5),
+        ([((*HERE, 0.7),), ((*HERE, 0.9),)], [HERE, None], 0.5),  # an answer where there is no instrument
+        ([((*HERE, 0.9), (11, 10, 31, 30, 0.8))], [HERE], 1),  # found twice: at recall 1 already by the first
+    ],
+)
+def test_average_precision_of_answers_by_hand(answers, truth, ap: float) -> None:
+    scores = box_scores([boxes_of(*some) for some in answers], [boxed(*([box] if box else [])) for box in truth], ONE)
+    assert scores["ap"] == pytest.approx(ap)
 
 
 def test_without_a_true_box_there_is_nothing_to_score() -> None:
     assert box_scores([boxes_of((*HERE, 0.9))], [boxed()], ONE) == dict.fromkeys(BOX_SCORES)
-
-
-def test_half_found_is_half() -> None:
-    scores = box_scores([boxes_of((*HERE, 0.9)), boxes_of()], [boxed(HERE), boxed(THERE)], ONE)
-    assert scores["ap"] == pytest.approx(51 / 101)  # precision 1 up to recall .5: recalls 0, .01 … .5
-
-
-def test_worse_answers_below_the_right_ones_take_nothing() -> None:
-    right, wrong = (*HERE, 0.9), (40, 40, 50, 50, 0.3)
-    scores = box_scores([boxes_of(right, wrong)], [boxed(HERE)], ONE)
-    assert scores["ap"] == pytest.approx(1)
-    above = box_scores([boxes_of((*HERE, 0.2), (40, 40, 50, 50, 0.8))], [boxed(HERE)], ONE)
-    assert above["ap"] == pytest.approx(0.5)
-
-
-def test_wrong_answers_in_images_without_an_instrument_take_something() -> None:
-    answers = [boxes_of((*HERE, 0.7)), boxes_of((*HERE, 0.9))]
-    assert box_scores(answers, [boxed(HERE), boxed()], ONE)["ap"] == pytest.approx(0.5)
-
-
-def test_finding_it_twice_counts_once() -> None:
-    scores = box_scores([boxes_of((*HERE, 0.9), (11, 10, 31, 30, 0.8))], [boxed(HERE)], ONE)
-    assert scores["ap"] == pytest.approx(1)  # at recall 1 already by the first
 
 
 def test_a_frames_score_is_of_the_most_confident_box() -> None:

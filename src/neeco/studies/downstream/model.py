@@ -20,11 +20,10 @@ from torch import Tensor, nn
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import write_atomically
 from neeco.base.registry import plugins
-from neeco.studies.downstream.batches import Batch, BatchSampler, collate, training_image
-from neeco.studies.downstream.scores import Prediction
+from neeco.studies.downstream.results import Prediction
+from neeco.studies.downstream.training_data import Batch, BatchSampler, collate, training_image
 
 WEIGHTS_FILE = "weights.safetensors"
-REPORT_EVERY = 10  # steps
 Predict = Callable[[Sequence[np.ndarray]], list[Prediction]]  # of uint8 images [H, W, 3], at their size
 
 
@@ -64,6 +63,7 @@ class TorchModel(ABC):
     gradient_clip: ClassVar[float] = 0.1  # norm, as in D-FINE
     warmup: ClassVar[float] = 0.1  # of the steps: the learning rate rises
     prediction_batch: ClassVar[int] = 16  # images
+    report_every: ClassVar[int] = 10  # steps
 
     @classmethod
     @abstractmethod
@@ -123,7 +123,7 @@ class TorchModel(ABC):
             nn.utils.clip_grad_norm_(module.parameters(), self.gradient_clip)
             optimizer.step()
             schedule.step()
-            if step % REPORT_EVERY == 0 or step == task.steps:  # a GPU waits here for its numbers
+            if step % self.report_every == 0 or step == task.steps:  # a GPU waits here for its numbers
                 value = loss.item()
                 if not math.isfinite(value):
                     raise NeecoError(f"{self.model}: its loss is not finite at step {step}; train with more images")

@@ -1,27 +1,249 @@
-"""Results of jobs: means over folds and differences with their intervals, findings in words, tables.
+"""Results of a downstream study: scores of predictions, their intervals over folds and frames, findings and tables.
 
-A study's results are one document, that of downstream.json, of plain values: "jobs" as they wrote them, "summary" and
-"findings" from here.
+Masks are scored per frame, boxes over a split (by pycocotools). A study's results are one document, that of
+downstream.json, of plain values: "jobs" as they wrote them, "summary" and "findings" from here.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
+import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
 
-from neeco.base.errors import counted
-from neeco.base.files import write_text
-from neeco.studies.downstream.conditions import BASELINES, PERMUTED, REAL
-from neeco.studies.downstream.intervals import Arm, Scores, arms_of
-from neeco.studies.downstream.scores import BOX_SCORES, MASK_SCORES
-from neeco.studies.tables import UNKNOWN, Cell, Column, ResultTable, Row, csv_text, markdown_document
+import numpy as np
 
+from neeco.evaluation.mask_metrics import boundary_f, dice, iou, mean_of, precision
+from neeco.studies.downstream.samples import Example
+from neeco.studies.downstream.training_data import BASELINES, PERMUTED, REAL
+from neeco.studies.tables import UNKNOWN, Cell, Column, ResultTable, Row, csv_text
+
+MASK_SCORES = ("iou", "dice", "precision", "recall", "boundary_f")
+BOX_SCORES = ("ap", "ap50", "ap75")
 MAIN = {"masks": "iou", "boxes": "ap"}  # the score that models are compared by
 TITLES = {"iou": "IoU", "dice": "Dice", "boundary_f": "boundary F", "ap": "AP50-95", "ap50": "AP50", "ap75": "AP75"}
 HELPS, HURTS, NONE_SHOWN, ONE_FOLD = "helps", "hurts", "no difference shown", "one fold gives no verdict"
 
 Document = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class IntervalSettings:
+    """Bootstrap of the intervals."""
+
+    confidence: float = 0.95
+    resamples: int = 2000
+    blocks: int = 10  # a test's frames are resampled in so many blocks of neighbours, whose errors are correlated
+
+
+INTERVALS = IntervalSettings()
+
+
+@dataclass(frozen=True)
+class Detections:
+    """The detections in one image, best first."""
+
+    boxes: np.ndarray  # [n, 4] x0, y0, x1, y1 px
+    classes: np.ndarray  # [n] int64, from 1
+    scores: np.ndarray  # [n] in [0, 1]
+
+    def of_class(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Boxes [m, 4] and scores [m] of one class."""
+        return self.boxes[self.classes == number], self.scores[self.classes == number]
+
+
+Prediction = np.ndarray | Detections  # classes of pixels uint8 [H, W], 0 tissue; or boxes
+
+
+def mask_scores(predicted: np.ndarray, truth: Example, classes: Sequence[str]) -> dict[str, float]:
+    """Scores of one frame: of a single class by name of the score; of several as `CLASS.score`, and their means.
+
+    predicted: uint8 [H, W]. NaN where neither side shows the class.
+    """
+    valid = truth.valid if truth.valid is not None else np.ones(predicted.shape, bool)
+    scores = []
+    for number in range(1, len(classes) + 1):
+        mask, true = predicted == number, truth.classes == number
+        row = {"iou": iou(mask, true, valid), "dice": dice(mask, true, valid)}
+        row |= {"precision": precision(mask, true, valid), "recall": precision(true, mask, valid)}
+        scores.append(row | {"boundary_f": boundary_f(mask, true, valid)})
+    if len(classes) == 1:
+        return scores[0]
+    named = {f"{name}.{key}": value for name, row in zip(classes, scores, strict=True) for key, value in row.items()}
+    return {key: mean_of([row[key] for row in scores]) for key in MASK_SCORES} | named
+
+
+def mean_scores(frames: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
+    """The mean of every score over those frames that have it; None where none has."""
+    names = dict.fromkeys(name for frame in frames for name in frame)
+    means = {name: mean_of([frame.get(name) for frame in frames]) for name in names}
+    return {name: None if math.isnan(value) else value for name, value in means.items()}
+
+
+def box_scores(
+    predictions: Sequence[Detections], truth: Sequence[Example], classes: Sequence[str]
+) -> dict[str, float | None]:
+    """AP of boxes as COCO's, mean over IoU .5 to .95, at .5 and at .75; of several classes their mean, and `CLASS.ap`.
+    None where the truth has no box."""
+    labelled = [example.boxes() for example in truth]
+    per_class = {}
+    for number, name in enumerate(classes, 1):
+        true = [boxes[numbers == number] for boxes, numbers in labelled]
+        if any(len(boxes) for boxes in true):
+            per_class[name] = _coco_ap([found.of_class(number) for found in predictions], true)
+    if not per_class:
+        return dict.fromkeys(BOX_SCORES)
+    means = np.mean(list(per_class.values()), axis=0).tolist()
+    scores: dict[str, float | None] = dict(zip(BOX_SCORES, means, strict=True))
+    return scores | ({f"{name}.ap": row[0] for name, row in per_class.items()} if len(classes) > 1 else {})
+
+
+def box_iou(found: Detections, truth: Example) -> float:
+    """Mean IoU of every true box with the most confident box of its class; NaN where the truth has none."""
+    values = []
+    for box, number in zip(*truth.boxes(), strict=True):
+        boxes, scores = found.of_class(number)
+        best = boxes[scores.argmax()] if len(scores) else np.zeros(4)
+        both = np.prod(np.clip(np.minimum(best[2:], box[2:]) - np.maximum(best[:2], box[:2]), 0, None))
+        areas = [np.prod(corners[2:] - corners[:2]) for corners in (best, box)]
+        values.append(float(both / (sum(areas) - both)))
+    return mean_of(values)
+
+
+def _coco_ap(found: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """AP over IoU .5 to .95, at .5 and at .75, by pycocotools."""
+    from pycocotools.coco import COCO
+    from pycocotools.cocoeval import COCOeval
+
+    def box_of(image: int, box: np.ndarray) -> dict[str, object]:
+        x0, y0, x1, y1 = map(float, box)
+        bbox = [x0, y0, x1 - x0, y1 - y0]
+        return {"image_id": image, "bbox": bbox, "area": bbox[2] * bbox[3], "category_id": 1}
+
+    labelled = [box_of(image, box) for image, boxes in enumerate(true, 1) for box in boxes]
+    detections = [
+        box_of(image, box) | {"score": float(score)}
+        for image, (boxes, scores) in enumerate(found, 1)
+        for box, score in zip(boxes, scores, strict=True)
+    ]
+    if not detections:
+        return 0.0, 0.0, 0.0
+    with contextlib.redirect_stdout(io.StringIO()):
+        truth = COCO()
+        truth.dataset = {
+            "info": {},
+            "images": [{"id": image} for image in range(1, len(true) + 1)],
+            "categories": [{"id": 1, "name": "instrument"}],
+            "annotations": [box | {"id": number, "iscrowd": 0} for number, box in enumerate(labelled, 1)],
+        }
+        truth.createIndex()
+        evaluation = COCOeval(truth, truth.loadRes(detections), "bbox")
+        evaluation.params.maxDets = [1, 10, 100]  # per image, as COCO
+        evaluation.evaluate()
+        evaluation.accumulate()
+        evaluation.summarize()
+    ap, ap50, ap75 = (float(value) for value in evaluation.stats[:3])
+    return ap, ap50, ap75
+
+
+class Arm(NamedTuple):
+    """A model in a condition with so many labelled frames."""
+
+    model: str
+    condition: str
+    real: int
+
+    @property
+    def words(self) -> list[str]:
+        """The words of its condition."""
+        return self.condition.split("+")
+
+
+class Estimate(NamedTuple):
+    """A mean over folds with the ends of its interval, which are None where there is one value only."""
+
+    folds: int
+    mean: float
+    low: float | None
+    high: float | None
+
+
+class Scores:
+    """The scores of a study's finished jobs by arm, test and metric, and the intervals of their means and differences.
+
+    All arms are resampled alike (the same seeds, the same frames), so that a difference of two is a paired one.
+    """
+
+    def __init__(self, jobs: Sequence[Document]) -> None:
+        self.jobs: dict[Arm, dict[int, Document]] = {}
+        for job in jobs:
+            if "error" not in job:
+                arm = Arm(job["model"], job["condition"], job["real"])
+                self.jobs.setdefault(arm, {})[job["fold"]] = job
+        self._resampled: dict[Any, np.ndarray] = {}
+
+    def estimate(self, arm: Arm, test: str, metric: str, against: Arm | None = None) -> Estimate | None:
+        """Return the mean of an arm's score over folds, or of its difference to another's over the folds that both
+        finished; None where there is no such fold."""
+        values = []
+        for one in (arm,) if against is None else (arm, against):
+            scores = {fold: job["splits"].get(test, {}).get(metric) for fold, job in self.jobs.get(one, {}).items()}
+            values.append({fold: score for fold, score in sorted(scores.items()) if score is not None})
+        folds = tuple(fold for fold in values[0] if fold in values[-1])
+        if not folds:
+            return None
+        mean = float(np.mean([values[0][fold] - (values[1][fold] if against else 0) for fold in folds]))
+        means = self._means(arm, test, metric, folds)
+        if against is not None:
+            means = means - self._means(against, test, metric, folds)
+        if not len(means):
+            return Estimate(len(folds), mean, None, None)
+        tail = (1 - INTERVALS.confidence) / 2
+        low, high = np.nanquantile(means, [tail, 1 - tail])
+        return Estimate(len(folds), mean, float(low), float(high))
+
+    def _means(self, arm: Arm, test: str, metric: str, folds: tuple[int, ...]) -> np.ndarray:
+        """[R]: means over resampled seeds and frames; [0] of one seed without scores of frames."""
+        key = arm, test, metric, folds
+        if key not in self._resampled:
+            rows = []
+            for fold in folds:
+                scores = self.jobs[arm][fold]["splits"][test]
+                frames = [frame.get(metric) for frame in scores.get("per_frame", ())]
+                rows.append(frames if any(value is not None for value in frames) else [scores[metric]])
+            values = np.array(rows, np.float64)  # [seeds, frames]; None is nan: a frame without the class
+            seeds, frames_drawn = seed_weights(len(folds)), block_weights(values.shape[1])
+            known = ~np.isnan(values)
+            total, count = (((seeds @ part) * frames_drawn).sum(1) for part in (np.nan_to_num(values), known))
+            self._resampled[key] = total / np.where(count > 0, count, np.nan) if values.size > 1 else np.empty(0)
+        return self._resampled[key]
+
+
+@cache
+def seed_weights(seeds: int) -> np.ndarray:
+    """[R, seeds]: how often each seed is drawn, in all one time fewer than there are seeds: as often would make
+    the variance of few too small (Rao and Wu, "Resampling inference with complex survey data", 1988)."""
+    times = max(seeds - 1, 1)
+    return (
+        np.random.default_rng(1).multinomial(times, np.full(seeds, 1 / seeds), INTERVALS.resamples).astype(np.float64)
+    )
+
+
+@cache
+def block_weights(frames: int) -> np.ndarray:
+    """[R, frames]: how often each frame is drawn, in blocks of neighbours from anywhere in the recording
+    (Politis and Romano, "A circular block-resampling procedure", 1992)."""
+    length = -(-frames // INTERVALS.blocks)
+    starts = np.random.default_rng(2).integers(frames, size=(INTERVALS.resamples, -(-frames // length)))
+    ends = np.zeros((INTERVALS.resamples, 2 * frames + 1))
+    rows = np.arange(INTERVALS.resamples)[:, None]
+    np.add.at(ends, (rows, starts), 1)
+    np.add.at(ends, (rows, starts + length), -1)
+    covered = ends.cumsum(1)
+    return covered[:, :frames] + covered[:, frames : 2 * frames]
 
 
 def title_of(condition: str, real: int) -> str:
@@ -54,19 +276,20 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
     the right ones.
     """
     rows, scores = [], Scores(jobs)
-    for arm in arms_of(jobs):
+    for arm in dict.fromkeys(Arm(job["model"], job["condition"], job["real"]) for job in jobs):
         main = MAIN[models[arm.model]]
         metrics = metrics_of([job for job in jobs if job["model"] == arm.model], models[arm.model])
         for test in tests:
-            folds = len(scores.by_fold(arm, test, main))
-            row: dict[str, Any] = {**arm._asdict(), "test": test, "folds": folds}
-            row |= {metric: scores.mean(arm, test, metric) for metric in metrics}
-            row["low"], row["high"] = scores.interval(arm, test, main)
+            means = {metric: scores.estimate(arm, test, metric) for metric in metrics}
+            score = means[main] or Estimate(0, math.nan, None, None)
+            row: dict[str, Any] = {**arm._asdict(), "test": test, "folds": score.folds}
+            row |= {metric: mean and mean.mean for metric, mean in means.items()}
+            row |= {"low": score.low, "high": score.high}
             reference = _reference(arm, test, scores, main)
-            if reference is not None and (found := scores.difference(arm, reference, test, main)) is not None:
-                both, difference, (low, high) = found
-                row |= {"against": reference.condition, "against_real": reference.real, "difference": difference}
-                row |= {"difference_low": low, "difference_high": high, "verdict": verdict(both, low, high)}
+            if reference is not None and (gain := scores.estimate(arm, test, main, reference)) is not None:
+                row |= {"against": reference.condition, "against_real": reference.real, "difference": gain.mean}
+                row |= {"difference_low": gain.low, "difference_high": gain.high}
+                row["verdict"] = verdict(gain.folds, gain.low, gain.high)
             rows.append(row)
     return rows
 
@@ -83,9 +306,9 @@ def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
     elif REAL not in words:
         real = max((other.real for other in others if set(other.words) in baselines), default=0)
     rivals = [
-        (value, other)
+        (score.mean, other)
         for other in others
-        if set(other.words) in wanted and other.real == real and (value := scores.mean(other, test, metric)) is not None
+        if set(other.words) in wanted and other.real == real and (score := scores.estimate(other, test, metric))
     ]
     return max(rivals)[1] if rivals else None
 
@@ -116,15 +339,15 @@ def is_synthetic(row: Document, experiment: Document) -> bool:
 
 def findings(experiment: Document) -> list[str]:
     """Return the findings: a sentence for every model, test and condition with synthetic images that is compared."""
-    found = []
+    sentences = []
     for model, test in models_and_tests(experiment):
         for row in rows_of(experiment, model, test):
             if "against" in row and (is_synthetic(row, experiment) or PERMUTED in row["condition"].split("+")):
                 score = f"{_title(MAIN[model['predicts']])} {row[MAIN[model['predicts']]]:.3f}"
                 against = f"{title_of(row['against'], row['against_real'])} ({_difference(row)})"
                 arm = f"{model['name']}, {test}: {title_of(row['condition'], row['real'])}"
-                found.append(f"{arm}: {score}; {row['verdict']} against {against}")
-    return found
+                sentences.append(f"{arm}: {score}; {row['verdict']} against {against}")
+    return sentences
 
 
 def _difference(row: Document) -> str:
@@ -166,24 +389,7 @@ def tables_of(experiment: Document) -> list[ResultTable]:
     return [table_of(experiment, model, test) for model, test in models_and_tests(experiment)]
 
 
-def budget_text(experiment: Document) -> str:
-    """Return the budget of every training and the number of seeds, in words."""
-    models = [
-        f"{model['name']}: {model['steps']} steps of {model['batch']} images of {model['input'][0]}x{model['input'][1]}"
-        for model in experiment["models"]
-    ]
-    return f"{'; '.join(models)}; {counted(experiment['folds'], 'fold')}"
-
-
 def summary_text(experiment: Document) -> str:
     """CSV with a line per arm and test, unrounded."""
     rows = experiment["summary"]
     return csv_text(list(dict.fromkeys(key for row in rows for key in row)), rows)
-
-
-def write_tables(output: Path, experiment: Document) -> None:
-    """Write downstream.csv and downstream.md into `output`."""
-    title, lead = f"Downstream on {Path(experiment['capture']).name}", f"{budget_text(experiment)}."
-    notes = [*experiment["findings"], *experiment["notes"], *failed_jobs(experiment)]
-    write_text(output / "downstream.csv", summary_text(experiment))
-    write_text(output / "downstream.md", markdown_document(title, lead, tables_of(experiment), "folds", notes))

@@ -7,10 +7,11 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import cv2
 import numpy as np
+from scipy.ndimage import find_objects
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes, read_json, read_json_lines, require_inside, require_like
@@ -18,42 +19,13 @@ from neeco.capture.checks.truth import PARTS_FILE
 from neeco.capture.images import image_files, image_size, read_image_bytes, read_labels
 from neeco.capture.model import Capture, Frame
 from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, truth_file, truth_names
-from neeco.evaluation.mask_metrics import boxes_of, pairs_of
+from neeco.evaluation.mask_metrics import pairs_of
 
 ClassNames = Literal["instrument", "parts"]
 WHOLE = ("instrument",)  # the classes where an instrument is one
-CACHE_BYTES = 1 << 30  # of decoded images of one kind that a process keeps
 DATASET_FILE, STATES_FILE, IMAGE_FOLDER = "dataset.json", "states.jsonl", "images"
 ANEW = "synthesize the set again"
-
-
-class Sized(Protocol):
-    """A value that knows its size in memory."""
-
-    @property
-    def bytes(self) -> int: ...
-
-
-V = TypeVar("V", bound=Sized)
-
-
-class LeastRecentlyUsed(Generic[V]):
-    """Values by key, of at most CACHE_BYTES in all; those that were not used for longest go first."""
-
-    def __init__(self) -> None:
-        self.used = 0
-        self._kept: OrderedDict[Hashable, V] = OrderedDict()
-
-    def get(self, key: Hashable, make: Callable[[], V]) -> V:
-        """The value of `key`, made where it is not kept."""
-        if key not in self._kept:
-            self._kept[key] = make()
-            self.used += self._kept[key].bytes
-        self._kept.move_to_end(key)
-        value = self._kept[key]
-        while self.used > CACHE_BYTES and len(self._kept) > 1:
-            self.used -= self._kept.popitem(last=False)[1].bytes
-        return value
+V = TypeVar("V")
 
 
 @dataclass(frozen=True)
@@ -76,7 +48,8 @@ class Example:
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """[n, 4] (x0, y0, x1, y1; px, x1 and y1 exclusive) about each class, and the classes [n]."""
-        boxes = [boxes_of(self.classes == number)[0] for number in self.shown]
+        places = [place for place in find_objects(self.classes) if place is not None]
+        boxes = [(x.start, y.start, x.stop, y.stop) for y, x in places]
         return np.array(boxes, np.float64).reshape(-1, 4), self.shown
 
     def outlines(self) -> list[tuple[int, np.ndarray]]:
@@ -124,26 +97,40 @@ def _classes_of(ids: np.ndarray, table: bytes, file: Path, remedy: str) -> np.nd
 
 
 class Sample(Protocol):
-    """An image with labels that is read when it is needed."""
+    """An image with labels that is read when it is needed. name: in messages and tables; key: equal for samples that
+    load the same. `load` raises NeecoError."""
 
     @property
-    def name(self) -> str:
-        """Its name in messages and tables."""
-
+    def name(self) -> str: ...
     @property
-    def key(self) -> Hashable:
-        """Equal for samples that load the same."""
-
-    def load(self) -> Example:
-        """Read it. Raises NeecoError."""
+    def key(self) -> Hashable: ...
+    def load(self) -> Example: ...
 
 
-EXAMPLES = LeastRecentlyUsed[Example]()
+class Cache:
+    """Decoded images by key, of at most `limit` bytes in all; those that were not used for longest go first."""
+
+    def __init__(self, limit: int = 2 << 30) -> None:
+        self.limit, self.used = limit, 0
+        self._kept: OrderedDict[Hashable, Any] = OrderedDict()
+
+    def get(self, key: Hashable, make: Callable[[], V]) -> V:
+        """The value of `key`, made where it is not kept; it has its size in `bytes`."""
+        if key not in self._kept:
+            self._kept[key] = make()
+            self.used += self._kept[key].bytes
+        self._kept.move_to_end(key)
+        value: V = self._kept[key]
+        while self.used > self.limit and len(self._kept) > 1:
+            self.used -= self._kept.popitem(last=False)[1].bytes
+        return value
+
+    def load(self, sample: Sample) -> Example:
+        """The sample's example."""
+        return self.get(sample.key, sample.load)
 
 
-def loaded(sample: Sample) -> Example:
-    """The sample's example, kept for as long as there is room."""
-    return EXAMPLES.get(sample.key, sample.load)
+CACHE = Cache()
 
 
 @dataclass(frozen=True)
@@ -259,11 +246,6 @@ def recorded_samples(
     # where only some frames' truth has parts, every id is a piece of the instrument
     table = class_table(masks.names or dict.fromkeys(range(1, 256), WHOLE[0]), wanted)
     return tuple(RecordedSample(frame, masks, table) for frame in frames)
-
-
-def has_labels(capture: Capture, split: str) -> bool:
-    """Return whether any frame of the split has a true mask."""
-    return any(truth_file(capture.root, frame.name) for frame in capture.split(split))
 
 
 def frame_size(samples: Sequence[RecordedSample]) -> tuple[int, int]:

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neeco.studies.downstream.batches import Batch
 from neeco.studies.downstream.model import TorchModel, missing_packages
-from neeco.studies.downstream.scores import Detections, Prediction
+from neeco.studies.downstream.results import Detections, Prediction
+from neeco.studies.downstream.training_data import Batch
 
 STRIDES = (16, 32)  # px, of the backbone's last two stages, which it detects on
 
@@ -83,7 +83,14 @@ class DFine(TorchModel):
         return DFineForObjectDetection(config)
 
     def loss(self, module: Any, batch: Batch) -> Tensor:
-        labels = [detection_labels(*boxes, batch.images.device) for boxes in batch.boxes()]
+        device = batch.images.device
+        labels = [  # as transformers takes them
+            {
+                "class_labels": torch.from_numpy(classes - 1).to(device),
+                "boxes": torch.from_numpy(boxes.astype(np.float32)).to(device),
+            }
+            for boxes, classes in batch.boxes()
+        ]
         return module(pixel_values=batch.images, labels=labels).loss
 
     def predictions(self, module: Any, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Prediction]:
@@ -97,12 +104,3 @@ class DFine(TorchModel):
             queries, classes = np.unravel_index(np.argsort(-score, axis=None, kind="stable"), score.shape)
             found.append(Detections(corners[queries].astype(np.float64), classes + 1, score[queries, classes]))
         return found
-
-
-def detection_labels(boxes: np.ndarray, classes: np.ndarray, device: torch.device) -> dict[str, Tensor]:
-    """One image's labels as transformers takes them, from its boxes [n, 4] (centre x, y, width, height; shares of the
-    image's sides) and their classes [n], from 1."""
-    return {
-        "class_labels": torch.from_numpy(classes - 1).to(device),
-        "boxes": torch.from_numpy(boxes.astype(np.float32)).to(device),
-    }

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neeco.studies.downstream.batches import Batch
 from neeco.studies.downstream.model import TorchModel
-from neeco.studies.downstream.scores import Prediction
+from neeco.studies.downstream.results import Prediction
+from neeco.studies.downstream.training_data import Batch
 
 
 class ResidualUnit(nn.Module):
