@@ -21,9 +21,10 @@ from neeco.capture import read_capture
 from neeco.cli import main
 from neeco.ingest.cameras.still_scene import read_right_camera
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.readers import format_of, read_table
+from neeco.ingest.readers import _bagfile, format_of, read_table
 from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.readers.rosbag import BagLimits, RosBag
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 from neeco.ingest.request import IngestRequest
@@ -314,29 +315,23 @@ def test_files_packed_as_a_whole_are_refused(tmp_path: Path, bags: dict[str, Pat
     assert "its files are packed as a whole; unpack one with `zstd -d`" in refusal(lambda: read_arm(path))
 
 
-def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path) -> None:
     """The limit is lowered: a bomb of its real size would take seconds to make."""
-    from neeco.ingest.readers import _bagfile
-
-    monkeypatch.setattr(_bagfile, "MAX_CHUNK_BYTES", 60_000)
+    known = RosBag()
+    known.limits = BagLimits(chunk_bytes=60_000)
     for kind, packed in (("a.bag", "bz2"), ("b.bag", "lz4"), ("c.bag", None), ("d-mcap", "zstd"), ("e-db3", "zstd")):
         with BagWriter(tmp_path, kind, packed=packed) as bag:
             for time in range(4):
                 bag.pose("/dvrk/PSM1/measured_cp", float(time), [0, 0, 0], [1, 0, 0, 0])
                 bag.image(LEFT, float(time), np.zeros((200, 200, 3), np.uint8), "rgb8")
-        known = format_of(bag.path)
-        assert known is not None
-        assert "a chunk of its messages" in refusal(lambda known=known, bag=bag: known.open_images(bag.path))
+        assert "a chunk of its messages" in refusal(lambda bag=bag: known.open_images(bag.path))
 
 
-def test_packed_bytes_are_unpacked_up_to_a_limit_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
-    from neeco.ingest.readers import _bagfile
-
-    monkeypatch.setattr(_bagfile, "MAX_CHUNK_BYTES", 1000)
-    assert _bagfile.unpack(bz2.compress(bytes(1000)), "bz2") == bytes(1000)
+def test_packed_bytes_are_unpacked_up_to_a_limit_and_no_further() -> None:
+    assert _bagfile.unpack(bz2.compress(bytes(1000)), "bz2", 1000) == bytes(1000)
     for data in (bz2.compress(bytes(1001)), bz2.compress(bytes(900))[:-5], b"BZh"):
         with pytest.raises((OSError, _bagfile.ReaderError)):
-            _bagfile.unpack(data, "bz2")
+            _bagfile.unpack(data, "bz2", 1000)
 
 
 def test_definitions_in_a_bag_are_never_executed(tmp_path: Path, bags: dict[str, Path]) -> None:
