@@ -14,7 +14,7 @@ from array import array
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cache, lru_cache, partial
 from io import BytesIO
 from pathlib import Path
@@ -245,6 +245,7 @@ class Samples:
     type: str
     limits: BagLimits
     static: bool = False
+    _: KW_ONLY
     stamps: array[int] = field(default_factory=lambda: array("q"))
     received: array[int] = field(default_factory=lambda: array("q"))
     frames: set[str] = field(default_factory=set)

@@ -59,7 +59,7 @@ _COMMANDS = re.compile(r"setpoint|goal|desired|command|target|servo|move_", re.I
 _PRISMATIC = re.compile(r"insertion|prismatic", re.IGNORECASE)  # joints in m
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BagLimits:
     """Limits on what is read of a bag."""
 
