@@ -24,7 +24,7 @@ from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers import _bagfile, format_of, read_table
 from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
-from neeco.ingest.readers.rosbag import BagLimits, RosBag
+from neeco.ingest.readers.rosbag import RosBag
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 from neeco.ingest.request import IngestRequest
@@ -318,7 +318,7 @@ def test_files_packed_as_a_whole_are_refused(tmp_path: Path, bags: dict[str, Pat
 def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path) -> None:
     """The limit is lowered: a bomb of its real size would take seconds to make."""
     known = RosBag()
-    known.limits = BagLimits(chunk_bytes=60_000)
+    known.limits = _bagfile.BagLimits(chunk_bytes=60_000)
     for kind, packed in (("a.bag", "bz2"), ("b.bag", "lz4"), ("c.bag", None), ("d-mcap", "zstd"), ("e-db3", "zstd")):
         with BagWriter(tmp_path, kind, packed=packed) as bag:
             for time in range(4):

@@ -38,7 +38,6 @@ from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
 from neeco.ingest.readers import OTHER, Stream, VideoSource
-from neeco.ingest.readers.rosbag import POSE_HEADER, BagLimits
 from neeco.ingest.readers.rows import restarts
 
 if sys.version_info >= (3, 14):
@@ -51,6 +50,7 @@ _DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor, "zstd
 _REMEDIES = {".bag": "`rosbag reindex`", ".mcap": "`mcap recover`", "": "`ros2 bag reindex`"}  # by suffix
 POSE = {"geometry_msgs/PoseStamped", "geometry_msgs/TransformStamped"}
 TRANSFORMS = {"tf2_msgs/TFMessage", "tf/tfMessage"}
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 JOINTS = "sensor_msgs/JointState"
 IMAGE = {"sensor_msgs/Image", "sensor_msgs/CompressedImage"}
 CAMERA_INFO = "sensor_msgs/CameraInfo"
@@ -64,6 +64,20 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
     "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY), "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2), "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
 }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class BagLimits:
+    """Limits on what is read of a bag."""
+
+    chunk_bytes: int = 256 << 20  # unpacked; recorders write some MiB
+    metadata_bytes: int = 16 << 20
+    joints: int = 400  # of one topic
+    bodies: int = 2000  # of all transforms
+    pixels: int = 90_000_000  # of an image, as for files of images
+    min_images: int = 2
+    skipped_images: int = 30  # that are read and dropped rather than sought over
+    other_clock_s: float = 1.0  # between stamps and receipt: they are of different clocks
 
 
 class _UnusableError(Exception):
@@ -296,7 +310,7 @@ class Samples:
             place, turn = message.pose.position, message.pose.orientation
         else:
             place, turn = message.transform.translation, message.transform.rotation
-        return zip(POSE_HEADER[1:], (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w), strict=True)
+        return zip(POSE_COLUMNS, (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w), strict=True)
 
     def table(self) -> np.ndarray:
         """[N, C]"""

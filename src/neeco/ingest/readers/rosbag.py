@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -43,7 +43,7 @@ from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import NORM_TOLERANCE, read_pose_log
 
 if TYPE_CHECKING:
-    from neeco.ingest.readers._bagfile import Samples, Survey
+    from neeco.ingest.readers._bagfile import BagLimits, Samples, Survey
 
 DVRK_CAMERA = "ECM"  # the arm that holds the endoscope, and the frame of its tip
 CHAIN_HEADER = ("t_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
@@ -57,20 +57,6 @@ DVRK_WRIST = ("wrist_pitch", "wrist_yaw", "jaw")  # of an instrument; the joints
 DVRK_HINT = "kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit"
 _COMMANDS = re.compile(r"setpoint|goal|desired|command|target|servo|move_", re.IGNORECASE)  # nothing measured
 _PRISMATIC = re.compile(r"insertion|prismatic", re.IGNORECASE)  # joints in m
-
-
-@dataclass(frozen=True, kw_only=True)
-class BagLimits:
-    """Limits on what is read of a bag."""
-
-    chunk_bytes: int = 256 << 20  # unpacked; recorders write some MiB
-    metadata_bytes: int = 16 << 20
-    joints: int = 400  # of one topic
-    bodies: int = 2000  # of all transforms
-    pixels: int = 90_000_000  # of an image, as for files of images
-    min_images: int = 2
-    skipped_images: int = 30  # that are read and dropped rather than sought over
-    other_clock_s: float = 1.0  # between stamps and receipt: they are of different clocks
 
 
 class RosBag(RecordingFormat):
@@ -87,7 +73,7 @@ class RosBag(RecordingFormat):
             return super().claims(path)
         return b"rosbag2_bagfile_information" in read_head(path / "metadata.yaml", 4096)
 
-    limits = BagLimits()
+    limits: BagLimits | None = None  # the usual ones
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         return _streams(self._survey(path))
@@ -145,9 +131,10 @@ class RosBag(RecordingFormat):
 
     def _survey(self, path: Path) -> Survey:
         self.require_package(path)
-        from neeco.ingest.readers._bagfile import survey_of
+        from neeco.ingest.readers._bagfile import BagLimits, survey_of
 
-        return survey_of(path, file_state(*(visible_entries(path) if path.is_dir() else [path])), self.limits)
+        files = visible_entries(path) if path.is_dir() else [path]
+        return survey_of(path, file_state(*files), self.limits or BagLimits())
 
 
 @lru_cache(maxsize=4)
