@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import IngestSettings, Splits
 from neeco.ingest.recording.template import open_questions, write_template
 from neeco.ingest.request import IngestRequest
-from neeco.ingest.sources import recordings_of
+from neeco.ingest.sources import sources_of
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 
@@ -41,7 +42,7 @@ def flags(folder, **more):
         "intrinsics": (290, 290, 160, 128),
         "sync": folder / "logs/sync.json",
     }
-    return recordings_of(IngestRequest(video=folder / "video.mp4", **(given | more)))[0]
+    return sources_of(IngestRequest(video=folder / "video.mp4", **(given | more)), Path("out"))[1][0]
 
 
 def test_flags(folder):
@@ -372,11 +373,11 @@ def test_two_instruments_with_one_joint_name_have_two_clocks(world, folder):
 def test_a_fault_of_a_flag_is_told_by_its_flag(folder):
     (folder / "empty").mkdir()
     with pytest.raises(NeecoError, match=r"empty: holds 0 images"):
-        recordings_of(IngestRequest(video=folder / "empty", fps=25))[0].source.open()
+        sources_of(IngestRequest(video=folder / "empty", fps=25), Path("out"))[1][0].source.open()
     (folder / "frames").mkdir()
     Image.new("RGB", (8, 8)).save(folder / "frames" / "1.png")
     with pytest.raises(NeecoError, match=r"--fps: when were the images taken\?"):
-        recordings_of(IngestRequest(video=folder / "frames"))
+        sources_of(IngestRequest(video=folder / "frames"), Path("out"))[1]
     joint = ("jaw_angle", folder / "logs/jaw_calibration.csv", folder / "logs/jaw.csv")
     with pytest.raises(
         NeecoError, match=r"--joint jaw_angle: .*calibration\.csv has no times, .*jaw\.csv has; give the"

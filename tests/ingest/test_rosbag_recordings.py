@@ -28,7 +28,7 @@ from neeco.ingest.readers.rosbag import RosBag
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 from neeco.ingest.request import IngestRequest
-from neeco.ingest.sources import recordings_of
+from neeco.ingest.sources import sources_of
 from neeco.ingest.timing.reading import read_episodes
 
 SIZE = (64, 48)  # px
@@ -181,7 +181,7 @@ def test_a_bag_alone_is_enough_where_it_holds_one_of_each(tmp_path: Path) -> Non
         for time in np.arange(40) / 25:
             bag.pose("/tool/pose", time, shaft(time), [1, 0, 0, 0], "tracker")
             bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
-    (recording,) = recordings_of(IngestRequest(video=bag.path, instrument=bag.path))
+    (recording,) = sources_of(IngestRequest(video=bag.path, instrument=bag.path), Path("out"))[1]
     data = read_episodes([recording])
     states, usable = data.with_assumed_clocks().states_at(data.times)
     assert usable.all()
