@@ -188,7 +188,7 @@ def test_a_plus_transform_to_the_ecm_is_turned_and_one_to_a_tracker_is_not(tmp_p
     poses[:, :3, 3] = ECM
     poses[1, :3, :3] = Rotation.from_rotvec([0, 0, 0.1]).as_matrix()  # it moves
     names = {name: poses for name in ("PSM1ToECM", "StylusToTracker", "StylusToCamera")}
-    path = plus_world.write_mha(tmp_path / "a.mha", plus_world.frame_fields(TIMES, names), (COUNT, 0, 0, 1), ())
+    path = plus_world.write_sequence(tmp_path / "a.mha", plus_world.frame_fields(TIMES, names), (COUNT, 0, 0, 1), ())
     assert_seen(read_pose_log(PoseColumns(path, stream="PSM1ToECM")))
     log = read_pose_log(PoseColumns(path, stream="StylusToTracker"))
     assert log.frame == BASE

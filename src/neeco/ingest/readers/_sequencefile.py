@@ -9,7 +9,7 @@ import re
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,15 +18,12 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.base.files import open_file, require_content
 from neeco.capture.documents import printable
-from neeco.ingest.readers import VideoSource
+from neeco.ingest.readers import VideoSource, parse_number
 
 META, NRRD = (".mha", ".mhd"), (".nrrd", ".nhdr")
-MAX_LINE_BYTES = 1 << 16
-MAX_HEADER_BYTES = 1 << 29  # 100 000 frames of 20 transforms
-MAX_FRAMES = 10_000_000
-MAX_SIDE = 8192  # px
-MAX_RATIO = 1032  # of unpacked to packed bytes by zlib
-CHUNK_BYTES = 1 << 20  # that are read, and unpacked, at once
+TRANSFORM, STATUS, TIME = "Transform", "Status", "Timestamp"
+IMAGE_STATUSES = ("ImageStatus", "Status")  # of MetaImage and NRRD files
+GOOD = "ok"
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w{1,200})")
 _UCHAR = ("uchar", "unsigned char", "uint8", "uint8_t", "met_uchar")
 _META_READ = {
@@ -37,6 +34,21 @@ _NRRD_READ = {"type": _UCHAR, "encoding": ("raw", "gzip", "gz"), **_SKIPS}  # th
 
 
 @dataclass(frozen=True, kw_only=True)
+class SequenceLimits:
+    """Limits on what a sequence's header may promise."""
+
+    line_bytes: int = 1 << 16
+    header_bytes: int = 1 << 29  # 100 000 frames of 20 transforms
+    frames: int = 10_000_000
+    side_px: int = 8192
+    zlib_ratio: int = 1032  # of unpacked to packed bytes
+    chunk_bytes: int = 1 << 20  # that are read, and unpacked, at once
+
+
+LIMITS = SequenceLimits()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FrameSequence:
     """The header of a sequence. size: (width, height) px, (0, 0) without images; count: of its frames; channels: 1
     or 3; fields: by name, each frame's text by its number; data: the file that holds the images, and from which byte;
@@ -58,6 +70,46 @@ class FrameSequence:
     def frame_bytes(self) -> int:
         return self.size[0] * self.size[1] * self.channels
 
+    @property
+    def transforms(self) -> list[str]:
+        """Names of the transforms, without the word."""
+        return sorted(name.removesuffix(TRANSFORM) for name in self.fields if name.endswith(TRANSFORM))
+
+    @cached_property
+    def images(self) -> tuple[list[int], tuple[str, ...]]:
+        """The frames whose images can be used, in order, and notes on the others."""
+        statuses = next((self.fields[name] for name in IMAGE_STATUSES if name in self.fields), {})
+        good = [frame for frame in range(self.count) if statuses.get(frame, GOOD).lower() == GOOD]
+        frames, latest = [], -np.inf
+        for frame in good:
+            if (stamp := self._stamps.get(frame, -np.inf)) > latest:
+                frames.append(frame)
+                latest = stamp
+        bad, unstamped = self.count - len(good), len(good) - len(frames)
+        notes = [f"{bad} images are not OK and left out"] if bad else []
+        notes += [f"{unstamped} images have no {TIME} later than the one before; left out"] if unstamped else []
+        return frames, tuple(f"{self.path.name}: {note}" for note in notes)
+
+    @cached_property
+    def times(self) -> dict[int, float]:
+        """Times s by frame, from the first usable image on where there are images. Raises NeecoError."""
+        if not self._stamps:
+            raise NeecoError(f"{self.path}: {TIME}: no frame has one (Seq_Frame0000_{TIME}); record again")
+        frames = self.images[0] if self.has_images else []
+        first = self._stamps[frames[0]] if frames else 0.0
+        return {frame: stamp - first for frame, stamp in self._stamps.items()}
+
+    @cached_property
+    def _stamps(self) -> dict[int, float]:
+        """PLUS's timestamps s, by frame."""
+        numbers = ((frame, parse_number(text)) for frame, text in self.fields.get(TIME, {}).items())
+        return {frame: stamp for frame, stamp in numbers if stamp is not None and np.isfinite(stamp)}
+
+    def statuses(self, name: str) -> dict[int, str]:
+        """Return the status of each frame that has a transform."""
+        stated = self.fields.get(name + TRANSFORM + STATUS, {})
+        return {frame: stated.get(frame, GOOD) for frame in self.fields[name + TRANSFORM]}
+
 
 @dataclass
 class _Header:
@@ -75,7 +127,7 @@ class _Header:
         return [int(word) for word in words]
 
     def fault(self, what: str) -> NeecoError:
-        return NeecoError(f"{self.path}: {what}; export the sequence again")
+        return NeecoError(f"{self.path}: {what}; copy or export the sequence again")
 
 
 def read_sequence(path: Path) -> FrameSequence:
@@ -87,8 +139,7 @@ def read_sequence(path: Path) -> FrameSequence:
     except OSError as error:
         raise NeecoError(f"{path}: cannot read: {error.strerror or error}; correct the path") from None
     if not header.frames:
-        what = "holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence"
-        raise NeecoError(f"{path}: {what}; give one, or another file")
+        raise header.fault("holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence")
     plain, sizes = header.plain, header.integers("sizes" if is_nrrd else "DimSize")
     usual = "" if is_nrrd else " ".join(["domain"] * (len(sizes) - 1) + ["list"])
     size, count, channels = _dimensions(header, sizes, plain.get("kinds", usual).lower().split())
@@ -96,45 +147,41 @@ def read_sequence(path: Path) -> FrameSequence:
         channels = header.integers("ElementNumberOfChannels")[0]
     if min(size) > 1:
         for name, allowed in (_NRRD_READ if is_nrrd else _META_READ).items():
-            if (found := plain.get(name.lower(), "")).lower() not in allowed:
-                raise header.fault(f"{name}: is {printable(found or 'nothing')}, and {allowed[-1]} is read")
+            if (value := plain.get(name.lower(), "")).lower() not in allowed:
+                raise header.fault(f"{name}: is {printable(value or 'nothing')}, and {allowed[-1]} is read")
         if channels not in (1, 3):
             raise header.fault(f"has {channels} channels, and grey or RGB is read")
     name = plain.get("data file", plain.get("datafile", plain.get("elementdatafile", "LOCAL")))
-    local, beside = name.upper() == "LOCAL", path.parent / name
-    if not local and (Path(name).name != name or not beside.is_file()):
-        problem = f"{printable(name)} is no file next to {path.name}"
-        raise NeecoError(f"{path}: {problem}; put there what was written with it")
+    file, start = path, header.end
+    if name.upper() != "LOCAL":
+        file, start = path.parent / name, 0
+        if Path(name).name != name or not file.is_file():
+            raise header.fault(f"{printable(name)} is no file next to {path.name}")
     packed = plain.get("encoding", "raw").lower() != "raw" or plain.get("compresseddata", "").lower() == "true"
     sequence = FrameSequence(
-        path=path, size=size, count=count, channels=channels, fields=header.frames,
-        data=(path, header.end) if local else (beside, 0), packed=packed,
-    )  # fmt: skip
-    if not sequence.has_images:
-        return sequence
-    file, start = sequence.data
-    require_content(file)
-    held, promised = file.stat().st_size - start, sequence.frame_bytes * count
-    stored = plain.get("compresseddatasize", "")
-    if not packed and held != promised:
-        what = f"holds {held / sequence.frame_bytes:.4g} images, its header states {count}"
-    elif packed and re.fullmatch(r"\d{1,18}", stored) and held < int(stored):
-        what = f"holds {held} bytes of compressed images, its header states {stored}"
-    elif packed and promised > MAX_RATIO * (held + 64):
-        what = f"holds {held} bytes, of which no {count} images of {size} can come"
-    else:
-        return sequence
-    raise NeecoError(f"{file}: {what}; copy or export the sequence again")
+        path=path, size=size, count=count, channels=channels, fields=header.frames, data=(file, start), packed=packed
+    )
+    if sequence.has_images:
+        require_content(file)
+        held, promised = file.stat().st_size - start, sequence.frame_bytes * count
+        stored = plain.get("compresseddatasize", "")
+        if not packed and held != promised:
+            raise header.fault(f"holds {held / sequence.frame_bytes:.4g} images, its header states {count}")
+        if packed and re.fullmatch(r"\d{1,18}", stored) and held < int(stored):
+            raise header.fault(f"holds {held} bytes of compressed images, its header states {stored}")
+        if packed and promised > LIMITS.zlib_ratio * (held + 64):
+            raise header.fault(f"holds {held} bytes, of which no {count} images of {size} can come")
+    return sequence
 
 
 def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> _Header:
     """MetaImage: `Name = value` lines, of which ElementDataFile is the last; NRRD: `field: value` and `key:=value`
     lines up to an empty one, or to the end of a header by itself."""
     header, ended = _Header(path), False
-    if is_nrrd and not stream.readline(MAX_LINE_BYTES).startswith(b"NRRD000"):
+    if is_nrrd and not stream.readline(LIMITS.line_bytes).startswith(b"NRRD000"):
         raise header.fault("does not begin with NRRD000")
-    for line in iter(partial(stream.readline, MAX_LINE_BYTES), b""):
-        if len(line) == MAX_LINE_BYTES or stream.tell() > MAX_HEADER_BYTES:
+    for line in iter(partial(stream.readline, LIMITS.line_bytes), b""):
+        if len(line) == LIMITS.line_bytes or stream.tell() > LIMITS.header_bytes:
             raise header.fault("its header does not end")
         text = line.decode("utf-8", "replace").strip()
         name, sign, value = (part.strip() for part in text.partition(":" if is_nrrd else "="))
@@ -162,7 +209,7 @@ def _dimensions(header: _Header, sizes: list[int], kinds: list[str]) -> tuple[tu
         raise header.fault("kinds: are not domain ... list, with the frames last")
     if len(sizes) not in (3, 4) or (len(sizes) == 4 and sizes[2] > 1):
         raise header.fault(f"{sizes} is no sequence of images; expected width, height, frames")
-    if max(sizes[:2]) > MAX_SIDE or sizes[-1] > MAX_FRAMES:
+    if max(sizes[:2]) > LIMITS.side_px or sizes[-1] > LIMITS.frames:
         raise header.fault(f"{sizes} is too large")
     return (sizes[0], sizes[1]), sizes[-1], channels
 
@@ -175,50 +222,41 @@ class SequenceImages(VideoSource):
     frames: tuple[int, ...]
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        wanted = sorted({int(index) for index in indices})
-        shape = (self.sequence.size[1], self.sequence.size[0], self.sequence.channels)
-        contents = _contents(self.sequence, [self.frames[index] for index in wanted])
-        for index, content in zip(wanted, contents, strict=True):
-            yield index, np.broadcast_to(np.frombuffer(content, np.uint8).reshape(shape), (*shape[:2], 3)).copy()
+        sequence, wanted = self.sequence, {self.frames[int(index)]: int(index) for index in indices}
+        (file, start), length, last = sequence.data, sequence.frame_bytes, max(wanted, default=-1)
+        shape = (sequence.size[1], sequence.size[0], sequence.channels)
+        try:
+            with open_file(file, "images of a sequence") as stream:
+                contents = _packed_frames(stream, start, length) if sequence.packed else iter(())
+                for number in range(last + 1) if sequence.packed else sorted(wanted):
+                    if not sequence.packed:
+                        stream.seek(start + number * length)
+                        contents = iter((stream.read(length),))
+                    content = next(contents, b"")
+                    if len(content) < length:
+                        raise NeecoError(f"{file}: its images end early; copy or export the sequence again")
+                    if number in wanted:
+                        pixels = np.frombuffer(content, np.uint8).reshape(shape)
+                        yield wanted[number], np.broadcast_to(pixels, (*shape[:2], 3)).copy()
+                if last == sequence.count - 1 and next(contents, b""):
+                    raise NeecoError(f"{file}: holds more images than its header says; export the sequence again")
+        except (zlib.error, OSError) as error:
+            raise NeecoError(f"{file}: its images are damaged ({error}); copy or export the sequence again") from None
 
 
-def _contents(sequence: FrameSequence, numbers: list[int]) -> Iterator[bytes]:
-    """Yield the bytes of frames in increasing order. Raises NeecoError where the data ends before them or is
-    damaged."""
-    (file, start), length = sequence.data, sequence.frame_bytes
-    try:
-        with open_file(file, "images of a sequence") as stream:
-            stream.seek(start)
-            unpacked, first, held = _unpacked(stream), 0, bytearray()  # first: the frame with which held begins
-            for number in numbers:
-                if not sequence.packed:
-                    stream.seek(start + number * length)
-                    held, first = bytearray(stream.read(length)), number
-                while sequence.packed and len(held) < (number - first + 1) * length:
-                    if passed := min(number - first, len(held) // length):
-                        first += passed
-                        del held[: passed * length]
-                    if not (part := next(unpacked, b"")):
-                        break
-                    held += part
-                content = bytes(held[(number - first) * length :][:length])
-                if len(content) < length:
-                    raise NeecoError(f"{file}: its images end early; copy or export the sequence again")
-                yield content
-            rest = len(held) - (sequence.count - first) * length
-            if sequence.packed and sequence.count - 1 in numbers and (rest > 0 or next(unpacked, b"")):
-                raise NeecoError(f"{file}: holds more images than its header says; export the sequence again")
-    except (zlib.error, OSError) as error:
-        raise NeecoError(f"{file}: its images are damaged ({error}); copy or export the sequence again") from None
-
-
-def _unpacked(stream: BinaryIO) -> Iterator[bytes]:
-    """Yield what streams of zlib or gzip, one after the other, unpack to, at most CHUNK_BYTES at a time."""
-    machine, packed = zlib.decompressobj(zlib.MAX_WBITS | 32), b""  # of either kind
-    while packed := packed or stream.read(CHUNK_BYTES):
-        if part := machine.decompress(packed, CHUNK_BYTES):
-            yield part
+def _packed_frames(stream: BinaryIO, start: int, length: int) -> Iterator[bytes]:
+    """Yield frames of so many bytes, which streams of zlib or gzip, one after the other, unpack to piece by piece; what
+    is left at the end as a last, shorter one."""
+    stream.seek(start)
+    machine, packed, unpacked = zlib.decompressobj(zlib.MAX_WBITS | 32), b"", bytearray()  # of either kind
+    while packed := packed or stream.read(LIMITS.chunk_bytes):
+        unpacked += machine.decompress(packed, LIMITS.chunk_bytes)
         packed = machine.unconsumed_tail
         if machine.eof:
             packed = machine.unused_data
             machine = zlib.decompressobj(zlib.MAX_WBITS | 32)
+        while len(unpacked) >= length:
+            yield bytes(unpacked[:length])
+            del unpacked[:length]
+    if unpacked:
+        yield bytes(unpacked)

@@ -24,13 +24,20 @@ from neeco.ingest.readers import (
     file_state,
     parse_number,
 )
-from neeco.ingest.readers._sequencefile import META, NRRD, FrameSequence, SequenceImages, read_sequence
+from neeco.ingest.readers._sequencefile import (
+    GOOD,
+    META,
+    NRRD,
+    STATUS,
+    TIME,
+    TRANSFORM,
+    FrameSequence,
+    SequenceImages,
+    read_sequence,
+)
 from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_of, of_dvrk
 
-TRANSFORM, STATUS, TIME = "Transform", "Status", "Timestamp"
-IMAGE_STATUSES = ("ImageStatus", "Status")  # of MetaImage and NRRD files
-GOOD = "ok"
 IMAGE_STREAM = "images"
 MIN_IMAGES = 2
 _ENDS = re.compile(r"(\w+?)To([A-Z0-9]\w*)")
@@ -50,55 +57,56 @@ class PlusSequence(RecordingFormat):
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         sequence = _sequence_of(path)
-        times = _times(sequence)
-        found = []
+        span = np.ptp([*sequence.times.values()])
+
+        def rate(count: int) -> float | None:
+            return (count - 1) / span if span > 0 and count > 1 else None
+
+        streams = []
         if sequence.has_images:
-            frames, notes = _image_frames(sequence)
+            frames, notes = sequence.images
+            title = f"{'grey' if sequence.channels == 1 else 'RGB'} images of {sequence.size[0]}x{sequence.size[1]}"
             why = f" ({notes[0].partition(': ')[2]})" if notes else ""
             few = f"{len(frames)} of {sequence.count} images can be used{why}; record again"
-            color = "grey" if sequence.channels == 1 else "RGB"
-            title = f"{color} images of {sequence.size[0]}x{sequence.size[1]}"
-            problem = None if len(frames) >= MIN_IMAGES else few
-            rate = _rate(times, sequence.count)
-            found.append(Stream(IMAGE_STREAM, IMAGES, title, len(frames), rate, problem=problem))
-        for name in _transforms(sequence):
-            texts, meaning = sequence.fields[name + TRANSFORM], _meaning(name)
+            problem = few if len(frames) < MIN_IMAGES else None
+            streams.append(Stream(IMAGE_STREAM, IMAGES, title, len(frames), rate(sequence.count), problem=problem))
+        for name in sequence.transforms:
+            texts, (body, _, meaning) = sequence.fields[name + TRANSFORM], _ends(name)
             # what is the same in every frame is a calibration (ImageToProbe), no motion
             fixed = len(texts) > 1 and len(set(texts.values())) == 1
-            statuses = list(_statuses(sequence, name).values())
-            why = f"{name}{TRANSFORM}{STATUS} is {printable(statuses[0], 20)} in all"
-            problem = None if GOOD in map(str.lower, statuses) else _unusable(why)
-            found.append(
+            statuses = [status.lower() for status in sequence.statuses(name).values()]
+            problem = None if GOOD in statuses else _unusable(_status_words(name, statuses[0]))
+            kind, title = (OTHER, "fixed transform") if fixed else (POSES, "transform")
+            streams.append(
                 Stream(
-                    name, OTHER if fixed else POSES, "fixed transform" if fixed else "transform", len(texts),
-                    _rate(times, len(texts)), body=_ends(name)[0], hints=meaning.hints, asks=meaning.asks,
+                    name, kind, title, len(texts), rate(len(texts)), body=body, hints=meaning.hints, asks=meaning.asks,
                     problem=problem,
                 )
             )  # fmt: skip
-        return tuple(found)
+        return tuple(streams)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         sequence = _sequence_of(path)
-        if not _transforms(sequence):
+        if not sequence.transforms:
             raise NeecoError(
                 f"{path}: holds no transforms (Seq_Frame0000_StylusToTrackerTransform); name a log of poses"
             )
         wanted = None if stream is None else stream.removesuffix(TRANSFORM)
         name = choose_stream(path, self.streams(path), wanted, (POSES,)).name
-        times, statuses, dropped = _times(sequence), _statuses(sequence, name), dict[str, list[int]]()
-        rows, frames = [], []
+        statuses, dropped = sequence.statuses(name), dict[str, list[int]]()
+        rows, frames, (_, stated_in, meaning) = [], [], _ends(name)
         for frame, text in sorted(sequence.fields[name + TRANSFORM].items()):
             numbers = [parse_number(word) for word in text.split()]
             if statuses[frame].lower() != GOOD:
-                dropped.setdefault(f"{name}{TRANSFORM}{STATUS} is {printable(statuses[frame], 20)}", []).append(frame)
-            elif frame not in times or len(numbers) != 16 or not np.isfinite(np.array(numbers, np.float64)).all():
+                dropped.setdefault(_status_words(name, statuses[frame]), []).append(frame)
+            elif frame not in sequence.times or len(numbers) != 16 or not np.isfinite(np.array(numbers, float)).all():
                 dropped.setdefault(f"they have no {TIME}, or no 16 numbers", []).append(frame)
             else:
-                rows.append([times[frame], *numbers])
+                rows.append([sequence.times[frame], *numbers])
                 frames.append(frame)
         table = Table(
             path, HEADER, np.array(rows, np.float64).reshape(-1, 17), np.array(frames, np.int64), stream=name,
-            record="frame", stated_in=_ends(name)[1], meaning=_meaning(name),
+            record="frame", stated_in=stated_in, meaning=meaning,
         )  # fmt: skip
         if not rows:
             raise NeecoError(f"{table.where}: {_unusable(next(iter(dropped)))}")
@@ -111,10 +119,9 @@ class PlusSequence(RecordingFormat):
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         sequence = _sequence_of(path)
         choose_stream(path, self.streams(path), stream, (IMAGES,))
-        frames, notes = _image_frames(sequence)
-        times = _times(sequence)
-        seconds = np.array([times[frame] for frame in frames])
-        return SequenceImages(path, sequence.size, tuple(notes), seconds, sequence=sequence, frames=tuple(frames))
+        frames, notes = sequence.images
+        seconds = np.array([sequence.times[frame] for frame in frames])
+        return SequenceImages(path, sequence.size, notes, seconds, sequence=sequence, frames=tuple(frames))
 
 
 def _sequence_of(path: Path) -> FrameSequence:
@@ -127,71 +134,19 @@ def _cached(path: Path, state: tuple[object, ...]) -> FrameSequence:
     return read_sequence(path)
 
 
+def _status_words(name: str, status: str) -> str:
+    return f"{name}{TRANSFORM}{STATUS} is {printable(status.upper(), 20)}"
+
+
 def _unusable(why: str) -> str:
     return f"no frame can be used: {why}; record again, or name another transform"
 
 
-def _statuses(sequence: FrameSequence, name: str) -> dict[int, str]:
-    """The status of each frame that has a transform."""
-    stated = sequence.fields.get(name + TRANSFORM + STATUS, {})
-    return {frame: stated.get(frame, GOOD) for frame in sequence.fields[name + TRANSFORM]}
-
-
-def _transforms(sequence: FrameSequence) -> list[str]:
-    return sorted(name.removesuffix(TRANSFORM) for name in sequence.fields if name.endswith(TRANSFORM))
-
-
-def _ends(name: str) -> tuple[str, str]:
-    """Return the ends of a transform: Stylus and Tracker of StylusToTracker; without a "To", as 3D Slicer names
-    transforms (LinearTransform_3), the whole name and nothing."""
+def _ends(name: str) -> tuple[str, str, NamedFrame]:
+    """Return the ends of a transform, Stylus and Tracker of StylusToTracker, and the meaning of the frame that it maps
+    to; without a "To", as 3D Slicer names transforms (LinearTransform_3), the whole name and nothing."""
     match = _ENDS.fullmatch(name)
-    return (name, "") if match is None else (match[1], match[2])
-
-
-def _meaning(name: str) -> NamedFrame:
-    """Return the meaning of the frame that a transform maps to."""
-    body, frame = _ends(name)
-    if not frame:
+    if match is None:
         why = f"{printable(name)} names no frame (StylusToTracker does)"
-        return NamedFrame(None, why, (BASE, CAMERA))
-    return meaning_of(frame, dvrk=of_dvrk(body))
-
-
-def _stamps(sequence: FrameSequence) -> dict[int, float]:
-    """PLUS's timestamps s, by frame."""
-    found = {frame: parse_number(text) for frame, text in sequence.fields.get(TIME, {}).items()}
-    stamps = {frame: stamp for frame, stamp in found.items() if stamp is not None and np.isfinite(stamp)}
-    if not stamps:
-        raise NeecoError(f"{sequence.path}: {TIME}: no frame has one (Seq_Frame0000_{TIME}); record again")
-    return stamps
-
-
-def _image_frames(sequence: FrameSequence) -> tuple[list[int], list[str]]:
-    """The frames whose images can be used, in order, and notes on the others."""
-    stamps, latest = _stamps(sequence), -np.inf
-    statuses = next((sequence.fields[name] for name in IMAGE_STATUSES if name in sequence.fields), {})
-    good = [frame for frame in range(sequence.count) if statuses.get(frame, GOOD).lower() == GOOD]
-    frames: list[int] = []
-    for frame in good:
-        if stamps.get(frame, -np.inf) > latest:
-            frames.append(frame)
-            latest = stamps[frame]
-    name, notes = sequence.path.name, []
-    if bad := sequence.count - len(good):
-        notes.append(f"{name}: {bad} images are not OK and left out")
-    if unstamped := len(good) - len(frames):
-        notes.append(f"{name}: {unstamped} images have no {TIME} later than the one before; left out")
-    return frames, notes
-
-
-def _times(sequence: FrameSequence) -> dict[int, float]:
-    """Times s by frame, from the first usable image on where there are images."""
-    stamps = _stamps(sequence)
-    frames = _image_frames(sequence)[0] if sequence.has_images else []
-    first = stamps[frames[0]] if frames else 0.0
-    return {frame: stamp - first for frame, stamp in stamps.items()}
-
-
-def _rate(times: dict[int, float], count: int) -> float | None:
-    span = max(times.values()) - min(times.values())
-    return (count - 1) / span if span > 0 and count > 1 else None
+        return name, "", NamedFrame(None, why, (BASE, CAMERA))
+    return match[1], match[2], meaning_of(match[2], dvrk=of_dvrk(match[1]))
