@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import StringIO
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,20 @@ from neeco.ingest.readers.columns import UNITS, canonical_unit
 from neeco.ingest.readers.ndi import find_tools
 
 EXPECTED = "CSV with a header line"
-MAX_COLUMNS = 4096
-MAX_PADDING = 16  # of the cells of a text as a table over those that it holds
-SAMPLE_LINES = 400  # that tell which columns hold numbers
 _COMMENT = re.compile(r"^\s*(?:#+|//|%\s)\s*")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextLimits:
+    """Limits on a text as a table."""
+
+    columns: int = 4096
+    padding: int = 16  # of its cells, by those that the text holds
+    sample_lines: int = 400  # that tell which columns hold numbers
+
+
+LIMITS = TextLimits()
 
 
 class DelimitedText(RecordingFormat):
@@ -45,30 +56,30 @@ class DelimitedText(RecordingFormat):
         if not used.any():
             raise NeecoError(f"{path}: has a header but no rows; record again or name another file")
         header, rows = unique_names(names), text.cells[used, : len(names)]
-        return Table(
-            path, header, rows, text.lines[used], decimal_comma=text.decimal_comma, bodies=find_tools(header, rows)
-        )
+        return Table(path, header, rows, text.lines[used], bodies=find_tools(header, rows))
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
     """The lines of a text that hold anything. cells [N, W]: stripped, "" where a line has fewer; lines [N]: their
     numbers, from 1; counts [N]: of their own cells; comment [N]: are they behind a `#`, `//` or `% `, which is left
-    out?; decimal_comma: commas in cells are those of decimals."""
+    out?"""
 
     cells: np.ndarray
     lines: np.ndarray
     counts: np.ndarray
     comment: np.ndarray
-    decimal_comma: bool
 
     def numeric(self, rows: np.ndarray | slice) -> np.ndarray:
         """Return which cells [R, W] of some lines hold numbers."""
-        found = np.zeros(self.cells[rows].shape, dtype=bool)
-        for place, cell in np.ndenumerate(self.cells[rows]):
-            value = parse_number(cell.replace(",", ".") if self.decimal_comma else cell)
-            found[place] = value is not None and cell.lower() not in MISSING
-        return found
+        cells = self.cells[rows]
+        found = [parse_number(cell) is not None and cell.lower() not in MISSING for cell in cells.ravel()]
+        return np.array(found, dtype=bool).reshape(cells.shape)
+
+    def names(self, row: int) -> list[str]:
+        """Return the cells of a line."""
+        names: list[str] = self.cells[row, : self.counts[row]].tolist()
+        return names
 
 
 def read_cells(path: Path) -> Cells:
@@ -84,10 +95,10 @@ def read_cells(path: Path) -> Cells:
     lines = [_COMMENT.sub("", text) for _, text in texts]
     counts = np.array([len(line.split()) if sign == " " else line.count(sign) + 1 for line in lines])
     columns = range(int(counts.max()))
-    if len(columns) > MAX_COLUMNS:
+    if len(columns) > LIMITS.columns:
         line = texts[int(counts.argmax())][0]
-        raise NeecoError(f"{path}: line {line}: has {len(columns)} cells; expected at most {MAX_COLUMNS}")
-    if len(columns) * len(lines) > MAX_PADDING * int(counts.sum()) + 10**6:
+        raise NeecoError(f"{path}: line {line}: has {len(columns)} cells; expected at most {LIMITS.columns}")
+    if len(columns) * len(lines) > LIMITS.padding * int(counts.sum()) + 10**6:
         raise NeecoError(f"{path}: most lines are much shorter than the longest one; expected the rows of one table")
     is_open = any(line.count('"') % 2 for line in lines)  # a quote left open must not swallow the rest of the file
     try:
@@ -99,11 +110,12 @@ def read_cells(path: Path) -> Cells:
     except (ValueError, OverflowError) as error:
         raise NeecoError(f"{path}: not readable as CSV ({' '.join(str(error).split())[:100]}); repair it") from None
     frame = frame.fillna("")  # where a line has fewer cells
+    stripped = [cell.strip(' \t"') for cell in frame.to_numpy(object).ravel().tolist()]
+    if sign in ";\t" and any("," in text for text in plain[:49]):
+        stripped = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in stripped]
     cells = np.empty(frame.size, object)
-    cells[:] = [cell.strip(' \t"') for cell in frame.to_numpy(object).ravel().tolist()]
-    commas = sign in ";\t" and any("," in text for text in plain[:49])
-    rows = cells.reshape(frame.shape)
-    return Cells(rows, np.array([number for number, _ in texts]), counts, comment, commas)
+    cells[:] = stripped
+    return Cells(cells.reshape(frame.shape), np.array([number for number, _ in texts]), counts, comment)
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -119,75 +131,53 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
 def _header(path: Path, text: Cells) -> tuple[list[str], int]:
     """The names of the columns, and the line from which the rows are. Raises NeecoError where nothing names them."""
     plain = np.flatnonzero(~text.comment).tolist()
-    sample = plain[len(plain) // 2 :][:SAMPLE_LINES]
+    sample = plain[len(plain) // 2 :][: LIMITS.sample_lines]
     numeric = np.flatnonzero(text.numeric(np.array(sample)).mean(axis=0) > 0.5)
-    start = next((row for row in plain if _is_row(text, row, numeric)), None)
+
+    def is_row(row: int) -> bool:
+        """Whether a line holds numbers, or a word for a missing one, wherever most do."""
+        held = text.numeric(slice(row, row + 1))[0, numeric]
+        missing = [index < text.counts[row] and text.cells[row, index].lower() in MISSING for index in numeric]
+        return bool(held.any() and (held | missing).all())
+
+    def names_columns(row: int, columns: np.ndarray) -> bool:
+        """Whether a line has no numbers where the rows have them, and names for at least half of those columns."""
+        held = text.numeric(slice(row, row + 1))[0, columns]
+        return sum(map(bool, text.cells[row, columns])) >= 0.5 * len(columns) and not held.any()
+
+    start = next((row for row in plain if is_row(row)), None)
     if not len(numeric) or start is None:
-        return _names(text, plain[0]), plain[0] + 1
-    above = [int(row) for row in plain if row < start]
-    places = [row for row in above if _names_columns(text, row, numeric)]
-    if places:
-        place, units = places[-1], [_unit_of(cell) for cell in text.cells[places[-1]]]
+        return text.names(plain[0]), plain[0] + 1
+    above = [row for row in plain if row < start]
+    if places := [row for row in above if names_columns(row, numeric)]:
+        place, others = places[-1], [row for row in above if row < places[-1]]
+        units = [canonical_unit(cell.strip("[]() ")) for cell in text.cells[place]]
+        units = [unit if any(unit in known for known in UNITS.values()) else "" for unit in units]
         filled = [unit for unit, cell in zip(units, text.cells[place], strict=True) if cell.strip("[]()- ")]
-        before = next((row for row in reversed(above) if row < place), None)
-        if before in places and sum(unit is not None for unit in filled) > 0.5 * len(filled) > 0:
-            place, before = before, next((row for row in reversed(above) if row < before), None)
+        if others and others[-1] in places and sum(map(bool, filled)) > 0.5 * len(filled) > 0:  # a line of units
+            place = others.pop()
         else:
-            units = [None] * len(units)
-        names = _names(text, place)
-        if before is not None:
-            names = _grouped(names, text.cells[before])
+            units = [""] * len(units)
+        names = text.names(place)
+        if others:  # names of groups, where these tell columns of one name apart
+            groups = accumulate(text.cells[others[-1]].tolist(), lambda last, group: str(group or last))
+            joined = ["_".join(filter(None, pair)) for pair in zip(groups, names, strict=False)]
+            names = joined if len(set(names)) < len(set(joined)) else names
         named = (f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, units, strict=False))
         return list(named), places[-1] + 1
-    if above and text.counts[above[-1]] == text.counts[start] and _names_columns(text, above[-1], np.array([0])):
-        return _names(text, above[-1]), above[-1] + 1
+    if above and text.counts[above[-1]] == text.counts[start] and names_columns(above[-1], np.array([0])):
+        return text.names(above[-1]), above[-1] + 1
     for row in reversed(np.flatnonzero(text.comment[:start]).tolist()):
-        if text.counts[row] == text.counts[start] and _names_columns(text, row, numeric):
-            return _names(text, row), start
-    found, number = printable(",".join(_names(text, plain[0]))[:40]), text.lines[plain[0]]
-    where = f"{path}: line {number}"
-    if above:
-        raise NeecoError(
-            f"{where} is no header of columns (found {found}), and the rows of numbers begin at line "
-            f"{text.lines[start]}; write a line that names the columns above that"
-        )
-    raise NeecoError(f"{where}: no header (found {found}); add a line naming the columns")
-
-
-def _names(text: Cells, row: int) -> list[str]:
-    return text.cells[row, : text.counts[row]].tolist()
-
-
-def _is_row(text: Cells, row: int, numeric: np.ndarray) -> bool:
-    """Return whether a line holds numbers, or a word for a missing one, wherever most do."""
-    held = text.numeric(slice(row, row + 1))[0, numeric]
-    missing = [index < text.counts[row] and text.cells[row, index].lower() in MISSING for index in numeric]
-    return bool(held.any() and (held | missing).all())
-
-
-def _names_columns(text: Cells, row: int, numeric: np.ndarray) -> bool:
-    """Return whether a line has no numbers where the rows have them, and names for at least half of those columns."""
-    named = sum(bool(cell) for cell in text.cells[row, numeric])
-    return named >= 0.5 * len(numeric) and not text.numeric(slice(row, row + 1))[0, numeric].any()
-
-
-def _unit_of(cell: str) -> str | None:
-    unit = canonical_unit(cell.strip("[]() "))
-    return unit if any(unit in units for units in UNITS.values()) else None
-
-
-def _grouped(names: list[str], groups: Sequence[str]) -> list[str]:
-    """Names of columns behind those of their groups, where these tell columns of one name apart."""
-    joined, last = [], ""
-    for name, group in zip(names, groups, strict=False):
-        last = group or last
-        joined.append("_".join(filter(None, (last, name))))
-    return joined if len(set(names)) < len(set(joined)) else names
+        if text.counts[row] == text.counts[start] and names_columns(row, numeric):
+            return text.names(row), start
+    found, where = printable(",".join(text.names(plain[0]))[:40]), f"{path}: line {text.lines[plain[0]]}"
+    rows = f", and the rows of numbers begin at line {text.lines[start]}" if above else ""
+    raise NeecoError(f"{where} is no header of columns (found {found}){rows}; add a line that names the columns")
 
 
 def _delimiter(lines: Sequence[str]) -> str:
     """Return the sign between the cells of the rows, which are most of the second half of a file."""
-    rows = lines[len(lines) // 2 :][:SAMPLE_LINES]
+    rows = lines[len(lines) // 2 :][: LIMITS.sample_lines]
     for delimiter in "\t;":  # before commas, which may be those of decimals then
         count, n_similar = Counter(row.count(delimiter) for row in rows).most_common(1)[0]
         if count and n_similar > 0.9 * len(rows):

@@ -40,7 +40,7 @@ from neeco.ingest.readers import (
 from neeco.ingest.readers.columns import BASE, CAMERA, PoseColumns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, meaning_of, of_dvrk
 from neeco.ingest.readers.interpolate import poses_at
-from neeco.ingest.readers.logs import NORM_TOLERANCE, read_pose_log
+from neeco.ingest.readers.logs import SETTINGS, read_pose_log
 
 if TYPE_CHECKING:
     from neeco.ingest.readers._bagfile import BagLimits, Samples, Survey
@@ -345,7 +345,7 @@ def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.n
         log = survey.poses[f"tf:{edge}"]
         if log.static:
             values = log.table()[-1]
-            if not (np.isfinite(values).all() and abs(np.linalg.norm(values[3:]) - 1) < NORM_TOLERANCE):
+            if not (np.isfinite(values).all() and abs(np.linalg.norm(values[3:]) - 1) < SETTINGS.norm_tolerance):
                 raise NeecoError(f"{survey.path}: tf:{edge}: is no rotation and translation; record it anew")
             pose = rigid(Rotation.from_quat(values[3:]).as_matrix(), 1000 * values[:3])
             poses = np.tile(pose, (len(seconds), 1, 1))
