@@ -282,7 +282,7 @@ def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder)
         ("[x_mm, y_mm, z_mm]", "[x_mm, y_mm, x_mm]", r"columns\.position: names a column twice"),
         ("[qw, qx, qy, qz]", "[a, b, c, d]", "the names do not say the order"),
         ("quaternion: [qw, qx, qy, qz]", "euler: [qx, qy, qz]", r"euler_convention: missing"),
-        ("quaternion:", "euler_convention: XXY, quaternion:", r"'XXY' is none"),
+        ("quaternion: [qw, qx, qy, qz]", "euler: [qx, qy, qz], euler_convention: XXY", r"'XXY' is none"),
         ("quaternion:", "rotation_vector: [a, b, c], quaternion:", "keep one of them"),
         ("millimetres", "inches", r"units\.length: 'inches' is no unit of length; use mm, cm, m"),
         ("[0, 1.5]", "[1.5, 0]", r"joints\.jaw\.limits: 1\.5 is not below 0"),
@@ -345,7 +345,11 @@ def test_an_offset_of_a_log_that_was_not_given_is_noted(folder):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("[]", "expected clock offsets"), ("{}", "clocks: missing"), ('{"clocks": {"em": "x"}}', "'x' is not an offset")],
+    [
+        ("[]", "expected clock offsets"),
+        ("{}", "clocks: expected clock offsets"),
+        ('{"clocks": {"em": "x"}}', "'x' is not an offset"),
+    ],
 )
 def test_sync_files_that_are_none(world, folder, content, message):
     with pytest.raises(NeecoError, match=rf"sync\.json: .*{message}"):

@@ -36,7 +36,7 @@ def test_frames_are_read_by_index_in_order(world):
 def test_a_video_is_decoded_once_where_its_frames_fit_into_memory(world, monkeypatch):
     path = world.video()
     opened = [open_video(path)]
-    monkeypatch.setattr(video, "MAX_BUFFERED_BYTES", 1000)
+    monkeypatch.setattr(video, "SETTINGS", video.VideoSettings(buffered_bytes=1000))
     opened.append(open_video(path))
     (_, first), (_, second) = (zip(*one.read([3, 11, 20]), strict=True) for one in opened)
     np.testing.assert_array_equal(first, second)
