@@ -21,8 +21,8 @@ from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Table, column_index, numbers, parse_number, read_table
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
+from neeco.ingest.readers.delimited import tool_columns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_in, meaning_of, of_dvrk
-from neeco.ingest.readers.ndi import tool_columns
 from neeco.ingest.readers.rows import Rows, drop_stuck, find_gaps, in_order, keep_measured, read_cells, read_times
 
 _FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)

@@ -36,9 +36,9 @@ from neeco.ingest.readers.columns import (
     recognise_value,
     split_unit,
 )
+from neeco.ingest.readers.delimited import tool_columns, tool_names
 from neeco.ingest.readers.frame_names import NamedFrame, without_frame
 from neeco.ingest.readers.logs import with_named_frame
-from neeco.ingest.readers.ndi import tool_columns, tool_names
 from neeco.ingest.readers.rosbag import DVRK_WRIST
 from neeco.ingest.readers.video import IMAGES, VIDEOS
 from neeco.ingest.recording.model import STILL, ImageFolder, VideoFile
