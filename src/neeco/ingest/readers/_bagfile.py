@@ -114,7 +114,11 @@ class _McapReader(McapReader):
 
     def open(self) -> None:
         self.bio = _AnyMcap(io.FileIO(str(self.path)))
-        self._open()
+        try:
+            self._open()
+        except BaseException:
+            self.bio.close()
+            raise
 
 
 @cache
@@ -372,22 +376,24 @@ def decode(message: Any) -> np.ndarray:
 
 @dataclass(kw_only=True, eq=False)  # cached by identity
 class Survey:
-    """Contents of a bag by stream, without the pixels of images. lenses: a CameraInfo by topic; origin: ns, of all
-    times."""
+    """Contents of a bag by stream, without the pixels of images. lenses: by topic, a CameraInfo and its numbers K, D, R
+    and P; origin: ns, of all times."""
 
     path: Path
     limits: BagLimits
     poses: dict[str, Samples] = field(default_factory=dict)
     joints: dict[str, Samples] = field(default_factory=dict)
     images: dict[str, Samples] = field(default_factory=dict)
-    lenses: dict[str, Any] = field(default_factory=dict)
+    lenses: dict[str, tuple[Any, dict[str, list[float]]]] = field(default_factory=dict)
     others: list[Stream] = field(default_factory=list)
     origin: int = 0
 
     def add(self, topic: str, kind: str, received: int, message: Any) -> None:
         if kind == CAMERA_INFO:
-            if message is not None and (topic not in self.lenses or not matrix_of(self.lenses[topic], "K")[0]):
-                self.lenses[topic] = message
+            if message is not None and (topic not in self.lenses or not self.lenses[topic][1]["K"][0]):
+                # its fields have capitals in ROS 1
+                fields = {name: getattr(message, name if hasattr(message, name) else name.lower()) for name in "KDRP"}
+                self.lenses[topic] = message, {name: list(map(float, values)) for name, values in fields.items()}
         elif kind in TRANSFORMS:
             for item in [] if message is None else message.transforms:
                 name = f"tf:{plain(item.child_frame_id).lstrip('/')}"
@@ -432,11 +438,6 @@ def survey_of(path: Path, state: tuple[object, ...], limits: BagLimits) -> Surve
     logs = logs or [log for log in [*survey.poses.values(), *survey.joints.values()] if log.stamps]
     survey.origin = min((min(log.stamps) or min(log.received) for log in logs), default=0)
     return survey
-
-
-def matrix_of(info: Any, name: str) -> list[float]:
-    """Return the numbers K, D, R or P of a CameraInfo, whose fields have capitals in ROS 1."""
-    return [float(value) for value in getattr(info, name if hasattr(info, name) else name.lower())]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -236,26 +236,21 @@ def _meaning(survey: Survey, name: str) -> tuple[NamedFrame, np.ndarray | None]:
 def _info_topic(survey: Survey, stream: str | None, of_right: bool) -> str | None:
     """Return the topic of the camera_info of a stream of images, which is in their namespace; of another bag's stream,
     whose topic is not in this one, that of its only right camera (with a baseline) or left one."""
-    from neeco.ingest.readers._bagfile import matrix_of
-
     plain = (stream or "").removesuffix("/compressed")
     topic = f"{plain.rpartition('/')[0]}/camera_info" if stream else None
     if topic in survey.lenses or stream in survey.images:
         return topic
-    sided = [name for name, info in survey.lenses.items() if bool(matrix_of(info, "P")[3]) == of_right]
+    sided = [name for name, (_, numbers) in survey.lenses.items() if bool(numbers["P"][3]) == of_right]
     return sided[0] if len(sided) == 1 else topic
 
 
 def _camera(survey: Survey, topic: str | None, stream: str) -> RosCamera | None:
     """Return the camera that a topic states, as it takes the images of a stream; None where it is not calibrated.
     Raises NeecoError."""
-    from neeco.ingest.readers._bagfile import matrix_of, plain
-
     if topic not in survey.lenses:
         return None
-    info, where = survey.lenses[topic], f"{survey.path}: {topic}"
+    (info, numbers), where, region = survey.lenses[topic], f"{survey.path}: {topic}", survey.lenses[topic][0].roi
     rectified = stream.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
-    numbers, region = {name: matrix_of(info, name) for name in "KDRP"}, info.roi
     cut = region.height not in (0, info.height) or region.width not in (0, info.width)
     if max(info.binning_x, info.binning_y) > 1 or cut:
         raise NeecoError(f"{where}: states binning or a part of the image; give the images' own `intrinsics`")
@@ -268,7 +263,7 @@ def _camera(survey: Survey, topic: str | None, stream: str) -> RosCamera | None:
         "projection_matrix": numbers["P"],
         "image_width": int(info.width),
         "image_height": int(info.height),
-        "distortion_model": "" if rectified else plain(info.distortion_model),
+        "distortion_model": "" if rectified else info.distortion_model,
     }
     return RosCamera(where, cameras_in(where, document)[0], rectified)
 
