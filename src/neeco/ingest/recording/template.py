@@ -61,7 +61,7 @@ class DraftLimits:
     tracker_rate: float = 40.0
 
 
-LIMITS = DraftLimits()
+LIMITS, IN_BASE = DraftLimits(), NamedFrame(BASE)
 
 # Lines of a draft that leave something open: what marks the first of them, and what to write there
 _QUESTIONS = (
@@ -93,28 +93,21 @@ class _Frames:
     file: Path
     stream: str | None = None
 
-    def open(self) -> VideoSource:
-        """Return the images; those of a folder at an assumed rate. Raises NeecoError."""
-        if self.line.startswith("images"):
-            return ImageFolder(self.file, fps=LIMITS.image_rate).open()
-        return VideoFile(self.file, stream=self.stream).open()
-
 
 @dataclass(frozen=True)
 class _Log:
-    """A log: its file, relative to the folder; stream: which of it; tool: which of several in an NDI export; meaning:
-    of the frame of a table's poses."""
+    """A log: its file, relative to the folder; says: the holder of remarks on the body (`hints`), and of keys that
+    nothing in the file answers (`asks`), its stream or the meaning of a table's frame; tool: which of several in an NDI
+    export; in_base: are its poses stated in a base's frame?"""
 
     file: str
-    stream: Stream | None = None
+    says: Stream | NamedFrame = IN_BASE
     tool: str | None = None
-    meaning: NamedFrame | None = None
-    in_base: bool = False  # are its poses stated in a base's frame?
+    in_base: bool = False
 
     @property
-    def says(self) -> Stream | NamedFrame:
-        """The holder of remarks on the body (`hints`), and of keys that nothing in the file answers (`asks`)."""
-        return self.stream or self.meaning or NamedFrame(BASE)
+    def stream(self) -> Stream | None:
+        return self.says if isinstance(self.says, Stream) else None
 
     @property
     def stem(self) -> str:
@@ -278,7 +271,7 @@ def _classify_table(files: _FolderFiles, name: str, file: Path) -> None:
     columns = [column for column in table.header if column]
     angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
     if pose.rotation or "rotation" in pose.unclear:
-        files.poses.append((replace(log, meaning=meaning), pose))
+        files.poses.append((replace(log, says=meaning or log.says), pose))
         joints = joint_columns(columns, pose_bodies(columns))
         files.joints += [(log, when, column, _joint_of(column)) for column in joints]
     elif value and when.time:
@@ -336,7 +329,13 @@ def _scope_lines(
     still, camera = False, "# camera: still   # or moving"
     if stands_still is not None and (source.stream is not None or stereo):
         with suppress(NeecoError):
-            still = stands_still(source.open())
+            is_folder = source.line.startswith("images")
+            images = (
+                ImageFolder(source.file, LIMITS.image_rate)
+                if is_folder
+                else VideoFile(source.file, None, source.stream)
+            )
+            still = stands_still(images.open())
             camera += "; in frames spread over the recording, the background does not keep its place"
     if still:
         camera = f"camera: {STILL}   # in frames spread over the recording, the background keeps its place"
@@ -440,35 +439,33 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
 
 
 def _joint_lines(files: _FolderFiles, log: _Log, when: RecognisedColumns, value: str, named: str | None) -> list[str]:
-    lines = log.lines()
+    lines, stem = log.lines(), log.stem.lower()
     if log.stream is None and named:  # a table of several joints is a robot's, as its poses are
         lines.append("clock: em   # that of the poses: correct it where another computer logged it")
     elif log.stream is None and not files.syncs:
         lines.append("# clock: em   # left out, it is its own, whose offset nothing states")
-    lines.append(f"columns: {{value: {_scalar(value)}}}")
-    stem = log.stem.lower()
     tables = [name for name, header in files.calibrations if value in header]
     tables += [name for name, _ in files.calibrations if Path(name).stem.lower().startswith(stem)]
-    lines += [f"calibration: {_scalar(tables[0])}"] if tables else []
+    lines += [f"columns: {{value: {_scalar(value)}}}", *(f"calibration: {_scalar(name)}" for name in tables[:1])]
     return lines + _unit_lines(when, {} if tables else {"angle": (value,)})
 
 
 def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | None]) -> list[str]:
     """A line asking for the units that neither the columns' names nor their format say."""
-    lines = []
-    if columns.counts_frames or columns.time is None:
+    lines, time = [], columns.time or ()
+    if columns.counts_frames or not time:
         why = "time counts frames" if columns.counts_frames else "nothing says when its rows were taken"
         lines.append(f"rate_hz: {LIMITS.tracker_rate:g}   # {why}, and this rate is a guess: correct it")
-    elif columns.time and len(columns.time) == 1 and not (columns.time_unit or split_unit(columns.time[0], "time")[1]):
-        wanted = {"time": columns.time} | wanted
-    implied = {"length": columns.length_unit}
+    elif len(time) == 1 and not columns.time_unit:
+        wanted = {"time": time} | wanted
+    units = {"time": "s", "length": "mm", "angle": "rad"}
     unsaid = [
-        kind for kind, names in wanted.items() if names and not implied.get(kind) and not split_unit(names[0], kind)[1]
+        f"{kind}: {units[kind]}"
+        for kind, names in wanted.items()
+        if names and not split_unit(names[0], kind)[1] and not (kind == "length" and columns.length_unit)
     ]
     if unsaid:
-        choices = {"time": "s", "length": "mm", "angle": "rad"}
-        values = ", ".join(f"{kind}: {choices[kind]}" for kind in unsaid)
-        lines.append(f"# units: {{{values}}}   # nothing says them: correct, and remove the #")
+        lines.append(f"# units: {{{', '.join(unsaid)}}}   # nothing says them: correct, and remove the #")
     return lines
 
 
