@@ -143,7 +143,7 @@ class PoseSection(LogSection):
 
     columns: PoseColumnsSection = field(default_factory=PoseColumnsSection)
     tool: Name | None = None
-    frame: Annotated[str, word(FRAMES, "is no frame of poses", f"write one of {', '.join(FRAMES)}")] | None = None
+    frame: Annotated[str, word(*FRAMES)] | None = None
 
     def log(self, video: Path | None) -> PoseColumns:
         """Return the log; in the file of the images, it shares their clock."""
@@ -327,7 +327,7 @@ def _episodes(node: Node) -> tuple[int, ...]:
 class RecordingSection(FramesSection, BasesSection):
     """The keys of recording.yaml."""
 
-    camera: Annotated[str, word((STILL, MOVING), "says nothing of a scope", f"write {STILL} or {MOVING}")] | None = None
+    camera: Annotated[str, word(STILL, MOVING)] | None = None
     stereo: StereoSection | None = None
     episodes: Annotated[tuple[int, ...], _episodes] = ()
     intrinsics: Annotated[Any, _intrinsics] = None
