@@ -27,7 +27,7 @@ _COMMENT = re.compile(r"^\s*(?:#+|//|%\s)\s*")
 _PORT = re.compile(r"port\b\s*(?P<port>[^:]*?)\s*(?::\s*(?P<name>.*))?$", re.IGNORECASE)
 _NUMBERED = re.compile(r"#\d+$")  # what tells columns of one name apart
 MARKERS = "markers"  # the column behind which those of a tool's markers begin
-_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_DECIMAL_COMMA = re.compile(r"[+-]?(?:\d+,\d*|,\d+)(?:[eE][+-]?\d+)?")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -60,7 +60,7 @@ from neeco.ingest.readers.video import ChosenFrames, open_video
 TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names
 DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
-_NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
+_NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*/\s*(\S+)\s*", re.IGNORECASE)
 
 
 class LeRobot(RecordingFormat):

@@ -324,18 +324,14 @@ def _scope_lines(
     """Return the lines on the scope whose images are the first of `frames`, the line that names the second camera's
     images, and whether the scope is stated to stand still. calibrations: files of lenses in the folder of the frames'
     files, as YAML; stands_still: judges images, None: they are not looked at."""
-    source = frames[0]
-    right, stereo, problem = _second_camera(source, frames[1:], calibrations)
+    first = frames[0]
+    right, stereo, problem = _second_camera(first, frames[1:], calibrations)
     still, camera = False, "# camera: still   # or moving"
-    if stands_still is not None and (source.stream is not None or stereo):
+    if stands_still is not None and (first.stream is not None or stereo):
         with suppress(NeecoError):
-            is_folder = source.line.startswith("images")
-            images = (
-                ImageFolder(source.file, LIMITS.image_rate)
-                if is_folder
-                else VideoFile(source.file, None, source.stream)
-            )
-            still = stands_still(images.open())
+            video = VideoFile(first.file, stream=first.stream)
+            source = ImageFolder(first.file, LIMITS.image_rate) if first.line.startswith("images") else video
+            still = stands_still(source.open())
             camera += "; in frames spread over the recording, the background does not keep its place"
     if still:
         camera = f"camera: {STILL}   # in frames spread over the recording, the background keeps its place"
@@ -345,11 +341,11 @@ def _scope_lines(
     elif right:
         why = problem or "its second camera, begun together: measures the depth of the tissue"
         lines.append(f"# stereo: {{{right}, calibration: stereo.yaml}}   # {why}")
-    lens, known = None, None if source.stream is None else format_of(source.file)
+    lens, known = None, None if first.stream is None else format_of(first.file)
     with suppress(NeecoError):
-        lens = known and known.lens(source.file, source.stream)
+        lens = known and known.lens(first.file, first.stream)
     if lens:
-        lines.append(f"# intrinsics: left out, {source.name} states the lens")
+        lines.append(f"# intrinsics: left out, {first.name} states the lens")
     elif not calibrations and not (stereo and still):
         lines.append("# intrinsics: [290, 290, 160, 128]   # fl_x, fl_y, cx, cy px; no calibration was found")
     lines += [f"{'# ' if index else ''}intrinsics: {name}" for index, name in enumerate(calibrations)]
