@@ -116,9 +116,6 @@ class LeRobot(RecordingFormat):
         damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
         count = int(places[-1]) + 1  # images that the states belong to, and those between
         last = int(numbers[-1]) + 1
-        if last < count and last == len(times):
-            places, count = np.arange(last), last
-            notes = (*notes, f"{film.name}: is shorter than its timestamps; state i is taken to be of image i")
         shown = max(last, count) if damaged else max(last, len(numbers)) if last > count else len(numbers)
         noun, remedy = f"states of episode {episode.number}", "download the data set again, or name another episode"
         if count > len(times):
