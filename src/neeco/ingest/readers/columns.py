@@ -18,14 +18,7 @@ VIDEO_CLOCK = "video"  # that of the images, and of logs that stand in the same 
 QUATERNION_WXYZ, QUATERNION_XYZW = "quaternion_wxyz", "quaternion_xyzw"
 CAMERA, BASE = "camera", "base"  # frames that poses may be stated in: OpenCV's camera axes, or what registration places
 ROTATION_VECTOR, EULER, ROTATION_MATRIX, MATRIX = "rotation_vector", "euler", "rotation_matrix", "matrix"
-FORMS = {
-    QUATERNION_WXYZ: (4,),
-    QUATERNION_XYZW: (4,),
-    ROTATION_VECTOR: (3,),
-    EULER: (3,),
-    ROTATION_MATRIX: (9,),
-    MATRIX: (12, 16),
-}  # how many columns each form of rotation takes; matrices row by row
+FORMS = (QUATERNION_WXYZ, QUATERNION_XYZW, ROTATION_VECTOR, EULER, ROTATION_MATRIX, MATRIX)  # matrices row by row
 
 UNITS = {
     "length": {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3},

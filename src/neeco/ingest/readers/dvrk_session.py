@@ -239,10 +239,7 @@ def _tables_in(path: Path) -> list[Path]:
 
 
 def _topics(path: Path) -> dict[str, Path]:
-    found = {topic: file for file in _tables_in(path) if (topic := _topic_of(file))}
-    if not found and not any(_films(path)):
-        raise NeecoError(f"{path}: holds no videos and no topics; give the folder of a session")
-    return found
+    return {topic: file for file in _tables_in(path) if (topic := _topic_of(file))}
 
 
 def _topic_of(file: Path) -> str | None:

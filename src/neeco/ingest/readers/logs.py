@@ -212,7 +212,9 @@ def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[s
 def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
     """Positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
     table = rows.table
-    form, rotation = _rotation_columns(table, source, found)
+    rotation, form = (source.rotation, source.form) if source.rotation else (found.rotation, found.form)
+    if rotation is None or form is None:
+        raise _unclear(table, found, "rotation", "qw, qx, qy, qz columns")
     position = source.position or found.position
     if form == MATRIX:
         position, read = tuple(rotation[i] for i in (3, 7, 11)), rotation
@@ -273,20 +275,6 @@ def continuous(quats: np.ndarray) -> tuple[np.ndarray, int]:
     flips = np.concatenate([[False], (quats[1:] * quats[:-1]).sum(axis=1) < 0])
     signs = np.where(np.cumsum(flips) % 2, -1.0, 1.0)
     return quats * signs[:, None], int(flips.sum())
-
-
-def _rotation_columns(table: Table, source: PoseColumns, found: RecognisedColumns) -> tuple[str, tuple[str, ...]]:
-    """Form and columns of the rotation."""
-    rotation, form = (source.rotation, source.form) if source.rotation else (found.rotation, found.form)
-    if rotation is None or form is None:
-        raise _unclear(table, found, "rotation", "qw, qx, qy, qz columns")
-    if len(rotation) not in named.FORMS[form]:
-        wanted = " or ".join(map(str, named.FORMS[form]))
-        raise NeecoError(f"{table.where}: {form}: takes {wanted} columns, not {len(rotation)}; list them all")
-    if form == EULER and not source.euler_convention:
-        listed = ", ".join(rotation)
-        raise NeecoError(f"{table.where}: {listed}: say their euler_convention in the recording (like XYZ)")
-    return form, rotation
 
 
 def _unclear(table: Table, found: RecognisedColumns, what: str, expected: str) -> NeecoError:
